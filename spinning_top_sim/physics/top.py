@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The heavy symmetric (Lagrange) top: its constants, its states, and what both must satisfy.
+
+A rigid symmetric body turns about a fixed point on its axis, without friction.  Euler angles are
+ZYZ (Taylor, *Classical Mechanics*, sect. 10.9): body to space is Rz(phi) Ry(theta) Rz(psi), phi is
+the precession, theta the tilt from the upward vertical, psi the spin about the symmetry axis.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+
+@dataclass(frozen=True, kw_only=True)
+class Top:
+    """
+    The constants of a top.
+
+    lambda1: principal moment of inertia across the axis, *about the pivot* [kg m^2], > 0
+    lambda3: principal moment of inertia along the axis [kg m^2], > 0
+    mass: [kg], >= 0
+    com_distance: signed distance from pivot to centre of mass along +e3 [m]
+    gravity: [m/s^2], downwards positive
+
+    Raises ValueError naming the field, its value and what is allowed.
+    """
+
+    lambda1: float
+    lambda3: float
+    mass: float
+    com_distance: float
+    gravity: float
+
+    def __post_init__(self) -> None:
+        _freeze_as_floats(self)
+        for name in ('lambda1', 'lambda3'):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f'{name} = {getattr(self, name)!r} kg m^2: must be > 0')
+        if self.mass < 0.0:
+            raise ValueError(f'mass = {self.mass!r} kg: must be >= 0')
+        if not math.isfinite(self.gravity_torque):
+            raise ValueError(
+                f'mass * gravity * com_distance = {self.gravity_torque!r} N m: must be finite')
+
+    @property
+    def gravity_torque(self) -> float:
+        """P = M g R [N m]: the potential energy is P cos(theta)."""
+        return self.mass * self.gravity * self.com_distance
+
+    @property
+    def is_realizable(self) -> bool:
+        """
+        Whether some body has this inertia.
+
+        About the centre of mass the moments obey the triangle inequality, so with the parallel
+        axis theorem lambda3 <= 2 (lambda1 - M R^2).  The equations of motion do not need it.
+        """
+        across_at_com = self.lambda1 - self.mass * self.com_distance ** 2
+        return self.lambda3 <= 2.0 * across_at_com * (1.0 + 1e-12)
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """
+    Where the top is and how it moves at one instant.
+
+    theta: tilt of the axis from the upward vertical [rad], in [0, pi]
+    theta_dot: [rad/s];  phi, psi: precession and spin angle [rad], any real number
+    l3: angular momentum along the body axis [kg m^2/s];  lz: along the vertical [kg m^2/s]
+
+    phi' and psi' follow from l3 and lz.  With the axis exactly vertical, lz = l3 (theta = 0) or
+    lz = -l3 (theta = pi, the double next to it) is the only possibility.
+    Raises ValueError naming the field, its value and what is allowed.
+    """
+
+    theta: float
+    theta_dot: float = 0.0
+    phi: float = 0.0
+    psi: float = 0.0
+    l3: float
+    lz: float
+
+    def __post_init__(self) -> None:
+        _freeze_as_floats(self)
+        if not 0.0 <= self.theta <= math.pi:
+            raise ValueError(f'theta = {self.theta!r} rad: must be in [0, pi]')
+        pole = pole_momentum(self.theta, self.l3)
+        if pole is not None and self.lz != pole:
+            raise ValueError(
+                f'lz = {self.lz!r} kg m^2/s: with the axis at a pole (theta = {self.theta!r} rad) '
+                f'it must equal {"l3" if self.theta == 0.0 else "-l3"} = {pole!r}')
+
+
+def pole_momentum(theta: float, l3: float) -> float | None:
+    """Return the only lz a top with a vertical axis can have, or None where the axis tilts."""
+    if theta == 0.0:
+        return l3
+    if theta == math.pi:
+        return -l3
+    return None
+
+
+def cusp_momentum(theta: float, l3: float) -> float:
+    """
+    Return the lz of a top that was spun about its axis only, and let go: L3 cos(theta0).
+
+    There phi' = 0 at theta0, the axis rests, and the tip draws cusps ("Analysis of Symmetric
+    Spinning Top", 2023, sect. 4.1 and eq. 33).
+    """
+    return l3 * math.cos(theta)
+
+
+def _freeze_as_floats(record: Top | State) -> None:
+    """Store every field as a finite float, or say which one is not."""
+    for field in fields(record):
+        value = getattr(record, field.name)
+        if isinstance(value, bool):
+            raise ValueError(f'{field.name} = {value!r}: must be a finite number')
+        try:
+            number = float(value)
+        except (TypeError, ValueError, OverflowError):
+            raise ValueError(f'{field.name} = {value!r}: must be a finite number') from None
+        if not math.isfinite(number):
+            raise ValueError(f'{field.name} = {value!r}: must be a finite number')
+        object.__setattr__(record, field.name, number)
