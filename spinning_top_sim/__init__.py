@@ -3,7 +3,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers import solve
+
+if TYPE_CHECKING:
+    from spinning_top_sim.solvers import solve
 
 __all__ = ['State', 'Top', 'solve']
+
+
+def __getattr__(name: str) -> Any:
+    """Import `solve`, and numpy with it, when it is first asked for: the node needs neither."""
+    if name == 'solve':
+        from spinning_top_sim.solvers import solve  # noqa: PLC0415
+        return solve
+    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
