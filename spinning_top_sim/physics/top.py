@@ -93,6 +93,18 @@ class State:
                 f'it must equal {"l3" if self.theta == 0.0 else "-l3"} = {pole!r}')
 
 
+class ContinuedState(State):
+    """
+    A state whose theta may be any real number: one that a motion through a pole has reached.
+
+    There theta, phi and psi go on smoothly (theta changes sign at the top, or passes pi), and a
+    motion that starts anew from it keeps them so.
+    """
+
+    def __post_init__(self) -> None:
+        """Accept every theta."""
+
+
 def pole_momentum(theta: float, l3: float) -> float | None:
     """Return the only lz a top with a vertical axis can have, or None where the axis tilts."""
     if theta == 0.0:

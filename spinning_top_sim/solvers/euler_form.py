@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Equations (29)-(32) of "Analysis of Symmetric Spinning Top" (2023), to the letter, for study.
+
+    d theta/dt  = theta'
+    d theta'/dt = phi'^2 sin cos - (lambda3/lambda1)(psi' + phi' cos) phi' sin + (P/lambda1) sin
+    d phi/dt    = (Lz - L3 cos)/(lambda1 sin^2)
+    d psi/dt    = L3/lambda3 - phi' cos
+
+They are singular where the axis is vertical, and near there wrong without a sign of it: cos(theta)
+rounds towards 1, Lz - L3 cos(theta) loses its digits, or a step leaps over the pole, and phi and
+psi drift off while every error estimate is small.  So this form stops with an error there.
+"""
+
+from __future__ import annotations
+
+import math
+
+from spinning_top_sim.physics.kinematics import AxisState
+from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.solvers.dormand_prince import IntegrationError, Vector
+
+# |sin(theta)| at which the rounding of cos(theta), 1.1e-16, costs phi' a millionth of L3/lambda1.
+SMALLEST_SINE = math.sqrt(2.0 ** -53 / 1e-6)
+ADVICE = "use the regular form (equations = 'transport') or method = 'exact'"
+
+
+class EulerForm:
+    """The equations above for one top and one motion; see `dormand_prince.Form`."""
+
+    name = 'euler'
+    number = float
+
+    def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
+        self.top, self.l3, self.lz = top, start.l3, start.lz
+        self._rtol, self._atol = rtol, atol
+        self.start = (start.theta, start.theta_dot, start.phi, start.psi)
+
+    @property
+    def first_step(self) -> float:
+        """A careful first step [s]: the control finds the right one within a few."""
+        top = self.top
+        rate = (abs(self.start[1]) + (abs(self.l3) + abs(self.lz)) / top.lambda1
+                + abs(self.l3) / top.lambda3 + math.sqrt(abs(top.gravity_torque) / top.lambda1))
+        return 0.1 * (self._rtol + self._atol) ** 0.2 / (rate or 1.0)
+
+    def rates(self, theta: float, theta_dot: float, phi: float, psi: float) -> Vector:
+        """Return (theta', theta'', phi', psi').  Raises IntegrationError near a pole."""
+        sine, cosine = math.sin(theta), math.cos(theta)
+        if not abs(sine) > SMALLEST_SINE:
+            raise IntegrationError(
+                f'euler equations: the axis is at a pole (theta = {theta!r} rad): cos(theta) '
+                f'rounds to {cosine!r} and eq. (31) loses phi\'; {ADVICE}')
+        top = self.top
+        phi_dot = (self.lz - self.l3 * cosine) / (top.lambda1 * sine * sine)
+        psi_dot = self.l3 / top.lambda3 - phi_dot * cosine
+        return (theta_dot,
+                phi_dot * phi_dot * sine * cosine
+                - top.lambda3 / top.lambda1 * (psi_dot + phi_dot * cosine) * phi_dot * sine
+                + top.gravity_torque / top.lambda1 * sine,
+                phi_dot, psi_dot)
+
+    def curvatures(self, y: Vector, rates: Vector) -> Vector:
+        """Return the equations differentiated once in time."""
+        theta = y[0]
+        theta_dot, theta_ddot, phi_dot, _ = rates
+        sine, cosine = math.sin(theta), math.cos(theta)
+        lambda1 = self.top.lambda1
+        phi_ddot = theta_dot * (self.l3 / lambda1 - 2.0 * phi_dot * cosine) / sine
+        theta_dddot = (
+            2.0 * phi_dot * phi_ddot * sine * cosine
+            + theta_dot * phi_dot * phi_dot * (cosine * cosine - sine * sine)
+            - self.l3 / lambda1 * (phi_ddot * sine + phi_dot * cosine * theta_dot)
+            + self.top.gravity_torque / lambda1 * cosine * theta_dot)
+        return theta_ddot, theta_dddot, phi_ddot, phi_dot * sine * theta_dot - phi_ddot * cosine
+
+    def error(self, y: Vector, y_new: Vector, difference: Vector) -> float:
+        """Return the largest error over atol + rtol |y|, component by component."""
+        return max([abs(e) / (self._atol + self._rtol * max(abs(a), abs(b)) or math.ulp(0.0))
+                    for e, a, b in zip(difference, y, y_new, strict=True)])
+
+    def check_step(self, y: Vector, y_new: Vector) -> None:
+        """Raise IntegrationError if the step leapt over a pole: phi and psi would be lost."""
+        if math.floor(y[0] / math.pi) != math.floor(y_new[0] / math.pi):
+            raise IntegrationError(
+                f'euler equations: a step leapt over a pole, from theta = {y[0]!r} to '
+                f'{y_new[0]!r} rad, and lost phi and psi; {ADVICE}')
+
+    def project(self, y: Vector) -> Vector:
+        """Return y as it is: L3 and Lz are exact in this form, and the rest is to the letter."""
+        return y
+
+
+def euler_state(form: EulerForm, y: Vector) -> AxisState:
+    """Return the state with these Euler angles."""
+    theta, theta_dot, phi, psi = y
+    return AxisState(form.top, form.l3, form.lz, theta, theta_dot, phi, psi)

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A motion sampled at many times: numpy columns, computed when they are asked for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.kinematics import Columns, lazy
+from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.solvers.rk45 import Propagator
+
+Column = NDArray[Any]
+
+
+class Motion(Columns):
+    """
+    States of a top at the times t (n,) [s].
+
+    theta, theta_dot, phi, psi  (n,) [rad], [rad/s]: ZYZ angles, unwrapped, continued through the
+    poles;  phi_dot, psi_dot  (n,) [rad/s];  theta_folded  (n,) in [0, pi];
+    quaternion  (n, 4): x, y, z, w of q(world <- body), sign continuous in time;
+    angular_velocity, angular_acceleration  (n, 3): body frame [rad/s], [rad/s^2];
+    energy [J], l3, lz [kg m^2/s]  (n,).
+    """
+
+    def __init__(self, top: Top, start: State, t: Column) -> None:
+        self.top, self.l3_start, self.lz_start, self.t = top, start.l3, start.lz, t
+
+    @lazy
+    def alpha(self) -> Column:
+        """cos(theta/2) exp(i (phi + psi)/2), complex."""
+        x, y, z, w = self.quaternion.T
+        return w + 1j * z
+
+    @lazy
+    def beta(self) -> Column:
+        """sin(theta/2) exp(i (phi - psi)/2), complex."""
+        x, y, z, w = self.quaternion.T
+        return y - 1j * x
+
+    @lazy
+    def quaternion(self) -> Column:
+        """Attitude q(world <- body), (n, 4): x, y, z, w."""
+        return np.stack(attitude.quaternion(self.alpha, self.beta), axis=-1)
+
+    @lazy
+    def theta_folded(self) -> Column:
+        """Tilt in [0, pi] [rad]."""
+        return 2.0 * np.arctan2(np.abs(self.beta), np.abs(self.alpha))
+
+    @lazy
+    def l3(self) -> Column:
+        """L . e3 [kg m^2/s]: a constant of this motion."""
+        return np.full(len(self.t), self.l3_start)
+
+    @lazy
+    def lz(self) -> Column:
+        """L . z [kg m^2/s]: a constant of this motion."""
+        return np.full(len(self.t), self.lz_start)
+
+    @lazy
+    def transverse_rate(self) -> Column:
+        """omega_1 + i omega_2 (n,), complex [rad/s], eq. (4)."""
+        return (-self.phi_dot * np.sin(self.theta) + 1j * self.theta_dot) * np.exp(
+            -1j * self.psi)
+
+    @lazy
+    def angular_velocity(self) -> Column:
+        """Body rates (n, 3) [rad/s]."""
+        rate = self.transverse_rate
+        return np.stack((rate.real, rate.imag, self.l3 / self.top.lambda3), axis=-1)
+
+    @lazy
+    def angular_acceleration(self) -> Column:
+        """Body angular acceleration (n, 3) [rad/s^2]."""
+        rate = attitude.angular_acceleration(
+            self.top, tuple(self.angular_velocity.T), self.vertical[0])
+        return np.stack((rate.real, rate.imag, np.zeros(len(self.t))), axis=-1)
+
+
+class SteppedMotion(Motion):
+    """Samples of a `Propagator`, taken one by one: rk45."""
+
+    PARTS = ('alpha', 'beta', 'theta', 'theta_dot', 'phi', 'psi', 'l3', 'transverse_rate')
+
+    def __init__(self, top: Top, start: State, t: Column, propagator: Propagator) -> None:
+        super().__init__(top, start, t)
+        columns: dict[str, list[Any]] = {name: [] for name in self.PARTS}
+        for instant in t.tolist():
+            state = propagator.at(instant)
+            for name, column in columns.items():
+                column.append(getattr(state, name))
+        for name, column in columns.items():
+            setattr(self, name, np.array(column))
+        self.steps, self.evaluations = propagator.steps, propagator.evaluations

@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The motion by Dormand-Prince steps, and by closed formulas where no step is needed."""
+
+from __future__ import annotations
+
+import cmath
+import math
+from typing import Protocol
+
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.kinematics import AxisState, OneState
+from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.solvers.dormand_prince import Integrator
+from spinning_top_sim.solvers.euler_form import EulerForm
+from spinning_top_sim.solvers.phases import (
+    MomentumState,
+    Polar,
+    Winding,
+    spin_excess,
+    windings,
+)
+from spinning_top_sim.solvers.transport import TransportForm
+
+EQUATIONS = ('transport', 'euler')
+# Rounding of the terms of theta'' against each other, in units of the last place.
+REST_ULPS = 8.0
+
+
+class Propagator(Protocol):
+    """A motion from its start at t = 0 on, read at times that never decrease."""
+
+    steps: int
+    evaluations: int
+
+    def reach(self, t: float, max_steps: int | None = None) -> bool:
+        """Compute what the state at t [s] needs; False if max_steps were not enough yet."""
+
+    def at(self, t: float) -> OneState:
+        """Return the state at t [s], not before the newest step's start."""
+
+
+def rk45(top: Top, start: State, *, equations: str = 'transport', rtol: float = 1e-11,
+         atol: float = 1e-12) -> Propagator:
+    """
+    Return the motion that begins at `start`.
+
+    rtol, atol: tolerated error a step.  The transport form scales its unknowns to 1, so there
+    the two add up; the Euler form tolerates atol + rtol |angle|.
+    Raises ValueError for a bad setting, IntegrationError where the Euler form cannot start.
+    """
+    check_settings(equations, rtol, atol)
+    if equations == 'euler':
+        return EulerMotion(top, start, rtol, atol)
+    if top.gravity_torque == 0.0:
+        return FreeMotion(top, start)
+    if nutation_rests(top, start):
+        return RestingMotion(top, start)
+    return TransportMotion(top, start, rtol, atol)
+
+
+def check_settings(equations: str, rtol: float, atol: float) -> None:
+    """Raise ValueError naming the setting that is off, its value and what is allowed."""
+    if equations not in EQUATIONS:
+        raise ValueError(f'equations = {equations!r}: must be one of {", ".join(EQUATIONS)}')
+    if not 1e-14 <= rtol <= 1e-2:
+        raise ValueError(f'rtol = {rtol!r}: must be in [1e-14, 1e-2]')
+    if not 0.0 <= atol <= 1e-2:
+        raise ValueError(f'atol = {atol!r}: must be in [0, 1e-2]')
+
+
+def nutation_rests(top: Top, start: State) -> bool:
+    """Whether theta stays as it is: sleeping, hanging at a pole, or steady precession."""
+    if start.theta_dot != 0.0:
+        return False
+    sine, cosine = math.sin(start.theta), math.cos(start.theta)
+    half_cosine, half_sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
+    phi_dot = attitude.precession_rate(top, start.l3, start.lz, half_cosine ** 2, half_sine ** 2)
+    terms = (phi_dot * phi_dot * sine * cosine, -start.l3 / top.lambda1 * phi_dot * sine,
+             top.gravity_torque / top.lambda1 * sine)
+    return abs(math.fsum(terms)) <= REST_ULPS * math.ulp(1.0) * sum(map(abs, terms))
+
+
+class _Stepped:
+    """A motion by steps: what both forms share."""
+
+    def __init__(self, form: TransportForm | EulerForm) -> None:
+        self._integrator = Integrator(form, form.start, form.first_step)
+
+    @property
+    def steps(self) -> int:
+        return self._integrator.steps
+
+    @property
+    def evaluations(self) -> int:
+        return self._integrator.evaluations
+
+    def reach(self, t: float, max_steps: int | None = None) -> bool:
+        integrator = self._integrator
+        taken = 0
+        while integrator.t1 < t:
+            if taken == max_steps:
+                return False
+            self._step()
+            taken += 1
+        return True
+
+    def _step(self) -> None:
+        self._integrator.step()
+
+    def _read(self, t: float) -> tuple[float, ...] | tuple[complex, ...]:
+        if t < self._integrator.t0:
+            raise ValueError(f't = {t!r} s: steps go forward, and the newest one began at '
+                             f'{self._integrator.t0!r} s; times must not decrease')
+        self.reach(t)
+        return self._integrator.interpolate(t)
+
+
+class EulerMotion(_Stepped):
+    """Equations (29)-(32) to the letter."""
+
+    def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
+        self._top, self._start = top, start
+        super().__init__(EulerForm(top, start, rtol, atol))
+
+    def at(self, t: float) -> OneState:
+        """Return the state at t [s]."""
+        return AxisState(self._top, self._start.l3, self._start.lz, *self._read(t))
+
+
+class TransportMotion(_Stepped):
+    """The regular form, with phases followed from step to step."""
+
+    def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
+        self._top, self._start = top, start
+        self._form = TransportForm(top, start, rtol, atol)
+        super().__init__(self._form)
+        self._alpha, self._beta = windings(start)
+        self._line_rate = 0.5 * spin_excess(top, start.l3)
+        self._carried_rate = 0.5 * self._form.spin_carried / top.lambda1
+        self._half_theta = 0.5 * start.theta
+
+    def at(self, t: float) -> OneState:
+        """Return the state at t [s], on the invariants."""
+        alpha, beta, m = self._read(t)
+        if t < self._integrator.t1:
+            alpha, beta, m = self._form.project((alpha, beta, m))
+        spin = cmath.rect(1.0, 0.5 * self._form.spin_rate * t)
+        return MomentumState(self._top, self._start, alpha * spin, beta * spin.conjugate(),
+                             -2j * self._top.lambda1 * m, t, self)
+
+    def polar(self, alpha: complex, beta: complex, t: float) -> Polar:
+        """See `phases.Phases`; t lies in the newest step."""
+        line = self._line_rate * t
+        return self._continue(alpha, beta, line)
+
+    def theta(self, half_theta: float, t: float) -> float:
+        """See `phases.Phases`; theta/2 turns by less than pi within a step."""
+        return 2.0 * (half_theta
+                      + math.tau * round((self._half_theta - half_theta) / math.tau))
+
+    def _continue(self, alpha: complex, beta: complex, line: float) -> Polar:
+        a, b = self._alpha, self._beta
+        return (a.on_line(alpha, a.phase + line) if a.crosses
+                else a.onward(alpha, a.phase + line),
+                b.on_line(beta, b.phase - line) if b.crosses
+                else b.onward(beta, b.phase - line))
+
+    def _step(self) -> None:
+        """Take a step, after moving the phases to where it starts."""
+        integrator, a, b = self._integrator, self._alpha, self._beta
+        alpha, beta, _ = integrator.y1
+        # The stepped frame lacks the spin of `TransportForm.spin_rate`: so does its line.
+        line = -self._carried_rate * integrator.t1
+        (cosine, phase_a), (sine, phase_b) = self._continue(alpha, beta, line)
+        a.phase, b.phase = phase_a - line, phase_b + line
+        self._half_theta = 0.5 * self.theta(math.atan2(sine, cosine), integrator.t1)
+        integrator.step()
+
+
+class FreeMotion:
+    """
+    No torque (P = 0): the momentum stands still and the axis turns about it uniformly.
+
+    alpha and beta less the spin Omega move on ellipses, at half the rate |L|/lambda1.
+    """
+
+    steps = evaluations = 0
+
+    def __init__(self, top: Top, start: State) -> None:
+        self._top, self._start = top, start
+        form = TransportForm(top, start, 0.0, 0.0, spin_carried_share=0.0)
+        self._alpha0, self._beta0, m = form.start
+        self._momentum = -2j * top.lambda1 * m
+        total = math.hypot(start.lz, abs(self._momentum))
+        self._rate = 0.5 * total / top.lambda1
+        # At x = pi/2: i/|L| times the momentum acting on (alpha, beta).
+        unit = 1j / total if total else 0j
+        self._alpha1 = unit * (start.lz * self._alpha0
+                               + self._momentum * self._beta0.conjugate())
+        self._beta1 = unit * (start.lz * self._beta0
+                              - self._momentum * self._alpha0.conjugate())
+        self._line_rate = 0.5 * spin_excess(top, start.l3)
+        self._alpha, self._beta = windings(start)
+
+    def reach(self, t: float, max_steps: int | None = None) -> bool:
+        """Nothing needs computing."""
+        return True
+
+    def at(self, t: float) -> OneState:
+        """Return the state at any t [s]."""
+        cosine, sine = math.cos(self._rate * t), math.sin(self._rate * t)
+        spin = cmath.rect(1.0, self._line_rate * t)
+        return MomentumState(
+            self._top, self._start, (cosine * self._alpha0 + sine * self._alpha1) * spin,
+            (cosine * self._beta0 + sine * self._beta1) * spin.conjugate(), self._momentum, t,
+            self)
+
+    def polar(self, alpha: complex, beta: complex, t: float) -> Polar:
+        """See `phases.Phases`: on an ellipse the angle is within pi of its parameter."""
+        return (self._continue(self._alpha, alpha, t, self._line_rate * t),
+                self._continue(self._beta, beta, t, -self._line_rate * t))
+
+    def _continue(self, winding: Winding, z: complex, t: float, line: float,
+                  ) -> tuple[float, float]:
+        if winding.crosses:
+            return winding.on_line(z, winding.phase + line)
+        turned = math.copysign(self._rate * t, winding.momentum)
+        return winding.nearest(z, winding.phase + line + turned)
+
+    def theta(self, half_theta: float, t: float) -> float:
+        """See `phases.Phases`: only a planar rotation takes theta out of [-pi, pi]."""
+        expected = 0.5 * self._start.theta
+        if self._alpha.crosses and self._beta.crosses:
+            expected += math.copysign(self._rate * t, self._start.theta_dot)
+        return 2.0 * (half_theta + math.tau * round((expected - half_theta) / math.tau))
+
+
+class RestingMotion:
+    """The nutation rests: theta stays, phi and psi turn uniformly."""
+
+    steps = evaluations = 0
+
+    def __init__(self, top: Top, start: State) -> None:
+        self._top, self._start = top, start
+        now = self._state(start.phi, start.psi)
+        self._phi_dot, self._psi_dot = now.phi_dot, now.psi_dot
+
+    def _state(self, phi: float, psi: float) -> AxisState:
+        start = self._start
+        return AxisState(self._top, start.l3, start.lz, start.theta, 0.0, phi, psi)
+
+    def reach(self, t: float, max_steps: int | None = None) -> bool:
+        """Nothing needs computing."""
+        return True
+
+    def at(self, t: float) -> OneState:
+        """Return the state at any t [s]."""
+        return self._state(self._start.phi + self._phi_dot * t,
+                           self._start.psi + self._psi_dot * t)
