@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Serialized ROS messages (XCDR version 1, little endian), written once and patched ever after.
+
+Format: OMG DDS-XTypes 1.3, sect. 7.4.1 and the RTPS encapsulation header: four bytes 00 01 00 00,
+then every primitive aligned to its own size counted from behind that header; a string is its
+length with the closing NUL, a sequence its element count, then the elements.  Padding is zero, so
+equal messages are equal bytes.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Sequence
+
+ENCAPSULATION = b'\x00\x01\x00\x00'
+NANOSECONDS = 1_000_000_000
+
+
+class CdrWriter:
+    """Appends fields in the order of the message definition; remembers nothing but the bytes."""
+
+    def __init__(self) -> None:
+        self.buffer = bytearray(ENCAPSULATION)
+
+    def _align(self, size: int) -> int:
+        """Pad to a multiple of `size`; return where the next field begins."""
+        self.buffer += bytes(-(len(self.buffer) - len(ENCAPSULATION)) % size)
+        return len(self.buffer)
+
+    def _append(self, code: str, size: int, value: float) -> int:
+        at = self._align(size)
+        self.buffer += struct.pack('<' + code, value)
+        return at
+
+    def uint32(self, value: int) -> int:
+        """Append a uint32; return its offset."""
+        return self._append('I', 4, value)
+
+    def stamp(self) -> int:
+        """Append a builtin_interfaces/Time of zero; return its offset."""
+        at = self._append('i', 4, 0)
+        self._append('I', 4, 0)
+        return at
+
+    def string(self, text: str) -> int:
+        """Append a string; return its offset."""
+        data = text.encode() + b'\0'
+        at = self.uint32(len(data))
+        self.buffer += data
+        return at
+
+    def strings(self, texts: Sequence[str]) -> int:
+        """Append a sequence of strings; return its offset."""
+        at = self.uint32(len(texts))
+        for text in texts:
+            self.string(text)
+        return at
+
+    def doubles(self, values: Iterable[float]) -> int:
+        """Append doubles one after the other (a fixed array); return the first one's offset."""
+        at = self._align(8)
+        for value in values:
+            self._append('d', 8, value)
+        return at
+
+    def double_sequence(self, values: Sequence[float]) -> int:
+        """Append a sequence of doubles; return the first one's offset."""
+        self.uint32(len(values))
+        return self.doubles(values) if values else len(self.buffer)
+
+
+class Template:
+    """A serialized message whose stamp and numbers are replaced in place."""
+
+    def __init__(self, writer: CdrWriter, stamp_at: int | None,
+                 fields: Sequence[tuple[int, int]]) -> None:
+        """
+        Take the bytes, the stamp's offset, and (offset, count) of each run of doubles to patch.
+
+        What lies between the runs keeps its bytes.
+        """
+        self._buffer = writer.buffer
+        self._stamp_at = stamp_at
+        self._stamp = struct.Struct('<iI')
+        self._runs = [(struct.Struct(f'<{count}d').pack_into, at) for at, count in fields]
+
+    def encode(self, stamp_ns: int, *runs: Sequence[float]) -> bytes:
+        """Return the message with this stamp [ns] and one sequence of numbers a run."""
+        buffer = self._buffer
+        if self._stamp_at is not None:
+            self._stamp.pack_into(buffer, self._stamp_at, *divmod(stamp_ns, NANOSECONDS))
+        for (pack_into, at), values in zip(self._runs, runs, strict=True):
+            pack_into(buffer, at, *values)
+        return bytes(buffer)

@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Every parameter of a simulation: name, default, unit, range, and when a change takes effect.
+
+One table serves the node (descriptors, validation), the command line and the documentation.
+The defaults are the cusp scene: a bicycle wheel on a pivot, spun about its axis and let go.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from spinning_top_sim.physics.top import State, Top, cusp_momentum
+
+Value = Any
+
+
+class Effect(enum.Enum):
+    """When a changed value is used."""
+
+    NOW = 'at once'
+    RESET = 'at the next ~/reset'
+    RECORDING = 'at the next start of a recording'
+    START = 'fixed when the node starts'
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """
+    One parameter.  Its type is that of the default; None is a double that may be left unset.
+
+    minimum, maximum: inclusive;  above: exclusive lower bound;  choices: allowed strings
+    """
+
+    name: str
+    default: Value
+    text: str
+    unit: str = ''
+    minimum: float | None = None
+    maximum: float | None = None
+    above: float | None = None
+    choices: tuple[str, ...] = ()
+    effect: Effect = Effect.NOW
+
+    @property
+    def is_double(self) -> bool:
+        """Whether the value is a double (an integer is taken for one)."""
+        return self.default is None or isinstance(self.default, float)
+
+    @property
+    def description(self) -> str:
+        """Return text, unit, range and effect as one line."""
+        unit = f' [{self.unit}]' if self.unit else ''
+        allowed = f'; {self.allowed}' if self.choices or self._bounds() else ''
+        unset = '; unset: L3 cos(theta0), the cusp' if self.default is None else ''
+        return f'{self.text}{unit}{allowed}{unset}; a change takes effect {self.effect.value}'
+
+    def _bounds(self) -> str:
+        parts = []
+        if self.above is not None:
+            parts.append(f'> {self.above:g}')
+        if self.minimum is not None:
+            parts.append(f'>= {self.minimum:g}')
+        if self.maximum is not None:
+            parts.append(f'<= {self.maximum:g}')
+        return ' and '.join(parts)
+
+    @property
+    def allowed(self) -> str:
+        """Return what may be given, in words."""
+        if self.choices:
+            return f'must be one of {", ".join(self.choices)}'
+        kind = {bool: 'true or false', int: 'an integer', str: 'a string', float: 'a number',
+                type(None): 'a number'}.get(type(self.default))
+        if isinstance(self.default, tuple):
+            kind = ('a list of strings' if isinstance(self.default[0], str)
+                    else f'a list of {len(self.default)} numbers')
+        bounds = self._bounds()
+        return f'must be {kind} {bounds}'.rstrip()
+
+    def check(self, value: Value) -> Value:
+        """Return the value in its own type.  Raises ValueError with name, value, allowed."""
+        if value is None and self.default is None:
+            return None
+        checked = self._convert(value)
+        if checked is None:
+            raise ValueError(f'{self.name} = {value!r}: {self.allowed}')
+        return checked
+
+    def _convert(self, value: Value) -> Value:
+        default = self.default
+        if isinstance(default, tuple):
+            return self._convert_list(value)
+        if isinstance(default, bool):
+            return value if isinstance(value, bool) else None
+        if isinstance(default, str):
+            good = isinstance(value, str) and (not self.choices or value in self.choices)
+            return value if good else None
+        kinds = (int, float) if self.is_double else (int,)
+        if isinstance(value, bool) or not isinstance(value, kinds):
+            return None
+        try:
+            number = float(value) if self.is_double else value
+        except OverflowError:
+            return None
+        return number if self._in_range(number) else None
+
+    def _in_range(self, number: float) -> bool:
+        return (math.isfinite(number)
+                and (self.above is None or number > self.above)
+                and (self.minimum is None or number >= self.minimum)
+                and (self.maximum is None or number <= self.maximum))
+
+    def _convert_list(self, value: Value) -> Value:
+        if isinstance(value, str | bytes):
+            return None
+        try:
+            items = tuple(value)
+        except TypeError:
+            return None
+        if isinstance(self.default[0], str):
+            return items if all(isinstance(item, str) for item in items) else None
+        numbers = all(isinstance(item, int | float) and not isinstance(item, bool)
+                      and math.isfinite(item) for item in items)
+        return tuple(map(float, items)) if numbers and len(items) == len(self.default) else None
+
+
+# name, default rate [Hz], on by default, what it is
+STREAM_DEFAULTS = (
+    ('pose', 100.0, True, 'pose (geometry_msgs/PoseStamped)'),
+    ('joint_states', 100.0, True, 'joint_states (sensor_msgs/JointState)'),
+    ('imu', 200.0, True, 'imu/data_raw and ground_truth/imu_bias (sensor_msgs/Imu)'),
+    ('imu_data', 200.0, False, 'imu/data (sensor_msgs/Imu with orientation)'),
+    ('ground_truth_imu', 200.0, True, 'ground_truth/imu (sensor_msgs/Imu, noise-free)'),
+    ('ground_truth_odom', 100.0, True, 'ground_truth/odom (nav_msgs/Odometry)'),
+    ('invariants', 10.0, True, '~/invariants (std_msgs/Float64MultiArray)'),
+    ('clock', 100.0, False, '/clock (rosgraph_msgs/Clock)'),
+)
+HIGHEST_RATE = 10_000.0
+
+
+def _streams() -> list[Parameter]:
+    rows = []
+    for name, rate, enabled, text in STREAM_DEFAULTS:
+        rows.append(Parameter(f'{name}.enabled', enabled, f'Whether there is {text}'))
+        rows.append(Parameter(f'{name}.rate', rate, f'Rate of {text}', 'Hz', above=0.0,
+                              maximum=HIGHEST_RATE))
+    return rows
+
+
+TABLE: tuple[Parameter, ...] = (
+    Parameter('top.mass', 2.0, 'Mass of the top', 'kg', minimum=0.0, effect=Effect.RESET),
+    Parameter('top.com_distance', 0.15, 'From the pivot to the centre of mass along the axis, '
+              'signed', 'm', effect=Effect.RESET),
+    Parameter('top.lambda1', 0.123, 'Moment of inertia across the axis, about the pivot',
+              'kg m^2', above=0.0, effect=Effect.RESET),
+    Parameter('top.lambda3', 0.15, 'Moment of inertia along the axis', 'kg m^2', above=0.0,
+              effect=Effect.RESET),
+    Parameter('top.gravity', 9.80665, 'Gravity, downwards positive', 'm/s^2',
+              effect=Effect.RESET),
+    Parameter('initial.theta', math.radians(30.0), 'Tilt at the start', 'rad', minimum=0.0,
+              maximum=math.pi, effect=Effect.RESET),
+    Parameter('initial.theta_dot', 0.0, 'Nutation rate at the start', 'rad/s',
+              effect=Effect.RESET),
+    Parameter('initial.phi', 0.0, 'Precession angle at the start', 'rad', effect=Effect.RESET),
+    Parameter('initial.psi', 0.0, 'Spin angle at the start', 'rad', effect=Effect.RESET),
+    Parameter('spin.l3', 1.6, 'Angular momentum along the axis; a change is a command',
+              'kg m^2/s'),
+    Parameter('spin.lz', None, 'Angular momentum along the vertical; a change is a command',
+              'kg m^2/s'),
+    Parameter('solver.method', 'rk45', 'Dormand-Prince steps or the closed form',
+              choices=('rk45', 'exact'), effect=Effect.RESET),
+    Parameter('solver.equations', 'transport', "rk45: regular form, or the paper's to the letter",
+              choices=('transport', 'euler'), effect=Effect.RESET),
+    Parameter('solver.rtol', 1e-11, 'rk45: relative tolerance of a step', minimum=1e-14,
+              maximum=1e-2, effect=Effect.RESET),
+    Parameter('solver.atol', 1e-12, 'rk45: absolute tolerance of a step', minimum=0.0,
+              maximum=1e-2, effect=Effect.RESET),
+    Parameter('pacing', 'timer', 'An rclpy timer, or a thread with absolute deadlines '
+              '(from 500 Hz on)', choices=('timer', 'thread'), effect=Effect.START),
+    Parameter('tick_rate', 200.0, 'How often due samples are sent', 'Hz', above=0.0,
+              maximum=HIGHEST_RATE),
+    Parameter('time_scale', 1.0, 'Simulated over real time', above=0.0, maximum=1e6),
+    Parameter('start_paused', False, 'Wait for ~/set_pause or ~/step', effect=Effect.START),
+    Parameter('publish_clock', False, 'Publish /clock (the same as clock.enabled)',
+              effect=Effect.START),
+    Parameter('world_frame', 'world', 'Frame of the pivot, z up', effect=Effect.START),
+    Parameter('body_frame', 'base_link', 'Frame of the body, z along its axis',
+              effect=Effect.START),
+    Parameter('seed', 0, 'Seed of the noise', minimum=0, maximum=2 ** 63 - 1,
+              effect=Effect.RESET),
+    *_streams(),
+    Parameter('imu.frame_id', 'imu_link', 'Frame of the IMU', effect=Effect.START),
+    Parameter('imu.lever_arm', (0.0, 0.0, 0.0), 'Position of the IMU in the body', 'm',
+              effect=Effect.RESET),
+    Parameter('imu.rpy', (0.0, 0.0, 0.0), 'Orientation of the IMU in the body, roll, pitch and '
+              'yaw about fixed axes', 'rad', effect=Effect.RESET),
+    Parameter('duration', 0.0, 'End after this much simulated time, 0 = never', 's',
+              minimum=0.0),
+    Parameter('record.enabled', False, 'Record from the start', effect=Effect.START),
+    Parameter('record.uri', '', 'File or folder of a recording; empty: '
+              'spinning_top_<date>_<time>.mcap here', effect=Effect.RECORDING),
+    Parameter('record.streams', ('all',), 'Which streams to record, by name; all: each enabled '
+              'one', effect=Effect.RECORDING),
+    Parameter('record.max_loss', 0.5, 'At most this much is lost by a power cut', 's',
+              minimum=0.01, maximum=60.0, effect=Effect.RECORDING),
+    Parameter('record.compression', 'zstd', 'Compression of the chunks',
+              choices=('zstd', 'lz4', 'none'), effect=Effect.RECORDING),
+    Parameter('record.min_free_bytes', 100_000_000, 'Stop recording when the disk has less free',
+              'bytes', minimum=0, effect=Effect.RECORDING),
+    Parameter('step.count', 1, 'Steps of one ~/step', minimum=1, maximum=1_000_000),
+    Parameter('step.dt', 0.01, 'Simulated time of one step', 's', minimum=1e-6, maximum=1e3),
+    Parameter('status_period', 1.0, 'Of the status line on the terminal, 0 = none', 's',
+              minimum=0.0),
+)
+BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in TABLE}
+
+
+def defaults() -> dict[str, Value]:
+    """Return every parameter's default."""
+    return {parameter.name: parameter.default for parameter in TABLE}
+
+
+def checked(values: Mapping[str, Value]) -> dict[str, Value]:
+    """
+    Return the defaults with these values put in, each and all together validated.
+
+    Raises ValueError naming the parameter, its value and what is allowed.
+    """
+    result = defaults()
+    for name, value in values.items():
+        if name not in BY_NAME:
+            raise ValueError(f'{name} = {value!r}: there is no such parameter')
+        result[name] = BY_NAME[name].check(value)
+    unknown = [name for name in result['record.streams']
+               if name != 'all' and f'{name}.rate' not in BY_NAME]
+    if unknown:
+        names = ', '.join(row[0] for row in STREAM_DEFAULTS)
+        raise ValueError(f'record.streams = {list(result["record.streams"])!r}: {unknown[0]!r} '
+                         f'is no stream; must be all or some of {names}')
+    start_state(result)
+    return result
+
+
+def top_of(values: Mapping[str, Value]) -> Top:
+    """Return the top that these parameters describe.  Raises ValueError as `Top` does."""
+    return Top(**{name: values[f'top.{name}']
+                  for name in ('lambda1', 'lambda3', 'mass', 'com_distance', 'gravity')})
+
+
+def start_state(values: Mapping[str, Value]) -> State:
+    """Return the state to start from; an unset spin.lz is the cusp.  Raises ValueError."""
+    top_of(values)
+    theta, l3, lz = values['initial.theta'], values['spin.l3'], values['spin.lz']
+    return State(theta=theta, theta_dot=values['initial.theta_dot'], phi=values['initial.phi'],
+                 psi=values['initial.psi'], l3=l3,
+                 lz=cusp_momentum(theta, l3) if lz is None else lz)

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The simulation itself: solver -> streams -> sinks, the same live and offline.
+
+Time is integer nanoseconds since the start.  The caller says how far to go and who takes what;
+every sample due until then is computed in order of time, once for all who take it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from spinning_top_sim.physics.kinematics import OneState
+from spinning_top_sim.physics.top import ContinuedState, State, pole_momentum
+from spinning_top_sim.solvers.rk45 import Propagator, rk45
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.imu import Imu
+from spinning_top_sim.streams.topics import Invariants, Stream, all_streams
+
+# Integration steps between two looks at whether to give way: about 5 ms.
+STEPS_AT_ONCE = 500
+
+
+class Simulation:
+    """
+    One top in motion.
+
+    streams: all of them, whose `publish` and `record` the caller sets;  now_ns: simulated time up
+    to which every sample has been sent (-1: not even that of t = 0);  l3, lz: as last commanded;
+    history: applied commands since the start as (t_ns, l3, lz).
+    """
+
+    def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
+        """Take checked parameters (`parameters.checked`) and the stamp of t = 0 [ns]."""
+        self.epoch_ns = epoch_ns
+        self._steps_before = self._evaluations_before = 0
+        self.streams: list[Stream] = []
+        self._solver: Propagator | None = None
+        self.restart(values)
+
+    def restart(self, values: Mapping[str, Any]) -> None:
+        """Go back to the start state of these parameters; sinks, counts and stamps remain."""
+        self.values = dict(values)
+        self.top = parameters.top_of(values)
+        self.history: list[tuple[int, float, float]] = []
+        self.now_ns = -1
+        streams = all_streams(values, Imu(values))
+        for new, old in zip(streams, self.streams, strict=False):
+            new.publish, new.record = old.publish, old.record
+            new.sent, new.skipped = old.sent, old.skipped
+        self.streams = streams
+        self._invariants = next(s for s in streams if isinstance(s, Invariants))
+        self._begin(parameters.start_state(values), 0)
+
+    def _begin(self, start: State, at_ns: int) -> None:
+        """Let the motion begin in a state, at a time; where it cannot, nothing has changed."""
+        solver = self._new_solver(start)
+        solver.reach(math.ulp(0.0))         # the first step shows whether there is a motion
+        state = solver.at(0.0)
+        if not math.isfinite(state.energy):
+            raise ValueError(f'the energy would be {state.energy!r} J')
+        if self._solver is not None:
+            self._steps_before += self._solver.steps
+            self._evaluations_before += self._solver.evaluations
+        self._solver, self._anchor_ns = solver, at_ns
+        self.l3, self.lz = start.l3, start.lz
+        self._invariants.start_from(state)
+
+    def _new_solver(self, start: State) -> Propagator:
+        values = self.values
+        return rk45(self.top, start, equations=values['solver.equations'],
+                    rtol=values['solver.rtol'], atol=values['solver.atol'])
+
+    @property
+    def steps(self) -> int:
+        """Integration steps taken so far."""
+        return self._steps_before + self._solver.steps
+
+    @property
+    def evaluations(self) -> int:
+        """Evaluations of the right-hand side so far."""
+        return self._evaluations_before + self._solver.evaluations
+
+    def state(self) -> OneState:
+        """Return the state at `now_ns` (at the start before the first sample)."""
+        return self._solver.at(self._local(max(self.now_ns, self._anchor_ns)))
+
+    def _local(self, t_ns: int) -> float:
+        return (t_ns - self._anchor_ns) / NANOSECONDS
+
+    def advance(self, target_ns: int, publish_from_ns: int = 0,
+                give_way: Callable[[], bool] = lambda: False) -> bool:
+        """
+        Send every sample due up to `target_ns`; return whether that was reached.
+
+        publish_from_ns: earlier samples are recorded, not published (they come too late)
+        give_way: asked between samples, and within long integrations; True ends the call early,
+            with nothing lost: the next call goes on there.
+        Raises IntegrationError where the equations cannot go on.
+        """
+        streams = [stream for stream in self.streams if stream.wanted]
+        for stream in streams:
+            if stream.next_ns <= self.now_ns:
+                stream.resume(self.now_ns)
+            if stream.record is None and stream.next_ns < publish_from_ns:
+                before = stream.next_ns
+                stream.resume(publish_from_ns - 1)
+                stream.skipped += (stream.next_ns - before) // stream.period_ns
+        while True:
+            due = min([stream.next_ns for stream in streams], default=target_ns + 1)
+            instant = min(due, target_ns)
+            if not self._reach(instant, give_way):
+                return False
+            if due > target_ns:
+                self.now_ns = max(self.now_ns, target_ns)
+                return True
+            self._send(due, streams, due >= publish_from_ns)
+            self.now_ns = due
+            if give_way():
+                return False
+
+    def _reach(self, t_ns: int, give_way: Callable[[], bool]) -> bool:
+        local = self._local(t_ns)
+        while not self._solver.reach(local, STEPS_AT_ONCE):
+            if give_way():
+                return False
+        return True
+
+    def _send(self, t_ns: int, streams: list[Stream], in_time: bool) -> None:
+        state = self._solver.at(self._local(t_ns))
+        stamp_ns = self.epoch_ns + t_ns
+        for stream in streams:
+            if stream.next_ns != t_ns:
+                continue
+            data = stream.encode(state, stamp_ns)
+            stream.next_ns += stream.period_ns
+            if stream.record is not None:
+                stream.record(stamp_ns, data)
+            if stream.publish is not None:
+                if in_time:
+                    stream.publish(data)
+                    stream.sent += 1
+                else:
+                    stream.skipped += 1
+
+    def command(self, l3: float, lz: float) -> None:
+        """
+        Let L3 and Lz jump now [kg m^2/s]: an impulsive torque.  Angles and theta' stay.
+
+        Raises ValueError naming what is off; then the motion goes on unchanged.
+        """
+        for name, value in (('l3', l3), ('lz', lz)):
+            if not math.isfinite(value):
+                raise ValueError(f'{name} = {value!r} kg m^2/s: must be finite')
+        at_ns = max(self.now_ns, 0)
+        state = self._solver.at(self._local(at_ns))
+        pole = pole_momentum(abs(state.theta), l3)
+        if pole is not None and lz != pole:
+            raise ValueError(
+                f'lz = {lz!r} kg m^2/s with l3 = {l3!r}: the axis is at a pole (theta = '
+                f'{state.theta!r} rad), where lz must equal {pole!r}; command both together')
+        start = ContinuedState(theta=state.theta, theta_dot=state.theta_dot, phi=state.phi,
+                               psi=state.psi, l3=l3, lz=lz)
+        try:
+            self._begin(start, at_ns)
+        except (ArithmeticError, ValueError, RuntimeError) as error:
+            raise ValueError(f'l3 = {l3!r}, lz = {lz!r} kg m^2/s: no motion from theta = '
+                             f'{state.theta!r} rad: {error}') from error
+        self.history.append((at_ns, l3, lz))

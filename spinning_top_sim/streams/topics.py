@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The streams: for each a topic, a message type, a rate, and how a state becomes bytes.
+
+A new stream is a subclass of `Stream` here, a template in messages.py and a line in
+parameters.STREAM_DEFAULTS.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from spinning_top_sim.physics.kinematics import OneState
+from spinning_top_sim.streams import messages
+from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.imu import Imu
+
+JOINTS = ('precession_joint', 'nutation_joint', 'spin_joint')
+INVARIANTS = ('energy', 'l3', 'lz', 'energy_drift', 'l3_drift', 'lz_drift',
+              'quaternion_norm_error', 'orientation_error')
+NAN = math.nan
+
+
+class Stream:
+    """
+    One topic: samples at t = k x period, k = 0, 1, 2.., whoever listens and however ticks fall.
+
+    publish, record: what a sample is handed to, None while nobody wants it;  sent, skipped:
+    counts of samples published, and of those that came too late to be published.
+    """
+
+    parameter: str
+    topic: str
+    type_name: str
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self.publish: Callable[[bytes], None] | None = None
+        self.record: Callable[[int, bytes], None] | None = None
+        self.sent = self.skipped = 0
+        self.next_ns = 0
+        self.period_ns = 1
+        self.set_rate(values[f'{self.parameter}.rate'])
+
+    def set_rate(self, rate: float) -> None:
+        """Put the samples on the grid of another rate [Hz]; call `resume` after."""
+        self.period_ns = max(1, round(NANOSECONDS / rate))
+
+    def resume(self, after_ns: int) -> None:
+        """Make the first grid point later than `after_ns` the next sample."""
+        self.next_ns = (after_ns // self.period_ns + 1) * self.period_ns
+
+    @property
+    def wanted(self) -> bool:
+        """Whether anybody takes the samples: else nothing is computed."""
+        return self.publish is not None or self.record is not None
+
+    def encode(self, state: OneState, stamp_ns: int) -> bytes:
+        """Return the serialized message for a state, with its stamp [ns]."""
+        raise NotImplementedError
+
+
+class Pose(Stream):
+    """The attitude, at the pivot."""
+
+    parameter, topic, type_name = 'pose', 'pose', 'geometry_msgs/msg/PoseStamped'
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        super().__init__(values)
+        self._encode = messages.pose_stamped(values['world_frame']).encode
+
+    def encode(self, state: OneState, stamp_ns: int) -> bytes:
+        return self._encode(stamp_ns, state.quaternion)
+
+
+class JointStates(Stream):
+    """The Euler angles as joints of the URDF."""
+
+    parameter, topic, type_name = 'joint_states', 'joint_states', 'sensor_msgs/msg/JointState'
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        super().__init__(values)
+        self._encode = messages.joint_state(JOINTS).encode
+
+    def encode(self, state: OneState, stamp_ns: int) -> bytes:
+        return self._encode(stamp_ns, (state.phi, state.theta, state.psi),
+                            (state.phi_dot, state.theta_dot, state.psi_dot))
+
+
+class GroundTruthOdometry(Stream):
+    """Attitude and body rates, exact."""
+
+    parameter, topic, type_name = ('ground_truth_odom', 'ground_truth/odom',
+                                   'nav_msgs/msg/Odometry')
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        super().__init__(values)
+        self._encode = messages.odometry(values['world_frame'], values['body_frame']).encode
+
+    def encode(self, state: OneState, stamp_ns: int) -> bytes:
+        return self._encode(stamp_ns, state.quaternion, state.angular_velocity)
+
+
+class ImuStream(Stream):
+    """What all IMU topics share: the sensor."""
+
+    type_name = 'sensor_msgs/msg/Imu'
+
+    def __init__(self, values: Mapping[str, Any], imu: Imu) -> None:
+        super().__init__(values)
+        self._imu = imu
+        self._encode = self._template(values['imu.frame_id']).encode
+
+    def _template(self, frame_id: str) -> messages.Template:
+        raise NotImplementedError
+
+
+class ImuRaw(ImuStream):
+    """What the sensor reads, without an orientation (REP-145)."""
+
+    parameter, topic = 'imu', 'imu/data_raw'
+
+    def _template(self, frame_id: str) -> messages.Template:
+        return messages.imu(frame_id, messages.UNKNOWN_ORIENTATION,
+                            messages.diagonal(self._imu.gyroscope_variance),
+                            messages.diagonal(self._imu.accelerometer_variance))
+
+    def encode(self, state: OneState, stamp_ns: int) -> bytes:
+        rates, force = self._imu.measured(state, self.next_ns // self.period_ns)
+        return self._encode(stamp_ns, (0.0, 0.0, 0.0, 1.0), rates, force)
+
+
+class ImuData(ImuRaw):
+    """What the sensor reads, with the exact orientation of its frame."""
+
+    parameter, topic = 'imu_data', 'imu/data'
+
+    def _template(self, frame_id: str) -> messages.Template:
+        return messages.imu(frame_id, messages.EXACT,
+                            messages.diagonal(self._imu.gyroscope_variance),
+                            messages.diagonal(self._imu.accelerometer_variance))
+
+    def encode(self, state: OneState, stamp_ns: int) -> bytes:
+        rates, force = self._imu.measured(state, self.next_ns // self.period_ns)
+        return self._encode(stamp_ns, self._imu.orientation(state), rates, force)
+
+
+class ImuBias(ImuStream):
+    """The bias that `ImuRaw` carries."""
+
+    parameter, topic = 'imu', 'ground_truth/imu_bias'
+
+    def _template(self, frame_id: str) -> messages.Template:
+        return messages.imu(frame_id, messages.UNKNOWN_ORIENTATION, messages.EXACT,
+                            messages.EXACT)
+
+    def encode(self, state: OneState, stamp_ns: int) -> bytes:
+        return self._encode(stamp_ns, (0.0, 0.0, 0.0, 1.0),
+                            *self._imu.bias(self.next_ns // self.period_ns))
+
+
+class GroundTruthImu(ImuStream):
+    """What a perfect sensor in the same place reads, with its orientation."""
+
+    parameter, topic = 'ground_truth_imu', 'ground_truth/imu'
+
+    def _template(self, frame_id: str) -> messages.Template:
+        return messages.imu(frame_id, messages.EXACT, messages.EXACT, messages.EXACT)
+
+    def encode(self, state: OneState, stamp_ns: int) -> bytes:
+        return self._encode(stamp_ns, self._imu.orientation(state),
+                            *self._imu.true(state))
+
+
+class Invariants(Stream):
+    """
+    How well the constants of the motion are kept; see `INVARIANTS` for the columns.
+
+    A drift is relative to the value that the motion began with (absolute where that is 0); the
+    orientation error [rad] is against the exact solution.
+    """
+
+    parameter, topic, type_name = 'invariants', '~/invariants', 'std_msgs/msg/Float64MultiArray'
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        super().__init__(values)
+        self._encode = messages.float64_multi_array(INVARIANTS).encode
+        self._start = (0.0, 0.0, 0.0)
+        self.orientation_error: Callable[[OneState, int], float] = lambda state, t_ns: NAN
+
+    def start_from(self, state: OneState) -> None:
+        """Measure drifts from this state on."""
+        self._start = (state.energy, state.l3_start, state.lz_start)
+
+    def encode(self, state: OneState, stamp_ns: int) -> bytes:
+        now = (state.energy, state.l3, state.lz)
+        drifts = [(value - start) / (abs(start) or 1.0)
+                  for value, start in zip(now, self._start, strict=True)]
+        norm_error = math.hypot(*state.quaternion) - 1.0
+        return self._encode(stamp_ns, (*now, *drifts, norm_error,
+                                       self.orientation_error(state, self.next_ns)))
+
+
+class Clock(Stream):
+    """Simulated time as the ROS clock."""
+
+    parameter, topic, type_name = 'clock', '/clock', 'rosgraph_msgs/msg/Clock'
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        super().__init__(values)
+        self._encode = messages.clock().encode
+
+    def encode(self, state: OneState, stamp_ns: int) -> bytes:
+        return self._encode(stamp_ns)
+
+
+def all_streams(values: Mapping[str, Any], imu: Imu) -> list[Stream]:
+    """Return every stream there is, in the order in which samples of one instant are sent."""
+    return [Clock(values), Pose(values), JointStates(values), ImuRaw(values, imu),
+            ImuData(values, imu), ImuBias(values, imu), GroundTruthImu(values, imu),
+            GroundTruthOdometry(values), Invariants(values)]
