@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The two YAML texts that rosbag2 (jazzy) expects in a log: offered QoS and bag metadata.
+
+Sources: rosbag2_storage, qos.cpp and yaml.hpp; rosbag2_storage_mcap, mcap_storage.cpp.  They are
+few fixed lines, written by hand so that a recording needs no YAML package.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+_METADATA_VERSION = 9  # of rosbag2_storage::BagMetadata in jazzy
+_NEVER = {'sec': 9223372036, 'nsec': 854775807}  # RMW_DURATION_INFINITE
+
+# What a reliable publisher with a queue of ten offers, rmw's enum values.
+DEFAULT_QOS: Mapping[str, Any] = {
+    'history': 1,                        # keep last
+    'depth': 10,
+    'reliability': 1,                    # reliable
+    'durability': 2,                     # volatile
+    'deadline': _NEVER,
+    'lifespan': _NEVER,
+    'liveliness': 1,                     # automatic
+    'liveliness_lease_duration': _NEVER,
+    'avoid_ros_namespace_conventions': False,
+}
+
+_POLICY_NAMES = {
+    'history': ('system_default', 'keep_last', 'keep_all', 'unknown'),
+    'reliability': ('system_default', 'reliable', 'best_effort', 'unknown', 'best_available'),
+    'durability': ('system_default', 'transient_local', 'volatile', 'unknown', 'best_available'),
+    'liveliness': ('system_default', 'automatic', 'manual_by_node', 'manual_by_topic', 'unknown',
+                   'best_available'),
+}
+
+
+@dataclass(frozen=True)
+class RecordedTopic:
+    """
+    One topic of a recording.
+
+    name: resolved, such as '/imu/data_raw';  type_name: 'package/msg/Type'
+    qos: what the publisher offers, with the keys of DEFAULT_QOS, integer policies as in rmw and
+        durations as {'sec': ..., 'nsec': ...}; what is left out is as in DEFAULT_QOS
+
+    Raises ValueError naming the key, its value and what is allowed.
+    """
+
+    name: str
+    type_name: str
+    qos: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for key, value in self.qos.items():
+            if key not in DEFAULT_QOS:
+                raise ValueError(f'qos of {self.name}: {key!r} is none of {list(DEFAULT_QOS)}')
+            names = _POLICY_NAMES.get(key)
+            if names is not None and not 0 <= value < len(names):
+                raise ValueError(
+                    f'qos of {self.name}: {key} = {value!r}: must be in [0, {len(names) - 1}]')
+
+
+def offered_qos_yaml(topic: RecordedTopic) -> str:
+    """
+    Return the `offered_qos_profiles` of a channel: a list of one profile, policies as integers.
+
+    Names would do for jazzy; integers are what older releases read, and jazzy too.
+    """
+    return '\n'.join(_qos_lines(topic, as_names=False))
+
+
+def bag_metadata_yaml(
+    topics: Sequence[RecordedTopic],
+    type_hashes: Sequence[str],
+    counts: Sequence[int],
+    *,
+    file_name: str,
+    start_ns: int,
+    end_ns: int,
+) -> str:
+    """
+    Return the `serialized_metadata` of the `rosbag2` record.
+
+    type_hashes, counts: one per topic, in their order
+    file_name: without its directory
+    start_ns, end_ns: earliest and latest stamp [ns since the epoch]; both 0 in an empty log
+    """
+    total = sum(counts)
+    lines = [
+        f'version: {_METADATA_VERSION}',
+        'storage_identifier: mcap',
+        'duration:',
+        f'  nanoseconds: {end_ns - start_ns}',
+        'starting_time:',
+        f'  nanoseconds_since_epoch: {start_ns}',
+        f'message_count: {total}',
+        'topics_with_message_count:' if topics else 'topics_with_message_count: []',
+    ]
+    for topic, type_hash, count in zip(topics, type_hashes, counts, strict=True):
+        lines += [
+            '  - topic_metadata:',
+            f'      name: {_quoted(topic.name)}',
+            f'      type: {_quoted(topic.type_name)}',
+            '      serialization_format: cdr',
+            '      offered_qos_profiles:',
+            *(f'        {line}' for line in _qos_lines(topic, as_names=True)),
+            f'      type_description_hash: {_quoted(type_hash)}',
+            f'    message_count: {count}',
+        ]
+    lines += [
+        'compression_format: ""',
+        'compression_mode: ""',
+        'relative_file_paths:',
+        f'  - {_quoted(file_name)}',
+        'files:',
+        f'  - path: {_quoted(file_name)}',
+        '    starting_time:',
+        f'      nanoseconds_since_epoch: {start_ns}',
+        '    duration:',
+        f'      nanoseconds: {end_ns - start_ns}',
+        f'    message_count: {total}',
+        'custom_data: ~',
+        f'ros_distro: {_quoted(os.environ.get("ROS_DISTRO") or "jazzy")}',
+    ]
+    return '\n'.join(lines)
+
+
+def _qos_lines(topic: RecordedTopic, *, as_names: bool) -> list[str]:
+    """Return the one profile of a topic as a YAML list, line by line."""
+    lines = []
+    for key, default in DEFAULT_QOS.items():
+        value = topic.qos.get(key, default)
+        if isinstance(default, Mapping):
+            lines += [f'{key}:', f'  sec: {int(value["sec"])}', f'  nsec: {int(value["nsec"])}']
+        elif isinstance(default, bool):
+            lines.append(f'{key}: {"true" if value else "false"}')
+        elif as_names and key in _POLICY_NAMES:
+            lines.append(f'{key}: {_POLICY_NAMES[key][value]}')
+        else:
+            lines.append(f'{key}: {int(value)}')
+    return [('- ' if i == 0 else '  ') + line for i, line in enumerate(lines)]
+
+
+def _quoted(text: str) -> str:
+    """Return a double-quoted YAML scalar; JSON's escapes are a subset of YAML's."""
+    # A file name may hold bytes that are no text: they must not spoil the closing of a log.
+    printable = text.encode(errors='replace').decode()
+    return json.dumps(printable, ensure_ascii=False)

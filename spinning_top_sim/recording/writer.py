@@ -1,0 +1,384 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Recording while the simulation runs: bounded loss, bounded memory, and no waiting for a disk.
+
+The simulation's thread only appends to a queue.  One other thread builds chunks, compresses and
+writes them, and brings them to the disk at least every half `max_loss`.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import os
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Literal
+
+from spinning_top_sim.recording.errors import RecordingError
+from spinning_top_sim.recording.rosbag2 import RecordedTopic
+from spinning_top_sim.recording.schemas import find_definition
+
+if TYPE_CHECKING:
+    from spinning_top_sim.recording.mcap_file import McapFile
+
+COMPRESSIONS = ('zstd', 'lz4', 'none')
+METADATA_NAME = 'spinning_top_sim'
+
+_ENTRY_BYTES = 128  # what a queued message costs besides its data, about
+_CLOSE_AT_EXIT_S = 10.0
+
+Message = tuple[int, int, bytes]  # topic index, stamp [ns], CDR
+
+
+@dataclass(frozen=True)
+class RecorderCounters:
+    """
+    Where a recording stands.
+
+    messages: in the file;  queued: accepted, not yet in the file
+    lost: handed over after the recording stopped, or when it failed
+    bytes: size of the file
+    flushes: how often the file was brought to the disk;  longest_flush: [s]
+    """
+
+    messages: int
+    queued: int
+    lost: int
+    bytes: int
+    flushes: int
+    longest_flush: float
+
+
+@dataclass(frozen=True)
+class RecordingSummary:
+    """
+    What a finished recording holds.
+
+    path: of the file;  bytes: its size
+    counts: messages in it by topic name;  lost: messages handed over that are not in it
+    error: why the recording stopped early, or None
+    indexed: whether the file has its summary; without, ordinary readers refuse it
+    """
+
+    path: Path
+    bytes: int
+    counts: dict[str, int]
+    lost: int
+    error: str | None
+    indexed: bool
+
+
+class McapRecorder:
+    """
+    A running recording.  `open` starts one, `close` ends it; also a context manager.
+
+    Trouble with the disk never reaches the caller: the recording stops, `state` becomes 'failed'
+    and `error` says why.  What was written up to then stays readable.
+    """
+
+    def __init__(
+        self, path: Path, topics: Sequence[RecordedTopic], file: McapFile, *,
+        max_loss: float, min_free_bytes: int, queue_bytes: int,
+    ) -> None:
+        """For `open`, which checks the arguments."""
+        self._path = path
+        self._topics = topics
+        self._file = file
+        self._flush_interval = max_loss / 2.0
+        self._min_free_bytes = min_free_bytes
+        self._queue_bytes = queue_bytes
+
+        self._lock = threading.Lock()  # held for a few instructions, never during I/O
+        self._queue: list[Message] = []
+        self._load = 0                 # bytes in the queue
+        self._offered = 0              # messages handed over, ever
+        self._accepting = True
+        self._state: Literal['recording', 'closed', 'failed'] = 'recording'
+        self._error: str | None = None
+        self._indexed = False
+        self._next_flush = 0.0         # on the monotonic clock
+        self._flushes = 0
+        self._longest_flush = 0.0
+
+        self._closing = False
+        self._wake = threading.Event()
+        self._taken = threading.Event()
+        # A daemon, so that a forgotten recording cannot hold up the end of the interpreter; the
+        # exit handler runs before daemons are stopped and closes the file properly.
+        self._thread = threading.Thread(target=self._run, name='recorder', daemon=True)
+        atexit.register(self.close, _CLOSE_AT_EXIT_S)
+        self._thread.start()
+
+    @classmethod
+    def open(
+        cls,
+        path: str | os.PathLike[str],
+        topics: Sequence[RecordedTopic],
+        metadata: Mapping[str, str],
+        *,
+        max_loss: float = 0.5,
+        compression: str = 'zstd',
+        min_free_bytes: int = 100_000_000,
+        queue_bytes: int = 32_000_000,
+    ) -> McapRecorder:
+        """
+        Create `path` and start recording into it.
+
+        topics: a message refers to them by index
+        metadata: what the `spinning_top_sim` record at the head of the file says
+        max_loss: most wall time whose messages a SIGKILL or a power loss may take [s], > 0
+        compression: one of COMPRESSIONS
+        min_free_bytes: recording stops when the disk has less left than this, >= 0
+        queue_bytes: `room` is False from here on; memory use stays below twice this, > 0
+
+        Raises ValueError for an argument out of range, and RecordingError, naming path or type
+        and the reason, when the file exists or cannot be made, or a definition is not installed.
+        """
+        path = Path(path)
+        topics = tuple(topics)
+        _check_arguments(
+            topics, metadata, max_loss=max_loss, compression=compression,
+            min_free_bytes=min_free_bytes, queue_bytes=queue_bytes)
+        definitions = {
+            name: find_definition(name) for name in {topic.type_name for topic in topics}}
+        try:
+            from spinning_top_sim.recording.mcap_file import McapFile  # noqa: PLC0415
+        except ImportError as error:
+            raise RecordingError(
+                f'recording needs the Python package mcap with zstandard and lz4: {error}'
+            ) from error
+        try:
+            disk = os.statvfs(path.parent)
+            free = disk.f_bavail * disk.f_frsize
+            if free < min_free_bytes:
+                raise OSError(_too_little_space(free, min_free_bytes))
+            file = McapFile(
+                path, topics, definitions, {METADATA_NAME: metadata},
+                library=f'spinning_top_sim {_version()}', compression=compression)
+        except FileExistsError as error:
+            raise RecordingError(
+                f'cannot record to {path}: it exists, and a recording overwrites nothing'
+            ) from error
+        except FileNotFoundError as error:
+            raise RecordingError(
+                f'cannot record to {path}: there is no directory {path.parent}') from error
+        except (OSError, ValueError) as error:
+            raise RecordingError(f'cannot record to {path}: {_reason(error)}') from error
+        return cls(path, topics, file, max_loss=max_loss, min_free_bytes=min_free_bytes,
+                   queue_bytes=queue_bytes)
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self._path
+
+    @property
+    def state(self) -> Literal['recording', 'closed', 'failed']:
+        """'recording' until the file is finished or the recording stopped with an `error`."""
+        return self._state
+
+    @property
+    def error(self) -> str | None:
+        """Why the recording stopped before it was closed, naming the path; None if it did not."""
+        return self._error
+
+    @property
+    def room(self) -> bool:
+        """
+        Whether the queue has room.
+
+        Where it has none, hold the simulation's clock instead of dropping anything; a burst that
+        began with room may be written to its end.  True also when the recording has stopped.
+        """
+        return self._load < self._queue_bytes
+
+    @property
+    def counters(self) -> RecorderCounters:
+        """Where the recording stands now."""
+        with self._lock:
+            messages = sum(self._file.counts)
+            missing = self._offered - messages
+            running = self._state == 'recording'
+            return RecorderCounters(
+                messages=messages, queued=missing if running else 0,
+                lost=0 if running else missing, bytes=self._file.size, flushes=self._flushes,
+                longest_flush=self._longest_flush)
+
+    def write(self, topic_index: int, log_time_ns: int, data: bytes) -> None:
+        """
+        Hand over a message; any thread may, and messages keep their order.
+
+        topic_index: in the `topics` of `open`
+        log_time_ns: the message's stamp [ns], >= 0; log and publish time alike
+        data: CDR with its four bytes of header
+
+        Never waits for the disk, never raises for its sake.  After the recording stopped the
+        message is only counted, as lost.
+        """
+        with self._lock:
+            self._offered += 1
+            if not self._accepting:
+                return
+            self._queue.append((topic_index, log_time_ns, data))
+            before = self._load
+            self._load = before + len(data) + _ENTRY_BYTES
+            half = self._queue_bytes >> 1
+            half_full = before < half <= self._load
+        if half_full:
+            self._wake.set()
+
+    def wait_for_room(self, timeout: float) -> bool:
+        """Wait until there is room, at most `timeout` [s]; return whether there is."""
+        self._taken.clear()
+        if not self.room:
+            self._wake.set()
+            self._taken.wait(timeout)
+        return self.room
+
+    def close(self, timeout: float = 10.0) -> RecordingSummary:
+        """
+        Bring everything to the disk, write the summary, and return what the file holds.
+
+        May be called again, also after an interrupted call.  Where the disk does not finish
+        within `timeout` [s], the summary's `error` says so and the file goes on being closed in
+        the background.
+        """
+        with self._lock:
+            self._accepting = False
+            self._closing = True
+        self._wake.set()
+        self._thread.join(timeout)
+        error = self._error
+        if self._thread.is_alive():
+            error = error or f'{self._path} could not be closed within {timeout:g} s'
+        else:
+            atexit.unregister(self.close)
+        messages = dict(zip((topic.name for topic in self._topics), self._file.counts,
+                            strict=True))
+        return RecordingSummary(
+            path=self._path, bytes=self._file.size, counts=messages,
+            lost=self._offered - sum(messages.values()), error=error, indexed=self._indexed)
+
+    def __enter__(self) -> McapRecorder:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _run(self) -> None:
+        """Record until closed or something fails; in the recorder's own thread."""
+        try:
+            self._record()
+        except Exception as error:  # whatever it is, the simulation goes on without a log
+            self._fail(f'recording to {self._path} stopped: {_reason(error)}')
+
+    def _record(self) -> None:
+        """Write what is queued, flush in time, finish when asked to."""
+        self._next_flush = time.monotonic() + self._flush_interval
+        while self._state == 'recording':
+            self._wake.clear()
+            closing = self._closing  # read before the queue: once set, nothing more comes
+            for message in self._take():
+                if self._file.append(*message):
+                    self._file.write_chunk()
+                    self._flush_if_due()
+            self._flush_if_due()
+            if closing:
+                self._finish()
+                return
+            self._wake.wait(max(0.0, self._next_flush - time.monotonic()))
+
+    def _take(self) -> list[Message]:
+        """Return what is queued and leave the queue empty."""
+        with self._lock:
+            messages, self._queue = self._queue, []
+            self._load = 0
+        self._taken.set()
+        return messages
+
+    def _flush_if_due(self) -> None:
+        """Close the chunk and bring it to the disk when it is time; mind the space left."""
+        start = time.monotonic()
+        if start < self._next_flush:
+            return
+        self._next_flush = start + self._flush_interval
+        self._file.write_chunk()
+        if self._file.size == self._file.synced_size:
+            return
+        self._file.sync()
+        self._flushes += 1
+        self._longest_flush = max(self._longest_flush, time.monotonic() - start)
+        free = self._file.free_bytes()
+        if free < self._min_free_bytes:
+            raise OSError(_too_little_space(free, self._min_free_bytes))
+
+    def _finish(self) -> None:
+        """End a recording that was asked to end."""
+        self._file.write_chunk()
+        self._file.finish()
+        self._indexed = True
+        self._state = 'closed'
+
+    def _fail(self, error: str) -> None:
+        """Stop accepting, say why, and leave behind the best file that the disk allows."""
+        with self._lock:
+            self._accepting = False
+            self._queue.clear()
+            self._load = 0
+            self._error = error
+            self._state = 'failed'
+        self._taken.set()
+        # Little space is left, or none: cutting off the torn chunk may have made enough of it.
+        with contextlib.suppress(Exception):
+            self._file.finish()
+            self._indexed = True
+
+
+def _check_arguments(
+    topics: Sequence[RecordedTopic], metadata: Mapping[str, str], *, max_loss: float,
+    compression: str, min_free_bytes: int, queue_bytes: int,
+) -> None:
+    """Raise ValueError for what no recording can be started with."""
+    names = [topic.name for topic in topics]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f'topic {name!r} is listed twice: once is allowed')
+    for item in metadata.items():
+        if not all(isinstance(text, str) for text in item):
+            raise ValueError(f'metadata {item!r}: key and value must be str')
+    if not 0.0 < max_loss <= threading.TIMEOUT_MAX:
+        raise ValueError(f'max_loss = {max_loss!r} s: must be > 0 and finite')
+    if compression not in COMPRESSIONS:
+        raise ValueError(f'compression = {compression!r}: must be one of {COMPRESSIONS}')
+    if min_free_bytes < 0:
+        raise ValueError(f'min_free_bytes = {min_free_bytes!r}: must be >= 0')
+    if queue_bytes <= 0:
+        raise ValueError(f'queue_bytes = {queue_bytes!r}: must be > 0')
+
+
+def _too_little_space(free: int, wanted: int) -> str:
+    return f'{free} bytes are free on the disk, fewer than min_free_bytes = {wanted}'
+
+
+def _reason(error: Exception) -> str:
+    """Return what went wrong, without the path that OSError adds."""
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    return f'{type(error).__name__}: {error}'
+
+
+def _version() -> str:
+    """Return the version of the installed package, or '0.0.0' where it was not installed."""
+    import importlib.metadata  # noqa: PLC0415
+    try:
+        return importlib.metadata.version('spinning_top_sim')
+    except importlib.metadata.PackageNotFoundError:
+        return '0.0.0'

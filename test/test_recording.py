@@ -1,0 +1,701 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The recorder: logs that others read, a bounded loss, and disks that fail.
+
+The readers are rosbags, mcap-ros2-support and mcap, none of them written here; the messages are
+serialized by rosbags.  Children are killed for good after a timeout, whatever they do.
+"""
+
+import json
+import os
+import signal
+import struct
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import yaml  # type: ignore[import-untyped]
+from mcap.exceptions import McapError
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.records import Channel as ChannelRecord
+from mcap.records import Chunk, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Qos, QosHistory, QosReliability
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+
+from spinning_top_sim.recording import mcap_file
+from spinning_top_sim.recording.errors import DefinitionNotFoundError, RecordingError
+from spinning_top_sim.recording.mcap_file import CHUNK_BYTES, McapFile
+from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic
+from spinning_top_sim.recording.schemas import find_definition
+from spinning_top_sim.recording.writer import COMPRESSIONS, McapRecorder
+
+ROOT = Path(__file__).parents[1]
+JAZZY = get_typestore(Stores.ROS2_JAZZY)
+POSE = 'geometry_msgs/msg/PoseStamped'
+ARRAY = 'std_msgs/msg/Float64MultiArray'
+TOPICS = (
+    RecordedTopic('/top/pose', POSE),
+    RecordedTopic('/top/spinning_top/invariants', ARRAY, {'depth': 3, 'reliability': 2}),
+    RecordedTopic('/top/silent', POSE),
+)
+METADATA = {'seed': '7', 'top.mass': '0.5', 'note': 'θ: "quoted"\nline'}
+EPOCH_NS = 1_700_000_000_000_000_000
+PATIENCE_S = 20.0  # for what happens at once on an idle machine
+
+
+def pose_cdr(number: int) -> bytes:
+    types = JAZZY.types
+    pose = types['geometry_msgs/msg/Pose'](
+        types['geometry_msgs/msg/Point'](1.0, 2.0, float(number)),
+        types['geometry_msgs/msg/Quaternion'](0.0, 0.6, 0.0, 0.8))
+    stamp = types['builtin_interfaces/msg/Time'](1_700_000_000, number)
+    header = types['std_msgs/msg/Header'](stamp, 'world')
+    return bytes(JAZZY.serialize_cdr(types[POSE](header, pose), POSE))
+
+
+def array_cdr(number: int) -> bytes:
+    """The CDR of a Float64MultiArray without labels, packed by hand."""
+    return struct.pack('<4sIII4xd', b'\x00\x01\x00\x00', 0, 0, 1, float(number))
+
+
+def some_messages(count: int) -> list[tuple[int, int, bytes]]:
+    """Messages of the first two topics in turn, 1 ms apart."""
+    makers = (pose_cdr, array_cdr)
+    return [(n % 2, EPOCH_NS + n * 1_000_000, makers[n % 2](n)) for n in range(count)]
+
+
+def record(path, messages, **options):
+    with McapRecorder.open(path, TOPICS, METADATA, **{'min_free_bytes': 0} | options) as recorder:
+        for message in messages:
+            recorder.write(*message)
+        return recorder.close()
+
+
+def complete_messages(path):
+    """Return (topic, channel, message) of every complete chunk, in file order; torn files too."""
+    found = []
+    with open(path, 'rb') as file:
+        reader = NonSeekingReader(file)
+        try:
+            for _, channel, message in reader.iter_messages(log_time_order=False):
+                found.append((channel.topic, channel, message))
+        except McapError:
+            pass
+    return found
+
+
+def numbers_in(path):
+    """Return the stamps of a log whose messages are stamped 0, 1, 2, ..."""
+    return [message.log_time for _, _, message in complete_messages(path)]
+
+
+def eventually(condition):
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, 'did not happen in time'
+        time.sleep(0.005)
+
+
+def start_child(code: str, *arguments) -> subprocess.Popen:
+    head = (
+        'import json, os, resource, signal, struct, sys, time\n'
+        'from spinning_top_sim.recording.rosbag2 import RecordedTopic\n'
+        'from spinning_top_sim.recording.writer import McapRecorder\n'
+        f'TOPICS = [RecordedTopic("/a", {ARRAY!r})]\n')
+    return subprocess.Popen(
+        [sys.executable, '-c', head + textwrap.dedent(code), *map(str, arguments)],
+        env=os.environ | {'PYTHONPATH': str(ROOT)}, start_new_session=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def outcome(child: subprocess.Popen) -> tuple[str, str]:
+    try:
+        return child.communicate(timeout=60)
+    finally:
+        kill(child)
+
+
+def kill(child: subprocess.Popen) -> None:
+    if child.poll() is None:
+        os.killpg(child.pid, signal.SIGKILL)
+    child.communicate()
+
+
+# What readers find
+
+@pytest.mark.parametrize('compression', COMPRESSIONS)
+@pytest.mark.parametrize('default_typestore', [None, JAZZY])
+def test_rosbags_reads_every_message(tmp_path, compression, default_typestore):
+    messages = some_messages(2000)
+    record(tmp_path / 'run.mcap', messages, compression=compression)
+    with AnyReader([tmp_path / 'run.mcap'], default_typestore=default_typestore) as reader:
+        read = list(reader.messages())
+        assert [(TOPICS[index].name, stamp, data) for index, stamp, data in messages] == [
+            (connection.topic, stamp, bytes(data)) for connection, stamp, data in read]
+        for number, (connection, _, data) in enumerate(read):
+            message = reader.deserialize(data, connection.msgtype)
+            value = message.pose.position.z if number % 2 == 0 else message.data[0]
+            assert value == number
+
+
+def test_mcap_ros2_support_reads_every_message(tmp_path):
+    record(tmp_path / 'run.mcap', some_messages(500))
+    with open(tmp_path / 'run.mcap', 'rb') as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        read = list(reader.iter_decoded_messages())
+    assert len(read) == 500
+    for number, (_, _, stored, message) in enumerate(read):
+        assert stored.log_time == stored.publish_time == EPOCH_NS + number * 1_000_000
+        value = message.pose.position.z if number % 2 == 0 else message.data[0]
+        assert value == number
+    assert read[0][3].header.frame_id == 'world'
+
+
+def test_all_checksums_and_indexes_are_there(tmp_path):
+    record(tmp_path / 'run.mcap', some_messages(30_000))
+    with open(tmp_path / 'run.mcap', 'rb') as file:
+        summary = make_reader(file, validate_crcs=True).get_summary()
+        file.seek(0)
+        records = list(StreamReader(file, emit_chunks=True, validate_crcs=True).records)
+    end = next(item for item in records if type(item).__name__ == 'DataEnd')
+    footer = records[-1]
+    assert end.data_section_crc != 0
+    assert footer.summary_crc != 0
+    chunks = [item for item in records if isinstance(item, Chunk)]
+    assert len(chunks) > 2
+    assert summary.statistics.chunk_count == len(chunks) == len(summary.chunk_indexes)
+    for chunk, index in zip(chunks, summary.chunk_indexes, strict=True):
+        assert chunk.uncompressed_crc != 0
+        assert chunk.uncompressed_size <= CHUNK_BYTES + 200
+        assert index.message_index_length > 0
+        breakup_chunk(chunk, validate_crc=True)
+
+
+def test_message_indexes_lead_to_the_messages(tmp_path):
+    """Reading one topic in reversed time order goes through the indexes only."""
+    record(tmp_path / 'run.mcap', some_messages(20_000))
+    with open(tmp_path / 'run.mcap', 'rb') as file:
+        reader = make_reader(file)
+        stamps = [message.log_time for _, _, message in reader.iter_messages(
+            topics=[TOPICS[1].name], reverse=True)]
+    assert stamps == [EPOCH_NS + n * 1_000_000 for n in range(19_999, 0, -2)]
+
+
+def test_channels_carry_qos_and_type_hash(tmp_path):
+    record(tmp_path / 'run.mcap', [])
+    with open(tmp_path / 'run.mcap', 'rb') as file:
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        assert reader.get_header().profile == 'ros2'
+        assert reader.get_header().library.startswith('spinning_top_sim ')
+    channels = {channel.topic: channel for channel in summary.channels.values()}
+    assert list(channels) == [topic.name for topic in TOPICS]
+    for topic in TOPICS:
+        channel = channels[topic.name]
+        assert channel.message_encoding == 'cdr'
+        assert yaml.safe_load(channel.metadata['offered_qos_profiles']) == [
+            dict(DEFAULT_QOS) | topic.qos]
+        assert channel.metadata['topic_type_hash'] == JAZZY.hash_rihs01(topic.type_name)
+        schema = summary.schemas[channel.schema_id]
+        assert (schema.name, schema.encoding) == (topic.type_name, 'ros2msg')
+    assert len(summary.schemas) == 2
+    with Reader(tmp_path / 'run.mcap') as reader:
+        profile: Qos = reader.connections[1].ext.offered_qos_profiles[0]
+        assert profile.reliability is QosReliability.BEST_EFFORT
+        assert (profile.history, profile.depth) == (QosHistory.KEEP_LAST, 3)
+
+
+def test_offered_qos_is_written_as_yaml_cpp_writes_it(tmp_path):
+    record(tmp_path / 'run.mcap', [])
+    with open(tmp_path / 'run.mcap', 'rb') as file:
+        channel = make_reader(file).get_summary().channels[1]
+    assert channel.metadata['offered_qos_profiles'] == textwrap.dedent("""\
+        - history: 1
+          depth: 10
+          reliability: 1
+          durability: 2
+          deadline:
+            sec: 9223372036
+            nsec: 854775807
+          lifespan:
+            sec: 9223372036
+            nsec: 854775807
+          liveliness: 1
+          liveliness_lease_duration:
+            sec: 9223372036
+            nsec: 854775807
+          avoid_ros_namespace_conventions: false""")
+
+
+@pytest.mark.parametrize('count', [0, 1, 1001])
+def test_bag_metadata_agrees_with_the_messages(tmp_path, monkeypatch, count):
+    monkeypatch.delenv('ROS_DISTRO', raising=False)
+    path = tmp_path / 'a "b": #ü.mcap'
+    summary = record(path, some_messages(count))
+    assert summary.counts == {
+        TOPICS[0].name: (count + 1) // 2, TOPICS[1].name: count // 2, TOPICS[2].name: 0}
+    with open(path, 'rb') as file:
+        records = {item.name: item.metadata for item in make_reader(file).iter_metadata()}
+    assert records['spinning_top_sim'] == METADATA
+    bag = yaml.safe_load(records['rosbag2']['serialized_metadata'])
+    assert bag['version'] == 9
+    assert bag['storage_identifier'] == 'mcap'
+    assert bag['ros_distro'] == 'jazzy'
+    assert bag['message_count'] == bag['files'][0]['message_count'] == count
+    assert bag['starting_time']['nanoseconds_since_epoch'] == (EPOCH_NS if count else 0)
+    assert bag['duration']['nanoseconds'] == max(0, count - 1) * 1_000_000
+    assert bag['relative_file_paths'] == [path.name]
+    for entry, topic in zip(bag['topics_with_message_count'], TOPICS, strict=True):
+        assert entry['message_count'] == summary.counts[topic.name]
+        assert entry['topic_metadata']['name'] == topic.name
+        assert entry['topic_metadata']['type'] == topic.type_name
+        assert entry['topic_metadata']['type_description_hash'].startswith('RIHS01_')
+        assert entry['topic_metadata']['offered_qos_profiles'][0]['history'] == 'keep_last'
+    assert bag['topics_with_message_count'][1]['topic_metadata']['offered_qos_profiles'][0][
+        'reliability'] == 'best_effort'
+
+
+def test_a_bag_folder_made_of_the_embedded_metadata_is_read(tmp_path):
+    """The record holds what rosbag2 would have put into metadata.yaml."""
+    record(tmp_path / 'run.mcap', some_messages(100))
+    with open(tmp_path / 'run.mcap', 'rb') as file:
+        text = next(item.metadata['serialized_metadata']
+                    for item in make_reader(file).iter_metadata() if item.name == 'rosbag2')
+    (tmp_path / 'metadata.yaml').write_text(
+        'rosbag2_bagfile_information:\n' + textwrap.indent(text, '  '))
+    with Reader(tmp_path) as reader:
+        assert reader.message_count == len(list(reader.messages())) == 100
+        assert reader.ros_distro == os.environ.get('ROS_DISTRO', 'jazzy')
+
+
+def test_the_same_messages_give_the_same_bytes(tmp_path):
+    """Chunk borders fall as time has it; what is in the chunks does not."""
+    messages = some_messages(3000)
+    seen = []
+    for name, max_loss in (('a', 60.0), ('b', 0.01)):
+        record(tmp_path / name, messages, max_loss=max_loss)
+        seen.append([(topic, message) for topic, _, message in complete_messages(tmp_path / name)])
+    assert seen[0] == seen[1]
+    assert [message.sequence for topic, message in seen[0] if topic == TOPICS[0].name] == list(
+        range(1500))
+
+
+def test_stamps_need_no_order(tmp_path):
+    messages = [(0, stamp, pose_cdr(stamp)) for stamp in (5, 3, 9, 4)]
+    record(tmp_path / 'run.mcap', messages)
+    with Reader(tmp_path / 'run.mcap') as reader:
+        assert [stamp for _, stamp, _ in reader.messages()] == [3, 4, 5, 9]
+        assert (reader.start_time, reader.end_time) == (3, 10)
+
+
+# Definitions
+
+def test_a_schema_is_the_text_of_rosbag2(tmp_path, monkeypatch):
+    """Depth first, sorted, each once, a line of 80 '=': local_message_definition_source.cpp."""
+    share = tmp_path / 'share' / 'nested_msgs' / 'msg'
+    share.mkdir(parents=True)
+    (share / 'Root.msg').write_bytes(
+        b'# Zebra in a comment\r\nnested_msgs/Zebra[<=3] z\nApe a\nstring<=5 s\nuint8 N=1\n')
+    (share / 'Ape.msg').write_bytes(b'Zebra[2] z # no newline at the end')
+    (share / 'Zebra.msg').write_bytes('float32 c  # [°]\n'.encode())
+    (share / 'Root.json').write_text(json.dumps({'type_hashes': [
+        {'type_name': 'nested_msgs/msg/Zebra', 'hash_string': 'RIHS01_0'},
+        {'type_name': 'nested_msgs/msg/Root', 'hash_string': 'RIHS01_1'}]}))
+    monkeypatch.setenv('AMENT_PREFIX_PATH', f'{tmp_path / "nothing"}{os.pathsep}{tmp_path}')
+    definition = find_definition('nested_msgs/msg/Root')
+    line = '=' * 80
+    assert definition.text == (
+        '# Zebra in a comment\r\nnested_msgs/Zebra[<=3] z\nApe a\nstring<=5 s\nuint8 N=1\n'
+        f'\n{line}\nMSG: nested_msgs/Ape\nZebra[2] z # no newline at the end'
+        f'\n{line}\nMSG: nested_msgs/Zebra\nfloat32 c  # [°]\n')
+    assert definition.type_hash == 'RIHS01_1'
+
+
+@pytest.mark.parametrize('type_name', [
+    POSE, ARRAY, 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/JointState', 'nav_msgs/msg/Odometry',
+    'diagnostic_msgs/msg/DiagnosticArray', 'visualization_msgs/msg/MarkerArray',
+    'rosgraph_msgs/msg/Clock'])
+def test_type_hashes_are_those_others_compute(type_name):
+    assert find_definition(type_name).type_hash == JAZZY.hash_rihs01(type_name)
+
+
+def test_definitions_are_found_beside_the_python_package(tmp_path, monkeypatch):
+    """As on a machine where another interpreter runs with ROS on its PYTHONPATH."""
+    expected = find_definition(POSE)
+    monkeypatch.delenv('AMENT_PREFIX_PATH', raising=False)
+    monkeypatch.setattr(sys, 'prefix', str(tmp_path))
+    assert find_definition(POSE) == expected
+
+
+@pytest.mark.parametrize('type_name', [
+    'geometry_msgs/msg/NoSuchType', 'no_such_msgs/msg/Type', 'PoseStamped', '../msg/passwd', ''])
+def test_a_missing_definition_is_named(tmp_path, type_name):
+    with pytest.raises(DefinitionNotFoundError) as caught:
+        McapRecorder.open(
+            tmp_path / 'run.mcap', [RecordedTopic('/a', type_name)], {}, min_free_bytes=0)
+    assert type_name in str(caught.value)
+    if '_msgs' in type_name:
+        assert str(Path(sys.prefix, 'share', type_name.partition('/')[0])) in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+# Starting
+
+def test_an_existing_file_is_left_alone(tmp_path):
+    path = tmp_path / 'run.mcap'
+    path.write_text('precious')
+    with pytest.raises(RecordingError, match=r'run\.mcap.*exists'):
+        McapRecorder.open(path, TOPICS, METADATA, min_free_bytes=0)
+    assert path.read_text() == 'precious'
+
+
+def test_a_dangling_link_is_not_followed(tmp_path):
+    (tmp_path / 'run.mcap').symlink_to(tmp_path / 'elsewhere')
+    with pytest.raises(RecordingError, match='exists'):
+        McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+    assert not (tmp_path / 'elsewhere').exists()
+
+
+def test_a_missing_directory_is_named(tmp_path):
+    with pytest.raises(RecordingError, match=f'no directory {tmp_path}/logs'):
+        McapRecorder.open(tmp_path / 'logs' / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+
+
+def test_a_file_that_may_not_be_made_is_named(tmp_path, monkeypatch):
+    def open_read_only(path, *_, **__):
+        raise PermissionError(13, os.strerror(13), str(path))
+
+    monkeypatch.setattr(mcap_file, 'open', open_read_only, raising=False)
+    with pytest.raises(RecordingError, match=r'run\.mcap: Permission denied$'):
+        McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+
+
+def test_a_parent_that_is_a_file_is_named(tmp_path):
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(RecordingError, match=r'run\.mcap: Not a directory'):
+        McapRecorder.open(tmp_path / 'file' / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+
+
+def test_too_little_space_at_the_start_leaves_no_file(tmp_path):
+    with pytest.raises(RecordingError, match=r'run\.mcap: \d+ bytes are free .* 10{30}'):
+        McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=10 ** 30)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_head_that_cannot_be_written_leaves_no_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(mcap_file.os, 'fsync', refuse_to_sync)
+    with pytest.raises(RecordingError, match=r'run\.mcap: Input/output error'):
+        McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+    assert not list(tmp_path.iterdir())
+
+
+def refuse_to_sync(descriptor):
+    raise OSError(5, os.strerror(5))
+
+
+@pytest.mark.parametrize(('argument', 'value'), [
+    ('max_loss', 0.0), ('max_loss', float('nan')), ('max_loss', float('inf')),
+    ('compression', 'zip'), ('min_free_bytes', -1), ('queue_bytes', 0)])
+def test_arguments_out_of_range_are_named(tmp_path, argument, value):
+    with pytest.raises(ValueError, match=f'{argument} = {value!r}'):
+        McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, **{argument: value})
+    assert not list(tmp_path.iterdir())
+
+
+def test_topics_twice_and_bad_metadata_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="'/top/pose' is listed twice"):
+        McapRecorder.open(tmp_path / 'run.mcap', [TOPICS[0], TOPICS[0]], {})
+    with pytest.raises(ValueError, match=r"\('seed', 7\)"):
+        McapRecorder.open(tmp_path / 'run.mcap', TOPICS, {'seed': 7})  # type: ignore[dict-item]
+
+
+@pytest.mark.parametrize('qos', [{'reliability': 9}, {'histroy': 1}])
+def test_a_wrong_qos_is_named(qos):
+    with pytest.raises(ValueError, match=next(iter(qos))):
+        RecordedTopic('/a', ARRAY, qos)
+
+
+def test_importing_the_recorder_imports_neither_mcap_nor_ros():
+    child = start_child("""
+        print([name for name in ('mcap', 'zstandard', 'lz4', 'rclpy', 'numpy', 'yaml')
+               if name in sys.modules])
+        """)
+    assert outcome(child) == ('[]\n', '')
+
+
+# Running and ending
+
+def test_what_is_written_reaches_the_disk_without_being_closed(tmp_path, monkeypatch):
+    synced = []
+    fsync = os.fsync
+    monkeypatch.setattr(mcap_file.os, 'fsync', lambda fd: (fsync(fd), synced.append(fd)))
+    recorder = McapRecorder.open(
+        tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02, min_free_bytes=0)
+    before = len(synced)
+    for message in some_messages(100):
+        recorder.write(*message)
+    eventually(lambda: recorder.counters.flushes > 0 and recorder.counters.queued == 0)
+    assert recorder.state == 'recording'
+    assert len(synced) > before
+    assert len(complete_messages(tmp_path / 'run.mcap')) == 100
+    assert recorder.counters.bytes == (tmp_path / 'run.mcap').stat().st_size
+    assert recorder.counters.longest_flush > 0.0
+    recorder.close()
+
+
+def test_a_torn_file_tells_its_topics_and_its_run(tmp_path):
+    recorder = McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+    with open(tmp_path / 'run.mcap', 'rb') as file:
+        records = []
+        with pytest.raises(McapError):
+            for item in StreamReader(file).records:
+                records.append(item)
+    recorder.close()
+    assert [item.topic for item in records if isinstance(item, ChannelRecord)] == [
+        topic.name for topic in TOPICS]
+    assert [item.name for item in records if isinstance(item, Schema)] == [POSE, ARRAY]
+    assert METADATA in [getattr(item, 'metadata', None) for item in records]
+
+
+def test_closing_twice_changes_nothing(tmp_path):
+    recorder = McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+    recorder.write(0, 1, pose_cdr(1))
+    first = recorder.close()
+    content = first.path.read_bytes()
+    recorder.write(0, 2, pose_cdr(2))
+    second = recorder.close()
+    assert recorder.state == 'closed'
+    assert (first.counts, first.bytes, first.error, first.indexed, first.lost) == (
+        second.counts, second.bytes, None, True, 0)
+    assert second.lost == recorder.counters.lost == 1
+    assert first.bytes == len(content) == len(second.path.read_bytes())
+
+
+def test_a_full_queue_says_so_and_loses_nothing(tmp_path, monkeypatch):
+    blocked, disk_is_back = threading.Event(), threading.Event()
+    append = McapFile.append
+
+    def append_slowly(self, *message):
+        blocked.set()
+        disk_is_back.wait(PATIENCE_S)
+        return append(self, *message)
+
+    monkeypatch.setattr(McapFile, 'append', append_slowly)
+    recorder = McapRecorder.open(
+        tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.01, min_free_bytes=0,
+        queue_bytes=10_000)
+    recorder.write(0, 0, pose_cdr(0))
+    assert blocked.wait(PATIENCE_S)  # with the first message, out of the queue
+    written = 1
+    while recorder.room:
+        recorder.write(0, written, pose_cdr(written))
+        written += 1
+    assert 10 < written < 100
+    assert not recorder.wait_for_room(0.01)
+    recorder.write(0, written, pose_cdr(written))  # a burst may go on
+    disk_is_back.set()
+    assert recorder.wait_for_room(PATIENCE_S)
+    summary = recorder.close()
+    assert (summary.lost, summary.error) == (0, None)
+    assert numbers_in(summary.path) == list(range(written + 1))
+
+
+def test_a_disk_that_hangs_does_not_hang_the_end(tmp_path, monkeypatch):
+    disk_is_back = threading.Event()
+    write_chunk = McapFile.write_chunk
+    monkeypatch.setattr(
+        McapFile, 'write_chunk', lambda self: (disk_is_back.wait(PATIENCE_S), write_chunk(self)))
+    recorder = McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+    recorder.write(0, 1, pose_cdr(1))
+    summary = recorder.close(timeout=0.05)
+    assert 'could not be closed within 0.05 s' in (summary.error or '')
+    assert not summary.indexed
+    disk_is_back.set()
+    summary = recorder.close(timeout=PATIENCE_S)
+    assert (summary.error, summary.indexed, summary.lost) == (None, True, 0)
+
+
+@pytest.mark.parametrize('ending', [
+    'pass', 'sys.exit(3)', 'raise KeyboardInterrupt', 'os.kill(os.getpid(), signal.SIGINT)'])
+def test_an_interpreter_that_ends_without_closing_leaves_a_whole_file(tmp_path, ending):
+    child = start_child(f"""
+        recorder = McapRecorder.open(sys.argv[1], TOPICS, {{}}, min_free_bytes=0, max_loss=60.0)
+        for number in range(100):
+            recorder.write(0, number, bytes(8))
+        {ending}
+        """, tmp_path / 'run.mcap')
+    outcome(child)
+    with Reader(tmp_path / 'run.mcap') as reader:
+        assert [stamp for _, stamp, _ in reader.messages()] == list(range(100))
+
+
+@pytest.mark.parametrize('max_loss', [0.5, 1.0])
+def test_a_kill_loses_no_more_than_promised(tmp_path, max_loss):
+    """
+    What a SIGKILL takes was accepted less than max_loss before it.
+
+    The child notes every message with the time after it was accepted, so a machine that is slow
+    to schedule it shortens what can be lost instead of failing the test.
+    """
+    children = []
+    try:
+        for number in range(3):
+            folder = tmp_path / str(number)
+            folder.mkdir()
+            children.append(start_child("""
+                recorder = McapRecorder.open(
+                    sys.argv[1] + '/run.mcap', TOPICS, {}, min_free_bytes=0,
+                    max_loss=float(sys.argv[2]))
+                with open(sys.argv[1] + '/accepted', 'wb', buffering=0) as accepted:
+                    for number in range(1_000_000):
+                        recorder.write(0, number, struct.pack('<4sIIId', bytes(4), 0, 0, 1, 0.0))
+                        accepted.write(struct.pack('<d', time.monotonic()))
+                        time.sleep(0.001)
+                """, folder, max_loss))
+        for number, child in enumerate(children):  # each at another phase of the flushes
+            accepted = tmp_path / str(number) / 'accepted'
+            lived = max_loss * (1.6 + 0.17 * number)
+            eventually(lambda a=accepted, s=lived, c=child: c.poll() is not None or (
+                a.exists() and len(t := times_in(a)) > 1 and t[-1] - t[0] > s))
+            kill(child)
+    finally:
+        for child in children:
+            kill(child)
+    for number in range(3):
+        accepted = times_in(tmp_path / str(number) / 'accepted')
+        kept = numbers_in(tmp_path / str(number) / 'run.mcap')
+        assert kept == list(range(len(kept)))
+        assert len(kept) > 10
+        if len(kept) < len(accepted):
+            assert accepted[-1] - accepted[len(kept)] <= max_loss
+
+
+def times_in(path: Path) -> list[float]:
+    content = path.read_bytes()
+    return [time for time, in struct.iter_unpack('<d', content[:len(content) // 8 * 8])]
+
+
+# Disks that fail
+
+FILL = """
+    def limit(size):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+    def wait_until(condition):
+        deadline = time.monotonic() + 20.0
+        while not condition():
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+
+    def tell(recorder):
+        summary = recorder.close()
+        recorder.write(0, 0, b'after the end')
+        print(json.dumps({
+            'state': recorder.state, 'error': recorder.error, 'room': recorder.room,
+            'bytes': summary.bytes, 'counts': summary.counts, 'lost': summary.lost,
+            'indexed': summary.indexed, 'written': written, 'same': summary.error}))
+
+    written = 0
+    def write(recorder, count):
+        global written
+        for _ in range(count):
+            recorder.write(0, written, os.urandom(1000))
+            written += 1
+    """
+
+
+def test_a_full_disk_stops_the_recording_and_leaves_an_indexed_file(tmp_path):
+    """The torn chunk is cut off, and where it stood there is room for the summary."""
+    child = start_child(FILL + """
+    recorder = McapRecorder.open(
+        sys.argv[1], TOPICS, {}, min_free_bytes=0, max_loss=100.0, queue_bytes=200_000)
+    write(recorder, 1500)
+    wait_until(lambda: recorder.counters.messages > 0)
+    limit(recorder.counters.bytes + 100_000)
+    write(recorder, 3000)
+    wait_until(lambda: recorder.state == 'failed')
+    tell(recorder)
+    """, tmp_path / 'run.mcap')
+    told = report(child)
+    assert told['state'] == 'failed'
+    assert str(tmp_path / 'run.mcap') in told['error']
+    assert 'File too large' in told['error']
+    assert told['same'] == told['error']
+    assert told['room']
+    assert told['indexed']
+    kept = told['counts']['/a']
+    assert kept > 1000
+    assert told['lost'] == told['written'] - kept
+    with Reader(tmp_path / 'run.mcap') as reader:
+        assert [stamp for _, stamp, _ in reader.messages()] == list(range(kept))
+
+
+def test_a_disk_that_fills_at_the_very_end_costs_only_the_index(tmp_path):
+    child = start_child(FILL + """
+    recorder = McapRecorder.open(sys.argv[1], TOPICS, {}, min_free_bytes=0, max_loss=0.02)
+    write(recorder, 300)
+    wait_until(lambda: recorder.counters.queued == 0)
+    limit(recorder.counters.bytes + 100)
+    tell(recorder)
+    """, tmp_path / 'run.mcap')
+    told = report(child)
+    assert told['state'] == 'failed'
+    assert 'File too large' in told['error']
+    assert not told['indexed']
+    assert told['lost'] == 0
+    assert told['bytes'] == (tmp_path / 'run.mcap').stat().st_size
+    assert numbers_in(tmp_path / 'run.mcap') == list(range(300))
+
+
+def report(child: subprocess.Popen) -> dict:
+    out, err = outcome(child)
+    assert err == ''
+    return json.loads(out)
+
+
+def test_a_failing_disk_stops_the_recording(tmp_path, monkeypatch):
+    recorder = McapRecorder.open(
+        tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02, min_free_bytes=0)
+    monkeypatch.setattr(mcap_file.os, 'fsync', refuse_to_sync)
+    for message in some_messages(50):
+        recorder.write(*message)
+    eventually(lambda: recorder.state == 'failed')
+    assert recorder.error == (
+        f'recording to {tmp_path / "run.mcap"} stopped: Input/output error')
+    recorder.write(0, 0, b'late')
+    assert recorder.room
+    assert recorder.close().error == recorder.error
+    assert recorder.counters.lost + recorder.counters.messages == 51
+    assert len(complete_messages(tmp_path / 'run.mcap')) == recorder.counters.messages
+
+
+def test_a_disk_that_runs_short_stops_the_recording_in_good_order(tmp_path, monkeypatch):
+    recorder = McapRecorder.open(
+        tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02, min_free_bytes=1)
+    monkeypatch.setattr(McapFile, 'free_bytes', lambda self: 0)
+    recorder.write(0, 7, pose_cdr(7))
+    eventually(lambda: recorder.state == 'failed')
+    assert recorder.error == (
+        f'recording to {tmp_path / "run.mcap"} stopped: '
+        '0 bytes are free on the disk, fewer than min_free_bytes = 1')
+    summary = recorder.close()
+    assert (summary.indexed, summary.lost) == (True, 0)
+    with Reader(tmp_path / 'run.mcap') as reader:
+        assert [stamp for _, stamp, _ in reader.messages()] == [7]
+
+
+def test_a_message_that_cannot_be_packed_is_no_exception_for_the_simulation(tmp_path):
+    recorder = McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+    recorder.write(0, -1, b'')
+    summary = recorder.close()
+    assert recorder.state == 'failed'
+    assert 'stopped: error:' in (summary.error or '')
+    assert (summary.indexed, summary.lost) == (True, 1)
