@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from spinning_top_sim.physics.kinematics import OneState
-from spinning_top_sim.physics.top import ContinuedState, State, pole_momentum
+from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
 from spinning_top_sim.solvers.rk45 import Propagator, rk45
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -42,9 +42,15 @@ class Simulation:
         self.restart(values)
 
     def restart(self, values: Mapping[str, Any]) -> None:
-        """Go back to the start state of these parameters; sinks, counts and stamps remain."""
-        self.values = dict(values)
-        self.top = parameters.top_of(values)
+        """
+        Go back to the start state of these parameters; sinks, counts and stamps remain.
+
+        Raises ValueError or IntegrationError where there is no motion from there; then the one
+        there was goes on.
+        """
+        top, start = parameters.top_of(values), parameters.start_state(values)
+        solver, state = _first_step(top, start, values)
+        self.values, self.top = dict(values), top
         self.history: list[tuple[int, float, float]] = []
         self.now_ns = -1
         streams = all_streams(values, Imu(values))
@@ -53,26 +59,16 @@ class Simulation:
             new.sent, new.skipped = old.sent, old.skipped
         self.streams = streams
         self._invariants = next(s for s in streams if isinstance(s, Invariants))
-        self._begin(parameters.start_state(values), 0)
+        self._begin(solver, state, 0)
 
-    def _begin(self, start: State, at_ns: int) -> None:
-        """Let the motion begin in a state, at a time; where it cannot, nothing has changed."""
-        solver = self._new_solver(start)
-        solver.reach(math.ulp(0.0))         # the first step shows whether there is a motion
-        state = solver.at(0.0)
-        if not math.isfinite(state.energy):
-            raise ValueError(f'the energy would be {state.energy!r} J')
+    def _begin(self, solver: Propagator, state: OneState, at_ns: int) -> None:
+        """Let a motion begin at a time."""
         if self._solver is not None:
             self._steps_before += self._solver.steps
             self._evaluations_before += self._solver.evaluations
         self._solver, self._anchor_ns = solver, at_ns
-        self.l3, self.lz = start.l3, start.lz
+        self.l3, self.lz = state.l3_start, state.lz_start
         self._invariants.start_from(state)
-
-    def _new_solver(self, start: State) -> Propagator:
-        values = self.values
-        return rk45(self.top, start, equations=values['solver.equations'],
-                    rtol=values['solver.rtol'], atol=values['solver.atol'])
 
     @property
     def steps(self) -> int:
@@ -165,8 +161,20 @@ class Simulation:
         start = ContinuedState(theta=state.theta, theta_dot=state.theta_dot, phi=state.phi,
                                psi=state.psi, l3=l3, lz=lz)
         try:
-            self._begin(start, at_ns)
+            solver, state_after = _first_step(self.top, start, self.values)
         except (ArithmeticError, ValueError, RuntimeError) as error:
             raise ValueError(f'l3 = {l3!r}, lz = {lz!r} kg m^2/s: no motion from theta = '
                              f'{state.theta!r} rad: {error}') from error
+        self._begin(solver, state_after, at_ns)
         self.history.append((at_ns, l3, lz))
+
+
+def _first_step(top: Top, start: State, values: Mapping[str, Any]) -> tuple[Propagator, OneState]:
+    """Return the motion from `start` and its first state; the first step shows if there is one."""
+    solver = rk45(top, start, equations=values['solver.equations'],
+                  rtol=values['solver.rtol'], atol=values['solver.atol'])
+    solver.reach(math.ulp(0.0))
+    state = solver.at(0.0)
+    if not math.isfinite(state.energy):
+        raise ValueError(f'the energy would be {state.energy!r} J')
+    return solver, state

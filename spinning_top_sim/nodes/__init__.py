@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ROS side, thin: parameters, timers, services, publishers.  What moves is elsewhere."""

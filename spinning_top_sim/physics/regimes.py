@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Which motion is this?  The classical names, from the constants of the motion alone.
+
+With u = cos(theta) the axis obeys u'^2 = f(u), a cubic; it swings between the two roots of f in
+[-1, 1].  The precession phi' = (Lz - L3 u)/(lambda1 (1 - u^2)) changes sign at u = Lz/L3: inside
+the swing the tip draws loops, outside it waves, at its end cusps (Goldstein, *Classical
+Mechanics*, 3rd ed., sect. 5.7; Klein & Sommerfeld, *Theorie des Kreisels*, ch. IV).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.top import State, Top
+
+# Relative distance below which two roots, or a root and Lz/L3, are said to coincide.
+COINCIDE = 1e-12
+
+
+@dataclass(frozen=True)
+class Swing:
+    """Between which tilts the axis swings: cosines low <= high, and f's third root beyond 1."""
+
+    low: float
+    high: float
+    beyond: float
+
+
+def swing(top: Top, state: State) -> Swing:
+    """Return the roots of u'^2 = f(u) around the state, in doubles."""
+    u0 = math.cos(state.theta)
+    half_cosine, half_sine = math.cos(0.5 * state.theta), math.sin(0.5 * state.theta)
+    s0, c0 = half_sine ** 2, half_cosine ** 2
+    f0, f1, f2, f3 = cubic(top, state, s0, c0)
+    if f0 == 0.0 and f1 == 0.0:
+        return Swing(u0, u0, math.inf if f3 == 0.0 else max(u0 - f2 / f3, u0))
+    if f0 == 0.0:                       # theta' = 0: u0 is one end, the others from a quadratic
+        ends = [0.0, *_quadratic_roots(f1, f2, f3)]
+        inside = [y for y in ends if -2.0 * c0 * (1.0 + COINCIDE) <= y
+                  <= 2.0 * s0 * (1.0 + COINCIDE) + COINCIDE]
+        other = inside[1] if len(inside) > 1 else 0.0
+        beyond = max([y for y in ends if y not in inside], default=math.inf)
+        return Swing(u0 + min(0.0, other), u0 + max(0.0, other), u0 + beyond)
+    low = _bisect(f0, f1, f2, f3, -2.0 * c0)
+    high = _bisect(f0, f1, f2, f3, 2.0 * s0)
+    beyond = math.inf if f3 == 0.0 else -f2 / f3 - low - high
+    return Swing(u0 + low, u0 + high, u0 + beyond)
+
+
+def cubic(top: Top, state: State, s0: float, c0: float) -> tuple[float, float, float, float]:
+    """Return f of u'^2 = f0 + f1 y + f2 y^2 + f3 y^3, y = u - u0; s0, c0: sin^2, cos^2 theta/2."""
+    torque, lambda1, l3, lz = top.gravity_torque, top.lambda1, state.l3, state.lz
+    u0 = c0 - s0
+    offset = (lz - l3) + 2.0 * l3 * s0 if s0 < c0 else (lz + l3) - 2.0 * l3 * c0
+    rate = attitude.precession_rate(top, l3, lz, c0, s0)
+    kinetic = 0.5 * lambda1 * (state.theta_dot ** 2 + 4.0 * s0 * c0 * rate ** 2)
+    return (4.0 * s0 * c0 * state.theta_dot ** 2,
+            (2.0 / lambda1 * (-2.0 * u0 * kinetic - 4.0 * torque * s0 * c0)
+             + 2.0 * offset * l3 / lambda1 ** 2),
+            2.0 / lambda1 * (2.0 * u0 * torque - kinetic) - (l3 / lambda1) ** 2,
+            2.0 * torque / lambda1)
+
+
+def _quadratic_roots(a0: float, a1: float, a2: float) -> list[float]:
+    """Return the real roots of a0 + a1 y + a2 y^2, without cancellation."""
+    if a2 == 0.0:
+        return [-a0 / a1] if a1 else []
+    square = a1 * a1 - 4.0 * a0 * a2
+    if square < 0.0:
+        return []
+    q = -0.5 * (a1 + math.copysign(math.sqrt(square), a1))
+    return sorted({q / a2, a0 / q if q else 0.0})
+
+
+def _bisect(f0: float, f1: float, f2: float, f3: float, end: float) -> float:
+    """Return the root between 0, where f > 0, and `end`, where f <= 0."""
+    inside, outside = 0.0, end
+    while True:
+        middle = 0.5 * (inside + outside)
+        if middle in (inside, outside):
+            return middle
+        if ((f3 * middle + f2) * middle + f1) * middle + f0 > 0.0:
+            inside = middle
+        else:
+            outside = middle
+
+
+def regime(top: Top, state: State) -> str:
+    """Return the motion's name."""
+    l3, lz = state.l3, state.lz
+    scale = abs(l3) + abs(lz)
+    at = swing(top, state)
+    resting = at.high - at.low <= COINCIDE
+    if top.gravity_torque == 0.0:
+        return 'free top' if scale or state.theta_dot else 'at rest'
+    if resting and (state.theta == 0.0 or state.theta == math.pi):
+        if scale == 0.0:
+            return 'at rest'
+        upright = (state.theta == 0.0) == (top.gravity_torque > 0.0)
+        if not upright:
+            return 'hanging'
+        stable = l3 * l3 > 4.0 * top.lambda1 * abs(top.gravity_torque)
+        return 'sleeping' if stable else 'sleeping, unstable'
+    if scale == 0.0:
+        return 'planar pendulum, ' + ('rotating' if at.high >= 1.0 - COINCIDE and at.low
+                                      <= -1.0 + COINCIDE else 'swinging')
+    if resting:
+        return 'steady precession'
+    if l3 == 0.0:
+        return 'spherical pendulum'
+    turning = lz / l3
+    if lz == l3 and at.high >= 1.0 - COINCIDE:
+        return 'through the top'
+    if lz == -l3 and at.low <= -1.0 + COINCIDE:
+        return 'through the bottom'
+    if min(abs(turning - at.low), abs(turning - at.high)) <= COINCIDE * max(1.0, abs(turning)):
+        return 'cusps'
+    return 'loops' if at.low < turning < at.high else 'waves'
