@@ -111,8 +111,8 @@ class McapRecorder:
         # A daemon, so that a forgotten recording cannot hold up the end of the interpreter; the
         # exit handler runs before daemons are stopped and closes the file properly.
         self._thread = threading.Thread(target=self._run, name='recorder', daemon=True)
-        atexit.register(self.close, _CLOSE_AT_EXIT_S)
         self._thread.start()
+        atexit.register(self.close, _CLOSE_AT_EXIT_S)
 
     @classmethod
     def open(
