@@ -6,6 +6,7 @@ The readers are rosbags, mcap-ros2-support and mcap, none of them written here; 
 serialized by rosbags.  Children are killed for good after a timeout, whatever they do.
 """
 
+import io
 import json
 import os
 import signal
@@ -15,15 +16,18 @@ import sys
 import textwrap
 import threading
 import time
+import zlib
 from pathlib import Path
 
 import pytest
 import yaml  # type: ignore[import-untyped]
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Channel as ChannelRecord
-from mcap.records import Chunk, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.records import Chunk, Message, MessageIndex, Schema, SummaryOffset
+from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Qos, QosHistory, QosReliability
@@ -48,6 +52,9 @@ TOPICS = (
 )
 METADATA = {'seed': '7', 'top.mass': '0.5', 'note': 'θ: "quoted"\nline'}
 EPOCH_NS = 1_700_000_000_000_000_000
+SUMMARY_OPCODES = (
+    Opcode.CHANNEL, Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.METADATA_INDEX,
+    Opcode.SUMMARY_OFFSET)  # what follows a group of the summary
 PATIENCE_S = 20.0  # for what happens at once on an idle machine
 
 
@@ -168,7 +175,13 @@ def test_all_checksums_and_indexes_are_there(tmp_path):
     end = next(item for item in records if type(item).__name__ == 'DataEnd')
     footer = records[-1]
     assert end.data_section_crc != 0
-    assert footer.summary_crc != 0
+    content = (tmp_path / 'run.mcap').read_bytes()
+    assert footer.summary_crc == zlib.crc32(content[footer.summary_start:-12])
+    assert summary.statistics.message_start_time == EPOCH_NS
+    assert summary.statistics.message_end_time == EPOCH_NS + 29_999 * 1_000_000
+    for group in (item for item in records if isinstance(item, SummaryOffset)):
+        assert content[group.group_start] == group.group_opcode
+        assert content[group.group_start + group.group_length] in SUMMARY_OPCODES
     chunks = [item for item in records if isinstance(item, Chunk)]
     assert len(chunks) > 2
     assert summary.statistics.chunk_count == len(chunks) == len(summary.chunk_indexes)
@@ -180,13 +193,33 @@ def test_all_checksums_and_indexes_are_there(tmp_path):
 
 
 def test_message_indexes_lead_to_the_messages(tmp_path):
-    """Reading one topic in reversed time order goes through the indexes only."""
-    record(tmp_path / 'run.mcap', some_messages(20_000))
-    with open(tmp_path / 'run.mcap', 'rb') as file:
-        reader = make_reader(file)
-        stamps = [message.log_time for _, _, message in reader.iter_messages(
-            topics=[TOPICS[1].name], reverse=True)]
-    assert stamps == [EPOCH_NS + n * 1_000_000 for n in range(19_999, 0, -2)]
+    """Chunk index -> message index -> message, by the offsets, as rosbag2 goes."""
+    path = tmp_path / 'run.mcap'
+    record(path, some_messages(20_000), max_loss=60.0)
+    with open(path, 'rb') as file:
+        summary = make_reader(file).get_summary()
+    content = path.read_bytes()
+    assert len(summary.chunk_indexes) > 1
+    found = []
+    for chunk_index in summary.chunk_indexes:
+        start = chunk_index.chunk_start_offset
+        plain = get_chunk_data_stream(record_at(content, start, Chunk))[0].read(2 * CHUNK_BYTES)
+        assert sorted(chunk_index.message_index_offsets) == [1, 2]
+        for channel_id, offset in chunk_index.message_index_offsets.items():
+            index = record_at(content, offset, MessageIndex)
+            assert index.channel_id == channel_id
+            for stamp, message_offset in index.records:
+                length = int.from_bytes(plain[message_offset + 1:message_offset + 9], 'little')
+                stream = ReadDataStream(io.BytesIO(plain[message_offset + 9:]))
+                message = Message.read(stream, length)
+                assert (message.channel_id, message.log_time) == (channel_id, stamp)
+                found.append((message.channel_id - 1, stamp, message.data))
+    assert sorted(found, key=lambda item: item[1]) == some_messages(20_000)
+
+
+def record_at(content: bytes, offset: int, kind):
+    """Return the record at a place in the file; its first nine bytes are opcode and length."""
+    return kind.read(ReadDataStream(io.BytesIO(content[offset + 9:])))
 
 
 def test_channels_carry_qos_and_type_hash(tmp_path):

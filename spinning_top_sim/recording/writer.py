@@ -93,7 +93,9 @@ class McapRecorder:
         self._min_free_bytes = min_free_bytes
         self._queue_bytes = queue_bytes
 
-        self._lock = threading.Lock()  # held for a few instructions, never during I/O
+        # Held for a few instructions, never during I/O; reentrant, because a signal handler may
+        # close the recording while its thread is inside write().
+        self._lock = threading.RLock()
         self._queue: list[Message] = []
         self._load = 0                 # bytes in the queue
         self._offered = 0              # messages handed over, ever
@@ -111,8 +113,8 @@ class McapRecorder:
         # A daemon, so that a forgotten recording cannot hold up the end of the interpreter; the
         # exit handler runs before daemons are stopped and closes the file properly.
         self._thread = threading.Thread(target=self._run, name='recorder', daemon=True)
-        atexit.register(self.close, _CLOSE_AT_EXIT_S)
         self._thread.start()
+        atexit.register(self.close, _CLOSE_AT_EXIT_S)
 
     @classmethod
     def open(
@@ -134,7 +136,7 @@ class McapRecorder:
         max_loss: most wall time whose messages a SIGKILL or a power loss may take [s], > 0
         compression: one of COMPRESSIONS
         min_free_bytes: recording stops when the disk has less left than this, >= 0
-        queue_bytes: `room` is False from here on; memory use stays below twice this, > 0
+        queue_bytes: `room` is False from here on; at most about twice this is in memory, > 0
 
         Raises ValueError for an argument out of range, and RecordingError, naming path or type
         and the reason, when the file exists or cannot be made, or a definition is not installed.
