@@ -42,7 +42,7 @@ def solve(top: Top, start: State, t: Any, *, method: str = 'exact', rtol: float 
     if method not in METHODS:
         raise ValueError(f'method = {method!r}: must be one of {", ".join(METHODS)}')
     if len(times) and times[0] < 0.0:
-        raise ValueError(f't[0] = {times[0]} s: must be >= 0 with method = \'rk45\'')
+        raise ValueError(f"t[0] = {times[0]} s: must be >= 0 with method = 'rk45'")
     falls = np.flatnonzero(np.diff(times) < 0.0)
     if len(falls):
         at = int(falls[0])

@@ -99,7 +99,7 @@ def unrolled_step(size: int, number: type) -> Step:
     estimate = ', '.join(f'h*({combination(ERROR, i)})' for i in range(size))
     lines.append(f'    return ({names("z")}), k7, ({estimate},)')
     scope: dict[str, Any] = {}
-    exec('\n'.join(lines), scope)  # noqa: S102 - our own text, made of the tableau alone
+    exec('\n'.join(lines), scope)
     return scope['step']
 
 

@@ -50,7 +50,7 @@ class EulerForm:
         if not abs(sine) > SMALLEST_SINE:
             raise IntegrationError(
                 f'euler equations: the axis is at a pole (theta = {theta!r} rad): cos(theta) '
-                f'rounds to {cosine!r} and eq. (31) loses phi\'; {ADVICE}')
+                f"rounds to {cosine!r} and eq. (31) loses phi'; {ADVICE}")
         top = self.top
         phi_dot = (self.lz - self.l3 * cosine) / (top.lambda1 * sine * sine)
         psi_dot = self.l3 / top.lambda3 - phi_dot * cosine

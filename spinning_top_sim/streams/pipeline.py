@@ -66,9 +66,20 @@ class Simulation:
         if self._solver is not None:
             self._steps_before += self._solver.steps
             self._evaluations_before += self._solver.evaluations
-        self._solver, self._anchor_ns = solver, at_ns
+        self._solver, self._anchor_ns, self._first = solver, at_ns, state
         self.l3, self.lz = state.l3_start, state.lz_start
         self._invariants.start_from(state)
+
+    @property
+    def anchor(self) -> State:
+        """The state in which the present motion began: the start, or the last command."""
+        first = self._first
+        return ContinuedState(theta=first.theta, theta_dot=first.theta_dot, phi=first.phi,
+                              psi=first.psi, l3=self.l3, lz=self.lz)
+
+    def energy_drift(self, state: OneState) -> float:
+        """Return the energy's relative drift since then (absolute where it was 0)."""
+        return (state.energy - self._first.energy) / (abs(self._first.energy) or 1.0)
 
     @property
     def steps(self) -> int:

@@ -1,0 +1,591 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node `spinning_top`: wires a `Simulation` to topics, services, parameters and a recorder."""
+
+from __future__ import annotations
+
+import functools
+import gc
+import json
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.task import Future
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import SetBool, Trigger
+
+from spinning_top_sim.nodes import reports
+from spinning_top_sim.nodes.pacing import DeadlineThread, SimulatedClock
+from spinning_top_sim.nodes.ros_parameters import ParameterChanges, declare, start_values
+from spinning_top_sim.physics.regimes import regime
+from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.streams import messages
+from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.pipeline import Simulation
+
+OK, WARN, ERROR = 0, 1, 2
+
+# The stamp of t = 0 is a multiple of this, so that grids meet across streams and runs.
+EPOCH_GRID_NS = 10_000_000
+# How often subscriptions are counted; a new subscriber waits at most this long.
+LISTENERS_PERIOD_NS = 50_000_000
+# One tick works at most this long before services and signals get their turn.
+TICK_BUDGET_S = 0.05
+# Samples later than this are not published any more.
+LATEST_NS = 500_000_000
+# A simulation further behind than this lets its clock slip: its real-time factor falls below 1.
+LONGEST_LAG_NS = 1_000_000_000
+
+
+class Simulator(Node):
+    """
+    See docs/interface.md for topics, services and parameters.
+
+    finished: completes when `duration` has passed.  Construct, then `start`, spin, `stop`.
+    Raises ValueError for a bad parameter.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('spinning_top')
+        self.finished: Future = Future()
+        values = start_values(self)
+        self._lock = threading.RLock()          # the simulation, between ticks and callbacks
+        self._simulation = Simulation(values)
+        self._counters = reports.Counters()
+        self._speed = reports.Speedometer()
+        self._terminal = reports.Terminal()
+        self._recorder: Any = None
+        self._record_error: str | None = None
+        self._failure: str | None = None
+        self._warned_overload = False
+        self._factor = 0.0
+        if values['spin.lz'] is None:
+            values = {**values, 'spin.lz': self._simulation.lz}
+        declare(self, values)
+        self._start_values = values
+        self._changes = ParameterChanges(self, values, self._apply)
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._qos: dict[str, QoSProfile] = {}
+        self._outputs: dict[str, Publisher] = {}
+        self._open_publishers()
+        self._make_interface()
+        self._simulated_clock = SimulatedClock(self._followed_time(), values['time_scale'])
+        self._paused = values['start_paused']
+        self._listeners_due = 0
+        self._last_tick = 0
+        self._pacer: DeadlineThread | None = None
+        self._tick_timer: Any = None
+        if not self._simulation.top.is_realizable:
+            top = self._simulation.top
+            self.get_logger().warning(
+                f'top.lambda3 = {top.lambda3!r} kg m^2: no rigid body has this with top.lambda1 '
+                f'= {top.lambda1!r}, top.mass = {top.mass!r} and top.com_distance = '
+                f'{top.com_distance!r} (lambda3 <= 2 (lambda1 - M R^2)); simulated all the same')
+
+    # ------------------------------------------------------------------------ construction
+
+    @property
+    def _values(self) -> dict[str, Any]:
+        return self._changes.values
+
+    def _followed_time(self) -> Any:
+        """Return ROS time where the node follows a /clock, else steady time."""
+        follows = self.get_parameter('use_sim_time').value
+        if follows and not self._enabled('clock'):
+            return lambda: self.get_clock().now().nanoseconds
+        return time.monotonic_ns
+
+    def _enabled(self, parameter: str) -> bool:
+        if parameter == 'clock' and self._values['publish_clock']:
+            return True
+        return self._values[f'{parameter}.enabled']
+
+    def _open_publishers(self) -> None:
+        """Have a publisher for each enabled stream, and for no other."""
+        for stream in self._simulation.streams:
+            wanted, there = self._enabled(stream.parameter), stream.topic in self._outputs
+            if wanted and not there:
+                self._outputs[stream.topic] = self._publisher(
+                    _message_type(stream.type_name), stream.topic)
+            elif there and not wanted:
+                stream.publish = None
+                self.destroy_publisher(self._outputs.pop(stream.topic))
+        self._listeners_due = 0
+
+    def _publisher(self, message_type: type, topic: str) -> Publisher:
+        qos = QoSProfile(depth=10)
+        publisher = self.create_publisher(
+            message_type, topic, qos,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        self._qos[publisher.topic_name] = qos       # with the overrides put in
+        return publisher
+
+    def _make_interface(self) -> None:
+        self._diagnostics = self._publisher(DiagnosticArray, '/diagnostics')
+        self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
+        for name, kind, callback in (
+                ('set_pause', SetBool, self._on_pause), ('step', Trigger, self._on_step),
+                ('reset', Trigger, self._on_reset), ('record', SetBool, self._on_record)):
+            self.create_service(kind, f'~/{name}', callback)
+        self.create_timer(1.0, self._report, clock=self._steady)
+        self._status_timer: Any = None
+        self._restart_status()
+
+    def _restart_status(self) -> None:
+        if self._status_timer is not None:
+            self.destroy_timer(self._status_timer)
+            self._status_timer = None
+        period = self._values['status_period']
+        if period > 0.0:
+            self._status_timer = self.create_timer(period, self._show_status, clock=self._steady)
+
+    # ---------------------------------------------------------------------- start and stop
+
+    def start(self) -> None:
+        """Let time run: simulated t = 0 is the next point of the stamps' grid."""
+        if self._values['record.enabled']:
+            try:
+                self._start_recording()
+            except Exception as error:      # whatever the disk has against it, the motion goes on
+                self._record_error = str(error)
+                self.get_logger().error(f'not recording: {error}')
+        gc.collect()
+        gc.freeze()             # what there is now stays: no full collection in the middle of it
+        now = self.get_clock().now().nanoseconds
+        epoch = _ceil_to(now, EPOCH_GRID_NS)
+        if epoch - now < NANOSECONDS and self._clock_is_wall():
+            time.sleep((epoch - now) / NANOSECONDS)
+        with self._lock:
+            self._set_epoch(epoch)
+            if not self._paused:
+                self._simulated_clock.start(0)
+        tick_rate = self._values['tick_rate']
+        if self._values['pacing'] == 'thread':
+            self._pacer = DeadlineThread(self._tick_in_thread, tick_rate)
+            self._pacer.start()
+        else:
+            self._tick_timer = self.create_timer(1.0 / tick_rate, self._tick, clock=self._steady)
+
+    def _clock_is_wall(self) -> bool:
+        return not self.get_parameter('use_sim_time').value
+
+    def _set_epoch(self, epoch_ns: int) -> None:
+        self._simulation.epoch_ns = epoch_ns
+
+    def stop(self) -> None:
+        """End the motion and close the recording; safe whatever state the context is in."""
+        if self._pacer is not None:
+            self._pacer.stop()
+        self._terminal.end()
+        summary = self._stop_recording()
+        if summary:
+            print(summary, flush=True)
+
+    def _finish(self) -> None:
+        """The duration has passed: let the last messages arrive, then end the spin."""
+        for publisher in self._outputs.values():
+            if publisher.get_subscription_count():
+                publisher.wait_for_all_acked(Duration(seconds=1))
+        if not self.finished.done():
+            self.finished.set_result(None)
+
+    # ------------------------------------------------------------------------------- ticks
+
+    def _tick_in_thread(self) -> None:
+        try:
+            self._tick()
+        except Exception:
+            if self.context.ok():       # else: publishing fails once the context is down
+                raise
+
+    def _tick(self) -> None:
+        """Send what is due."""
+        with self._lock:
+            if self._paused or self._failure or self.finished.done():
+                return
+            self._count_tick()
+            target = self._simulated_clock.now()
+            duration = round(self._values['duration'] * NANOSECONDS)
+            if duration:
+                target = min(target, duration)
+            self._advance(target)
+            if duration and self._simulation.now_ns >= duration:
+                self._finish()
+
+    def _count_tick(self) -> None:
+        now = time.monotonic_ns()
+        period = NANOSECONDS / self._values['tick_rate']
+        if self._last_tick and now - self._last_tick > 1.5 * period:
+            self._counters.late_ticks += 1
+            self._counters.skipped_ticks += round((now - self._last_tick) / period) - 1
+        self._last_tick = now
+        if now >= self._listeners_due:
+            self._look_for_listeners()
+            self._listeners_due = now + LISTENERS_PERIOD_NS
+
+    def _look_for_listeners(self) -> None:
+        for stream in self._simulation.streams:
+            publisher = self._outputs.get(stream.topic)
+            heard = publisher is not None and publisher.get_subscription_count() > 0
+            stream.publish = publisher.publish if heard else None
+
+    def _advance(self, target_ns: int) -> None:
+        simulation = self._simulation
+        stop_at = time.perf_counter() + TICK_BUDGET_S
+        recorder = self._recorder
+
+        def give_way() -> bool:
+            return time.perf_counter() > stop_at or (recorder is not None and not recorder.room)
+
+        skipped = sum(stream.skipped for stream in simulation.streams)
+        scale = self._values['time_scale']
+        try:
+            arrived = simulation.advance(target_ns, target_ns - int(LATEST_NS * scale), give_way)
+        except IntegrationError as error:
+            self._fail(str(error))
+            return
+        lag = target_ns - simulation.now_ns
+        if not arrived and lag > LONGEST_LAG_NS * scale:
+            self._counters.slipped_ns += lag
+            self._simulated_clock.start(simulation.now_ns)
+            self._warn_overload('the clock slips')
+        elif sum(stream.skipped for stream in simulation.streams) > skipped:
+            self._warn_overload('live topics skip samples')
+
+    def _warn_overload(self, consequence: str) -> None:
+        if not self._warned_overload:
+            self._warned_overload = True
+            self.get_logger().warning(
+                f'this machine cannot keep up with these rates: {consequence}; a recording '
+                'stays complete, and /diagnostics counts')
+
+    def _fail(self, reason: str) -> None:
+        """The equations cannot go on: stand still, say so, and wait for ~/reset."""
+        self._failure = reason
+        self._simulated_clock.stop()
+        self.get_logger().error(f'{reason}; the motion stands still: change the solver.* '
+                                'parameters and call ~/reset')
+
+    # ---------------------------------------------------------------- commands, parameters
+
+    def _on_command(self, message: Float64MultiArray) -> None:
+        try:
+            if len(message.data) != 2:
+                raise ValueError(f'data has {len(message.data)} values: must be [L3, Lz]')
+            self._command(*message.data)
+        except ValueError as error:
+            self._counters.rejected_commands += 1
+            self.get_logger().warning(f'~/commands: refused: {error}')
+            return
+        self._changes.follow(spin__l3=message.data[0], spin__lz=message.data[1])
+
+    def _command(self, l3: float, lz: float) -> None:
+        with self._lock:
+            if not self._paused and not self._failure:
+                self._advance(self._simulated_clock.now())
+            if self._failure:
+                raise ValueError(f'l3 = {l3!r}, lz = {lz!r}: the motion stands still: '
+                                 f'{self._failure}')
+            simulation = self._simulation
+            simulation.command(l3, lz)
+            self._counters.commands += 1
+            at_ns = simulation.history[-1][0]
+            self._journal('command', at_ns, l3=l3, lz=lz)
+            self._record('~/commands', at_ns, messages.float64_multi_array(
+                ('l3', 'lz')).encode(0, (l3, lz)))
+
+    def _apply(self, values: dict[str, Any], changed: set[str]) -> None:
+        """Put a validated change of parameters into effect.  Raises ValueError to refuse."""
+        with self._lock:
+            if changed & {'spin.l3', 'spin.lz'}:
+                self._refuse_counted(values['spin.l3'], values['spin.lz'])
+            rest = changed - {'spin.l3', 'spin.lz'}
+            if rest:
+                self._journal('parameters', max(self._simulation.now_ns, 0),
+                              **{name: values[name] for name in sorted(rest)})
+            # `self._changes` takes the values over only after this.
+            before, self._changes.values = self._changes.values, values
+            try:
+                self._put_into_effect(values, rest)
+            except Exception:
+                self._changes.values = before
+                raise
+
+    def _refuse_counted(self, l3: float, lz: float) -> None:
+        try:
+            self._command(l3, lz)
+        except ValueError:
+            self._counters.rejected_commands += 1
+            raise
+
+    def _put_into_effect(self, values: dict[str, Any], changed: set[str]) -> None:
+        simulation = self._simulation
+        for stream in simulation.streams:
+            if f'{stream.parameter}.rate' in changed:
+                stream.set_rate(values[f'{stream.parameter}.rate'])
+                stream.resume(simulation.now_ns)
+        if any(name.endswith('.enabled') for name in changed):
+            self._open_publishers()
+        if 'time_scale' in changed:
+            self._simulated_clock.set_scale(values['time_scale'])
+        if 'status_period' in changed:
+            self._restart_status()
+        if 'tick_rate' in changed:
+            if self._pacer is not None:
+                self._pacer.set_rate(values['tick_rate'])
+            elif self._tick_timer is not None:
+                self._tick_timer.timer_period_ns = round(NANOSECONDS / values['tick_rate'])
+
+    # ---------------------------------------------------------------------------- services
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> Any:
+        with self._lock:
+            if request.data and not self._paused:
+                self._simulated_clock.stop()
+                self._advance(self._simulated_clock.now())
+                self._simulated_clock.stop()
+                self._paused = True
+            elif not request.data and self._paused:
+                self._paused = False
+                self._last_tick = 0
+                if not self._failure:
+                    self._simulated_clock.start(max(self._simulation.now_ns, 0))
+            response.success = True
+            state = 'paused' if self._paused else 'running'
+            response.message = f'{state} at t = {self._seconds():.9g} s'
+        return response
+
+    def _seconds(self) -> float:
+        return max(self._simulation.now_ns, 0) / NANOSECONDS
+
+    def _on_step(self, _: Trigger.Request, response: Trigger.Response) -> Any:
+        with self._lock:
+            if not self._paused:
+                response.success = False
+                response.message = 'running: ~/step works while paused (~/set_pause true)'
+                return response
+            self._look_for_listeners()
+            count, dt = self._values['step.count'], self._values['step.dt']
+            target = max(self._simulation.now_ns, 0) + count * round(dt * NANOSECONDS)
+            try:
+                self._simulation.advance(target)
+            except IntegrationError as error:
+                self._fail(str(error))
+            self._simulated_clock.start(max(self._simulation.now_ns, 0))
+            self._simulated_clock.stop()
+            response.success = self._failure is None
+            response.message = self._failure or f'at t = {self._seconds():.9g} s'
+        return response
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Any:
+        with self._lock:
+            simulation = self._simulation
+            # Back to the spin it was started with, whatever was commanded since.
+            values = {**self._values, 'spin.l3': self._start_values['spin.l3'],
+                      'spin.lz': self._start_values['spin.lz']}
+            last_stamp = simulation.epoch_ns + simulation.now_ns
+            try:
+                simulation.restart(values)
+            except (ValueError, RuntimeError) as error:
+                response.success = False
+                response.message = f'not reset: {error}'
+                return response
+            now = self.get_clock().now().nanoseconds
+            self._set_epoch(_ceil_to(max(last_stamp + 1, now), EPOCH_GRID_NS))
+            self._failure = None
+            self._simulated_clock.start(0)
+            if self._paused:
+                self._simulated_clock.stop()
+            self._speed.read(0)
+            self._journal('reset', 0, epoch_ns=simulation.epoch_ns, parameters=values)
+            response.success = True
+            response.message = f'at t = 0, stamps go on from {simulation.epoch_ns} ns'
+        self._changes.follow(spin__l3=values['spin.l3'], spin__lz=values['spin.lz'])
+        return response
+
+    def _on_record(self, request: SetBool.Request, response: SetBool.Response) -> Any:
+        try:
+            if request.data:
+                response.message = self._start_recording()
+            else:
+                response.message = self._stop_recording() or 'not recording'
+            response.success = True
+        except Exception as error:
+            response.success = False
+            response.message = f'not recording: {error}'
+            self.get_logger().error(response.message)
+        return response
+
+    # --------------------------------------------------------------------------- recording
+
+    def _start_recording(self) -> str:
+        """Open a log and let the streams write to it; return what to tell the caller."""
+        from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
+        from spinning_top_sim.recording.writer import McapRecorder  # noqa: PLC0415
+
+        with self._lock:
+            if self._recorder is not None:
+                return f'recording already to {self._recorder.path}'
+            values, simulation = self._values, self._simulation
+            chosen = values['record.streams']
+            streams = [stream for stream in simulation.streams if stream.topic in self._outputs
+                       and ('all' in chosen or stream.parameter in chosen)]
+            topics = [RecordedTopic(self._outputs[stream.topic].topic_name, stream.type_name,
+                                    _rosbag2_qos(self._qos[self._outputs[stream.topic]
+                                                           .topic_name]))
+                      for stream in streams]
+            for name, type_name in (('~/commands', 'std_msgs/msg/Float64MultiArray'),
+                                    ('~/events', 'std_msgs/msg/String')):
+                topics.append(RecordedTopic(self.resolve_topic_name(name), type_name))
+            recorder = McapRecorder.open(
+                _free_path(values['record.uri']), topics, self._log_metadata(),
+                max_loss=values['record.max_loss'], compression=values['record.compression'],
+                min_free_bytes=values['record.min_free_bytes'])
+            for index, stream in enumerate(streams):
+                stream.record = functools.partial(recorder.write, index)
+            self._journal_topics = {'~/commands': len(streams), '~/events': len(streams) + 1}
+            self._recorder, self._record_error = recorder, None
+            self._journal('start', max(simulation.now_ns, 0))
+            return f'recording to {recorder.path}'
+
+    def _log_metadata(self) -> dict[str, str]:
+        """Return what makes the run computable again from its log."""
+        from spinning_top_sim.recording.provenance import provenance  # noqa: PLC0415
+
+        simulation = self._simulation
+        return provenance(simulation.values, simulation.epoch_ns, simulation.now_ns,
+                          simulation.history,
+                          self._values)
+
+    def _stop_recording(self) -> str | None:
+        """Close the log; return what to tell, None if there was none."""
+        with self._lock:
+            recorder, self._recorder = self._recorder, None
+            for stream in self._simulation.streams:
+                stream.record = None
+        if recorder is None:
+            return None
+        summary = recorder.close()
+        messages_written = sum(summary.counts.values())
+        text = (f'{summary.path}: {messages_written} messages, '
+                f'{reports.bytes_for_people(summary.bytes)}')
+        return f'{text}; stopped early: {summary.error}' if summary.error else text
+
+    def _record(self, topic: str, at_ns: int, data: bytes) -> None:
+        if self._recorder is not None:
+            self._recorder.write(self._journal_topics[topic],
+                                 self._simulation.epoch_ns + at_ns, data)
+
+    def _journal(self, event: str, at_ns: int, **details: Any) -> None:
+        """Log what happened to the motion, so that it can be computed again."""
+        text = json.dumps({'event': event, 't_ns': at_ns, **details}, default=list)
+        self._record('~/events', at_ns, messages.string(text))
+
+    def _check_recorder(self) -> None:
+        recorder = self._recorder
+        if recorder is not None and recorder.error is not None:
+            self._record_error = recorder.error
+            self.get_logger().error(f'recording stopped: {recorder.error}; the simulation goes on')
+            self._stop_recording()
+
+    # ----------------------------------------------------------------------------- reports
+
+    def _report(self) -> None:
+        """Publish /diagnostics, once a second."""
+        self._check_recorder()
+        with self._lock:
+            simulation, counters = self._simulation, self._counters
+            self._factor = self._speed.read(max(simulation.now_ns, 0))
+            skipped = sum(stream.skipped for stream in simulation.streams)
+            sent = sum(stream.sent for stream in simulation.streams)
+            problems = []
+            if self._paused:
+                problems.append((OK, 'paused'))
+            if skipped or counters.slipped_ns:
+                problems.append((WARN, 'this machine cannot keep up'))
+            if self._record_error:
+                problems.append((ERROR, f'recording: {self._record_error}'))
+            if self._failure:
+                problems.append((ERROR, self._failure))
+            numbers: dict[str, object] = {
+                'simulated time [s]': f'{self._seconds():.6f}',
+                'real-time factor': f'{self._factor:.3f}',
+                'late ticks': counters.late_ticks,
+                'skipped ticks': counters.skipped_ticks,
+                'published messages': sent,
+                'skipped samples': skipped,
+                'clock slip [s]': f'{counters.slipped_ns / NANOSECONDS:.3f}',
+                'commands': counters.commands,
+                'rejected commands': counters.rejected_commands,
+                'integration steps': simulation.steps,
+                'evaluations': simulation.evaluations,
+            }
+        numbers.update(self._recorder_numbers())
+        self._diagnostics.publish(reports.diagnostics(
+            self.get_clock().now().to_msg(), self.get_fully_qualified_name().lstrip('/'),
+            problems, numbers))
+
+    def _recorder_numbers(self) -> dict[str, object]:
+        recorder = self._recorder
+        if recorder is None:
+            return {'recorder': 'failed' if self._record_error else 'off'}
+        counters = recorder.counters
+        return {'recorder': recorder.state, 'recorded file': recorder.path,
+                'recorded messages': counters.messages, 'recorded bytes': counters.bytes,
+                'queued messages': counters.queued,
+                'longest flush [s]': f'{counters.longest_flush:.3f}'}
+
+    def _show_status(self) -> None:
+        with self._lock:
+            simulation = self._simulation
+            state = simulation.state()
+            name = self._regime_name()
+            drift = simulation.energy_drift(state)
+            sent = sum(stream.sent for stream in simulation.streams)
+            paused = ' FAILED' if self._failure else ' paused' if self._paused else ''
+            line = (max(simulation.now_ns, 0), paused, name, state.theta, simulation.l3,
+                    simulation.lz)
+        log = None if self._recorder is None else self._recorder.counters.bytes
+        self._terminal.show(reports.status_line(*line, self._factor, drift, sent, log))
+
+    def _regime_name(self) -> str:
+        """Return the motion's name."""
+        return regime(self._simulation.top, self._simulation.anchor)
+
+
+def _message_type(type_name: str) -> type:
+    """Import the Python class of a message type when a stream of it is enabled."""
+    import importlib  # noqa: PLC0415
+
+    package, _, name = type_name.split('/')
+    return getattr(importlib.import_module(f'{package}.msg'), name)
+
+
+def _rosbag2_qos(qos: QoSProfile) -> dict[str, Any]:
+    return {name: int(getattr(qos, name)) for name in ('history', 'depth', 'reliability',
+                                                       'durability', 'liveliness')}
+
+
+def _ceil_to(value: int, grid: int) -> int:
+    return -(-value // grid) * grid
+
+
+def _free_path(uri: str) -> Path:
+    """Return the file to record to: `uri`, or a new one named by date in it or here."""
+    path = Path(uri).expanduser()
+    if uri and not path.is_dir():
+        return path
+    stem = time.strftime('spinning_top_%Y-%m-%d_%H-%M-%S')
+    number, free = 1, path / f'{stem}.mcap'
+    while free.exists():
+        number += 1
+        free = path / f'{stem}_{number}.mcap'
+    return free

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a log says about the run it holds: enough to compute the run again."""
+
+from __future__ import annotations
+
+import json
+import platform
+import sys
+from collections.abc import Iterable, Mapping
+from importlib import metadata
+from typing import Any
+
+# Version of these keys.
+FORMAT = '1'
+LIBRARIES = ('numpy', 'mcap', 'rclpy')
+
+
+def provenance(values: Mapping[str, Any], epoch_ns: int, begun_ns: int,
+               history: Iterable[tuple[int, float, float]], now: Mapping[str, Any],
+               evaluation: str = 'one state at a time') -> dict[str, str]:
+    """
+    Return the `spinning_top_sim` metadata record.
+
+    values: parameters at the start of the motion (the last reset);  now: as they are, with later
+    changes;  epoch_ns: stamp of t = 0;  begun_ns: simulated time at which the recording begins;
+    history: commands applied before, as (t_ns, l3, lz);  evaluation: how states were computed,
+    which decides their last bits.
+    """
+    return {
+        'format': FORMAT,
+        'version': _version('spinning_top_sim'),
+        'parameters': json.dumps(dict(values), default=list, sort_keys=True),
+        'parameters_now': json.dumps(dict(now), default=list, sort_keys=True),
+        'seed': str(values['seed']),
+        'epoch_ns': str(epoch_ns),
+        'begun_ns': str(begun_ns),
+        'history': json.dumps(list(history)),
+        'evaluation': evaluation,
+        'platform': f'{platform.machine()} {platform.system()} '
+                    f'{platform.python_implementation()} {platform.python_version()} '
+                    f'{sys.byteorder}',
+        'libraries': json.dumps({name: _version(name) for name in LIBRARIES}),
+    }
+
+
+def _version(distribution: str) -> str:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return 'unknown'
