@@ -10,7 +10,7 @@ from typing import Protocol
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.kinematics import AxisState, OneState
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.dormand_prince import Integrator
+from spinning_top_sim.solvers.dormand_prince import Form, Integrator, Vector
 from spinning_top_sim.solvers.euler_form import EulerForm
 from spinning_top_sim.solvers.phases import (
     MomentumState,
@@ -29,8 +29,13 @@ REST_ULPS = 8.0
 class Propagator(Protocol):
     """A motion from its start at t = 0 on, read at times that never decrease."""
 
-    steps: int
-    evaluations: int
+    @property
+    def steps(self) -> int:
+        """Integration steps taken."""
+
+    @property
+    def evaluations(self) -> int:
+        """Evaluations of the right-hand side."""
 
     def reach(self, t: float, max_steps: int | None = None) -> bool:
         """Compute what the state at t [s] needs; False if max_steps were not enough yet."""
@@ -83,8 +88,8 @@ def nutation_rests(top: Top, start: State) -> bool:
 class _Stepped:
     """A motion by steps: what both forms share."""
 
-    def __init__(self, form: TransportForm | EulerForm) -> None:
-        self._integrator = Integrator(form, form.start, form.first_step)
+    def __init__(self, form: Form, start: Vector, first_step: float) -> None:
+        self._integrator = Integrator(form, start, first_step)
 
     @property
     def steps(self) -> int:
@@ -107,7 +112,7 @@ class _Stepped:
     def _step(self) -> None:
         self._integrator.step()
 
-    def _read(self, t: float) -> tuple[float, ...] | tuple[complex, ...]:
+    def _read(self, t: float) -> Vector:
         if t < self._integrator.t0:
             raise ValueError(f't = {t!r} s: steps go forward, and the newest one began at '
                              f'{self._integrator.t0!r} s; times must not decrease')
@@ -120,7 +125,8 @@ class EulerMotion(_Stepped):
 
     def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
         self._top, self._start = top, start
-        super().__init__(EulerForm(top, start, rtol, atol))
+        form = EulerForm(top, start, rtol, atol)
+        super().__init__(form, form.start, form.first_step)
 
     def at(self, t: float) -> OneState:
         """Return the state at t [s]."""
@@ -133,7 +139,7 @@ class TransportMotion(_Stepped):
     def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
         self._top, self._start = top, start
         self._form = TransportForm(top, start, rtol, atol)
-        super().__init__(self._form)
+        super().__init__(self._form, self._form.start, self._form.first_step)
         self._alpha, self._beta = windings(start)
         self._line_rate = 0.5 * spin_excess(top, start.l3)
         self._carried_rate = 0.5 * self._form.spin_carried / top.lambda1
@@ -184,7 +190,8 @@ class FreeMotion:
     alpha and beta less the spin Omega move on ellipses, at half the rate |L|/lambda1.
     """
 
-    steps = evaluations = 0
+    steps = 0
+    evaluations = 0
 
     def __init__(self, top: Top, start: State) -> None:
         self._top, self._start = top, start
@@ -238,7 +245,8 @@ class FreeMotion:
 class RestingMotion:
     """The nutation rests: theta stays, phi and psi turn uniformly."""
 
-    steps = evaluations = 0
+    steps = 0
+    evaluations = 0
 
     def __init__(self, top: Top, start: State) -> None:
         self._top, self._start = top, start

@@ -34,12 +34,15 @@ class Simulation:
     """
 
     def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
-        """Take checked parameters (`parameters.checked`) and the stamp of t = 0 [ns]."""
+        """
+        Take checked parameters (`parameters.checked`) and the stamp of t = 0 [ns].
+
+        Raises ValueError or IntegrationError where there is no motion from their start state.
+        """
         self.epoch_ns = epoch_ns
         self._steps_before = self._evaluations_before = 0
         self.streams: list[Stream] = []
-        self._solver: Propagator | None = None
-        self.restart(values)
+        self._load(values)
 
     def restart(self, values: Mapping[str, Any]) -> None:
         """
@@ -48,8 +51,13 @@ class Simulation:
         Raises ValueError or IntegrationError where there is no motion from there; then the one
         there was goes on.
         """
-        top, start = parameters.top_of(values), parameters.start_state(values)
-        solver, state = _first_step(top, start, values)
+        counts = self.steps, self.evaluations
+        self._load(values)
+        self._steps_before, self._evaluations_before = counts
+
+    def _load(self, values: Mapping[str, Any]) -> None:
+        top = parameters.top_of(values)
+        solver, state = _first_step(top, parameters.start_state(values), values)
         self.values, self.top = dict(values), top
         self.history: list[tuple[int, float, float]] = []
         self.now_ns = -1
@@ -63,9 +71,6 @@ class Simulation:
 
     def _begin(self, solver: Propagator, state: OneState, at_ns: int) -> None:
         """Let a motion begin at a time."""
-        if self._solver is not None:
-            self._steps_before += self._solver.steps
-            self._evaluations_before += self._solver.evaluations
         self._solver, self._anchor_ns, self._first = solver, at_ns, state
         self.l3, self.lz = state.l3_start, state.lz_start
         self._invariants.start_from(state)
@@ -176,6 +181,7 @@ class Simulation:
         except (ArithmeticError, ValueError, RuntimeError) as error:
             raise ValueError(f'l3 = {l3!r}, lz = {lz!r} kg m^2/s: no motion from theta = '
                              f'{state.theta!r} rad: {error}') from error
+        self._steps_before, self._evaluations_before = self.steps, self.evaluations
         self._begin(solver, state_after, at_ns)
         self.history.append((at_ns, l3, lz))
 
