@@ -22,8 +22,8 @@ from spinning_top_sim.solvers.phases import (
 from spinning_top_sim.solvers.transport import TransportForm
 
 EQUATIONS = ('transport', 'euler')
-# Rounding of the terms of theta'' against each other, in units of the last place.
-REST_ULPS = 8.0
+# How many units in the last place count as rounding.
+REST_ULPS = 2.0
 
 
 class Propagator(Protocol):
@@ -74,15 +74,25 @@ def check_settings(equations: str, rtol: float, atol: float) -> None:
 
 
 def nutation_rests(top: Top, start: State) -> bool:
-    """Whether theta stays as it is: sleeping, hanging at a pole, or steady precession."""
+    """
+    Whether theta stays as it is: sleeping, hanging at a pole, or steady precession.
+
+    Steady means theta'' = 0, eq. (30), as nearly as its terms and the given L3 and Lz, doubles
+    all, can say.
+    """
     if start.theta_dot != 0.0:
         return False
     sine, cosine = math.sin(start.theta), math.cos(start.theta)
     half_cosine, half_sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
     phi_dot = attitude.precession_rate(top, start.l3, start.lz, half_cosine ** 2, half_sine ** 2)
-    terms = (phi_dot * phi_dot * sine * cosine, -start.l3 / top.lambda1 * phi_dot * sine,
+    gyroscopic = start.l3 / top.lambda1
+    terms = (phi_dot * phi_dot * sine * cosine, -gyroscopic * phi_dot * sine,
              top.gravity_torque / top.lambda1 * sine)
-    return abs(math.fsum(terms)) <= REST_ULPS * math.ulp(1.0) * sum(map(abs, terms))
+    doubt = sum(map(abs, terms))
+    if start.lz - start.l3 * cosine:
+        rounded_rate = (abs(start.lz) + abs(start.l3)) / (top.lambda1 * sine * sine)
+        doubt += abs((2.0 * phi_dot * cosine - gyroscopic) * sine) * rounded_rate
+    return abs(math.fsum(terms)) <= REST_ULPS * math.ulp(1.0) * doubt
 
 
 class _Stepped:
