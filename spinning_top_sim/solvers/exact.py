@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from decimal import Decimal, localcontext
+from math import cos, sin, sinh, sqrt
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from spinning_top_sim.physics.top import State, Top
@@ -33,9 +34,8 @@ if TYPE_CHECKING:
 FIXED_BITS = 128
 FIXED_ONE = 1 << FIXED_BITS
 FRACTION_MASK = FIXED_ONE - 1
-# A 56-bit fraction of a turn is all that a double holds of it.
-SHORT_SHIFT = FIXED_BITS - 56
-RADIANS_PER_SHORT = 2.0 * math.pi / 2.0 ** 56
+FIXED_UNIT = 2.0 ** -FIXED_BITS
+RADIANS_PER_UNIT = 2.0 * math.pi * FIXED_UNIT
 QUARTER_PERIOD_ANGLE = 0.5 * math.pi
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
@@ -53,7 +53,7 @@ class Functions(NamedTuple):
     atan2: Callable[[Any, Any], Any]
 
 
-SCALAR = Functions(math.sin, math.sinh, math.sqrt, math.atan2)
+SCALAR = Functions(sin, sinh, sqrt, math.atan2)
 
 
 class FactorBranch(NamedTuple):
@@ -204,6 +204,7 @@ class ExactSolution:
         self.two_lambda1 = finite('2 lambda1', 2 * Decimal(top.lambda1))
         self.quarter0, self.offset0 = motion.quarter0, float(motion.offset0)
         self.branches = _nutation_branch(motion, 0), _nutation_branch(motion, 1)
+        self._flat_branches = tuple(_flat(x) for x in self.branches)
         for u_dot in motion.u_dot:
             finite('d cos(theta)/dt', u_dot)
         self.turning = _Turning.of(motion, start.theta) if motion.turning else None
@@ -213,7 +214,8 @@ class ExactSolution:
                       Decimal('1e-300'))
         self.time_limit = min(float(Decimal(MOST_TURNS) / fastest), 1e300)   # [s]
         self.ns_limit = int(Decimal(MOST_TURNS) / fastest * 10 ** 9)
-        self._quarters = FixedRate.of(motion.quarter_rate)
+        self._quarter_rate = FixedRate.of(motion.quarter_rate).rate
+        self._offset_and_half = int(motion.offset0 * FIXED_ONE) + FIXED_ONE // 2
         self._alpha_turns = FixedRate.of(alpha.rate / two_pi, alpha.phase_turns)
         self._beta_turns = FixedRate.of(beta.rate / two_pi, beta.phase_turns)
         self._phi = FixedRate.of(motion.mean_precession_rate)
@@ -229,54 +231,55 @@ class ExactSolution:
         """
         if not -self.ns_limit <= ns <= self.ns_limit:
             raise self._too_late(ns * 1e-9)
-        quarters, y = self._nutation_phase(ns)
-        branch = self.branches[quarters & 1]
-        alpha, beta = branch.alpha, branch.beta
-        if branch.imaginary:
-            s = math.sinh(y * branch.stretch)
+        # As in _nutation_phase, without the call.
+        phase = ns * self._quarter_rate
+        whole = phase + self._offset_and_half >> FIXED_BITS
+        quarters = self.quarter0 + whole
+        y = QUARTER_PERIOD_ANGLE * ((phase - (whole << FIXED_BITS)) * FIXED_UNIT + self.offset0)
+        (alpha_real_prefactor, a3, a2, a1, a0, alpha_imag_prefactor, b3, b2, b1, b0,
+         alpha_drift, alpha_crosses,
+         beta_real_prefactor, c3, c2, c1, c0, beta_imag_prefactor, d3, d2, d1, d0,
+         beta_drift, beta_crosses, imaginary, stretch) = self._flat_branches[quarters & 1]
+        if imaginary:
+            s = sinh(y * stretch)
             xi = -s * s
         else:
-            s = math.sin(y)
+            s = sin(y)
             xi = s * s
-        c = math.sqrt(1.0 - xi)
+        c = sqrt(1.0 - xi)
         prefactors = (1.0, c, s, s * c)
-        a3, a2, a1, a0 = alpha.real
-        b3, b2, b1, b0 = alpha.imag
-        alpha_real = prefactors[alpha.real_prefactor] * (((a3 * xi + a2) * xi + a1) * xi + a0)
-        alpha_imag = alpha.sense * prefactors[alpha.imag_prefactor] * (
-            ((b3 * xi + b2) * xi + b1) * xi + b0)
-        a3, a2, a1, a0 = beta.real
-        b3, b2, b1, b0 = beta.imag
-        beta_real = prefactors[beta.real_prefactor] * (((a3 * xi + a2) * xi + a1) * xi + a0)
-        beta_imag = beta.sense * prefactors[beta.imag_prefactor] * (
-            ((b3 * xi + b2) * xi + b1) * xi + b0)
+        alpha_real = prefactors[alpha_real_prefactor] * (((a3 * xi + a2) * xi + a1) * xi + a0)
+        alpha_imag = prefactors[alpha_imag_prefactor] * (((b3 * xi + b2) * xi + b1) * xi + b0)
+        beta_real = prefactors[beta_real_prefactor] * (((c3 * xi + c2) * xi + c1) * xi + c0)
+        beta_imag = prefactors[beta_imag_prefactor] * (((d3 * xi + d2) * xi + d1) * xi + d0)
         if quarters & 2:
-            if alpha.crosses:
+            if alpha_crosses:
                 alpha_real = -alpha_real
-            if beta.crosses:
+            if beta_crosses:
                 beta_real = -beta_real
-        scale = 1.0 / math.sqrt(alpha_real * alpha_real + alpha_imag * alpha_imag
-                                + beta_real * beta_real + beta_imag * beta_imag)
+        scale = 1.0 / sqrt(alpha_real * alpha_real + alpha_imag * alpha_imag
+                           + beta_real * beta_real + beta_imag * beta_imag)
         rate, start = self._alpha_turns
-        angle = ((ns * rate + start & FRACTION_MASK) >> SHORT_SHIFT) * RADIANS_PER_SHORT \
-            + alpha.drift * y
-        sin, cos = scale * math.sin(angle), scale * math.cos(angle)
-        z = alpha_real * sin + alpha_imag * cos
-        w = alpha_real * cos - alpha_imag * sin
+        angle = (ns * rate + start & FRACTION_MASK) * RADIANS_PER_UNIT + alpha_drift * y
+        s, c = scale * sin(angle), scale * cos(angle)
+        z = alpha_real * s + alpha_imag * c
+        w = alpha_real * c - alpha_imag * s
         rate, start = self._beta_turns
-        angle = ((ns * rate + start & FRACTION_MASK) >> SHORT_SHIFT) * RADIANS_PER_SHORT \
-            + beta.drift * y
-        sin, cos = scale * math.sin(angle), scale * math.cos(angle)
-        return -beta_real * sin - beta_imag * cos, beta_real * cos - beta_imag * sin, z, w
+        angle = (ns * rate + start & FRACTION_MASK) * RADIANS_PER_UNIT + beta_drift * y
+        s, c = scale * sin(angle), scale * cos(angle)
+        return -beta_real * s - beta_imag * c, beta_real * c - beta_imag * s, z, w
 
     def _nutation_phase(self, ns: int) -> tuple[int, float]:
-        """Return the nearest whole number of quarter periods, and the angle y from there."""
-        phase = ns * self._quarters.rate
-        whole = phase + FIXED_ONE // 2 >> FIXED_BITS
-        part = (phase - (whole << FIXED_BITS)) / FIXED_ONE
-        shift = round(part + self.offset0)
-        return (self.quarter0 + whole + shift,
-                QUARTER_PERIOD_ANGLE * ((part - shift) + self.offset0))
+        """
+        Return the nearest whole number of quarter periods, and the angle y from there.
+
+        The offset at t = 0 joins as a double: it may be too small for fixed point (near a pole).
+        """
+        phase = ns * self._quarter_rate
+        whole = phase + self._offset_and_half >> FIXED_BITS
+        return (self.quarter0 + whole,
+                QUARTER_PERIOD_ANGLE
+                * ((phase - (whole << FIXED_BITS)) * FIXED_UNIT + self.offset0))
 
     def state_at(self, ns: int) -> tuple[float, float, float, float, float, float, float, float]:
         """Return (theta, theta_dot, phi, psi, x, y, z, w) at `ns` nanoseconds [rad, rad/s]."""
@@ -295,23 +298,21 @@ class ExactSolution:
             half_theta += 2.0 * math.pi * round(self.turning.turns(quarters, y, half_theta))
 
         rate, start = self._alpha_turns
-        angle = ((ns * rate + start & FRACTION_MASK) >> SHORT_SHIFT) * RADIANS_PER_SHORT \
-            + alpha_argument
-        sin_alpha, cos_alpha = math.sin(angle), math.cos(angle)
+        angle = (ns * rate + start & FRACTION_MASK) * RADIANS_PER_UNIT + alpha_argument
+        sin_alpha, cos_alpha = sin(angle), cos(angle)
         rate, start = self._beta_turns
-        angle = ((ns * rate + start & FRACTION_MASK) >> SHORT_SHIFT) * RADIANS_PER_SHORT \
-            + beta_argument
-        sin_beta, cos_beta = math.sin(angle), math.cos(angle)
-        scale = 1.0 / math.sqrt(alpha * alpha + beta * beta)
+        angle = (ns * rate + start & FRACTION_MASK) * RADIANS_PER_UNIT + beta_argument
+        sin_beta, cos_beta = sin(angle), cos(angle)
+        scale = 1.0 / sqrt(alpha * alpha + beta * beta)
         cos_half, sin_half = scale * alpha, scale * beta
         omega1, omega2 = transverse_rates(
             self.precession_across_axis(alpha, beta), theta_dot,
             cos_alpha * cos_beta + sin_alpha * sin_beta,
             sin_alpha * cos_beta - cos_alpha * sin_beta)
         return (2.0 * half_theta, theta_dot,
-                ns * self._phi.rate / FIXED_ONE
+                ns * self._phi.rate * FIXED_UNIT
                 + (self.phi_phase + (alpha_argument + beta_argument)),
-                ns * self._psi.rate / FIXED_ONE
+                ns * self._psi.rate * FIXED_UNIT
                 + (self.psi_phase + (alpha_argument - beta_argument)),
                 -sin_half * sin_beta, sin_half * cos_beta,
                 cos_half * sin_alpha, cos_half * cos_alpha,
@@ -416,6 +417,16 @@ def _nutation_branch(motion: ThetaMotion, odd: int) -> NutationBranch:
     return NutationBranch(factor('alpha'), factor('beta'), float(motion.u_dot[odd]),
                           _coefficients(motion.u_dot_series), motion.imaginary,
                           float(motion.stretch))
+
+
+def _flat(branch: NutationBranch) -> tuple[Any, ...]:
+    """Return what `quaternion_at` unpacks at once, the sense taken into the imaginary part."""
+    flat: list[Any] = []
+    for factor in (branch.alpha, branch.beta):
+        flat += (factor.real_prefactor, *factor.real,
+                 factor.imag_prefactor, *(factor.sense * x for x in factor.imag),
+                 factor.drift, factor.crosses)
+    return (*flat, branch.imaginary, branch.stretch)
 
 
 def _coefficients(series: Series, checked: str = '') -> tuple[float, ...]:
