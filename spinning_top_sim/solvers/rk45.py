@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import cmath
 import math
-from typing import Protocol
+from abc import ABC, abstractmethod
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.kinematics import AxisState, OneState
@@ -21,31 +21,14 @@ from spinning_top_sim.solvers.phases import (
 )
 from spinning_top_sim.solvers.transport import TransportForm
 
+NANOSECONDS = 1_000_000_000
 EQUATIONS = ('transport', 'euler')
 # How many units in the last place count as rounding.
 REST_ULPS = 2.0
 
 
-class Propagator(Protocol):
-    """A motion from its start at t = 0 on, read at times that never decrease."""
-
-    @property
-    def steps(self) -> int:
-        """Integration steps taken."""
-
-    @property
-    def evaluations(self) -> int:
-        """Evaluations of the right-hand side."""
-
-    def reach(self, t: float, max_steps: int | None = None) -> bool:
-        """Compute what the state at t [s] needs; False if max_steps were not enough yet."""
-
-    def at(self, t: float) -> OneState:
-        """Return the state at t [s], not before the newest step's start."""
-
-
 def rk45(top: Top, start: State, *, equations: str = 'transport', rtol: float = 1e-11,
-         atol: float = 1e-12) -> Propagator:
+         atol: float = 1e-12) -> SteppedOrClosed:
     """
     Return the motion that begins at `start`.
 
@@ -95,18 +78,41 @@ def nutation_rests(top: Top, start: State) -> bool:
     return abs(math.fsum(terms)) <= REST_ULPS * math.ulp(1.0) * doubt
 
 
-class _Stepped:
+class SteppedOrClosed(ABC):
+    """A motion read at seconds, or at the integer nanoseconds of a `Propagator`."""
+
+    steps = 0
+    evaluations = 0
+
+    @abstractmethod
+    def at(self, t: float) -> OneState:
+        """Return the state at t [s]."""
+
+    def reach(self, t: float, max_steps: int | None = None) -> bool:
+        """Compute what the state at t [s] needs; False if max_steps did not do."""
+        return True
+
+    def at_ns(self, ns: int) -> OneState:
+        """See `Propagator`."""
+        return self.at(ns / NANOSECONDS)
+
+    def reach_ns(self, ns: int, max_steps: int | None = None) -> bool:
+        """See `Propagator`."""
+        return self.reach(ns / NANOSECONDS, max_steps)
+
+
+class _Stepped(SteppedOrClosed):
     """A motion by steps: what both forms share."""
 
     def __init__(self, form: Form, start: Vector, first_step: float) -> None:
         self._integrator = Integrator(form, start, first_step)
 
     @property
-    def steps(self) -> int:
+    def steps(self) -> int:  # type: ignore[override]
         return self._integrator.steps
 
     @property
-    def evaluations(self) -> int:
+    def evaluations(self) -> int:  # type: ignore[override]
         return self._integrator.evaluations
 
     def reach(self, t: float, max_steps: int | None = None) -> bool:
@@ -193,15 +199,12 @@ class TransportMotion(_Stepped):
         integrator.step()
 
 
-class FreeMotion:
+class FreeMotion(SteppedOrClosed):
     """
     No torque (P = 0): the momentum stands still and the axis turns about it uniformly.
 
     alpha and beta less the spin Omega move on ellipses, at half the rate |L|/lambda1.
     """
-
-    steps = 0
-    evaluations = 0
 
     def __init__(self, top: Top, start: State) -> None:
         self._top, self._start = top, start
@@ -218,10 +221,6 @@ class FreeMotion:
                               - self._momentum * self._alpha0.conjugate())
         self._line_rate = 0.5 * spin_excess(top, start.l3)
         self._alpha, self._beta = windings(start)
-
-    def reach(self, t: float, max_steps: int | None = None) -> bool:
-        """Nothing needs computing."""
-        return True
 
     def at(self, t: float) -> OneState:
         """Return the state at any t [s]."""
@@ -252,11 +251,8 @@ class FreeMotion:
         return 2.0 * (half_theta + math.tau * round((expected - half_theta) / math.tau))
 
 
-class RestingMotion:
+class RestingMotion(SteppedOrClosed):
     """The nutation rests: theta stays, phi and psi turn uniformly."""
-
-    steps = 0
-    evaluations = 0
 
     def __init__(self, top: Top, start: State) -> None:
         self._top, self._start = top, start
@@ -266,10 +262,6 @@ class RestingMotion:
     def _state(self, phi: float, psi: float) -> AxisState:
         start = self._start
         return AxisState(self._top, start.l3, start.lz, start.theta, 0.0, phi, psi)
-
-    def reach(self, t: float, max_steps: int | None = None) -> bool:
-        """Nothing needs computing."""
-        return True
 
     def at(self, t: float) -> OneState:
         """Return the state at any t [s]."""
