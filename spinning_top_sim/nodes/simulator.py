@@ -6,6 +6,7 @@ from __future__ import annotations
 import functools
 import gc
 import json
+import math
 import threading
 import time
 from pathlib import Path
@@ -511,6 +512,11 @@ class Simulator(Node):
                 problems.append((OK, 'paused'))
             if skipped or counters.slipped_ns:
                 problems.append((WARN, 'this machine cannot keep up'))
+            error = self._orientation_error()
+            limit = self._values['max_error']
+            if error > limit > 0.0:
+                problems.append((WARN, f'orientation error {error:.3g} rad: more than max_error '
+                                       f'= {limit:g} rad'))
             if self._record_error:
                 problems.append((ERROR, f'recording: {self._record_error}'))
             if self._failure:
@@ -523,6 +529,7 @@ class Simulator(Node):
                 'published messages': sent,
                 'skipped samples': skipped,
                 'clock slip [s]': f'{counters.slipped_ns / NANOSECONDS:.3f}',
+                'orientation error [rad]': f'{error:.3g}',
                 'commands': counters.commands,
                 'rejected commands': counters.rejected_commands,
                 'integration steps': simulation.steps,
@@ -532,6 +539,13 @@ class Simulator(Node):
         self._diagnostics.publish(reports.diagnostics(
             self.get_clock().now().to_msg(), self.get_fully_qualified_name().lstrip('/'),
             problems, numbers))
+
+    def _orientation_error(self) -> float:
+        """Return the present error of rk45 [rad]; NaN where nobody wants to know."""
+        simulation = self._simulation
+        if self._values['max_error'] == 0.0:
+            return math.nan
+        return simulation.orientation_error(simulation.state(), max(simulation.now_ns, 0))
 
     def _recorder_numbers(self) -> dict[str, object]:
         recorder = self._recorder
