@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.long_decimals import pi
-from spinning_top_sim.solvers.theta_setup import TERMS, Branch, Series, ThetaMotion, set_up
+from spinning_top_sim.solvers.theta_series import TERMS, Series
+from spinning_top_sim.solvers.theta_setup import Branch, ThetaMotion, set_up
 
 if TYPE_CHECKING:
     import numpy as np
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 # Fixed point: turns, quarter periods and radians per nanosecond in units of 2^-128.
 FIXED_BITS = 128
 FIXED_ONE = 1 << FIXED_BITS
+FIXED_HALF = FIXED_ONE // 2
 FRACTION_MASK = FIXED_ONE - 1
 FIXED_UNIT = 2.0 ** -FIXED_BITS
 RADIANS_PER_UNIT = 2.0 * math.pi * FIXED_UNIT
@@ -42,6 +44,10 @@ QUARTER_PERIOD_ANGLE = 0.5 * math.pi
 MOST_TURNS = 2.0 ** 52
 # Smaller amplitudes leave no room for their products in doubles.
 LEAST_AMPLITUDE = Decimal('1e-290')
+# Larger numbers leave none for splitting them.
+MOST = Decimal('1e290')
+# Closer to the separatrix hyperbolic functions overflow.
+LEAST_M1 = Decimal('1e-290')
 
 
 class Functions(NamedTuple):
@@ -50,10 +56,11 @@ class Functions(NamedTuple):
     sin: Callable[[Any], Any]
     sinh: Callable[[Any], Any]
     sqrt: Callable[[Any], Any]
+    hypot: Callable[[Any, Any], Any]
     atan2: Callable[[Any, Any], Any]
 
 
-SCALAR = Functions(sin, sinh, sqrt, math.atan2)
+SCALAR = Functions(sin, sinh, sqrt, math.hypot, math.atan2)
 
 
 class FactorBranch(NamedTuple):
@@ -77,7 +84,8 @@ class FactorBranch(NamedTuple):
 class NutationBranch(NamedTuple):
     alpha: FactorBranch
     beta: FactorBranch
-    u_dot: float
+    u_dot: float                    # times `magnifier`, a power of 2: near a pole all is small
+    magnifier: float
     u_dot_series: tuple[float, ...]
     imaginary: bool
     stretch: float
@@ -122,7 +130,7 @@ def nutation_at(branch: NutationBranch, y: Any, flip: Any, functions: Functions)
     theta1 = sin_2y * (((c3 * xi_2y + c2) * xi_2y + c1) * xi_2y + c0)
     # In this order nothing overflows on the separatrix, where all grow like cosh x.
     theta_dot = (-0.5 * branch.u_dot * (theta1 / (alpha * alpha + beta * beta))
-                 / (alpha_slope * beta_slope))
+                 / (branch.magnifier * alpha_slope * beta_slope))
     return NutationPoint(alpha, beta, alpha_argument, beta_argument, theta_dot)
 
 
@@ -139,7 +147,7 @@ def _factor_at(factor: FactorBranch, y: Any, flip: Any, xi: Any, prefactors: tup
     real = prefactors[factor.real_prefactor] * polynomial
     b3, b2, b1, b0 = factor.imag
     imag = prefactors[factor.imag_prefactor] * (((b3 * xi + b2) * xi + b1) * xi + b0)
-    modulus = functions.sqrt(real * real + imag * imag)
+    modulus = functions.hypot(real, imag)       # its square may be too small for a double
     return modulus, factor.drift * y + factor.sense * functions.atan2(imag, real), modulus
 
 
@@ -176,21 +184,31 @@ class ExactSolution:
         with localcontext() as context:
             context.prec = motion.digits
             self._take_over(motion, top, start)
+        self._check_start()
         self._arrays: ArrayEvaluator | None = None
 
-    def _take_over(self, motion: ThetaMotion, top: Top, start: State) -> None:
-        def finite(name: str, value: Decimal) -> float:
-            number = float(value)
-            if not math.isfinite(number):
-                raise ValueError(f'{name} = {value:.3e}: too large for a double, in the motion of '
-                                 f'{top} from {start}')
-            return number
+    def _check_start(self) -> None:
+        """Refuse constants so far apart that doubles lose the start among them."""
+        theta, theta_dot, *_ = self.state_at(0)
+        for name, value, wanted in (('theta', theta, self.start.theta),
+                                    ('theta_dot', theta_dot, self.start.theta_dot)):
+            if not abs(value - wanted) <= 1e-14 * max(1.0, abs(wanted)):
+                raise ValueError(f'{name} = {wanted!r} cannot be held in doubles: the constants '
+                                 f'of {self.top} and {self.start} are too far apart in size')
 
+    def _take_over(self, motion: ThetaMotion, top: Top, start: State) -> None:
+        if motion.m1 < LEAST_M1:
+            raise ValueError(f'm1 = {motion.m1:.3e} for {top} from {start}: the motion is closer '
+                             f'to the separatrix than {LEAST_M1}')
         self.m, self.m1 = float(motion.m), float(motion.m1)
         period = motion.nutation_period
         self.nutation_period = None if period is None else float(period)
-        self.mean_precession_rate = finite('mean precession rate', motion.mean_precession_rate)
-        self.mean_spin_rate = finite('mean spin rate', motion.mean_spin_rate)
+        for name, value in (('the rate of the nutation', motion.quarter_rate),
+                            ('the rate of (phi + psi)/2', motion.alpha.rate),
+                            ('the rate of (phi - psi)/2', motion.beta.rate)):
+            _in_range(name, value)
+        self.mean_precession_rate = _in_range('mean precession rate', motion.mean_precession_rate)
+        self.mean_spin_rate = _in_range('mean spin rate', motion.mean_spin_rate)
         self.theta_min, self.theta_max = (float(x) for x in motion.theta_bounds)
 
         # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
@@ -199,14 +217,13 @@ class ExactSolution:
             Decimal(start.phi) - alpha.start_argument - beta.start_argument)
         self.psi_phase = float(
             Decimal(start.psi) - alpha.start_argument + beta.start_argument)
-        self.a_plus, self.a_minus = finite('lz + l3', motion.a_plus), finite('lz - l3', motion.a_minus)
-        self.axial_rate = finite('l3/lambda3', Decimal(start.l3) / Decimal(top.lambda3))
-        self.two_lambda1 = finite('2 lambda1', 2 * Decimal(top.lambda1))
-        self.quarter0, self.offset0 = motion.quarter0, float(motion.offset0)
+        two_lambda1 = 2 * Decimal(top.lambda1)
+        self.bottom_rate = _in_range('(lz + l3)/(2 lambda1)', motion.a_plus / two_lambda1)
+        self.top_rate = _in_range('(lz - l3)/(2 lambda1)', motion.a_minus / two_lambda1)
+        self.axial_rate = _in_range('l3/lambda3', Decimal(start.l3) / Decimal(top.lambda3))
+        self.quarter0 = motion.quarter0
         self.branches = _nutation_branch(motion, 0), _nutation_branch(motion, 1)
         self._flat_branches = tuple(_flat(x) for x in self.branches)
-        for u_dot in motion.u_dot:
-            finite('d cos(theta)/dt', u_dot)
         self.turning = _Turning.of(motion, start.theta) if motion.turning else None
 
         two_pi = 2 * pi()
@@ -215,7 +232,8 @@ class ExactSolution:
         self.time_limit = min(float(Decimal(MOST_TURNS) / fastest), 1e300)   # [s]
         self.ns_limit = int(Decimal(MOST_TURNS) / fastest * 10 ** 9)
         self._quarter_rate = FixedRate.of(motion.quarter_rate).rate
-        self._offset_and_half = int(motion.offset0 * FIXED_ONE) + FIXED_ONE // 2
+        self._offset0 = int(motion.offset0 * FIXED_ONE)
+        self._offset_rest = float(motion.offset0 - Decimal(self._offset0) / FIXED_ONE)
         self._alpha_turns = FixedRate.of(alpha.rate / two_pi, alpha.phase_turns)
         self._beta_turns = FixedRate.of(beta.rate / two_pi, beta.phase_turns)
         self._phi = FixedRate.of(motion.mean_precession_rate)
@@ -232,10 +250,10 @@ class ExactSolution:
         if not -self.ns_limit <= ns <= self.ns_limit:
             raise self._too_late(ns * 1e-9)
         # As in _nutation_phase, without the call.
-        phase = ns * self._quarter_rate
-        whole = phase + self._offset_and_half >> FIXED_BITS
+        phase = ns * self._quarter_rate + self._offset0
+        whole = phase + FIXED_HALF >> FIXED_BITS
         quarters = self.quarter0 + whole
-        y = QUARTER_PERIOD_ANGLE * ((phase - (whole << FIXED_BITS)) * FIXED_UNIT + self.offset0)
+        y = QUARTER_PERIOD_ANGLE * ((phase - (whole << FIXED_BITS)) * FIXED_UNIT + self._offset_rest)
         (alpha_real_prefactor, a3, a2, a1, a0, alpha_imag_prefactor, b3, b2, b1, b0,
          alpha_drift, alpha_crosses,
          beta_real_prefactor, c3, c2, c1, c0, beta_imag_prefactor, d3, d2, d1, d0,
@@ -273,13 +291,13 @@ class ExactSolution:
         """
         Return the nearest whole number of quarter periods, and the angle y from there.
 
-        The offset at t = 0 joins as a double: it may be too small for fixed point (near a pole).
+        y keeps its relative accuracy when it is small: a top races past a pole that it misses by
+        little.  What fixed point leaves out of a tiny offset at t = 0 is added as a double.
         """
-        phase = ns * self._quarter_rate
-        whole = phase + self._offset_and_half >> FIXED_BITS
-        return (self.quarter0 + whole,
-                QUARTER_PERIOD_ANGLE
-                * ((phase - (whole << FIXED_BITS)) * FIXED_UNIT + self.offset0))
+        phase = ns * self._quarter_rate + self._offset0
+        whole = phase + FIXED_HALF >> FIXED_BITS
+        part = (phase - (whole << FIXED_BITS)) * FIXED_UNIT + self._offset_rest
+        return self.quarter0 + whole, QUARTER_PERIOD_ANGLE * part
 
     def state_at(self, ns: int) -> tuple[float, float, float, float, float, float, float, float]:
         """Return (theta, theta_dot, phi, psi, x, y, z, w) at `ns` nanoseconds [rad, rad/s]."""
@@ -325,12 +343,12 @@ class ExactSolution:
         Lz - L3 cos(theta) over lambda1 sin(theta), in half angles: nothing cancels, and at a pole
         that can be reached the singular term is absent.
         """
-        total = 0.0 * alpha
-        if self.a_plus:
-            total = total + self.a_plus * (beta / alpha)
-        if self.a_minus:
-            total = total + self.a_minus * (alpha / beta)
-        return total / self.two_lambda1
+        precession = 0.0 * alpha
+        if self.bottom_rate:
+            precession = precession + self.bottom_rate * (beta / alpha)
+        if self.top_rate:
+            precession = precession + self.top_rate * (alpha / beta)
+        return precession
 
     def _too_late(self, seconds: float) -> ValueError:
         return ValueError(f't = {seconds!r} s: must be finite and within {self.time_limit:.6g} s, '
@@ -414,9 +432,19 @@ def _nutation_branch(motion: ThetaMotion, odd: int) -> NutationBranch:
         return FactorBranch(branch.real.prefactor, real,
                             imag_series.prefactor, _coefficients(imag_series),
                             factor.sense, float(factor.drift), factor.crosses, branch.has_zero)
-    return NutationBranch(factor('alpha'), factor('beta'), float(motion.u_dot[odd]),
-                          _coefficients(motion.u_dot_series), motion.imaginary,
+    alpha, beta = factor('alpha'), factor('beta')
+    smallest = min(max(map(abs, x.real + x.imag)) for x in (alpha, beta))
+    magnifier = 2.0 ** -math.frexp(smallest)[1] if smallest else 1.0
+    return NutationBranch(alpha, beta, _in_range("cos(theta)'", motion.u_dot[odd] * Decimal(magnifier)),
+                          magnifier, _coefficients(motion.u_dot_series), motion.imaginary,
                           float(motion.stretch))
+
+
+def _in_range(name: str, value: Decimal) -> float:
+    if abs(value) > MOST:
+        raise ValueError(f'{name} is {value:.3e}: must be at most {MOST} for doubles to hold '
+                         f'the motion; the constants of the top are too far apart in size')
+    return float(value)
 
 
 def _flat(branch: NutationBranch) -> tuple[Any, ...]:

@@ -29,12 +29,13 @@ from spinning_top_sim.solvers.exact import (
     transverse_rates,
 )
 from spinning_top_sim.solvers.long_decimals import double_double, pi
-from spinning_top_sim.solvers.theta_setup import Factor, Series, ThetaMotion
+from spinning_top_sim.solvers.theta_series import Series
+from spinning_top_sim.solvers.theta_setup import Branch, Factor, ThetaMotion
 
 if TYPE_CHECKING:
     from spinning_top_sim.solvers.exact import ExactSolution
 
-ARRAY = Functions(np.sin, np.sinh, np.sqrt, np.arctan2)
+ARRAY = Functions(np.sin, np.sinh, np.sqrt, np.hypot, np.arctan2)
 CHUNK = 4096                # times in a block: its temporaries stay in the cache
 TWO_PI = 2.0 * math.pi
 NEGLIGIBLE = 1e-18          # beside the largest coefficient
@@ -142,6 +143,7 @@ class ArrayEvaluator:
             two_pi = 2 * pi()
             alpha, beta = motion.alpha, motion.beta
             self.quarters = Rate(motion.quarter_rate)
+            self.offset0 = double_double(motion.offset0)
             self.precession, self.spin = (
                 Rate(motion.mean_precession_rate), Rate(motion.mean_spin_rate))
             self.alpha_turns, self.beta_turns, self.spin_turns = (
@@ -189,10 +191,7 @@ class ArrayEvaluator:
         solution = self.solution
         columns = np.zeros((6, len(t)))
         for block in _blocks(len(t)):
-            whole, part = self.quarters.whole_and_part(t[block], _part_of(t_rest, block))
-            shift = np.rint(part + solution.offset0)
-            quarters = whole + (solution.quarter0 + shift)
-            y = QUARTER_PERIOD_ANGLE * ((part - shift) + solution.offset0)
+            quarters, y = self._nutation_phase(t[block], _part_of(t_rest, block))
             place = quarters.astype(np.int64) & 3
             flip = np.where(place < 2, 1.0, -1.0)
             odd = (place & 1).astype(bool)
@@ -206,6 +205,21 @@ class ArrayEvaluator:
             if solution.turning:
                 out[5] = solution.turning.turns(quarters, y, np.arctan2(out[1], out[0]))
         return columns
+
+    def _nutation_phase(self, t: np.ndarray, t_rest: np.ndarray | None
+                        ) -> tuple[np.ndarray, np.ndarray]:
+        """Return whole quarter periods and the angle y from there, accurate relative to itself."""
+        high, rest = self.quarters.product(t, t_rest)
+        whole = np.rint(high)
+        part = high - whole
+        offset, offset_rest = self.offset0
+        shift = np.rint(part + (rest + offset))
+        part -= shift
+        nearest = part + offset                     # Knuth's sum: exact with what it leaves out
+        taken = nearest - part
+        left_out = (part - (nearest - taken)) + (offset - taken)
+        return (whole + (self.solution.quarter0 + shift),
+                QUARTER_PERIOD_ANGLE * (nearest + (left_out + (rest + offset_rest))))
 
     def theta(self, nutation: np.ndarray) -> np.ndarray:
         alpha, beta, *_, turns = nutation

@@ -19,6 +19,7 @@ HALVINGS = 8
 
 
 def pi() -> Decimal:
+    """Return pi to the current precision."""
     return +_pi(getcontext().prec)
 
 
@@ -44,6 +45,7 @@ def _pi(digits: int) -> Decimal:
 
 
 def sign(x: Decimal) -> int:
+    """Return -1, 0 or 1."""
     return int(x > 0) - int(x < 0)
 
 
@@ -82,6 +84,7 @@ def sin_cos(x: Decimal) -> tuple[Decimal, Decimal]:
 
 
 def sinh_cosh(x: Decimal) -> tuple[Decimal, Decimal]:
+    """Return sinh x and cosh x."""
     if abs(x) < Decimal('0.1'):         # here exp(x) - exp(-x) would cancel
         s = _odd_power_series(x, 1)
         return s, (1 + s * s).sqrt()
@@ -109,7 +112,7 @@ def atan2(y: Decimal, x: Decimal) -> Decimal:
 
 def carlson_rf(x: Decimal, y: Decimal, z: Decimal) -> Decimal:
     """Carlson's integral R_F by duplication, then the series in e2, e3 [DLMF 19.36.1]."""
-    mean = first_mean = (x + y + z) / 3
+    mean = (x + y + z) / 3
     dx, dy = mean - x, mean - y
     spread = max(abs(dx), abs(dy), abs(mean - z))
     scale = 1
