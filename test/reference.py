@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The reference cases (data/reference_cases.json: 30 digits, computed with 70-digit arithmetic)."""
+"""The reference cases of data/reference_cases.json: 30 digits, from 70-digit arithmetic."""
 
 import json
 import math
