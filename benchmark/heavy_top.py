@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import sys
-from typing import NamedTuple
+from collections.abc import Iterable
 
 import numpy as np
 import report
@@ -38,19 +38,16 @@ EARLY_ATTITUDE = ('-0.70827915297431256', '0.43878108812658190', '0.545728396145
                   '0.08939975282400501')
 
 
-class Published(NamedTuple):
-    """What a code publishes of this problem, as the distance of its numbers from the digits."""
-
-    code: str
-    error: float
-    of: str
-
-
-PUBLISHED = (
-    Published('Kynema, constants of its test', 1.2e-6, 'displacement at 2 s [m]'),
-    Published('Kynema, its CSV, dt = 2e-6 s', 1.1e-7, 'displacement at 2 s [m]'),
-    Published('EXUDYN, h = 1e-4 s', 5.3e-5, 'at 0.2 s'),
-)
+# What others publish, m at 2 s; both from https://github.com/kynema/kynema, tests/.
+PUBLISHED = {
+    'Kynema, constants of its test Dynamic_HeavyTopSpinningUnderGravity': (
+        '-0.150416985652933', '-1.724164450779749', '-0.673023460701136'),
+    'Kynema, heavy_top_kynema_material_0pt000002s.csv, steps of 2e-6 s': (
+        '-0.1504168894608856', '-1.7241654846852867', '-0.6730223697288009'),
+}
+# EXUDYN with steps of 1e-4 s is about so far off at 0.2 s: a distance that was measured when the
+# digits were computed, and, unlike the others, cannot be measured again from here.
+EXUDYN = 5.3e-5
 
 
 def main() -> int:
@@ -67,7 +64,10 @@ def main() -> int:
         rows.append((f'rk45 transport, rtol {rtol:g}', report.number(
             displacement_error(HEAVY_TOP, peer('rk45 transport'), rtol)),
             'displacement at 2 s [m]'))
-    rows += [(row.code, report.number(row.error), row.of) for row in PUBLISHED]
+    rows += [(code, report.number(distance(numbers)), 'displacement at 2 s [m]')
+             for code, numbers in PUBLISHED.items()]
+    rows.append(('EXUDYN, steps of 1e-4 s (quoted, not measured here)', report.number(EXUDYN),
+                 'at 0.2 s'))
     text = report.preamble('The heavy top of Brüls, Cardona and Arnold') + '\n' + report.table(
         ('code', 'error', 'of what'), rows)
     passed = ours <= BOUND
@@ -88,8 +88,13 @@ def displacement(case: Case, method: Peer, setting: float) -> np.ndarray:
 
 
 def displacement_error(case: Case, method: Peer, setting: float) -> float:
-    """Return the distance from the digits [m]."""
-    return math.dist(displacement(case, method, setting), map(float, DISPLACEMENT))
+    """Return how far a method ends from the digits [m]."""
+    return distance(displacement(case, method, setting))
+
+
+def distance(displaced: Iterable[float | str]) -> float:
+    """Return the largest difference from the digits [m] of the three coordinates."""
+    return max(abs(float(a) - float(b)) for a, b in zip(displaced, DISPLACEMENT, strict=True))
 
 
 def attitude_error(ns: int, digits: tuple[str, ...]) -> float:
