@@ -11,6 +11,8 @@ with and without the projection onto the invariants.
 from __future__ import annotations
 
 import cmath
+import math
+import statistics
 
 import numpy as np
 import report
@@ -50,12 +52,15 @@ def main() -> None:
              f'{TARGET:g} rad, over those at c = L3/2.  The worst of 640 samples counts; '
              f'between tolerances of {TOLERANCES[0]:g} to {TOLERANCES[-1]:g} the logarithms are '
              'interpolated.\n']
-    rows = []
+    rows, ratios = [], []
     for case in CASES:
         taken = [evaluations_for(case, share) for share in SHARES]
         rows.append((case.title, f'{taken[SHARES.index(0.5)]:.0f}',
                      *(f'{n / taken[SHARES.index(0.5)]:.2f}' for n in taken)))
+        ratios.append([n / taken[SHARES.index(0.5)] for n in taken])
         print(rows[-1], flush=True)
+    rows.append(('geometric mean', '', *(f'{math.exp(statistics.fmean(map(math.log, column))):.2f}'
+                                         for column in zip(*ratios, strict=True))))
     parts.append(report.table(('case', 'evaluations, c = L3/2',
                                *(f'c = {share:g} L3' for share in SHARES)), rows))
     parts.append('## Projection\n\nLargest error [rad], and evaluations, at rtol '

@@ -11,11 +11,13 @@ return.  Errors are against the exact solution, and its own against heyoka in lo
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 import multiprocessing
+import resource
+import signal
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import matplotlib as mpl
@@ -45,6 +47,8 @@ from spinning_top_sim import State
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 
 DURATION, RATE = 10, 64
+# Limits are of processor time.  What does not even use it is waited for so many times longer.
+PATIENCE = 20.0
 SITUATIONS = (
     Case('at the top, moving', WHEEL, State(theta=0.0, theta_dot=3.0, l3=0.3, lz=0.3)),
     Case('sleeping, stable', *scene('sleeping')),
@@ -67,6 +71,10 @@ METHODS = (
 # wrong: a pass by a pole that is missed costs pi.
 LOST_ATTITUDE, LOST_ANGLE = 0.01, 1.0
 
+SENSITIVITY_SPANS = (10, 30, 100)
+SENSITIVE = (CUSP, *(case for case in SITUATIONS if case.title.startswith(
+    ('sleeping, unstable', 'waking sleeper', 'near the separatrix'))))
+
 HOUR = 3600
 HOUR_RATE = 16
 CHECKPOINTS = (10, 100, 1000, 3600)
@@ -77,7 +85,7 @@ RUNNERS = (
     ('MuJoCo RK4', 512.0))
 
 
-@dataclass
+@dataclasses.dataclass
 class Outcome:
     """What a method did in a situation; errors [rad] are the largest over all samples."""
 
@@ -111,12 +119,13 @@ def main() -> None:
     labels = [_label(*method) for method in METHODS]
     text += ['## Overview\n', report.table(('situation', *labels), overview)]
     text += ['## An hour of cusps\n', hour(options.hour_limit)]
+    text += ['## Where errors grow exponentially\n', sensitivity()]
     text += ['## Each situation\n', *details]
     report.write('stability.md', '\n'.join(text))
 
 
 INTRODUCTION = """
-{duration} s of every situation at {rate} Hz, at most {limit:g} s of real time for each run.
+{duration} s of every situation at {rate} Hz, at most {limit:g} s of processor time for each run.
 
 - **right**: finished, the attitude within {attitude:g} rad throughout, phi and psi, where the
   method has them, within {angle:g} rad
@@ -137,7 +146,7 @@ def meet(case: Case, name: str, setting: float) -> Outcome:
     """Let a method meet a situation."""
     method = peer(name)
     ns = grid_ns(DURATION, RATE)
-    begin = time.perf_counter()
+    begin = time.process_time()
     try:
         runner = method.ready(case, setting)
         samples = runner.samples(ns)
@@ -145,7 +154,7 @@ def meet(case: Case, name: str, setting: float) -> Outcome:
         return Outcome(f'refused: {error}'.split(';', maxsplit=1)[0])
     except ArithmeticError as error:
         return Outcome(f'refused: {type(error).__name__}: {error}')
-    seconds = time.perf_counter() - begin
+    seconds = time.process_time() - begin
     if not np.all(np.isfinite(samples.quaternion)):
         return Outcome('NaN', seconds=seconds, work=runner.work)
     exact = case.exact.states_at_ns(ns)
@@ -178,21 +187,23 @@ def in_child(run: Callable[..., Any], arguments: tuple[Any, ...], limit: float) 
     receiver, sender = context.Pipe(duplex=False)
 
     def child() -> None:
+        resource.setrlimit(resource.RLIMIT_CPU, (round(limit), round(limit)))
         sender.send(run(*arguments))
 
     process = context.Process(target=child)
     process.start()
     sender.close()
     try:
-        if receiver.poll(limit):
+        if receiver.poll(PATIENCE * limit):
             return receiver.recv()
-        return Outcome(f'hung: not done in {limit:g} s')
     except EOFError:
         process.join()
-        return Outcome(f'crashed: exit code {process.exitcode}')
+        if process.exitcode not in (-signal.SIGXCPU, -signal.SIGKILL):
+            return Outcome(f'crashed: exit code {process.exitcode}')
     finally:
         process.kill()
         process.join()
+    return Outcome(f'hung: not done in {limit:g} s')
 
 
 def _describe(case: Case) -> str:
@@ -211,6 +222,30 @@ def _row(name: str, setting: float, outcome: Outcome) -> tuple[str, ...]:
             *(report.number(error) for error in (outcome.attitude, outcome.phi, outcome.psi)),
             f'{outcome.work} {peer(name).unit}' if outcome.work else '–',
             report.number(outcome.seconds))
+
+
+# ----------------------------------------------------------------------------------- sensitivity
+
+def sensitivity() -> str:
+    """Return a table: errors of rk45, and what one rounding of the start does to the truth."""
+    ns = grid_ns(SENSITIVITY_SPANS[-1], RATE)
+    ends = [span * RATE + 1 for span in SENSITIVITY_SPANS]
+    lines = []
+    for case in SENSITIVE:
+        truth = case.exact.states_at_ns(ns).quaternion
+        start = dataclasses.replace(case.start, theta=math.nextafter(case.start.theta, math.inf))
+        curves = [('theta one double up, exact',
+                   Case(case.title, case.top, start).exact.states_at_ns(ns).quaternion)]
+        curves += [(_label('rk45 transport', rtol),
+                    peer('rk45 transport').ready(case, rtol).attitudes(ns))
+                   for rtol in (1e-9, 1e-11, 1e-13)]
+        for label, attitudes in curves:
+            errors = angles_between(attitudes, truth)
+            lines.append((case.title, report.number(case.exact.m1), label,
+                          *(report.number(errors[:end].max()) for end in ends)))
+    return ('Largest difference of the attitude from the exact motion [rad].  m1 says how close '
+            'the separatrix is.\n\n' + report.table(
+                ('motion', 'm1', 'what', *(f'{span} s' for span in SENSITIVITY_SPANS)), lines))
 
 
 # ------------------------------------------------------------------------------------------ hour
