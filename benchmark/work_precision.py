@@ -85,8 +85,8 @@ INTRODUCTION = """
 Error: the largest rotation angle [rad] between an attitude and the true one, over all samples.
 Truth: `method='exact'`, whose own error is measured at some of the instants against heyoka
 with {bits}-bit numbers.  Time: processor time of a whole call that returns all attitudes, divided
-by their number; what is done once before, a model's compilation or loading, is a column of its own (our
-exact solution prepares each motion anew, some milliseconds, and that is in its time).
+by their number; what is done once before, a model's compilation or loading, is a column of its
+own (our exact solution prepares each motion anew, some milliseconds, and that is in its time).
 Ratio 1 is {reference} at {tolerance:g}.  Times over 10 s are medians of {rounds} interleaved
 rounds in one process; those over 1000 s are of one run, and a method whose run would take more
 than {longest:g} s is left out there and says so.  SciPy, heyoka Euler and `rk45 euler` solve the
