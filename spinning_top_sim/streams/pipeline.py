@@ -8,12 +8,14 @@ every sample due until then is computed in order of time, once for all who take 
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.kinematics import OneState
+from spinning_top_sim.physics.regimes import Description, describe
 from spinning_top_sim.physics.top import State, Top, pole_momentum
 from spinning_top_sim.solvers.propagator import (
     ExactPropagator,
@@ -84,9 +86,9 @@ class Simulation:
         self._invariants.start_from(state)
 
     @property
-    def anchor(self) -> State:
-        """The state in which the present motion began: the start, or the last command."""
-        return self._anchor
+    def begun(self) -> object:
+        """Something that is the same as long as the same motion goes on."""
+        return self._first
 
     def energy_drift(self, state: OneState) -> float:
         """Return the energy's relative drift since then (absolute where it was 0)."""
@@ -112,15 +114,27 @@ class Simulation:
 
         0 for the exact solution itself; NaN for a motion that it cannot hold.
         """
+        exact = self._exact()
+        if exact is None or exact is self._solver:
+            return math.nan if exact is None else 0.0
+        return attitude.angle_between(state.quaternion,
+                                      exact.at_ns(t_ns - self._anchor_ns).quaternion)
+
+    def describe(self) -> Description | None:
+        """Return the present motion in numbers; None where the closed form cannot hold it."""
+        exact = self._exact()
+        if exact is None:
+            return None
+        return describe(self.top, exact.solution.start, exact.solution)
+
+    def _exact(self) -> ExactPropagator | None:
+        """Return the closed form of the present motion, set up when first asked for."""
         if isinstance(self._solver, ExactPropagator):
-            return 0.0
+            return self._solver
         if self._reference is None:
-            try:
-                self._reference = ExactPropagator(self.top, self.anchor)
-            except ValueError:
-                return math.nan
-        exact = self._reference.at_ns(t_ns - self._anchor_ns)
-        return attitude.angle_between(state.quaternion, exact.quaternion)
+            with contextlib.suppress(ValueError):
+                self._reference = ExactPropagator(self.top, self._anchor)
+        return self._reference
 
     def advance(self, target_ns: int, publish_from_ns: int = 0,
                 give_way: Callable[[], bool] = lambda: False) -> bool:
