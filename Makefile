@@ -13,7 +13,7 @@ MAKEFLAGS += --no-builtin-rules
 .SUFFIXES:
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help run test lint build clean check-scene FORCE
+.PHONY: help run test dependencies lint build clean check-scene FORCE
 
 # DDS stays on this machine: by default it would ask the whole network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
@@ -61,8 +61,10 @@ check-scene:
 	@test -f 'config/$(SCENE).yaml' || { \
 	    echo 'There is no scene "$(SCENE)" (config/$(SCENE).yaml). There are: $(SCENES)' >&2; exit 2; }
 
+dependencies: $(VENV)/.deps-test $(VENV)/.package
+
 # `pytest`, not `python -m pytest`: what is tested is the installed package.
-test: $(VENV)/.deps-test $(VENV)/.package
+test: dependencies
 	'$(VENV)/bin/pytest' $(TESTS) $(ARGS)
 
 lint: $(VENV)/.deps-test $(VENV)/.deps-lint $(VENV)/.package
