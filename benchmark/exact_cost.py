@@ -22,8 +22,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
-from spinning_top_sim.physics.top import State, Top  # noqa: E402
-from spinning_top_sim.solvers.exact import ExactSolution  # noqa: E402
+from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.solvers.exact import ExactSolution
 
 UNIT = Top(lambda1=1.0, lambda3=0.5, mass=1.0, com_distance=0.5, gravity=9.8)
 SMALL = Top(lambda1=0.002, lambda3=0.001, mass=0.5, com_distance=0.05, gravity=9.81)
