@@ -13,6 +13,7 @@ NAME = 'spinning_top_sim'
 # scripts/ too, installed there as data by pip and by colcon alike.
 EXECUTABLES = {
     'sim_node': 'spinning_top_sim.nodes.sim_node',
+    'simulate': 'spinning_top_sim.tools.simulate',
 }
 
 DATA_FILES = {
@@ -60,6 +61,9 @@ setup(
             'rosbags>=0.10.11,<0.12',
             'scipy>=1.11,<2',
         ],
+        # simulate: parameter files, a progress bar, Parquet
+        'tools': ['PyYAML>=6.0,<7', 'tqdm>=4.64,<5'],
+        'parquet': ['pyarrow>=14'],
         'plot': ['matplotlib>=3.6,<4'],
         # Narrow: a new release of these finds new faults.
         'lint': [

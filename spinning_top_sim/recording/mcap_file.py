@@ -57,7 +57,7 @@ _MESSAGE_FIELDS = 2 + 4 + 8 + 8      # what `length` counts besides the data
 _INDEX = struct.Struct('<BQHI')      # opcode, length, channel, length of the entries
 
 
-def _compressor(compression: str) -> Callable[[bytes | bytearray], bytes]:
+def _compressor(compression: str) -> Callable[[bytes | memoryview], bytes]:
     """Return what compresses a chunk."""
     if compression == 'zstd':
         return zstandard.ZstdCompressor().compress
@@ -177,30 +177,35 @@ class McapFile:
         self.write_chunk()
         import numpy  # noqa: PLC0415 - a live recording needs none
 
-        plain = bytearray()
+        head = numpy.dtype([
+            ('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
+            ('log_time', '<u8'), ('publish_time', '<u8')])
+        plain = numpy.empty(sum(len(times) * (head.itemsize + rows.shape[1])
+                                for _, times, rows in parts), 'u1')
+        at = 0
         indexes = []
         for topic_index, times, rows in parts:
             count, size = rows.shape
-            records = numpy.empty(count, numpy.dtype([
-                ('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
-                ('log_time', '<u8'), ('publish_time', '<u8'), ('data', f'V{size}')]))
-            records['opcode'] = Opcode.MESSAGE
-            records['length'] = _MESSAGE_FIELDS + size
-            records['channel'] = topic_index + 1
+            length = head.itemsize + size
+            records = plain[at:at + count * length].reshape(count, length)
+            heads = records[:, :head.itemsize].view(head)[:, 0]
+            heads['opcode'] = Opcode.MESSAGE
+            heads['length'] = _MESSAGE_FIELDS + size
+            heads['channel'] = topic_index + 1
             sequence = self._sequences[topic_index]
-            records['sequence'] = numpy.arange(sequence, sequence + count) & 0xFFFFFFFF
-            records['log_time'] = records['publish_time'] = times
-            records['data'] = numpy.ascontiguousarray(rows).view(f'V{size}')[:, 0]
+            heads['sequence'] = numpy.arange(sequence, sequence + count) & 0xFFFFFFFF
+            heads['log_time'] = heads['publish_time'] = times
+            records[:, head.itemsize:] = rows
             self._sequences[topic_index] = sequence + count
             entries = numpy.empty((count, 2), '<u8')
             entries[:, 0] = times
-            entries[:, 1] = len(plain) + records.itemsize * numpy.arange(count)
+            entries[:, 1] = at + length * numpy.arange(count)
             indexes.append((topic_index, count, entries.tobytes()))
-            plain += records.view('u1').data
-        self._write_chunk(plain, min(int(times.min()) for _, times, _ in parts),
+            at += count * length
+        self._write_chunk(plain.data, min(int(times.min()) for _, times, _ in parts),
                           max(int(times.max()) for _, times, _ in parts), indexes)
 
-    def _write_chunk(self, plain: bytes | bytearray, start_ns: int, end_ns: int,
+    def _write_chunk(self, plain: bytes | memoryview, start_ns: int, end_ns: int,
                      indexes: Sequence[tuple[int, int, bytes]]) -> None:
         """Write a chunk and its message indexes: (topic index, message count, entries)."""
         packed = self._compress(plain)

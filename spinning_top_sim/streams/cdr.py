@@ -88,6 +88,10 @@ class Template:
         self._stamp = struct.Struct('<iI')
         self._runs = [(struct.Struct(f'<{count}d').pack_into, at) for at, count in fields]
 
+    def __len__(self) -> int:
+        """Return the size of every message [bytes]."""
+        return len(self._buffer)
+
     def encode(self, stamp_ns: int, *runs: Sequence[float]) -> bytes:
         """Return the message with this stamp [ns] and one sequence of numbers a run."""
         buffer = self._buffer
