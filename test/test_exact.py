@@ -14,7 +14,7 @@ import random
 import subprocess
 import sys
 from dataclasses import replace
-from decimal import Decimal, localcontext
+from decimal import Context, Decimal, Inexact, localcontext
 from fractions import Fraction
 from pathlib import Path
 
@@ -510,7 +510,7 @@ def test_bad_arrays_and_counts_are_refused():
     with pytest.raises(ValueError, match='count'):
         solution.quaternion_grid(0, 1, -1)
     with pytest.raises(ValueError, match='t = '):
-        solution.quaternion_at(10 ** 30)
+        solution.quaternion_at(10 ** 400)
     with pytest.raises(ValueError, match='t = '):
         solution.full_state_at(-10 ** 30)
     with pytest.raises(ValueError, match='t = '):
@@ -563,6 +563,15 @@ def test_huge_start_angles_keep_their_fraction_of_a_turn():
         assert z == pytest.approx(float(sine) * math.cos(state.theta / 2), abs=1e-15)
         assert w == pytest.approx(float(cosine) * math.cos(state.theta / 2), abs=1e-15)
         assert solution.state_at(0)[2:4] == (phi, psi)
+
+
+def test_the_caller_s_decimal_context_does_not_matter():
+    expected = ExactSolution(*REGIMES['cusp'])
+    with localcontext(Context(prec=3, traps=[Inexact])):
+        solution = ExactSolution(*REGIMES['cusp'])
+        assert solution.full_state_at(10 ** 15) == expected.full_state_at(10 ** 15)
+        grid = solution.quaternion_grid(10 ** 15, 10 ** 6, 5)
+    assert (grid == expected.quaternion_grid(10 ** 15, 10 ** 6, 5)).all()
 
 
 # ------------------------------------------------------------------------------ long decimals
