@@ -494,11 +494,27 @@ def test_empty_single_and_unsorted_times():
     assert (solution.states(t).phi[order] == solution.states(t[order]).phi).all()
 
 
+def test_columns_belong_to_the_times_that_were_given():
+    solution = ExactSolution(*REGIMES['looping'])
+    t = np.array([1.0, 2.0])
+    states = solution.states(t)
+    t += 5.0
+    assert (states.theta == solution.states(np.array([1.0, 2.0])).theta).all()
+
+
 @pytest.mark.parametrize('t', [[math.nan], [0.0, math.inf], [-math.inf], [1e300]])
 def test_times_that_are_none_are_refused(t):
     solution = ExactSolution(*REGIMES['looping'])
     with pytest.raises(ValueError, match='t = '):
         solution.states(np.array(t))
+
+
+def test_grids_of_many_steps_side_by_side():
+    solution = ExactSolution(*REGIMES['cusp'])
+    for _ in range(2):
+        for step in range(1_000_000, 1_000_040):
+            grid = solution.quaternion_grid(7, step, 2)
+            assert difference(grid[1], solution.quaternion_at(7 + step)) <= BOUND
 
 
 def test_bad_arrays_and_counts_are_refused():

@@ -47,6 +47,7 @@ SHORT_TURNS = 2.0 ** 22     # so many turns are counted right with a rate split 
 
 GRID_BLOCK = 512            # states in a row of the grid's product
 GRID_ROWS = 16              # rows that are worked on together
+KEPT_GRIDS = 16             # steps whose factor matrices are kept, 0.1 MB each
 MOST_ROWS = 1 << 15         # whose count times a limb fits 64 bits
 LIMB = 48                   # bits: two limbs are the fraction of a turn
 
@@ -113,7 +114,7 @@ class ArrayEvaluator:
 
     def states(self, t: Any) -> ExactStates:
         """See ExactSolution.states."""
-        return ExactStates(self, self._checked(t))
+        return ExactStates(self, self._checked(t).copy())     # columns come later
 
     def states_at_ns(self, ns: Any) -> ExactStates:
         """See ExactSolution.states_at_ns."""
@@ -128,7 +129,7 @@ class ArrayEvaluator:
 
     def quaternion(self, t: Any) -> np.ndarray:
         """See ExactSolution.quaternion."""
-        return self.states(t).quaternion
+        return self.attitudes.quaternion(self._checked(t), None)
 
     def quaternion_grid(self, start_ns: int, step_ns: int, count: int) -> np.ndarray:
         """See ExactSolution.quaternion_grid."""
@@ -499,7 +500,7 @@ class _Attitudes:
         largest_xi = sinh_cosh(motion.stretch * pi() / 2)[0] ** 2 if self.imaginary else ONE
         self.alpha, self.beta = (_AttitudeFactor(factor, v_rate, v_start, largest_xi)
                                  for factor in (motion.alpha, motion.beta))
-        self._grid: _Grid | None = None
+        self._grids: dict[int, _Grid] = {}
 
     def quaternion(self, t: np.ndarray, t_rest: np.ndarray | None) -> np.ndarray:
         """Return (n, 4) x, y, z, w."""
@@ -559,9 +560,11 @@ class _Attitudes:
 
     def quaternion_grid(self, start_ns: int, step_ns: int, count: int) -> np.ndarray:
         """Return (count, 4) x, y, z, w; in the real form only."""
-        if self._grid is None or self._grid.step_ns != step_ns:
-            self._grid = _Grid(self, step_ns)
-        return self._grid.quaternion(start_ns, count)
+        if step_ns not in self._grids:
+            if len(self._grids) == KEPT_GRIDS:
+                self._grids.clear()
+            self._grids[step_ns] = _Grid(self, step_ns)
+        return self._grids[step_ns].quaternion(start_ns, count)
 
 
 # ------------------------------------------------------------------------------ uniform grids

@@ -13,8 +13,8 @@ are each a theta function of the nutation's phase over a common one, times a uni
     alpha = (R + i s J)(y)/D(y) exp i(rate t + phase + s kappa y),   R + i s J ~ theta(y - i s a)
 
 (F. Klein, A. Sommerfeld, Ueber die Theorie des Kreisels, ch. VI;  E. T. Whittaker, Analytical
-Dynamics, sect. 72-76;  theta functions, nome and quarter periods K, K' as in DLMF ch. 20 and 22,
-R_F as in DLMF ch. 19: https://dlmf.nist.gov).  So a state costs the same at every t.  The phase
+Dynamics, ch. VI;  theta functions, nome and quarter periods K, K' as in DLMF ch. 20 and 22, R_F
+as in DLMF ch. 19: https://dlmf.nist.gov).  So a state costs the same at every t.  The phase
 is counted in quarter periods, Z = N + 2y/pi with N whole and |y| <= pi/4: over even N (u near u1)
 alpha is theta1 and beta theta2, over odd N (u near u2) the other way round.
 
