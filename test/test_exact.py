@@ -14,7 +14,7 @@ import random
 import subprocess
 import sys
 from dataclasses import replace
-from decimal import Decimal, localcontext
+from decimal import Context, Decimal, Inexact, localcontext
 from fractions import Fraction
 from pathlib import Path
 
@@ -494,11 +494,27 @@ def test_empty_single_and_unsorted_times():
     assert (solution.states(t).phi[order] == solution.states(t[order]).phi).all()
 
 
+def test_columns_belong_to_the_times_that_were_given():
+    solution = ExactSolution(*REGIMES['looping'])
+    t = np.array([1.0, 2.0])
+    states = solution.states(t)
+    t += 5.0
+    assert (states.theta == solution.states(np.array([1.0, 2.0])).theta).all()
+
+
 @pytest.mark.parametrize('t', [[math.nan], [0.0, math.inf], [-math.inf], [1e300]])
 def test_times_that_are_none_are_refused(t):
     solution = ExactSolution(*REGIMES['looping'])
     with pytest.raises(ValueError, match='t = '):
         solution.states(np.array(t))
+
+
+def test_grids_of_many_steps_side_by_side():
+    solution = ExactSolution(*REGIMES['cusp'])
+    for _ in range(2):
+        for step in range(1_000_000, 1_000_040):
+            grid = solution.quaternion_grid(7, step, 2)
+            assert difference(grid[1], solution.quaternion_at(7 + step)) <= BOUND
 
 
 def test_bad_arrays_and_counts_are_refused():
@@ -510,7 +526,7 @@ def test_bad_arrays_and_counts_are_refused():
     with pytest.raises(ValueError, match='count'):
         solution.quaternion_grid(0, 1, -1)
     with pytest.raises(ValueError, match='t = '):
-        solution.quaternion_at(10 ** 30)
+        solution.quaternion_at(10 ** 400)
     with pytest.raises(ValueError, match='t = '):
         solution.full_state_at(-10 ** 30)
     with pytest.raises(ValueError, match='t = '):
@@ -563,6 +579,15 @@ def test_huge_start_angles_keep_their_fraction_of_a_turn():
         assert z == pytest.approx(float(sine) * math.cos(state.theta / 2), abs=1e-15)
         assert w == pytest.approx(float(cosine) * math.cos(state.theta / 2), abs=1e-15)
         assert solution.state_at(0)[2:4] == (phi, psi)
+
+
+def test_the_caller_s_decimal_context_does_not_matter():
+    expected = ExactSolution(*REGIMES['cusp'])
+    with localcontext(Context(prec=3, traps=[Inexact])):
+        solution = ExactSolution(*REGIMES['cusp'])
+        assert solution.full_state_at(10 ** 15) == expected.full_state_at(10 ** 15)
+        grid = solution.quaternion_grid(10 ** 15, 10 ** 6, 5)
+    assert (grid == expected.quaternion_grid(10 ** 15, 10 ** 6, 5)).all()
 
 
 # ------------------------------------------------------------------------------ long decimals

@@ -17,12 +17,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from decimal import Decimal, localcontext
+from decimal import Decimal
 from math import cos, sin, sinh, sqrt
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.long_decimals import ZERO, pi
+from spinning_top_sim.solvers.long_decimals import ZERO, pi, precision
 from spinning_top_sim.solvers.theta_series import TERMS, Series
 from spinning_top_sim.solvers.theta_setup import Branch, ThetaMotion, set_up
 
@@ -48,6 +48,246 @@ LEAST_AMPLITUDE = Decimal('1e-290')
 MOST = Decimal('1e290')
 # Closer to the separatrix hyperbolic functions overflow.
 LEAST_M1 = Decimal('1e-290')
+
+
+class ExactSolution:
+    """
+    The motion of `top` that is in the state `start` at t = 0.
+
+    Quaternions turn body into world, (x, y, z, w), their sign continuous in time.  theta goes
+    smoothly through a pole that is passed exactly (and out of [0, pi]), phi and psi are unwrapped.
+    On every motion each of them, over max(1, |value|), is within 5e-15.
+
+    Attributes: nutation_period [s], None if the nutation rests; mean_precession_rate and
+    mean_spin_rate [rad/s]; theta_min and theta_max [rad], of theta folded into [0, pi];
+    m and m1 = 1 - m, the parameter of the elliptic functions: m1 -> 0 on the separatrix;
+    time_limit [s] and ns_limit [ns], the farthest time either way.
+
+    Raises ValueError for motions whose constants doubles cannot hold, and, from every evaluation,
+    for times at which a phase exceeds 2^52 turns.
+    """
+
+    def __init__(self, top: Top, start: State):
+        self.top, self.start = top, start
+        self.theta_motion = motion = set_up(top, start)
+        with precision(motion.digits):
+            self._take_over(motion, top, start)
+        self._check_start()
+        self._arrays: ArrayEvaluator | None = None
+
+    def _check_start(self) -> None:
+        """Refuse constants so far apart that doubles lose the start among them."""
+        theta, theta_dot, *_ = self.state_at(0)
+        for name, value, wanted in (('theta', theta, self.start.theta),
+                                    ('theta_dot', theta_dot, self.start.theta_dot)):
+            if not abs(value - wanted) <= 1e-14 * max(1.0, abs(wanted)):
+                raise ValueError(f'{name} = {wanted!r} cannot be held in doubles: the constants '
+                                 f'of {self.top} and {self.start} are too far apart in size')
+
+    def _take_over(self, motion: ThetaMotion, top: Top, start: State) -> None:
+        if motion.m1 < LEAST_M1:
+            raise ValueError(f'm1 = {motion.m1:.3e} for {top} from {start}: the motion is closer '
+                             f'to the separatrix than {LEAST_M1}')
+        self.m, self.m1 = float(motion.m), float(motion.m1)
+        period = motion.nutation_period
+        self.nutation_period = None if period is None else float(period)
+        for name, value in (('the rate of the nutation', motion.quarter_rate),
+                            ('the rate of (phi + psi)/2', motion.alpha.rate),
+                            ('the rate of (phi - psi)/2', motion.beta.rate)):
+            _in_range(name, value)
+        self.mean_precession_rate = _in_range('mean precession rate', motion.mean_precession_rate)
+        self.mean_spin_rate = _in_range('mean spin rate', motion.mean_spin_rate)
+        self.theta_min, self.theta_max = (float(x) for x in motion.theta_bounds)
+
+        # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
+        alpha, beta = motion.alpha, motion.beta
+        self.phi_phase = float(
+            Decimal(start.phi) - alpha.start_argument - beta.start_argument)
+        self.psi_phase = float(
+            Decimal(start.psi) - alpha.start_argument + beta.start_argument)
+        two_lambda1 = 2 * Decimal(top.lambda1)
+        self.bottom_rate = _in_range('(lz + l3)/(2 lambda1)', motion.a_plus / two_lambda1)
+        self.top_rate = _in_range('(lz - l3)/(2 lambda1)', motion.a_minus / two_lambda1)
+        self.axial_rate = _in_range('l3/lambda3', Decimal(start.l3) / Decimal(top.lambda3))
+        self.quarter0 = motion.quarter0
+        self.branches = _nutation_branch(motion, 0), _nutation_branch(motion, 1)
+        self._flat_branches = tuple(_flat(x) for x in self.branches)
+        self.turning = _Turning.of(motion, start.theta) if motion.turning else None
+
+        two_pi = 2 * pi()
+        fastest = max(abs(motion.quarter_rate), abs(alpha.rate / two_pi), abs(beta.rate / two_pi),
+                      Decimal('1e-300'))
+        self.time_limit = min(float(Decimal(MOST_TURNS) / fastest), 1e300)   # [s]
+        self.ns_limit = min(int(Decimal(MOST_TURNS) / fastest * 10 ** 9), 2 ** 63 - 1)
+        self._quarter_rate, self._offset0 = FixedRate.of(motion.quarter_rate, motion.offset0)
+        self._offset_rest = float(motion.offset0 - Decimal(self._offset0) / FIXED_ONE)
+        self._alpha_turns = FixedRate.of(alpha.rate / two_pi, alpha.phase_turns)
+        self._beta_turns = FixedRate.of(beta.rate / two_pi, beta.phase_turns)
+        self._phi = FixedRate.of(motion.mean_precession_rate, ZERO)
+        self._psi = FixedRate.of(motion.mean_spin_rate, ZERO)
+
+    # ------------------------------------------------------------------------------ one state
+
+    def quaternion_at(self, ns: int) -> tuple[float, float, float, float]:
+        """
+        Return the attitude (x, y, z, w) at `ns` nanoseconds, a Python int, after the start.
+
+        The formulas of `nutation_at`, with alpha and beta as complex numbers: no angles.
+        Raises ValueError for a time too far away.
+        """
+        if not -self.ns_limit <= ns <= self.ns_limit:
+            raise self.too_late(f'{ns} ns')
+        # As in _nutation_phase, without the call.
+        phase = ns * self._quarter_rate + self._offset0
+        whole = phase + FIXED_HALF >> FIXED_BITS
+        quarters = self.quarter0 + whole
+        part = (phase - (whole << FIXED_BITS)) * FIXED_UNIT + self._offset_rest
+        y = QUARTER_PERIOD_ANGLE * part
+        (alpha_real_prefactor, a3, a2, a1, a0, alpha_imag_prefactor, b3, b2, b1, b0,
+         alpha_drift, alpha_crosses,
+         beta_real_prefactor, c3, c2, c1, c0, beta_imag_prefactor, d3, d2, d1, d0,
+         beta_drift, beta_crosses, imaginary, stretch) = self._flat_branches[quarters & 1]
+        if imaginary:
+            s = sinh(y * stretch)
+            xi = -s * s
+        else:
+            s = sin(y)
+            xi = s * s
+        c = sqrt(1.0 - xi)
+        prefactors = (1.0, c, s, s * c)
+        alpha_real = prefactors[alpha_real_prefactor] * (((a3 * xi + a2) * xi + a1) * xi + a0)
+        alpha_imag = prefactors[alpha_imag_prefactor] * (((b3 * xi + b2) * xi + b1) * xi + b0)
+        beta_real = prefactors[beta_real_prefactor] * (((c3 * xi + c2) * xi + c1) * xi + c0)
+        beta_imag = prefactors[beta_imag_prefactor] * (((d3 * xi + d2) * xi + d1) * xi + d0)
+        if quarters & 2:
+            if alpha_crosses:
+                alpha_real = -alpha_real
+            if beta_crosses:
+                beta_real = -beta_real
+        scale = 1.0 / sqrt(alpha_real * alpha_real + alpha_imag * alpha_imag
+                           + beta_real * beta_real + beta_imag * beta_imag)
+        rate, start = self._alpha_turns
+        angle = (ns * rate + start & FRACTION_MASK) * RADIANS_PER_UNIT + alpha_drift * y
+        s, c = scale * sin(angle), scale * cos(angle)
+        z = alpha_real * s + alpha_imag * c
+        w = alpha_real * c - alpha_imag * s
+        rate, start = self._beta_turns
+        angle = (ns * rate + start & FRACTION_MASK) * RADIANS_PER_UNIT + beta_drift * y
+        s, c = scale * sin(angle), scale * cos(angle)
+        return -beta_real * s - beta_imag * c, beta_real * c - beta_imag * s, z, w
+
+    def _nutation_phase(self, ns: int) -> tuple[int, float]:
+        """
+        Return the nearest whole number of quarter periods, and the angle y from there.
+
+        y keeps its relative accuracy when it is small: a top races past a pole that it misses by
+        little.  What fixed point leaves out of a tiny offset at t = 0 is added as a double.
+        """
+        phase = ns * self._quarter_rate + self._offset0
+        whole = phase + FIXED_HALF >> FIXED_BITS
+        part = (phase - (whole << FIXED_BITS)) * FIXED_UNIT + self._offset_rest
+        return self.quarter0 + whole, QUARTER_PERIOD_ANGLE * part
+
+    def state_at(self, ns: int) -> tuple[float, float, float, float, float, float, float, float]:
+        """Return (theta, theta_dot, phi, psi, x, y, z, w) at `ns`, an int [rad, rad/s]."""
+        return self.full_state_at(ns)[:8]
+
+    def full_state_at(self, ns: int) -> tuple[
+            float, float, float, float, float, float, float, float, float, float, float]:
+        """Return what `state_at` does, and the body's angular velocity in its frame [rad/s]."""
+        if not -self.ns_limit <= ns <= self.ns_limit:
+            raise self.too_late(f'{ns} ns')
+        quarters, y = self._nutation_phase(ns)
+        point = nutation_at(self.branches[quarters & 1], y, -1.0 if quarters & 2 else 1.0, SCALAR)
+        alpha, beta, alpha_argument, beta_argument, theta_dot = point
+        half_theta = math.atan2(beta, alpha)
+        if self.turning:
+            half_theta += 2.0 * math.pi * round(self.turning.turns(quarters, y, half_theta))
+
+        rate, start = self._alpha_turns
+        angle = (ns * rate + start & FRACTION_MASK) * RADIANS_PER_UNIT + alpha_argument
+        sin_alpha, cos_alpha = sin(angle), cos(angle)
+        rate, start = self._beta_turns
+        angle = (ns * rate + start & FRACTION_MASK) * RADIANS_PER_UNIT + beta_argument
+        sin_beta, cos_beta = sin(angle), cos(angle)
+        scale = 1.0 / sqrt(alpha * alpha + beta * beta)
+        cos_half, sin_half = scale * alpha, scale * beta
+        omega1, omega2 = transverse_rates(
+            self.precession_across_axis(alpha, beta), theta_dot,
+            cos_alpha * cos_beta + sin_alpha * sin_beta,
+            sin_alpha * cos_beta - cos_alpha * sin_beta)
+        return (2.0 * half_theta, theta_dot,
+                ns * self._phi.rate * FIXED_UNIT
+                + (self.phi_phase + (alpha_argument + beta_argument)),
+                ns * self._psi.rate * FIXED_UNIT
+                + (self.psi_phase + (alpha_argument - beta_argument)),
+                -sin_half * sin_beta, sin_half * cos_beta,
+                cos_half * sin_alpha, cos_half * cos_alpha,
+                omega1, omega2, self.axial_rate)
+
+    def precession_across_axis(self, alpha: Any, beta: Any) -> Any:
+        """
+        Return phi' sin(theta) from two numbers in the ratio of cos(theta/2) and sin(theta/2).
+
+        Lz - L3 cos(theta) over lambda1 sin(theta), in half angles: nothing cancels, and at a pole
+        that can be reached the singular term is absent.
+        """
+        precession = 0.0 * alpha
+        if self.bottom_rate:
+            precession = precession + self.bottom_rate * (beta / alpha)
+        if self.top_rate:
+            precession = precession + self.top_rate * (alpha / beta)
+        return precession
+
+    def too_late(self, time: str) -> ValueError:
+        """Return the refusal of a time at which nothing is left of a phase."""
+        return ValueError(f't = {time}: must be finite and within {self.time_limit:.6g} s, '
+                          f'where a phase of this motion reaches 2^52 turns')
+
+    # ---------------------------------------------------------------------------- many states
+
+    def states(self, t: np.ndarray) -> ExactStates:
+        """
+        Return the states at t, (n,) float64 seconds after the start, in any order and sign.
+
+        Columns of the result are computed when asked for.
+        Raises ValueError for a time that is not finite or too far.
+        """
+        return self.arrays.states(t)
+
+    def states_at_ns(self, ns: np.ndarray) -> ExactStates:
+        """
+        Return the states at ns, (n,) int64 nanoseconds: exact where seconds would be rounded.
+
+        Raises ValueError for an array of another kind, or a time too far away.
+        """
+        return self.arrays.states_at_ns(ns)
+
+    def quaternion(self, t: np.ndarray) -> np.ndarray:
+        """
+        Return the attitudes (n, 4) x, y, z, w at t, (n,) float64 seconds, in any order.
+
+        Raises ValueError for a time that is not finite or too far.
+        """
+        return self.arrays.quaternion(t)
+
+    def quaternion_grid(self, start_ns: int, step_ns: int, count: int) -> np.ndarray:
+        """
+        Return the attitudes (count, 4) x, y, z, w at start_ns + k step_ns, in nanoseconds.
+
+        Several times faster than `quaternion`, most so when called again with the same step;
+        near the separatrix (m1 < 2e-4) as fast as that.
+        Raises ValueError for a negative count, or a time too far away.
+        """
+        return self.arrays.quaternion_grid(start_ns, step_ns, count)
+
+    @property
+    def arrays(self) -> ArrayEvaluator:
+        """The numpy half, imported and prepared when first asked for."""
+        if self._arrays is None:
+            from spinning_top_sim.solvers.exact_arrays import ArrayEvaluator  # noqa: PLC0415
+            self._arrays = ArrayEvaluator(self)
+        return self._arrays
 
 
 class Functions(NamedTuple):
@@ -167,234 +407,6 @@ class FixedRate(NamedTuple):
     def at(self, ns: int) -> int:
         """Return start + rate ns, in fixed point."""
         return self.start + self.rate * ns
-
-
-class ExactSolution:
-    """
-    The motion of `top` that is in the state `start` at t = 0.
-
-    Quaternions turn body into world, (x, y, z, w), their sign continuous in time.  theta goes
-    smoothly through a pole that is passed exactly (and out of [0, pi]), phi and psi are unwrapped.
-    On every motion each of them, over max(1, |value|), is within 5e-15.
-
-    Attributes: nutation_period [s], None if the nutation rests; mean_precession_rate and
-    mean_spin_rate [rad/s]; theta_min and theta_max [rad], of theta folded into [0, pi];
-    m and m1 = 1 - m, the parameter of the elliptic functions: m1 -> 0 on the separatrix.
-
-    Raises ValueError for motions whose constants doubles cannot hold, and, from every evaluation,
-    for times at which a phase exceeds 2^52 turns.
-    """
-
-    def __init__(self, top: Top, start: State):
-        self.top, self.start = top, start
-        self.theta_motion = motion = set_up(top, start)
-        with localcontext() as context:
-            context.prec = motion.digits
-            self._take_over(motion, top, start)
-        self._check_start()
-        self._arrays: ArrayEvaluator | None = None
-
-    def _check_start(self) -> None:
-        """Refuse constants so far apart that doubles lose the start among them."""
-        theta, theta_dot, *_ = self.state_at(0)
-        for name, value, wanted in (('theta', theta, self.start.theta),
-                                    ('theta_dot', theta_dot, self.start.theta_dot)):
-            if not abs(value - wanted) <= 1e-14 * max(1.0, abs(wanted)):
-                raise ValueError(f'{name} = {wanted!r} cannot be held in doubles: the constants '
-                                 f'of {self.top} and {self.start} are too far apart in size')
-
-    def _take_over(self, motion: ThetaMotion, top: Top, start: State) -> None:
-        if motion.m1 < LEAST_M1:
-            raise ValueError(f'm1 = {motion.m1:.3e} for {top} from {start}: the motion is closer '
-                             f'to the separatrix than {LEAST_M1}')
-        self.m, self.m1 = float(motion.m), float(motion.m1)
-        period = motion.nutation_period
-        self.nutation_period = None if period is None else float(period)
-        for name, value in (('the rate of the nutation', motion.quarter_rate),
-                            ('the rate of (phi + psi)/2', motion.alpha.rate),
-                            ('the rate of (phi - psi)/2', motion.beta.rate)):
-            _in_range(name, value)
-        self.mean_precession_rate = _in_range('mean precession rate', motion.mean_precession_rate)
-        self.mean_spin_rate = _in_range('mean spin rate', motion.mean_spin_rate)
-        self.theta_min, self.theta_max = (float(x) for x in motion.theta_bounds)
-
-        # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
-        alpha, beta = motion.alpha, motion.beta
-        self.phi_phase = float(
-            Decimal(start.phi) - alpha.start_argument - beta.start_argument)
-        self.psi_phase = float(
-            Decimal(start.psi) - alpha.start_argument + beta.start_argument)
-        two_lambda1 = 2 * Decimal(top.lambda1)
-        self.bottom_rate = _in_range('(lz + l3)/(2 lambda1)', motion.a_plus / two_lambda1)
-        self.top_rate = _in_range('(lz - l3)/(2 lambda1)', motion.a_minus / two_lambda1)
-        self.axial_rate = _in_range('l3/lambda3', Decimal(start.l3) / Decimal(top.lambda3))
-        self.quarter0 = motion.quarter0
-        self.branches = _nutation_branch(motion, 0), _nutation_branch(motion, 1)
-        self._flat_branches = tuple(_flat(x) for x in self.branches)
-        self.turning = _Turning.of(motion, start.theta) if motion.turning else None
-
-        two_pi = 2 * pi()
-        fastest = max(abs(motion.quarter_rate), abs(alpha.rate / two_pi), abs(beta.rate / two_pi),
-                      Decimal('1e-300'))
-        self.time_limit = min(float(Decimal(MOST_TURNS) / fastest), 1e300)   # [s]
-        self.ns_limit = int(Decimal(MOST_TURNS) / fastest * 10 ** 9)
-        self._quarter_rate, self._offset0 = FixedRate.of(motion.quarter_rate, motion.offset0)
-        self._offset_rest = float(motion.offset0 - Decimal(self._offset0) / FIXED_ONE)
-        self._alpha_turns = FixedRate.of(alpha.rate / two_pi, alpha.phase_turns)
-        self._beta_turns = FixedRate.of(beta.rate / two_pi, beta.phase_turns)
-        self._phi = FixedRate.of(motion.mean_precession_rate, ZERO)
-        self._psi = FixedRate.of(motion.mean_spin_rate, ZERO)
-
-    # ------------------------------------------------------------------------------ one state
-
-    def quaternion_at(self, ns: int) -> tuple[float, float, float, float]:
-        """
-        Return the attitude (x, y, z, w) at `ns` integer nanoseconds after the start.
-
-        The formulas of `nutation_at`, with alpha and beta as complex numbers: no angles.
-        """
-        if not -self.ns_limit <= ns <= self.ns_limit:
-            raise self._too_late(ns * 1e-9)
-        # As in _nutation_phase, without the call.
-        phase = ns * self._quarter_rate + self._offset0
-        whole = phase + FIXED_HALF >> FIXED_BITS
-        quarters = self.quarter0 + whole
-        part = (phase - (whole << FIXED_BITS)) * FIXED_UNIT + self._offset_rest
-        y = QUARTER_PERIOD_ANGLE * part
-        (alpha_real_prefactor, a3, a2, a1, a0, alpha_imag_prefactor, b3, b2, b1, b0,
-         alpha_drift, alpha_crosses,
-         beta_real_prefactor, c3, c2, c1, c0, beta_imag_prefactor, d3, d2, d1, d0,
-         beta_drift, beta_crosses, imaginary, stretch) = self._flat_branches[quarters & 1]
-        if imaginary:
-            s = sinh(y * stretch)
-            xi = -s * s
-        else:
-            s = sin(y)
-            xi = s * s
-        c = sqrt(1.0 - xi)
-        prefactors = (1.0, c, s, s * c)
-        alpha_real = prefactors[alpha_real_prefactor] * (((a3 * xi + a2) * xi + a1) * xi + a0)
-        alpha_imag = prefactors[alpha_imag_prefactor] * (((b3 * xi + b2) * xi + b1) * xi + b0)
-        beta_real = prefactors[beta_real_prefactor] * (((c3 * xi + c2) * xi + c1) * xi + c0)
-        beta_imag = prefactors[beta_imag_prefactor] * (((d3 * xi + d2) * xi + d1) * xi + d0)
-        if quarters & 2:
-            if alpha_crosses:
-                alpha_real = -alpha_real
-            if beta_crosses:
-                beta_real = -beta_real
-        scale = 1.0 / sqrt(alpha_real * alpha_real + alpha_imag * alpha_imag
-                           + beta_real * beta_real + beta_imag * beta_imag)
-        rate, start = self._alpha_turns
-        angle = (ns * rate + start & FRACTION_MASK) * RADIANS_PER_UNIT + alpha_drift * y
-        s, c = scale * sin(angle), scale * cos(angle)
-        z = alpha_real * s + alpha_imag * c
-        w = alpha_real * c - alpha_imag * s
-        rate, start = self._beta_turns
-        angle = (ns * rate + start & FRACTION_MASK) * RADIANS_PER_UNIT + beta_drift * y
-        s, c = scale * sin(angle), scale * cos(angle)
-        return -beta_real * s - beta_imag * c, beta_real * c - beta_imag * s, z, w
-
-    def _nutation_phase(self, ns: int) -> tuple[int, float]:
-        """
-        Return the nearest whole number of quarter periods, and the angle y from there.
-
-        y keeps its relative accuracy when it is small: a top races past a pole that it misses by
-        little.  What fixed point leaves out of a tiny offset at t = 0 is added as a double.
-        """
-        phase = ns * self._quarter_rate + self._offset0
-        whole = phase + FIXED_HALF >> FIXED_BITS
-        part = (phase - (whole << FIXED_BITS)) * FIXED_UNIT + self._offset_rest
-        return self.quarter0 + whole, QUARTER_PERIOD_ANGLE * part
-
-    def state_at(self, ns: int) -> tuple[float, float, float, float, float, float, float, float]:
-        """Return (theta, theta_dot, phi, psi, x, y, z, w) at `ns` nanoseconds [rad, rad/s]."""
-        return self.full_state_at(ns)[:8]
-
-    def full_state_at(self, ns: int) -> tuple[
-            float, float, float, float, float, float, float, float, float, float, float]:
-        """Return what `state_at` does, and the body's angular velocity in its frame [rad/s]."""
-        if not -self.ns_limit <= ns <= self.ns_limit:
-            raise self._too_late(ns * 1e-9)
-        quarters, y = self._nutation_phase(ns)
-        point = nutation_at(self.branches[quarters & 1], y, -1.0 if quarters & 2 else 1.0, SCALAR)
-        alpha, beta, alpha_argument, beta_argument, theta_dot = point
-        half_theta = math.atan2(beta, alpha)
-        if self.turning:
-            half_theta += 2.0 * math.pi * round(self.turning.turns(quarters, y, half_theta))
-
-        rate, start = self._alpha_turns
-        angle = (ns * rate + start & FRACTION_MASK) * RADIANS_PER_UNIT + alpha_argument
-        sin_alpha, cos_alpha = sin(angle), cos(angle)
-        rate, start = self._beta_turns
-        angle = (ns * rate + start & FRACTION_MASK) * RADIANS_PER_UNIT + beta_argument
-        sin_beta, cos_beta = sin(angle), cos(angle)
-        scale = 1.0 / sqrt(alpha * alpha + beta * beta)
-        cos_half, sin_half = scale * alpha, scale * beta
-        omega1, omega2 = transverse_rates(
-            self.precession_across_axis(alpha, beta), theta_dot,
-            cos_alpha * cos_beta + sin_alpha * sin_beta,
-            sin_alpha * cos_beta - cos_alpha * sin_beta)
-        return (2.0 * half_theta, theta_dot,
-                ns * self._phi.rate * FIXED_UNIT
-                + (self.phi_phase + (alpha_argument + beta_argument)),
-                ns * self._psi.rate * FIXED_UNIT
-                + (self.psi_phase + (alpha_argument - beta_argument)),
-                -sin_half * sin_beta, sin_half * cos_beta,
-                cos_half * sin_alpha, cos_half * cos_alpha,
-                omega1, omega2, self.axial_rate)
-
-    def precession_across_axis(self, alpha: Any, beta: Any) -> Any:
-        """
-        Return phi' sin(theta) from two numbers in the ratio of cos(theta/2) and sin(theta/2).
-
-        Lz - L3 cos(theta) over lambda1 sin(theta), in half angles: nothing cancels, and at a pole
-        that can be reached the singular term is absent.
-        """
-        precession = 0.0 * alpha
-        if self.bottom_rate:
-            precession = precession + self.bottom_rate * (beta / alpha)
-        if self.top_rate:
-            precession = precession + self.top_rate * (alpha / beta)
-        return precession
-
-    def _too_late(self, seconds: float) -> ValueError:
-        return ValueError(f't = {seconds!r} s: must be finite and within {self.time_limit:.6g} s, '
-                          f'where phases reach 2^52 turns')
-
-    # ---------------------------------------------------------------------------- many states
-
-    def states(self, t: np.ndarray) -> ExactStates:
-        """
-        Return the states at t, (n,) float64 seconds after the start, in any order and sign.
-
-        Columns of the result are computed when asked for.
-        Raises ValueError for a time that is not finite or too far.
-        """
-        return self.arrays.states(t)
-
-    def states_at_ns(self, ns: np.ndarray) -> ExactStates:
-        """Return the states at ns, (n,) int64 nanoseconds, exact where seconds would round."""
-        return self.arrays.states_at_ns(ns)
-
-    def quaternion(self, t: np.ndarray) -> np.ndarray:
-        """Return the attitudes (n, 4) x, y, z, w at t, (n,) float64 seconds, in any order."""
-        return self.arrays.quaternion(t)
-
-    def quaternion_grid(self, start_ns: int, step_ns: int, count: int) -> np.ndarray:
-        """
-        Return the attitudes (count, 4) x, y, z, w at start_ns + k step_ns, in nanoseconds.
-
-        Several times faster than `quaternion`, most so when called again with the same step.
-        """
-        return self.arrays.quaternion_grid(start_ns, step_ns, count)
-
-    @property
-    def arrays(self) -> ArrayEvaluator:
-        """The numpy half, imported and prepared when first asked for."""
-        if self._arrays is None:
-            from spinning_top_sim.solvers.exact_arrays import ArrayEvaluator  # noqa: PLC0415
-            self._arrays = ArrayEvaluator(self)
-        return self._arrays
 
 
 def transverse_rates(precession: Any, theta_dot: Any, cos_psi: Any, sin_psi: Any

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from decimal import Decimal, localcontext
+from decimal import Decimal
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +29,7 @@ from spinning_top_sim.solvers.exact import (
     nutation_at,
     transverse_rates,
 )
-from spinning_top_sim.solvers.long_decimals import ONE, double_double, pi, sinh_cosh
+from spinning_top_sim.solvers.long_decimals import ONE, double_double, pi, precision, sinh_cosh
 from spinning_top_sim.solvers.theta_series import Series
 from spinning_top_sim.solvers.theta_setup import Factor, ThetaMotion
 
@@ -47,48 +47,9 @@ SHORT_TURNS = 2.0 ** 22     # so many turns are counted right with a rate split 
 
 GRID_BLOCK = 512            # states in a row of the grid's product
 GRID_ROWS = 16              # rows that are worked on together
+KEPT_GRIDS = 16             # steps whose factor matrices are kept, 0.1 MB each
 MOST_ROWS = 1 << 15         # whose count times a limb fits 64 bits
 LIMB = 48                   # bits: two limbs are the fraction of a turn
-
-
-def _blocks(n: int) -> Iterator[slice]:
-    for first in range(0, n, CHUNK):
-        yield slice(first, min(first + CHUNK, n))
-
-
-def _halves(x: Any) -> tuple[Any, Any]:
-    """Split doubles into two of 26 bits each, whose products are exact [Dekker 1971]."""
-    big = 134217729.0 * x   # 2^27 + 1
-    high = big - (big - x)
-    return high, x - high
-
-
-class Rate:
-    """
-    A rate in double-double; its product with a time has no rounding that grows with the time.
-
-    Times are pairs of arrays: the doubles, and what they leave out (None: nothing).
-    """
-
-    def __init__(self, per_second: Decimal):
-        self.high, self.low = double_double(per_second)
-        self.halves = _halves(self.high)
-
-    def product(self, t: np.ndarray, t_rest: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Return rate * t as nearest double and rest."""
-        t1, t2 = _halves(t)
-        r1, r2 = self.halves
-        high = self.high * t
-        rest = ((r1 * t1 - high) + r1 * t2 + r2 * t1) + r2 * t2 + self.low * t
-        if t_rest is not None:
-            rest += self.high * t_rest
-        return high, rest
-
-    def fraction(self, t: np.ndarray, t_rest: np.ndarray | None
-                 ) -> tuple[np.ndarray, np.ndarray]:
-        """Return rate * t less whole numbers, as a double in [-1/2, 1/2] and a small rest."""
-        high, rest = self.product(t, t_rest)
-        return high - np.rint(high), rest
 
 
 class ExactStates:
@@ -138,8 +99,7 @@ class ArrayEvaluator:
     def __init__(self, solution: ExactSolution):
         self.solution = solution
         motion = solution.theta_motion
-        with localcontext() as context:
-            context.prec = motion.digits
+        with precision(motion.digits):
             two_pi = 2 * pi()
             alpha, beta = motion.alpha, motion.beta
             self.quarters = Rate(motion.quarter_rate)
@@ -154,7 +114,7 @@ class ArrayEvaluator:
 
     def states(self, t: Any) -> ExactStates:
         """See ExactSolution.states."""
-        return ExactStates(self, self._checked(t))
+        return ExactStates(self, self._checked(t).copy())     # columns come later
 
     def states_at_ns(self, ns: Any) -> ExactStates:
         """See ExactSolution.states_at_ns."""
@@ -169,7 +129,7 @@ class ArrayEvaluator:
 
     def quaternion(self, t: Any) -> np.ndarray:
         """See ExactSolution.quaternion."""
-        return self.states(t).quaternion
+        return self.attitudes.quaternion(self._checked(t), None)
 
     def quaternion_grid(self, start_ns: int, step_ns: int, count: int) -> np.ndarray:
         """See ExactSolution.quaternion_grid."""
@@ -273,12 +233,17 @@ class ArrayEvaluator:
         if t.size:
             latest = max(float(t.max()), -float(t.min()))
             if not latest <= self.solution.time_limit:      # catches NaN too
-                raise self.solution._too_late(latest)
+                raise self.solution.too_late(f'{latest!r} s')
         return t
 
     def _check_ns(self, ns: int) -> None:
         if abs(ns) > self.solution.ns_limit:
-            raise self.solution._too_late(ns * 1e-9)
+            raise self.solution.too_late(f'{ns} ns')
+
+
+def _blocks(n: int) -> Iterator[slice]:
+    for first in range(0, n, CHUNK):
+        yield slice(first, min(first + CHUNK, n))
 
 
 def _part_of(t_rest: np.ndarray | None, block: slice) -> np.ndarray | None:
@@ -288,9 +253,47 @@ def _part_of(t_rest: np.ndarray | None, block: slice) -> np.ndarray | None:
 def _seconds(ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return int64 nanoseconds in seconds, as nearest doubles and rests."""
     whole, count = (x.astype(np.float64) for x in np.divmod(ns, 10 ** 9))
-    part, part_rest = Rate(Decimal('1e-9')).product(count, None)
+    part, part_rest = NANOSECOND.product(count, None)
     total = whole + part                            # Dekker's sum: whole is 0 or the larger
     return total, (part - (total - whole)) + part_rest
+
+
+def _halves(x: Any) -> tuple[Any, Any]:
+    """Split doubles into two of 26 bits each, whose products are exact [Dekker 1971]."""
+    big = 134217729.0 * x   # 2^27 + 1
+    high = big - (big - x)
+    return high, x - high
+
+
+class Rate:
+    """
+    A rate in double-double; its product with a time has no rounding that grows with the time.
+
+    Times are pairs of arrays: the doubles, and what they leave out (None: nothing).
+    """
+
+    def __init__(self, per_second: Decimal):
+        self.high, self.low = double_double(per_second)
+        self.halves = _halves(self.high)
+
+    def product(self, t: np.ndarray, t_rest: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """Return rate * t as nearest double and rest."""
+        t1, t2 = _halves(t)
+        r1, r2 = self.halves
+        high = self.high * t
+        rest = ((r1 * t1 - high) + r1 * t2 + r2 * t1) + r2 * t2 + self.low * t
+        if t_rest is not None:
+            rest += self.high * t_rest
+        return high, rest
+
+    def fraction(self, t: np.ndarray, t_rest: np.ndarray | None
+                 ) -> tuple[np.ndarray, np.ndarray]:
+        """Return rate * t less whole numbers, as a double in [-1/2, 1/2] and a small rest."""
+        high, rest = self.product(t, t_rest)
+        return high - np.rint(high), rest
+
+
+NANOSECOND = Rate(Decimal('1e-9'))
 
 
 # -------------------------------------------------------------------------- one form all round
@@ -497,7 +500,7 @@ class _Attitudes:
         largest_xi = sinh_cosh(motion.stretch * pi() / 2)[0] ** 2 if self.imaginary else ONE
         self.alpha, self.beta = (_AttitudeFactor(factor, v_rate, v_start, largest_xi)
                                  for factor in (motion.alpha, motion.beta))
-        self._grid: _Grid | None = None
+        self._grids: dict[int, _Grid] = {}
 
     def quaternion(self, t: np.ndarray, t_rest: np.ndarray | None) -> np.ndarray:
         """Return (n, 4) x, y, z, w."""
@@ -557,9 +560,11 @@ class _Attitudes:
 
     def quaternion_grid(self, start_ns: int, step_ns: int, count: int) -> np.ndarray:
         """Return (count, 4) x, y, z, w; in the real form only."""
-        if self._grid is None or self._grid.step_ns != step_ns:
-            self._grid = _Grid(self, step_ns)
-        return self._grid.quaternion(start_ns, count)
+        if step_ns not in self._grids:
+            if len(self._grids) == KEPT_GRIDS:
+                self._grids.clear()
+            self._grids[step_ns] = _Grid(self, step_ns)
+        return self._grids[step_ns].quaternion(start_ns, count)
 
 
 # ------------------------------------------------------------------------------ uniform grids
