@@ -60,6 +60,7 @@ setup(
             'rosbags>=0.10.11,<0.12',
             'scipy>=1.11,<2',
         ],
+        'plot': ['matplotlib>=3.6,<4'],
         # Narrow: a new release of these finds new faults.
         'lint': [
             'mypy>=2.4.1,<2.5',

@@ -6,6 +6,7 @@ from __future__ import annotations
 import functools
 import gc
 import json
+import math
 import threading
 import time
 from pathlib import Path
@@ -25,7 +26,6 @@ from std_srvs.srv import SetBool, Trigger
 from spinning_top_sim.nodes import reports
 from spinning_top_sim.nodes.pacing import DeadlineThread, SimulatedClock
 from spinning_top_sim.nodes.ros_parameters import ParameterChanges, declare, start_values
-from spinning_top_sim.physics.regimes import regime
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import messages
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -67,6 +67,8 @@ class Simulator(Node):
         self._failure: str | None = None
         self._warned_overload = False
         self._factor = 0.0
+        self._described: object = None          # the motion that `_regime` names
+        self._regime = ''
         if values['spin.lz'] is None:
             values = {**values, 'spin.lz': self._simulation.lz}
         declare(self, values)
@@ -164,7 +166,8 @@ class Simulator(Node):
         if epoch - now < NANOSECONDS and self._clock_is_wall():
             time.sleep((epoch - now) / NANOSECONDS)
         with self._lock:
-            self._set_epoch(epoch)
+            self._simulation.epoch_ns = epoch
+            self._speed.read(0)
             if not self._paused:
                 self._simulated_clock.start(0)
         tick_rate = self._values['tick_rate']
@@ -176,9 +179,6 @@ class Simulator(Node):
 
     def _clock_is_wall(self) -> bool:
         return not self.get_parameter('use_sim_time').value
-
-    def _set_epoch(self, epoch_ns: int) -> None:
-        self._simulation.epoch_ns = epoch_ns
 
     def stop(self) -> None:
         """End the motion and close the recording; safe whatever state the context is in."""
@@ -399,7 +399,7 @@ class Simulator(Node):
                 response.message = f'not reset: {error}'
                 return response
             now = self.get_clock().now().nanoseconds
-            self._set_epoch(_ceil_to(max(last_stamp + 1, now), EPOCH_GRID_NS))
+            simulation.epoch_ns = _ceil_to(max(last_stamp + 1, now), EPOCH_GRID_NS)
             self._failure = None
             self._simulated_clock.start(0)
             if self._paused:
@@ -511,6 +511,11 @@ class Simulator(Node):
                 problems.append((OK, 'paused'))
             if skipped or counters.slipped_ns:
                 problems.append((WARN, 'this machine cannot keep up'))
+            error = self._orientation_error()
+            limit = self._values['max_error']
+            if error > limit > 0.0:
+                problems.append((WARN, f'orientation error {error:.3g} rad: more than max_error '
+                                       f'= {limit:g} rad'))
             if self._record_error:
                 problems.append((ERROR, f'recording: {self._record_error}'))
             if self._failure:
@@ -523,6 +528,7 @@ class Simulator(Node):
                 'published messages': sent,
                 'skipped samples': skipped,
                 'clock slip [s]': f'{counters.slipped_ns / NANOSECONDS:.3f}',
+                'orientation error [rad]': f'{error:.3g}',
                 'commands': counters.commands,
                 'rejected commands': counters.rejected_commands,
                 'integration steps': simulation.steps,
@@ -532,6 +538,13 @@ class Simulator(Node):
         self._diagnostics.publish(reports.diagnostics(
             self.get_clock().now().to_msg(), self.get_fully_qualified_name().lstrip('/'),
             problems, numbers))
+
+    def _orientation_error(self) -> float:
+        """Return the present error of rk45 [rad]; NaN where nobody wants to know."""
+        simulation = self._simulation
+        if self._values['max_error'] == 0.0:
+            return math.nan
+        return simulation.orientation_error(simulation.state(), max(simulation.now_ns, 0))
 
     def _recorder_numbers(self) -> dict[str, object]:
         recorder = self._recorder
@@ -557,8 +570,15 @@ class Simulator(Node):
         self._terminal.show(reports.status_line(*line, self._factor, drift, sent, log))
 
     def _regime_name(self) -> str:
-        """Return the motion's name."""
-        return regime(self._simulation.top, self._simulation.anchor)
+        """Return the motion's name; tell its numbers whenever it is a new motion."""
+        simulation = self._simulation
+        if simulation.begun is not self._described:
+            self._described = simulation.begun
+            description = simulation.describe()
+            self._regime = 'beyond doubles' if description is None else description.name
+            if description is not None:
+                self._terminal.tell(str(description))
+        return self._regime
 
 
 def _message_type(type_name: str) -> type:

@@ -14,6 +14,7 @@ function takes one state (floats, complex) or many (numpy arrays) alike.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from spinning_top_sim.physics.top import Top
@@ -103,6 +104,14 @@ def specific_force(gravity: float, point: tuple[float, float, float],
     return (a2 * r3 - a3 * r2 + w1 * along - r1 * square + gravity * vertical[0],
             a3 * r1 - a1 * r3 + w2 * along - r2 * square + gravity * vertical[1],
             a1 * r2 - a2 * r1 + w3 * along - r3 * square + gravity * vertical[2])
+
+
+def angle_between(p: tuple[float, float, float, float],
+                  q: tuple[float, float, float, float]) -> float:
+    """Return the angle [rad] of the rotation from one attitude to another, accurate near 0."""
+    apart = math.dist(p, q)
+    opposite = math.hypot(*[a + b for a, b in zip(p, q, strict=True)])
+    return 4.0 * math.atan2(min(apart, opposite), max(apart, opposite))
 
 
 def _over(momentum: float, square: Scalar) -> Scalar:

@@ -6,12 +6,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.rk45 import rk45
+from spinning_top_sim.solvers.propagator import METHODS
+from spinning_top_sim.solvers.rk45 import check_settings, rk45
 
 if TYPE_CHECKING:
     from spinning_top_sim.solvers.motion import Motion
-
-METHODS = ('exact', 'rk45')
 
 
 def solve(top: Top, start: State, t: Any, *, method: str = 'exact', rtol: float = 1e-11,
@@ -28,7 +27,7 @@ def solve(top: Top, start: State, t: Any, *, method: str = 'exact', rtol: float 
     # numpy is imported by who wants arrays: a node steps without it.
     import numpy as np  # noqa: PLC0415
 
-    from spinning_top_sim.solvers.motion import SteppedMotion  # noqa: PLC0415
+    from spinning_top_sim.solvers.motion import ExactMotion, SteppedMotion  # noqa: PLC0415
 
     try:
         times = np.asarray(t, dtype=np.float64)
@@ -39,8 +38,12 @@ def solve(top: Top, start: State, t: Any, *, method: str = 'exact', rtol: float 
     if not np.all(np.isfinite(times)):
         at = int(np.argmin(np.isfinite(times)))
         raise ValueError(f't[{at}] = {times[at]} s: must be finite')
+    atol = 0.1 * rtol if atol is None else atol
+    check_settings(equations, rtol, atol)
     if method not in METHODS:
         raise ValueError(f'method = {method!r}: must be one of {", ".join(METHODS)}')
+    if method == 'exact':
+        return ExactMotion(top, start, times)
     if len(times) and times[0] < 0.0:
         raise ValueError(f"t[0] = {times[0]} s: must be >= 0 with method = 'rk45'")
     falls = np.flatnonzero(np.diff(times) < 0.0)
@@ -48,6 +51,5 @@ def solve(top: Top, start: State, t: Any, *, method: str = 'exact', rtol: float 
         at = int(falls[0])
         raise ValueError(f't[{at + 1}] = {times[at + 1]} s after {times[at]} s: must not '
                          "decrease with method = 'rk45'")
-    propagator = rk45(top, start, equations=equations, rtol=rtol,
-                      atol=0.1 * rtol if atol is None else atol)
-    return SteppedMotion(top, start, times, propagator)
+    stepped = rk45(top, start, equations=equations, rtol=rtol, atol=atol)
+    return SteppedMotion(top, start, times, stepped)

@@ -51,8 +51,13 @@ class IntegrationError(RuntimeError):
 class Form(Protocol):
     """Equations of motion y' = f(y) in some chart, with what the step control needs to know."""
 
-    name: str
-    number: type                            # float or complex
+    @property
+    def name(self) -> str:
+        """Of the equations."""
+
+    @property
+    def number(self) -> type:
+        """Of the unknowns: float or complex."""
 
     def rates(self, *y: Any) -> Vector:
         """Return y'."""

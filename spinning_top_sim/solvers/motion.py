@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.kinematics import Columns, lazy
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.rk45 import Propagator
+from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.solvers.rk45 import SteppedOrClosed
 
 Column = NDArray[Any]
 
@@ -83,17 +84,55 @@ class Motion(Columns):
 
 
 class SteppedMotion(Motion):
-    """Samples of a `Propagator`, taken one by one: rk45."""
+    """Samples of steps, taken one by one."""
 
     PARTS = ('alpha', 'beta', 'theta', 'theta_dot', 'phi', 'psi', 'l3', 'transverse_rate')
 
-    def __init__(self, top: Top, start: State, t: Column, propagator: Propagator) -> None:
+    def __init__(self, top: Top, start: State, t: Column, stepped: SteppedOrClosed) -> None:
         super().__init__(top, start, t)
         columns: dict[str, list[Any]] = {name: [] for name in self.PARTS}
         for instant in t.tolist():
-            state = propagator.at(instant)
+            state = stepped.at(instant)
             for name, column in columns.items():
                 column.append(getattr(state, name))
         for name, column in columns.items():
             setattr(self, name, np.array(column))
-        self.steps, self.evaluations = propagator.steps, propagator.evaluations
+        self.steps, self.evaluations = stepped.steps, stepped.evaluations
+
+
+class ExactMotion(Motion):
+    """Samples of the closed form, each column evaluated for all times at once."""
+
+    def __init__(self, top: Top, start: State, t: Column) -> None:
+        super().__init__(top, start, t)
+        self.solution = ExactSolution(top, start)
+        self._states = self.solution.states(t)
+
+    @lazy
+    def quaternion(self) -> Column:
+        return self._states.quaternion
+
+    @lazy
+    def theta(self) -> Column:
+        return self._states.theta
+
+    @lazy
+    def theta_dot(self) -> Column:
+        return self._states.theta_dot
+
+    @lazy
+    def phi(self) -> Column:
+        return self._states.phi
+
+    @lazy
+    def psi(self) -> Column:
+        return self._states.psi
+
+    @lazy
+    def angular_velocity(self) -> Column:
+        return self._states.angular_velocity
+
+    @lazy
+    def transverse_rate(self) -> Column:
+        rates = self.angular_velocity
+        return rates[:, 0] + 1j * rates[:, 1]

@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import cmath
 import math
-from typing import Protocol
+from abc import ABC, abstractmethod
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.kinematics import AxisState, OneState
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.dormand_prince import Integrator
+from spinning_top_sim.solvers.dormand_prince import Form, Integrator, Vector
 from spinning_top_sim.solvers.euler_form import EulerForm
 from spinning_top_sim.solvers.phases import (
     MomentumState,
@@ -21,26 +21,14 @@ from spinning_top_sim.solvers.phases import (
 )
 from spinning_top_sim.solvers.transport import TransportForm
 
+NANOSECONDS = 1_000_000_000
 EQUATIONS = ('transport', 'euler')
-# Rounding of the terms of theta'' against each other, in units of the last place.
-REST_ULPS = 8.0
-
-
-class Propagator(Protocol):
-    """A motion from its start at t = 0 on, read at times that never decrease."""
-
-    steps: int
-    evaluations: int
-
-    def reach(self, t: float, max_steps: int | None = None) -> bool:
-        """Compute what the state at t [s] needs; False if max_steps were not enough yet."""
-
-    def at(self, t: float) -> OneState:
-        """Return the state at t [s], not before the newest step's start."""
+# How many units in the last place count as rounding.
+REST_ULPS = 2.0
 
 
 def rk45(top: Top, start: State, *, equations: str = 'transport', rtol: float = 1e-11,
-         atol: float = 1e-12) -> Propagator:
+         atol: float = 1e-12) -> SteppedOrClosed:
     """
     Return the motion that begins at `start`.
 
@@ -69,29 +57,62 @@ def check_settings(equations: str, rtol: float, atol: float) -> None:
 
 
 def nutation_rests(top: Top, start: State) -> bool:
-    """Whether theta stays as it is: sleeping, hanging at a pole, or steady precession."""
+    """
+    Whether theta stays as it is: sleeping, hanging at a pole, or steady precession.
+
+    Steady means theta'' = 0, eq. (30), as nearly as its terms and the given L3 and Lz, doubles
+    all, can say.
+    """
     if start.theta_dot != 0.0:
         return False
     sine, cosine = math.sin(start.theta), math.cos(start.theta)
     half_cosine, half_sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
     phi_dot = attitude.precession_rate(top, start.l3, start.lz, half_cosine ** 2, half_sine ** 2)
-    terms = (phi_dot * phi_dot * sine * cosine, -start.l3 / top.lambda1 * phi_dot * sine,
+    gyroscopic = start.l3 / top.lambda1
+    terms = (phi_dot * phi_dot * sine * cosine, -gyroscopic * phi_dot * sine,
              top.gravity_torque / top.lambda1 * sine)
-    return abs(math.fsum(terms)) <= REST_ULPS * math.ulp(1.0) * sum(map(abs, terms))
+    doubt = sum(map(abs, terms))
+    if start.lz - start.l3 * cosine:
+        rounded_rate = (abs(start.lz) + abs(start.l3)) / (top.lambda1 * sine * sine)
+        doubt += abs((2.0 * phi_dot * cosine - gyroscopic) * sine) * rounded_rate
+    return abs(math.fsum(terms)) <= REST_ULPS * math.ulp(1.0) * doubt
 
 
-class _Stepped:
+class SteppedOrClosed(ABC):
+    """A motion read at seconds, or at the integer nanoseconds of a `Propagator`."""
+
+    steps = 0
+    evaluations = 0
+
+    @abstractmethod
+    def at(self, t: float) -> OneState:
+        """Return the state at t [s]."""
+
+    def reach(self, t: float, max_steps: int | None = None) -> bool:
+        """Compute what the state at t [s] needs; False if max_steps did not do."""
+        return True
+
+    def at_ns(self, ns: int) -> OneState:
+        """See `Propagator`."""
+        return self.at(ns / NANOSECONDS)
+
+    def reach_ns(self, ns: int, max_steps: int | None = None) -> bool:
+        """See `Propagator`."""
+        return self.reach(ns / NANOSECONDS, max_steps)
+
+
+class _Stepped(SteppedOrClosed):
     """A motion by steps: what both forms share."""
 
-    def __init__(self, form: TransportForm | EulerForm) -> None:
-        self._integrator = Integrator(form, form.start, form.first_step)
+    def __init__(self, form: Form, start: Vector, first_step: float) -> None:
+        self._integrator = Integrator(form, start, first_step)
 
     @property
-    def steps(self) -> int:
+    def steps(self) -> int:  # type: ignore[override]
         return self._integrator.steps
 
     @property
-    def evaluations(self) -> int:
+    def evaluations(self) -> int:  # type: ignore[override]
         return self._integrator.evaluations
 
     def reach(self, t: float, max_steps: int | None = None) -> bool:
@@ -107,7 +128,7 @@ class _Stepped:
     def _step(self) -> None:
         self._integrator.step()
 
-    def _read(self, t: float) -> tuple[float, ...] | tuple[complex, ...]:
+    def _read(self, t: float) -> Vector:
         if t < self._integrator.t0:
             raise ValueError(f't = {t!r} s: steps go forward, and the newest one began at '
                              f'{self._integrator.t0!r} s; times must not decrease')
@@ -120,7 +141,8 @@ class EulerMotion(_Stepped):
 
     def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
         self._top, self._start = top, start
-        super().__init__(EulerForm(top, start, rtol, atol))
+        form = EulerForm(top, start, rtol, atol)
+        super().__init__(form, form.start, form.first_step)
 
     def at(self, t: float) -> OneState:
         """Return the state at t [s]."""
@@ -133,7 +155,7 @@ class TransportMotion(_Stepped):
     def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
         self._top, self._start = top, start
         self._form = TransportForm(top, start, rtol, atol)
-        super().__init__(self._form)
+        super().__init__(self._form, self._form.start, self._form.first_step)
         self._alpha, self._beta = windings(start)
         self._line_rate = 0.5 * spin_excess(top, start.l3)
         self._carried_rate = 0.5 * self._form.spin_carried / top.lambda1
@@ -177,14 +199,12 @@ class TransportMotion(_Stepped):
         integrator.step()
 
 
-class FreeMotion:
+class FreeMotion(SteppedOrClosed):
     """
     No torque (P = 0): the momentum stands still and the axis turns about it uniformly.
 
     alpha and beta less the spin Omega move on ellipses, at half the rate |L|/lambda1.
     """
-
-    steps = evaluations = 0
 
     def __init__(self, top: Top, start: State) -> None:
         self._top, self._start = top, start
@@ -201,10 +221,6 @@ class FreeMotion:
                               - self._momentum * self._alpha0.conjugate())
         self._line_rate = 0.5 * spin_excess(top, start.l3)
         self._alpha, self._beta = windings(start)
-
-    def reach(self, t: float, max_steps: int | None = None) -> bool:
-        """Nothing needs computing."""
-        return True
 
     def at(self, t: float) -> OneState:
         """Return the state at any t [s]."""
@@ -235,10 +251,8 @@ class FreeMotion:
         return 2.0 * (half_theta + math.tau * round((expected - half_theta) / math.tau))
 
 
-class RestingMotion:
+class RestingMotion(SteppedOrClosed):
     """The nutation rests: theta stays, phi and psi turn uniformly."""
-
-    steps = evaluations = 0
 
     def __init__(self, top: Top, start: State) -> None:
         self._top, self._start = top, start
@@ -248,10 +262,6 @@ class RestingMotion:
     def _state(self, phi: float, psi: float) -> AxisState:
         start = self._start
         return AxisState(self._top, start.l3, start.lz, start.theta, 0.0, phi, psi)
-
-    def reach(self, t: float, max_steps: int | None = None) -> bool:
-        """Nothing needs computing."""
-        return True
 
     def at(self, t: float) -> OneState:
         """Return the state at any t [s]."""

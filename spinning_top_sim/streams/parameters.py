@@ -180,6 +180,8 @@ TABLE: tuple[Parameter, ...] = (
               maximum=1e-2, effect=Effect.RESET),
     Parameter('solver.atol', 1e-12, 'rk45: absolute tolerance of a step', minimum=0.0,
               maximum=1e-2, effect=Effect.RESET),
+    Parameter('max_error', 1e-6, 'rk45: warn in /diagnostics when the orientation is further '
+              'from the exact solution; 0 = do not look', 'rad', minimum=0.0),
     Parameter('pacing', 'timer', 'An rclpy timer, or a thread with absolute deadlines '
               '(from 500 Hz on)', choices=('timer', 'thread'), effect=Effect.START),
     Parameter('tick_rate', 200.0, 'How often due samples are sent', 'Hz', above=0.0,

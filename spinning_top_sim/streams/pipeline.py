@@ -8,15 +8,22 @@ every sample due until then is computed in order of time, once for all who take 
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.kinematics import OneState
-from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
-from spinning_top_sim.solvers.rk45 import Propagator, rk45
+from spinning_top_sim.physics.regimes import Description, describe
+from spinning_top_sim.physics.top import State, Top, pole_momentum
+from spinning_top_sim.solvers.propagator import (
+    ExactPropagator,
+    Propagator,
+    anchored,
+    propagate,
+)
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.topics import Invariants, Stream, all_streams
 
@@ -34,12 +41,15 @@ class Simulation:
     """
 
     def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
-        """Take checked parameters (`parameters.checked`) and the stamp of t = 0 [ns]."""
+        """
+        Take checked parameters (`parameters.checked`) and the stamp of t = 0 [ns].
+
+        Raises ValueError or IntegrationError where there is no motion from their start state.
+        """
         self.epoch_ns = epoch_ns
         self._steps_before = self._evaluations_before = 0
         self.streams: list[Stream] = []
-        self._solver: Propagator | None = None
-        self.restart(values)
+        self._load(values)
 
     def restart(self, values: Mapping[str, Any]) -> None:
         """
@@ -48,7 +58,13 @@ class Simulation:
         Raises ValueError or IntegrationError where there is no motion from there; then the one
         there was goes on.
         """
-        top, start = parameters.top_of(values), parameters.start_state(values)
+        counts = self.steps, self.evaluations
+        self._load(values)
+        self._steps_before, self._evaluations_before = counts
+
+    def _load(self, values: Mapping[str, Any]) -> None:
+        top = parameters.top_of(values)
+        start = parameters.start_state(values)
         solver, state = _first_step(top, start, values)
         self.values, self.top = dict(values), top
         self.history: list[tuple[int, float, float]] = []
@@ -59,23 +75,20 @@ class Simulation:
             new.sent, new.skipped = old.sent, old.skipped
         self.streams = streams
         self._invariants = next(s for s in streams if isinstance(s, Invariants))
-        self._begin(solver, state, 0)
+        self._begin(solver, start, state, 0)
 
-    def _begin(self, solver: Propagator, state: OneState, at_ns: int) -> None:
+    def _begin(self, solver: Propagator, start: State, state: OneState, at_ns: int) -> None:
         """Let a motion begin at a time."""
-        if self._solver is not None:
-            self._steps_before += self._solver.steps
-            self._evaluations_before += self._solver.evaluations
-        self._solver, self._anchor_ns, self._first = solver, at_ns, state
+        self._solver, self._anchor, self._anchor_ns, self._first = solver, start, at_ns, state
+        self._reference: ExactPropagator | None = None
+        self._invariants.orientation_error = self.orientation_error
         self.l3, self.lz = state.l3_start, state.lz_start
         self._invariants.start_from(state)
 
     @property
-    def anchor(self) -> State:
-        """The state in which the present motion began: the start, or the last command."""
-        first = self._first
-        return ContinuedState(theta=first.theta, theta_dot=first.theta_dot, phi=first.phi,
-                              psi=first.psi, l3=self.l3, lz=self.lz)
+    def begun(self) -> object:
+        """Something that is the same as long as the same motion goes on."""
+        return self._first
 
     def energy_drift(self, state: OneState) -> float:
         """Return the energy's relative drift since then (absolute where it was 0)."""
@@ -93,10 +106,35 @@ class Simulation:
 
     def state(self) -> OneState:
         """Return the state at `now_ns` (at the start before the first sample)."""
-        return self._solver.at(self._local(max(self.now_ns, self._anchor_ns)))
+        return self._solver.at_ns(max(self.now_ns - self._anchor_ns, 0))
 
-    def _local(self, t_ns: int) -> float:
-        return (t_ns - self._anchor_ns) / NANOSECONDS
+    def orientation_error(self, state: OneState, t_ns: int) -> float:
+        """
+        Return the angle between a state at t_ns and the exact solution there [rad].
+
+        0 for the exact solution itself; NaN for a motion that it cannot hold.
+        """
+        exact = self._exact()
+        if exact is None or exact is self._solver:
+            return math.nan if exact is None else 0.0
+        return attitude.angle_between(state.quaternion,
+                                      exact.at_ns(t_ns - self._anchor_ns).quaternion)
+
+    def describe(self) -> Description | None:
+        """Return the present motion in numbers; None where the closed form cannot hold it."""
+        exact = self._exact()
+        if exact is None:
+            return None
+        return describe(self.top, exact.solution.start, exact.solution)
+
+    def _exact(self) -> ExactPropagator | None:
+        """Return the closed form of the present motion, set up when first asked for."""
+        if isinstance(self._solver, ExactPropagator):
+            return self._solver
+        if self._reference is None:
+            with contextlib.suppress(ValueError):
+                self._reference = ExactPropagator(self.top, self._anchor)
+        return self._reference
 
     def advance(self, target_ns: int, publish_from_ns: int = 0,
                 give_way: Callable[[], bool] = lambda: False) -> bool:
@@ -130,14 +168,14 @@ class Simulation:
                 return False
 
     def _reach(self, t_ns: int, give_way: Callable[[], bool]) -> bool:
-        local = self._local(t_ns)
-        while not self._solver.reach(local, STEPS_AT_ONCE):
+        local_ns = t_ns - self._anchor_ns
+        while not self._solver.reach_ns(local_ns, STEPS_AT_ONCE):
             if give_way():
                 return False
         return True
 
     def _send(self, t_ns: int, streams: list[Stream], in_time: bool) -> None:
-        state = self._solver.at(self._local(t_ns))
+        state = self._solver.at_ns(t_ns - self._anchor_ns)
         stamp_ns = self.epoch_ns + t_ns
         for stream in streams:
             if stream.next_ns != t_ns:
@@ -163,29 +201,30 @@ class Simulation:
             if not math.isfinite(value):
                 raise ValueError(f'{name} = {value!r} kg m^2/s: must be finite')
         at_ns = max(self.now_ns, 0)
-        state = self._solver.at(self._local(at_ns))
+        state = self._solver.at_ns(at_ns - self._anchor_ns)
         pole = pole_momentum(abs(state.theta), l3)
         if pole is not None and lz != pole:
             raise ValueError(
                 f'lz = {lz!r} kg m^2/s with l3 = {l3!r}: the axis is at a pole (theta = '
                 f'{state.theta!r} rad), where lz must equal {pole!r}; command both together')
-        start = ContinuedState(theta=state.theta, theta_dot=state.theta_dot, phi=state.phi,
-                               psi=state.psi, l3=l3, lz=lz)
+        start = anchored(state, l3, lz)
         try:
             solver, state_after = _first_step(self.top, start, self.values)
         except (ArithmeticError, ValueError, RuntimeError) as error:
             raise ValueError(f'l3 = {l3!r}, lz = {lz!r} kg m^2/s: no motion from theta = '
                              f'{state.theta!r} rad: {error}') from error
-        self._begin(solver, state_after, at_ns)
+        self._steps_before, self._evaluations_before = self.steps, self.evaluations
+        self._begin(solver, start, state_after, at_ns)
         self.history.append((at_ns, l3, lz))
 
 
 def _first_step(top: Top, start: State, values: Mapping[str, Any]) -> tuple[Propagator, OneState]:
     """Return the motion from `start` and its first state; the first step shows if there is one."""
-    solver = rk45(top, start, equations=values['solver.equations'],
-                  rtol=values['solver.rtol'], atol=values['solver.atol'])
-    solver.reach(math.ulp(0.0))
-    state = solver.at(0.0)
+    solver = propagate(top, start, method=values['solver.method'],
+                       equations=values['solver.equations'], rtol=values['solver.rtol'],
+                       atol=values['solver.atol'])
+    solver.reach_ns(1)
+    state = solver.at_ns(0)
     if not math.isfinite(state.energy):
         raise ValueError(f'the energy would be {state.energy!r} J')
     return solver, state

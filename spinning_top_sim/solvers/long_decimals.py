@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Elementary and elliptic functions in long decimals.
+
+Every function works to the precision of the current `decimal` context, and is accurate relative to
+its result (small arguments included).  The standard library offers sqrt, exp and ln; the rest is
+here.  DLMF is the Digital Library of Mathematical Functions, https://dlmf.nist.gov.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from decimal import Decimal, getcontext, localcontext
+from functools import lru_cache
+
+ZERO, ONE = Decimal(0), Decimal(1)
+HALVINGS = 8
+
+
+def pi() -> Decimal:
+    """Return pi to the current precision."""
+    return +_pi(getcontext().prec)
+
+
+@lru_cache
+def _pi(digits: int) -> Decimal:
+    """Machin: pi = 16 arctan(1/5) - 4 arctan(1/239)."""
+    unit = 10 ** (digits + 10)
+
+    def arctan_of_inverse(n: int) -> int:
+        total = term = unit // n
+        k = 1
+        while term:
+            term //= -n * n
+            k += 2
+            total += term // k
+            if term == -1:              # floor division never brings a negative term to 0
+                break
+        return total
+
+    with localcontext() as context:
+        context.prec = digits + 5
+        return Decimal(4 * (4 * arctan_of_inverse(5) - arctan_of_inverse(239))) / unit
+
+
+def sign(x: Decimal) -> int:
+    """Return -1, 0 or 1."""
+    return int(x > 0) - int(x < 0)
+
+
+def sum_until_negligible(terms: Iterable[Decimal]) -> Decimal:
+    """Sum a fast-falling series, up to the first term that no longer counts."""
+    total = ZERO
+    for term in terms:
+        total += term
+        if not term or term.adjusted() < total.adjusted() - getcontext().prec:
+            break
+    return total
+
+
+def _odd_power_series(x: Decimal, sense: int) -> Decimal:
+    """Return sum_k sense^k x^(2k+1)/(2k+1)!: sin x (sense -1) or sinh x (+1)."""
+    square = sense * x * x
+
+    def terms() -> Iterable[Decimal]:
+        term, n = x, 1
+        while True:
+            yield term
+            term = term * square / ((n + 1) * (n + 2))
+            n += 2
+    return sum_until_negligible(terms())
+
+
+def sin_cos(x: Decimal) -> tuple[Decimal, Decimal]:
+    """Reduce to an eighth of a turn, halve the angle, sum the power series, double it again."""
+    quarter_turn = pi() / 2
+    quarters = (x / quarter_turn).to_integral_value()
+    s = _odd_power_series((x - quarters * quarter_turn) / 2 ** HALVINGS, -1)
+    c = (1 - s * s).sqrt()
+    for _ in range(HALVINGS):
+        s, c = 2 * s * c, 1 - 2 * s * s
+    return [(s, c), (c, -s), (-s, -c), (-c, s)][int(quarters) % 4]
+
+
+def sinh_cosh(x: Decimal) -> tuple[Decimal, Decimal]:
+    """Return sinh x and cosh x."""
+    if abs(x) < Decimal('0.1'):         # here exp(x) - exp(-x) would cancel
+        s = _odd_power_series(x, 1)
+        return s, (1 + s * s).sqrt()
+    e = x.exp()
+    return (e - 1 / e) / 2, (e + 1 / e) / 2
+
+
+def one_minus_exp(x: Decimal) -> Decimal:
+    """Return 1 - exp(-x)."""
+    s, c = sinh_cosh(x / 2)
+    return 2 * s / (s + c)
+
+
+def atan2(y: Decimal, x: Decimal) -> Decimal:
+    """Turn back by the angle in doubles; a short series of the small angle left is enough."""
+    radius = (x * x + y * y).sqrt()
+    if not radius:
+        return ZERO
+    y, x = y / radius, x / radius
+    guess = Decimal(math.atan2(y, x))
+    s, c = sin_cos(guess)
+    rest = y * c - x * s                # sin of the rest, about 1e-16
+    return guess + rest + rest ** 3 / 6 + 3 * rest ** 5 / 40
+
+
+def carlson_rf(x: Decimal, y: Decimal, z: Decimal) -> Decimal:
+    """Carlson's integral R_F by duplication, then the series in e2, e3 [DLMF 19.36.1]."""
+    mean = (x + y + z) / 3
+    dx, dy = mean - x, mean - y
+    spread = max(abs(dx), abs(dy), abs(mean - z))
+    scale = 1
+    tolerance = Decimal(10) ** (-getcontext().prec // 8)    # the series leaves out order 8
+    while spread > abs(mean) * scale * tolerance:
+        root_x, root_y, root_z = x.sqrt(), y.sqrt(), z.sqrt()
+        shift = root_x * root_y + root_y * root_z + root_z * root_x
+        x, y, z = (x + shift) / 4, (y + shift) / 4, (z + shift) / 4
+        mean = (mean + shift) / 4
+        scale *= 4
+    X, Y = dx / (mean * scale), dy / (mean * scale)
+    Z = -X - Y
+    e2, e3 = X * Y - Z * Z, X * Y * Z
+    return (1 - e2 / 10 + e3 / 14 + e2 ** 2 / 24 - 3 * e2 * e3 / 44 - 5 * e2 ** 3 / 208
+            + 3 * e3 ** 2 / 104 + e2 ** 2 * e3 / 16) / mean.sqrt()
+
+
+def complete_integral(complementary: Decimal) -> Decimal:
+    """Return K(m) from 1 - m > 0, by the arithmetic-geometric mean [DLMF 19.8.5]."""
+    a, b = ONE, complementary.sqrt()
+    while abs(a - b) > a * Decimal(10) ** (-getcontext().prec // 2):    # the last step squares it
+        a, b = (a + b) / 2, (a * b).sqrt()
+    return pi() / (a + b)
+
+
+def reduced_turns(radians: Decimal) -> Decimal:
+    """Return an angle of any size in turns, less its whole turns: in [-1/2, 1/2]."""
+    with localcontext() as context:
+        context.prec += max(0, radians.adjusted())
+        turns = radians / (2 * pi())
+        rest = turns - turns.to_integral_value()
+    return +rest
+
+
+def double_double(x: Decimal) -> tuple[float, float]:
+    """Split into the nearest double and the nearest double to the rest."""
+    high = float(x)
+    return high, float(x - Decimal(high))

@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Jacobi's theta functions as short series, in long decimals.
+
+theta1..theta4 of y with nome q = exp(-pi K'/K), or after Jacobi's imaginary transformation with
+nome q' = exp(-pi K/K') and hyperbolic functions of x = y K/K' (DLMF 20.2, 20.7(viii)).  One of the
+nomes is at most exp(-pi), so that four terms reach 1e-21.  Each series has one prefactor
+and, beside it, a polynomial in sin^2 y, which is what is evaluated in doubles.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from decimal import Decimal, getcontext
+
+from spinning_top_sim.solvers.long_decimals import (
+    ONE,
+    ZERO,
+    complete_integral,
+    one_minus_exp,
+    pi,
+    sin_cos,
+)
+
+TERMS = 4               # the nome is <= exp(-pi): the fifth term is below 1e-21
+NEGLIGIBLE = Decimal('1e-19')   # beside 1; ends the series of a form with a larger nome
+
+
+@dataclass(frozen=True)
+class Series:
+    """
+    A sum of weights[k] times cos or sin of n y, n = 1, 3, 5... or 0, 2, 4...
+
+    In the imaginary form y stands for ix: cosh for cos, sinh for sin.
+    """
+
+    kind: str
+    weights: tuple[Decimal, ...]
+
+    PREFACTORS = {'cos even': 0, 'cos odd': 1, 'sin odd': 2, 'sin even': 3}  # noqa: RUF012
+
+    @property
+    def prefactor(self) -> int:
+        """Index of what the terms have in common in (1, cos y, sin y, sin y cos y)."""
+        return self.PREFACTORS[self.kind]
+
+    def polynomial(self) -> list[Decimal]:
+        """Return c[i] with sum = prefactor * sum_i c[i] xi^i, xi = sin^2 y (or -sinh^2 x)."""
+        total = [ZERO] * len(self.weights)
+        for weight, shape in zip(self.weights, _multiple_angles(self.kind), strict=False):
+            for i, coefficient in enumerate(shape):
+                if coefficient:         # 'sin even' has one coefficient more than its degree
+                    total[i] += weight * coefficient
+        return total
+
+    @property
+    def at_zero(self) -> Decimal:
+        """The value of a cosine series at y = 0."""
+        return sum(self.weights, ZERO)
+
+    def __call__(self, sin: Decimal, cos: Decimal, xi: Decimal) -> Decimal:
+        value = ZERO
+        for coefficient in reversed(self.polynomial()):
+            value = value * xi + coefficient
+        return value * (ONE, cos, sin, sin * cos)[self.prefactor]
+
+    def scaled(self, scale: Decimal) -> Series:
+        """Return the series times a constant."""
+        return Series(self.kind, tuple(scale * weight for weight in self.weights))
+
+
+def _multiple_angles(kind: str) -> Iterator[list[int]]:
+    """
+    Yield the polynomials in xi = sin^2 y that cos n y or sin n y are, less the common prefactor.
+
+    From f(n+2) = (2 - 4 xi) f(n) - f(n-2) [DLMF 4.21(iii)].
+    """
+    before, now = {'cos odd': ([1], [1]), 'sin odd': ([-1], [1]),
+                   'cos even': ([1, -2], [1]), 'sin even': ([-2], [0])}[kind]
+    while True:
+        yield now
+        after = [2 * x for x in now] + [0]
+        for i, x in enumerate(now):
+            after[i + 1] -= 4 * x
+        for i, x in enumerate(before):
+            after[i] -= x
+        before, now = now, after
+
+
+@dataclass(frozen=True)
+class ThetaForm:
+    """
+    The theta series in the real form (nome q, circular functions of y) or in the imaginary form
+    (Jacobi's transformation [DLMF 20.7(viii)]: nome q', hyperbolic functions of x = y K/K').
+    """
+
+    K: Decimal
+    K_prime: Decimal            # infinite for m = 0
+    imaginary: bool
+    nome: Decimal
+    terms: int = TERMS
+
+    @classmethod
+    def of(cls, m: Decimal, m1: Decimal) -> ThetaForm:
+        """Choose the form with the smaller nome, at most exp(-pi)."""
+        K = complete_integral(m1)
+        K_prime = complete_integral(m) if m else Decimal('Infinity')
+        imaginary = m > m1
+        return cls(K, K_prime, imaginary,
+                   (-pi() * (K / K_prime if imaginary else K_prime / K)).exp())
+
+    def real(self) -> ThetaForm:
+        """Return the real form whatever the nome, with all the terms it takes."""
+        nome = (-pi() * self.K_prime / self.K).exp()
+        terms = 1
+        while nome ** (terms * terms) > NEGLIGIBLE:
+            terms += 1
+        return ThetaForm(self.K, self.K_prime, False, nome, terms + 1)
+
+    def _weights(self, weight: Callable[[int], Decimal], alternating: bool = False
+                 ) -> tuple[Decimal, ...]:
+        return tuple((-1) ** (k * alternating) * weight(k) for k in range(self.terms))
+
+    def _power(self, exponent: int) -> Decimal:
+        return self.nome ** exponent if exponent else ONE
+
+    def _square(self, k: int) -> Decimal:
+        """Weights of theta3, and alternating of theta4 [DLMF 20.2.3, 20.2.4]."""
+        return (2 if k else 1) * self._power(k * k)
+
+    def _pronic(self, k: int) -> Decimal:
+        """Weights of theta2, and alternating of theta1, less 2 nome^(1/4) [DLMF 20.2.1, 2]."""
+        return self._power(k * (k + 1))
+
+    def denominator_even(self) -> Series:
+        """theta4(y), D over even quarter periods."""
+        if self.imaginary:
+            return Series('cos odd', self._weights(self._pronic))
+        return Series('cos even', self._weights(self._square, alternating=True))
+
+    def denominator_odd(self) -> Series:
+        """theta3(y), D over odd quarter periods."""
+        return Series('cos even', self._weights(self._square))
+
+    def theta1(self) -> Series:
+        """theta1(y) less 2 nome^(1/4)."""
+        return Series('sin odd', self._weights(self._pronic, alternating=True))
+
+    @property
+    def odd_over_even(self) -> Decimal:
+        """The transforms of theta1 and theta4 have lost a factor 2 q'^(1/4), of theta2 not."""
+        return 4 * self.nome.sqrt() if self.imaginary else ONE
+
+    def slopes_of_sn2(self) -> tuple[Decimal, Decimal]:
+        """
+        Return c with d(sn^2 chi)/dchi = 2 sn cn dn = c theta1(2y)/D(y)^4, over even and odd N.
+
+        By duplication [DLMF 20.7.10] and the quotients of DLMF 22.2.
+        """
+        theta3, theta4 = self.denominator_odd().at_zero, self.denominator_even().at_zero
+        if not self.imaginary:
+            theta2 = sum(self._pronic(k) for k in range(self.terms))
+            even = theta3 * theta4 ** 3 / theta2
+            return even, -even
+        theta1_slope = sum((-1) ** k * (2 * k + 1) * self._pronic(k) for k in range(self.terms))
+        even = 2 * theta4 ** 4 * self.K_prime / (pi() * theta1_slope)
+        return even, -16 * self.nome * even
+
+    def shifted_theta1(self, a: Decimal) -> tuple[Series, Series]:
+        """R and J of i theta1(y - ia), less positive constants."""
+        if self.imaginary:
+            angle = pi() * a / (2 * self.K_prime)
+            sines, cosines = zip(*(sin_cos((2 * k + 1) * angle) for k in range(self.terms)),
+                                 strict=True)
+            return (Series('cos odd', self._weights(lambda k: self._pronic(k) * sines[k], True)),
+                    Series('sin odd', self._weights(lambda k: self._pronic(k) * cosines[k], True)))
+        minus, plus = self._growing_weights(a)
+        return (Series('cos odd', self._weights(lambda k: minus[k], True)),
+                Series('sin odd', self._weights(lambda k: plus[k], True)))
+
+    def shifted_theta2(self, a: Decimal) -> tuple[Series, Series]:
+        """R and J of theta2(y - ia), less positive constants."""
+        if self.imaginary:
+            angle = pi() * a / (2 * self.K_prime)
+            sines, cosines = zip(*(sin_cos(2 * k * angle) for k in range(self.terms)), strict=True)
+            return (
+                Series('cos even', self._weights(lambda k: self._square(k) * cosines[k], True)),
+                Series('sin even', self._weights(lambda k: -self._square(k) * sines[k], True)))
+        minus, plus = self._growing_weights(a)
+        return Series('cos odd', tuple(plus)), Series('sin odd', tuple(minus))
+
+    def _growing_weights(self, a: Decimal) -> tuple[list[Decimal], list[Decimal]]:
+        """
+        Return 2 q^(k(k+1)) exp(-A) times sinh, and cosh, of (2k+1) A, with A = pi a/(2K).
+
+        That is q^(k^2) g^k (1 -+ E^(2k+1)) with E = exp(-2A), g = q/E <= 1: no large numbers.
+        """
+        depth = pi() * a / self.K
+        g = (depth - pi() * self.K_prime / self.K).exp()
+        E, one_minus_E = (-depth).exp(), one_minus_exp(depth)
+        minus, plus = [], []
+        for k in range(self.terms):
+            growth = self._power(k * k) * (g ** k if k else 1)
+            one_minus_power = one_minus_E * sum((E ** j for j in range(1, 2 * k + 1)), ONE)
+            minus.append(growth * one_minus_power)
+            plus.append(growth * (2 - one_minus_power))
+        return minus, plus
+
+    def log_slope(self, a: Decimal) -> Decimal:
+        """tau(a) = d/da log theta2(ia), to full precision: it sets the mean rates."""
+        if self.imaginary:
+            angle = pi() * a / (2 * self.K_prime)
+            waves = [sin_cos(2 * k * angle) for k in range(self.with_all_terms().terms)]
+            slope = sum((-1) ** k * 2 * k * self._square(k) * s for k, (s, _) in enumerate(waves))
+            value = sum((-1) ** k * self._square(k) * c for k, (_, c) in enumerate(waves))
+            return (pi() / (2 * self.K_prime) * (a / self.K - slope / value))
+        minus, plus = self.with_all_terms()._growing_weights(a)
+        slope = sum((2 * k + 1) * x for k, x in enumerate(minus))
+        return pi() / (2 * self.K) * slope / sum(plus)
+
+    def with_all_terms(self) -> ThetaForm:
+        """Return the same form with every term that reaches the working precision."""
+        if not self.nome:
+            return self
+        digits_per_square = -self.nome.adjusted() - 1           # at least 1
+        return replace(self, terms=2 + math.isqrt(getcontext().prec // digits_per_square))
