@@ -68,7 +68,7 @@ test: dependencies
 	'$(VENV)/bin/pytest' $(TESTS) $(ARGS)
 
 lint: $(VENV)/.deps-test $(VENV)/.deps-lint $(VENV)/.package
-	'$(VENV)/bin/ruff' check .
+	'$(VENV)/bin/ruff' check . scripts/*
 	'$(VENV)/bin/mypy'
 
 build: $(VENV)/.deps-colcon $(VENV)/.package

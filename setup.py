@@ -61,6 +61,7 @@ setup(
             'scipy>=1.11,<2',
         ],
         'plot': ['matplotlib>=3.6,<4'],
+        'plot': ['matplotlib>=3.6,<4'],     # docs/figures.py
         # Narrow: a new release of these finds new faults.
         'lint': [
             'mypy>=2.4.1,<2.5',
