@@ -158,7 +158,7 @@ class FixedRate(NamedTuple):
     start: int
 
     @classmethod
-    def of(cls, per_second: Decimal, start: Decimal = Decimal(0)) -> FixedRate:  # noqa: B008
+    def of(cls, per_second: Decimal, start: Decimal = Decimal(0)) -> FixedRate:
         return cls(int(per_second * FIXED_ONE / 10 ** 9), int(start * FIXED_ONE))
 
 

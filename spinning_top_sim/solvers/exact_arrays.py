@@ -30,7 +30,7 @@ from spinning_top_sim.solvers.exact import (
 )
 from spinning_top_sim.solvers.long_decimals import double_double, pi
 from spinning_top_sim.solvers.theta_series import Series
-from spinning_top_sim.solvers.theta_setup import Branch, Factor, ThetaMotion
+from spinning_top_sim.solvers.theta_setup import Factor, ThetaMotion
 
 if TYPE_CHECKING:
     from spinning_top_sim.solvers.exact import ExactSolution

@@ -2,14 +2,16 @@
 """
 The inertial measurement unit: where it sits on the body, and what it adds to the truth.
 
-Rates and specific force come from the state itself, never from differences.  Conventions: REP-145
+Rates and specific force come from the state itself, never from differences; the errors follow
+kalibr's model, with its names and units.  Conventions: REP-145
 (at rest an accelerometer reads +g upwards), REP-103 (x, y, z right-handed), URDF roll-pitch-yaw.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from spinning_top_sim.physics.kinematics import OneState
@@ -18,13 +20,14 @@ Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
 Quaternion = tuple[float, float, float, float]
 ZERO: Vector = (0.0, 0.0, 0.0)
+NO_NOISE = 12 * (0.0,)
 
 
 class Imu:
     """
-    An IMU at `imu.lever_arm` [m] and `imu.rpy` [rad] of the body frame.
+    Where the IMU sits: at `imu.lever_arm` [m] and `imu.rpy` [rad] of the body frame.
 
-    gyroscope_variance, accelerometer_variance: of the white noise in one sample, per axis.
+    What it measures there is `true`; what it reads, `Sensor.read`.
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
@@ -32,7 +35,6 @@ class Imu:
         self._turned = values['imu.rpy'] != ZERO
         self._to_sensor = _transposed(_rotation(*values['imu.rpy']))
         self._mounting = _quaternion(*values['imu.rpy'])
-        self.gyroscope_variance = self.accelerometer_variance = 0.0
 
     def orientation(self, state: OneState) -> Quaternion:
         """Return q(world <- IMU) as x, y, z, w."""
@@ -46,13 +48,143 @@ class Imu:
             return _apply(self._to_sensor, rates), _apply(self._to_sensor, force)
         return rates, force
 
-    def measured(self, state: OneState, index: int) -> tuple[Vector, Vector]:
-        """Return what the sensor reads at its sample number `index`."""
-        return self.true(state)
 
-    def bias(self, index: int) -> tuple[Vector, Vector]:
-        """Return the bias in sample number `index`: [rad/s], [m/s^2]."""
-        return ZERO, ZERO
+@dataclass(frozen=True)
+class Axes:
+    """
+    The errors of three axes of one kind, in samples `period` [s] apart.
+
+    white: standard deviation of one sample's noise, density/sqrt(period)
+    walk: of the bias' change from one sample to the next, random walk x sqrt(period)
+    turn_on: of the bias at the start;  limit: largest reading, inf for none
+    resolution: readings are multiples of this, 0 for any number
+    (kalibr, "IMU Noise Model"; N. Trawny, S. Roumeliotis, "Indirect Kalman filter for 3D attitude
+    estimation", 2005, eqs. 133, 140)
+    """
+
+    white: float
+    walk: float
+    turn_on: float
+    limit: float
+    resolution: float
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any], kind: str, period: float) -> Axes:
+        """Return those of `imu.<kind>_...`."""
+        return cls(white=values[f'imu.{kind}_noise_density'] / math.sqrt(period),
+                   walk=values[f'imu.{kind}_random_walk'] * math.sqrt(period),
+                   turn_on=values[f'imu.{kind}_turn_on_bias'],
+                   limit=values[f'imu.{kind}_range'] or math.inf,
+                   resolution=values[f'imu.{kind}_resolution'])
+
+    @property
+    def is_random(self) -> bool:
+        """Whether anything is drawn."""
+        return bool(self.white or self.walk or self.turn_on)
+
+    @property
+    def variance(self) -> float:
+        """Of what is added to a sample besides the bias: white noise and rounding."""
+        return self.white ** 2 + self.resolution ** 2 / 12.0
+
+    def read(self, exact: Vector, white: Sequence[float], bias: Sequence[float]) -> Vector:
+        """Return the readings: noise and bias added, cut at the range, rounded."""
+        x, y, z = (max(-self.limit, min(self.limit, value + noise + offset))
+                   for value, noise, offset in zip(exact, white, bias, strict=True))
+        step = self.resolution
+        if step:
+            return round(x / step) * step, round(y / step) * step, round(z / step) * step
+        return x, y, z
+
+
+PERFECT = Axes(white=0.0, walk=0.0, turn_on=0.0, limit=math.inf, resolution=0.0)
+
+
+class Sensor:
+    """
+    What the IMU reads at a rate: noise of sample k depends on the seed and on k alone.
+
+    gyroscope, accelerometer: their `Axes`.
+    """
+
+    def __init__(self, values: Mapping[str, Any], period_ns: int) -> None:
+        period = period_ns * 1e-9
+        self.gyroscope = Axes.of(values, 'gyroscope', period)
+        self.accelerometer = Axes.of(values, 'accelerometer', period)
+        self._perfect = self.gyroscope == self.accelerometer == PERFECT
+        self._noise: Noise | None = None
+        if self.gyroscope.is_random or self.accelerometer.is_random:
+            self._noise = Noise(values['seed'], self.gyroscope, self.accelerometer)
+
+    def read(self, exact: tuple[Vector, Vector], index: int) -> tuple[Vector, Vector]:
+        """Return the readings of rates [rad/s] and force [m/s^2] in sample `index`."""
+        if self._perfect:
+            return exact
+        row = NO_NOISE if self._noise is None else self._noise.sample(index)
+        return (self.gyroscope.read(exact[0], row[0:3], row[6:9]),
+                self.accelerometer.read(exact[1], row[3:6], row[9:12]))
+
+    def bias(self, index: int) -> tuple[Sequence[float], Sequence[float]]:
+        """Return the bias in sample `index`: [rad/s], [m/s^2]."""
+        row = NO_NOISE if self._noise is None else self._noise.sample(index)
+        return row[6:9], row[9:12]
+
+
+class Noise:
+    """
+    White noise and wandering bias of both kinds of axes, by sample number.
+
+    Block b of 512 samples is drawn from a generator keyed by seed and b (Philox, counter-based:
+    Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC11), so that samples can be
+    read from anywhere; the bias at the start of a block is the sum over the blocks before.
+    """
+
+    BLOCK = 512
+
+    def __init__(self, seed: int, gyroscope: Axes, accelerometer: Axes) -> None:
+        # 80 ms of numpy for those who want noise only.
+        import numpy  # noqa: PLC0415
+
+        self._numpy, self._seed = numpy, seed
+        kinds = (gyroscope, accelerometer)
+        self._white = numpy.repeat([kind.white for kind in kinds], 3)
+        self._walk = numpy.repeat([kind.walk for kind in kinds], 3)
+        # Where the bias of block b begins; that of block 0 is the turn-on bias.
+        self._bias_starts = [numpy.repeat([kind.turn_on for kind in kinds], 3)
+                             * self._normal(0, 6, turn_on=True)[0]]
+        self._block = -1
+        self._rows: list[list[float]] = []
+
+    def sample(self, index: int) -> Sequence[float]:
+        """Return white noise (rates, force) and bias (rates, force): 12 numbers."""
+        block, row = divmod(index, self.BLOCK)
+        if block != self._block:
+            self._load(block)
+        return self._rows[row]
+
+    def _load(self, block: int) -> None:
+        numpy = self._numpy
+        while len(self._bias_starts) <= block:
+            before = len(self._bias_starts) - 1
+            _, bias = self._draw(before)
+            self._bias_starts.append(bias[-1])
+        white, bias = self._draw(block)
+        self._rows = numpy.hstack((white, bias)).tolist()
+        self._block = block
+
+    def _draw(self, block: int) -> tuple[Any, Any]:
+        """Return white noise and bias of a block, (512, 6) each."""
+        normal = self._normal(block, 12)
+        steps = normal[:, 6:] * self._walk
+        if block == 0:
+            steps[0] = 0.0              # sample 0 has the turn-on bias itself
+        bias = self._bias_starts[block] + self._numpy.cumsum(steps, axis=0)
+        return normal[:, :6] * self._white, bias
+
+    def _normal(self, block: int, columns: int, turn_on: bool = False) -> Any:
+        generator = self._numpy.random.Generator(self._numpy.random.Philox(
+            key=self._seed, counter=[0, 0, int(turn_on), block]))
+        return generator.standard_normal((1 if turn_on else self.BLOCK, columns))
 
 
 def _rotation(roll: float, pitch: float, yaw: float) -> Matrix:

@@ -15,12 +15,13 @@ from typing import Any
 from spinning_top_sim.physics.kinematics import OneState
 from spinning_top_sim.streams import messages
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.imu import Imu
+from spinning_top_sim.streams.imu import Imu, Sensor
 
 JOINTS = ('precession_joint', 'nutation_joint', 'spin_joint')
 INVARIANTS = ('energy', 'l3', 'lz', 'energy_drift', 'l3_drift', 'lz_drift',
               'quaternion_norm_error', 'orientation_error')
 NAN = math.nan
+IDENTITY = (0.0, 0.0, 0.0, 1.0)
 
 
 class Stream:
@@ -103,61 +104,67 @@ class GroundTruthOdometry(Stream):
 
 
 class ImuStream(Stream):
-    """What all IMU topics share: the sensor."""
+    """What all IMU topics share: the mounting, and the sensor at the stream's rate."""
 
     type_name = 'sensor_msgs/msg/Imu'
+    oriented = True
 
     def __init__(self, values: Mapping[str, Any], imu: Imu) -> None:
+        self._values, self._imu = values, imu
         super().__init__(values)
-        self._imu = imu
-        self._encode = self._template(values['imu.frame_id']).encode
 
-    def _template(self, frame_id: str) -> messages.Template:
-        raise NotImplementedError
+    def set_rate(self, rate: float) -> None:
+        super().set_rate(rate)
+        # A density says how much noise a sample has at a rate.
+        self._sensor = Sensor(self._values, self.period_ns)
+        gyroscope, accelerometer = self._variances()
+        self._encode = messages.imu(
+            self._values['imu.frame_id'],
+            messages.EXACT if self.oriented else messages.UNKNOWN_ORIENTATION,
+            messages.diagonal(gyroscope), messages.diagonal(accelerometer)).encode
+
+    def _variances(self) -> tuple[float, float]:
+        """Return the variances of angular velocity and linear acceleration."""
+        return 0.0, 0.0
+
+    @property
+    def _index(self) -> int:
+        """Number k of the sample that is being encoded."""
+        return self.next_ns // self.period_ns
 
 
 class ImuRaw(ImuStream):
     """What the sensor reads, without an orientation (REP-145)."""
 
-    parameter, topic = 'imu', 'imu/data_raw'
+    parameter, topic, oriented = 'imu', 'imu/data_raw', False
 
-    def _template(self, frame_id: str) -> messages.Template:
-        return messages.imu(frame_id, messages.UNKNOWN_ORIENTATION,
-                            messages.diagonal(self._imu.gyroscope_variance),
-                            messages.diagonal(self._imu.accelerometer_variance))
+    def _variances(self) -> tuple[float, float]:
+        return self._sensor.gyroscope.variance, self._sensor.accelerometer.variance
 
     def encode(self, state: OneState, stamp_ns: int) -> bytes:
-        rates, force = self._imu.measured(state, self.next_ns // self.period_ns)
-        return self._encode(stamp_ns, (0.0, 0.0, 0.0, 1.0), rates, force)
+        rates, force = self._sensor.read(self._imu.true(state), self._index)
+        return self._encode(stamp_ns, self._orientation(state), rates, force)
+
+    def _orientation(self, state: OneState) -> tuple[float, ...]:
+        return IDENTITY
 
 
 class ImuData(ImuRaw):
     """What the sensor reads, with the exact orientation of its frame."""
 
-    parameter, topic = 'imu_data', 'imu/data'
+    parameter, topic, oriented = 'imu_data', 'imu/data', True
 
-    def _template(self, frame_id: str) -> messages.Template:
-        return messages.imu(frame_id, messages.EXACT,
-                            messages.diagonal(self._imu.gyroscope_variance),
-                            messages.diagonal(self._imu.accelerometer_variance))
-
-    def encode(self, state: OneState, stamp_ns: int) -> bytes:
-        rates, force = self._imu.measured(state, self.next_ns // self.period_ns)
-        return self._encode(stamp_ns, self._imu.orientation(state), rates, force)
+    def _orientation(self, state: OneState) -> tuple[float, ...]:
+        return self._imu.orientation(state)
 
 
 class ImuBias(ImuStream):
     """The bias that `ImuRaw` carries."""
 
-    parameter, topic = 'imu', 'ground_truth/imu_bias'
-
-    def _template(self, frame_id: str) -> messages.Template:
-        return messages.imu(frame_id, messages.UNKNOWN_ORIENTATION, messages.EXACT,
-                            messages.EXACT)
+    parameter, topic, oriented = 'imu', 'ground_truth/imu_bias', False
 
     def encode(self, state: OneState, stamp_ns: int) -> bytes:
-        return self._encode(stamp_ns, (0.0, 0.0, 0.0, 1.0),
-                            *self._imu.bias(self.next_ns // self.period_ns))
+        return self._encode(stamp_ns, IDENTITY, *self._sensor.bias(self._index))
 
 
 class GroundTruthImu(ImuStream):
@@ -165,12 +172,8 @@ class GroundTruthImu(ImuStream):
 
     parameter, topic = 'ground_truth_imu', 'ground_truth/imu'
 
-    def _template(self, frame_id: str) -> messages.Template:
-        return messages.imu(frame_id, messages.EXACT, messages.EXACT, messages.EXACT)
-
     def encode(self, state: OneState, stamp_ns: int) -> bytes:
-        return self._encode(stamp_ns, self._imu.orientation(state),
-                            *self._imu.true(state))
+        return self._encode(stamp_ns, self._imu.orientation(state), *self._imu.true(state))
 
 
 class Invariants(Stream):
