@@ -22,7 +22,7 @@ from math import cos, sin, sinh, sqrt
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.long_decimals import pi
+from spinning_top_sim.solvers.long_decimals import ZERO, pi
 from spinning_top_sim.solvers.theta_series import TERMS, Series
 from spinning_top_sim.solvers.theta_setup import Branch, ThetaMotion, set_up
 
@@ -82,6 +82,8 @@ class FactorBranch(NamedTuple):
 
 
 class NutationBranch(NamedTuple):
+    """Both factors and cos(theta)' over even or odd quarter periods."""
+
     alpha: FactorBranch
     beta: FactorBranch
     u_dot: float                    # times `magnifier`, a power of 2: near a pole all is small
@@ -117,9 +119,9 @@ def nutation_at(branch: NutationBranch, y: Any, flip: Any, functions: Functions)
     c = functions.sqrt(1.0 - xi)        # cos y > 0, or cosh x
     prefactors = (1.0, c, s, s * c)
     alpha, alpha_argument, alpha_slope = _factor_at(
-        branch.alpha, y, flip, xi, prefactors, functions)
+        branch.alpha, y, flip, xi, prefactors, functions=functions)
     beta, beta_argument, beta_slope = _factor_at(
-        branch.beta, y, flip, xi, prefactors, functions)
+        branch.beta, y, flip, xi, prefactors, functions=functions)
     if not branch.u_dot:                # resting, perhaps at a pole
         return NutationPoint(alpha, beta, alpha_argument, beta_argument, 0.0 * y)
     # theta' = -u'/sin(theta), with the zero that u' shares with a factor at a pole divided out.
@@ -135,7 +137,7 @@ def nutation_at(branch: NutationBranch, y: Any, flip: Any, functions: Functions)
 
 
 def _factor_at(factor: FactorBranch, y: Any, flip: Any, xi: Any, prefactors: tuple[Any, ...],
-               functions: Functions) -> tuple[Any, Any, Any]:
+               *, functions: Functions) -> tuple[Any, Any, Any]:
     """Return modulus (signed if real), argument, and the modulus less the factor sin y."""
     a3, a2, a1, a0 = factor.real
     polynomial = ((a3 * xi + a2) * xi + a1) * xi + a0
@@ -158,8 +160,13 @@ class FixedRate(NamedTuple):
     start: int
 
     @classmethod
-    def of(cls, per_second: Decimal, start: Decimal = Decimal(0)) -> FixedRate:
+    def of(cls, per_second: Decimal, start: Decimal) -> FixedRate:
+        """Round a rate per second and a start."""
         return cls(int(per_second * FIXED_ONE / 10 ** 9), int(start * FIXED_ONE))
+
+    def at(self, ns: int) -> int:
+        """Return start + rate ns, in fixed point."""
+        return self.start + self.rate * ns
 
 
 class ExactSolution:
@@ -231,13 +238,12 @@ class ExactSolution:
                       Decimal('1e-300'))
         self.time_limit = min(float(Decimal(MOST_TURNS) / fastest), 1e300)   # [s]
         self.ns_limit = int(Decimal(MOST_TURNS) / fastest * 10 ** 9)
-        self._quarter_rate = FixedRate.of(motion.quarter_rate).rate
-        self._offset0 = int(motion.offset0 * FIXED_ONE)
+        self._quarter_rate, self._offset0 = FixedRate.of(motion.quarter_rate, motion.offset0)
         self._offset_rest = float(motion.offset0 - Decimal(self._offset0) / FIXED_ONE)
         self._alpha_turns = FixedRate.of(alpha.rate / two_pi, alpha.phase_turns)
         self._beta_turns = FixedRate.of(beta.rate / two_pi, beta.phase_turns)
-        self._phi = FixedRate.of(motion.mean_precession_rate)
-        self._psi = FixedRate.of(motion.mean_spin_rate)
+        self._phi = FixedRate.of(motion.mean_precession_rate, ZERO)
+        self._psi = FixedRate.of(motion.mean_spin_rate, ZERO)
 
     # ------------------------------------------------------------------------------ one state
 
@@ -253,7 +259,8 @@ class ExactSolution:
         phase = ns * self._quarter_rate + self._offset0
         whole = phase + FIXED_HALF >> FIXED_BITS
         quarters = self.quarter0 + whole
-        y = QUARTER_PERIOD_ANGLE * ((phase - (whole << FIXED_BITS)) * FIXED_UNIT + self._offset_rest)
+        part = (phase - (whole << FIXED_BITS)) * FIXED_UNIT + self._offset_rest
+        y = QUARTER_PERIOD_ANGLE * part
         (alpha_real_prefactor, a3, a2, a1, a0, alpha_imag_prefactor, b3, b2, b1, b0,
          alpha_drift, alpha_crosses,
          beta_real_prefactor, c3, c2, c1, c0, beta_imag_prefactor, d3, d2, d1, d0,
@@ -435,9 +442,9 @@ def _nutation_branch(motion: ThetaMotion, odd: int) -> NutationBranch:
     alpha, beta = factor('alpha'), factor('beta')
     smallest = min(max(map(abs, x.real + x.imag)) for x in (alpha, beta))
     magnifier = 2.0 ** -math.frexp(smallest)[1] if smallest else 1.0
-    return NutationBranch(alpha, beta, _in_range("cos(theta)'", motion.u_dot[odd] * Decimal(magnifier)),
-                          magnifier, _coefficients(motion.u_dot_series), motion.imaginary,
-                          float(motion.stretch))
+    u_dot = _in_range("cos(theta)'", motion.u_dot[odd] * Decimal(magnifier))
+    return NutationBranch(alpha, beta, u_dot, magnifier, _coefficients(motion.u_dot_series),
+                          motion.imaginary, float(motion.stretch))
 
 
 def _in_range(name: str, value: Decimal) -> float:

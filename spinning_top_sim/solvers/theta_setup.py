@@ -10,13 +10,13 @@ Cayley-Klein parameters
 
 are each a theta function of the nutation's phase over a common one, times a uniform rotation:
 
-    alpha = (A_alpha/D(y)) (R + i s J)(y) exp i(rate t + phase + s kappa y),     R + i s J = theta(y - i s a)
+    alpha = (R + i s J)(y)/D(y) exp i(rate t + phase + s kappa y),   R + i s J ~ theta(y - i s a)
 
 (F. Klein, A. Sommerfeld, Ueber die Theorie des Kreisels, ch. VI;  E. T. Whittaker, Analytical
 Dynamics, sect. 72-76;  theta functions, nome and quarter periods K, K' as in DLMF ch. 20 and 22,
-R_F as in DLMF ch. 19: https://dlmf.nist.gov).  So a state costs the same at every t.  The phase is counted in quarter
-periods, Z = N + 2y/pi with N whole and |y| <= pi/4: over even N (u near u1) alpha is theta1 and
-beta theta2, over odd N (u near u2) the other way round.
+R_F as in DLMF ch. 19: https://dlmf.nist.gov).  So a state costs the same at every t.  The phase
+is counted in quarter periods, Z = N + 2y/pi with N whole and |y| <= pi/4: over even N (u near u1)
+alpha is theta1 and beta theta2, over odd N (u near u2) the other way round.
 
 The work is done in long decimals, 60 digits and more if two roots of the cubic are close, because
 everything that cancels, cancels here: close to a pole, to the separatrix, to steady precession.
@@ -45,7 +45,7 @@ from spinning_top_sim.solvers.theta_series import Series, ThetaForm
 FIRST_DIGITS = 60
 MOST_DIGITS = 480
 KEPT_DIGITS = 40        # what must be left of the digits after the discriminant has cancelled
-FULL_CIRCLE_M1 = Decimal('1e-5')    # below, the real form takes too many terms and cancels
+FULL_CIRCLE_M1 = Decimal('2e-4')    # below, the series of the real form cancels too much
 
 
 class _RootsTooCloseError(ArithmeticError):
@@ -106,7 +106,7 @@ class ThetaMotion:
     quarter_rate: Decimal       # quarter periods per second, w/K
     quarter0: int               # phase at t = 0 in quarter periods: whole part,
     offset0: Decimal            # and a rest in [-1/2, 1/2], accurate relative to itself
-    u_dot: tuple[Decimal, Decimal]      # cos(theta)' = u_dot * u_dot_series(2y)/D^4 over even, odd N
+    u_dot: tuple[Decimal, Decimal]      # u' = u_dot u_dot_series(2y)/D^4 over even and odd N
     u_dot_series: Series
     turning: tuple[int, int] | None     # planar rotation: theta/2 follows (pi/2)(i + j Z)
     a_plus: Decimal             # Lz + L3

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.kinematics import OneState
+from spinning_top_sim.physics.kinematics import Columns, OneState
 from spinning_top_sim.physics.regimes import Description, describe
 from spinning_top_sim.physics.top import State, Top, pole_momentum
 from spinning_top_sim.solvers.propagator import (
@@ -108,7 +108,7 @@ class Simulation:
         """Return the state at `now_ns` (at the start before the first sample)."""
         return self._solver.at_ns(max(self.now_ns - self._anchor_ns, 0))
 
-    def orientation_error(self, state: OneState, t_ns: int) -> float:
+    def orientation_error(self, state: Columns, t_ns: int) -> float:
         """
         Return the angle between a state at t_ns and the exact solution there [rad].
 
