@@ -57,7 +57,6 @@ setup(
             'rosbags>=0.10.11,<0.12',
             'scipy>=1.11,<2',
         ],
-        'plot': ['matplotlib>=3.6,<4'],
         'plot': ['matplotlib>=3.6,<4'],     # docs/figures.py
         # Narrow: a new release of these finds new faults.
         'lint': [
