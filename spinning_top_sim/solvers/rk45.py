@@ -83,6 +83,7 @@ class SteppedOrClosed(ABC):
 
     steps = 0
     evaluations = 0
+    earliest_ns = 0
 
     @abstractmethod
     def at(self, t: float) -> OneState:
@@ -114,6 +115,13 @@ class _Stepped(SteppedOrClosed):
     @property
     def evaluations(self) -> int:  # type: ignore[override]
         return self._integrator.evaluations
+
+    @property
+    def earliest_ns(self) -> int:  # type: ignore[override]
+        """See `Propagator`."""
+        start = self._integrator.t0
+        ns = math.ceil(start * NANOSECONDS)
+        return ns if ns / NANOSECONDS >= start else ns + 1
 
     def reach(self, t: float, max_steps: int | None = None) -> bool:
         integrator = self._integrator
