@@ -17,6 +17,7 @@ from typing import Protocol
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.top import State, Top
 
+
 class Averages(Protocol):
     """What the closed form knows of a whole nutation (`solvers.exact.ExactSolution`)."""
 
