@@ -85,6 +85,11 @@ class Terminal:
         else:
             print(line, flush=True)
 
+    def tell(self, line: str) -> None:
+        """Show a line that stays."""
+        self.end()
+        print(line, flush=True)
+
     def end(self) -> None:
         """Leave the cursor on a fresh line."""
         if self._open:

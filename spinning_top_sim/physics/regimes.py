@@ -12,9 +12,111 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.top import State, Top
+
+
+class Averages(Protocol):
+    """What the closed form knows of a whole nutation (`solvers.exact.ExactSolution`)."""
+
+    @property
+    def nutation_period(self) -> float | None:
+        """[s], None where the nutation rests."""
+
+    @property
+    def mean_precession_rate(self) -> float:
+        """[rad/s]."""
+
+    @property
+    def mean_spin_rate(self) -> float:
+        """[rad/s]."""
+
+    @property
+    def theta_min(self) -> float:
+        """[rad]."""
+
+    @property
+    def theta_max(self) -> float:
+        """[rad]."""
+
+    @property
+    def m1(self) -> float:
+        """1 - m, complementary parameter of the elliptic functions."""
+
+
+@dataclass(frozen=True)
+class Description:
+    """
+    A motion in the numbers that a physicist asks for.
+
+    name: see `regime`;  nutation_period [s], None where theta rests
+    theta_min, theta_max [rad]: between which the axis swings
+    mean_precession_rate, mean_spin_rate [rad/s]: <phi'>, <psi'> over a nutation
+    precession_min, precession_max [rad/s]: extremes of phi'
+    separatrix_distance: 1 - m of the elliptic functions; 0 is the motion that rises for ever
+    gyroscopic_ratio: L3^2/(4 lambda1 |P|); an upright top sleeps above 1; inf without gravity
+    """
+
+    name: str
+    nutation_period: float | None
+    theta_min: float
+    theta_max: float
+    mean_precession_rate: float
+    precession_min: float
+    precession_max: float
+    mean_spin_rate: float
+    separatrix_distance: float
+    gyroscopic_ratio: float
+
+    def __str__(self) -> str:
+        low, high = math.degrees(self.theta_min), math.degrees(self.theta_max)
+        swing_text = (f'theta = {low:.4g} deg' if self.nutation_period is None else
+                      f'theta from {low:.4g} to {high:.4g} deg every '
+                      f'{self.nutation_period:.6g} s')
+        return (f'{self.name}: {swing_text}; precession {self.mean_precession_rate:.6g} rad/s '
+                f'({self.precession_min:.4g} to {self.precession_max:.4g}), spin '
+                f'{self.mean_spin_rate:.6g} rad/s; L3^2/(4 lambda1 |P|) = '
+                f'{self.gyroscopic_ratio:.4g}, 1 - m = {self.separatrix_distance:.3g}')
+
+
+def describe(top: Top, state: State, averages: Averages) -> Description:
+    """Return the numbers of the motion through `state`, with those of the closed form."""
+    slowest, fastest = precession_extremes(top, state, averages.theta_min, averages.theta_max)
+    weight = 4.0 * top.lambda1 * abs(top.gravity_torque)
+    return Description(
+        name=regime(top, state), nutation_period=averages.nutation_period,
+        theta_min=averages.theta_min, theta_max=averages.theta_max,
+        mean_precession_rate=averages.mean_precession_rate,
+        precession_min=slowest, precession_max=fastest,
+        mean_spin_rate=averages.mean_spin_rate, separatrix_distance=averages.m1,
+        gyroscopic_ratio=state.l3 * state.l3 / weight if weight else math.inf)
+
+
+def precession_extremes(top: Top, state: State, theta_min: float,
+                        theta_max: float) -> tuple[float, float]:
+    """
+    Return the least and the greatest phi' [rad/s] while theta swings between two tilts.
+
+    They lie at the ends, or where d phi'/du = 0: L3 u^2 - 2 Lz u + L3 = 0.
+    """
+    tilts = [theta_min, theta_max]
+    l3, lz = state.l3, state.lz
+    if abs(lz) > abs(l3) > 0.0:
+        inner = math.acos(l3 / (lz + math.copysign(math.sqrt(lz * lz - l3 * l3), lz)))
+        if theta_min < inner < theta_max:
+            tilts.append(inner)
+    rates = []
+    for theta in tilts:
+        cos2, sin2 = math.cos(0.5 * theta) ** 2, math.sin(0.5 * theta) ** 2
+        if theta == math.pi:
+            cos2 = 0.0
+        singular = (cos2 == 0.0 and lz + l3 != 0.0) or (sin2 == 0.0 and lz - l3 != 0.0)
+        rates.append(math.copysign(math.inf, lz - l3 * math.cos(theta)) if singular
+                     else attitude.precession_rate(top, l3, lz, cos2, sin2))
+    return min(rates), max(rates)
+
 
 # Relative distance below which two roots, or a root and Lz/L3, are said to coincide.
 COINCIDE = 1e-12
@@ -96,10 +198,10 @@ def regime(top: Top, state: State) -> str:
     resting = at.high - at.low <= COINCIDE
     if top.gravity_torque == 0.0:
         return 'free top' if scale or state.theta_dot else 'at rest'
-    if resting and (state.theta == 0.0 or state.theta == math.pi):
+    if resting and 1.0 - abs(at.low) <= COINCIDE:
         if scale == 0.0:
             return 'at rest'
-        upright = (state.theta == 0.0) == (top.gravity_torque > 0.0)
+        upright = (at.low > 0.0) == (top.gravity_torque > 0.0)
         if not upright:
             return 'hanging'
         stable = l3 * l3 > 4.0 * top.lambda1 * abs(top.gravity_torque)

@@ -152,6 +152,20 @@ def _streams() -> list[Parameter]:
     return rows
 
 
+def _axes(kind: str, unit: str) -> list[Parameter]:
+    """Return the error model of three axes; names and units of the first two are kalibr's."""
+    walk = {'rad/s': 'rad/s^2', 'm/s^2': 'm/s^3'}[unit]
+    return [
+        Parameter(f'imu.{kind}_{name}', 0.0, text, unit_text, minimum=0.0, effect=Effect.RESET)
+        for name, text, unit_text in (
+            ('noise_density', f'White noise of the {kind}, 0 = none', f'{unit}/sqrt(Hz)'),
+            ('random_walk', f'Random walk of the bias of the {kind}, 0 = none',
+             f'{walk}/sqrt(Hz)'),
+            ('turn_on_bias', f'Standard deviation of the bias of the {kind} at the start', unit),
+            ('range', f'Largest reading of the {kind}, 0 = unlimited', unit),
+            ('resolution', f'Smallest step of the readings of the {kind}, 0 = none', unit))]
+
+
 TABLE: tuple[Parameter, ...] = (
     Parameter('top.mass', 2.0, 'Mass of the top', 'kg', minimum=0.0, effect=Effect.RESET),
     Parameter('top.com_distance', 0.15, 'From the pivot to the centre of mass along the axis, '
@@ -201,6 +215,8 @@ TABLE: tuple[Parameter, ...] = (
               effect=Effect.RESET),
     Parameter('imu.rpy', (0.0, 0.0, 0.0), 'Orientation of the IMU in the body, roll, pitch and '
               'yaw about fixed axes', 'rad', effect=Effect.RESET),
+    *_axes('gyroscope', 'rad/s'),
+    *_axes('accelerometer', 'm/s^2'),
     Parameter('duration', 0.0, 'End after this much simulated time, 0 = never', 's',
               minimum=0.0),
     Parameter('record.enabled', False, 'Record from the start', effect=Effect.START),

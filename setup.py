@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Build and install by pip, by `colcon build`, by hand; the only place with version ranges."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = 'spinning_top_sim'
+
+# Executable: the module whose main() it runs and whose return value is its exit code.
+# `ros2 run` looks in lib/<package>, where pip puts no console script: so each has a file in
+# scripts/ too, installed there as data by pip and by colcon alike.
+EXECUTABLES = {
+    'sim_node': 'spinning_top_sim.nodes.sim_node',
+    'simulate': 'spinning_top_sim.tools.simulate',
+}
+
+DATA_FILES = {
+    'share/ament_index/resource_index/packages': [f'resource/{NAME}'],
+    f'share/{NAME}': ['package.xml'],
+    f'share/{NAME}/config': glob('config/*.yaml'),
+    f'share/{NAME}/launch': glob('launch/*.launch.*'),
+    f'share/{NAME}/urdf': glob('urdf/*'),
+    f'share/{NAME}/rviz': glob('rviz/*.rviz'),
+    f'lib/{NAME}': [f'scripts/{name}' for name in EXECUTABLES],
+}
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    description='The heavy symmetric top in real time for ROS 2, with a known exact truth',
+    maintainer='spinning_top_sim maintainers',
+    maintainer_email='maintainers@spinning-top-sim.example',
+    license='Apache-2.0',
+    python_requires='>=3.11',
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
+    data_files=[(folder, sorted(files)) for folder, files in DATA_FILES.items() if files],
+    entry_points={'console_scripts': [
+        f'{name} = {module}:main' for name, module in EXECUTABLES.items()]},
+    zip_safe=True,
+    # rclpy and the message packages are not here: on a ROS machine they come from ROS
+    # (package.xml), elsewhere from the extra `ros`.
+    install_requires=[
+        'numpy>=1.26,<3',
+        'mcap>=1.2,<2',             # with zstandard and lz4
+    ],
+    extras_require={
+        'ros': [
+            'ros-jazzy-rclpy[fastrtps]>=7.1.6,<8',
+            'ros-jazzy-common-interfaces>=5.3.6,<6',
+        ],
+        'test': [
+            'catkin_pkg>=1.0,<2',
+            'docutils>=0.20,<1',
+            'mcap-ros2-support>=0.5.5,<0.7',
+            'pyarrow>=14,<30',
+            'pytest>=7.4,<10',
+            'PyYAML>=6.0,<7',
+            'rosbags>=0.10.11,<0.12',
+            'scipy>=1.11,<2',
+        ],
+        # simulate: parameter files, a progress bar, Parquet
+        'tools': ['PyYAML>=6.0,<7', 'tqdm>=4.64,<5'],
+        'parquet': ['pyarrow>=14,<30'],
+        'plot': ['matplotlib>=3.6,<4'],     # docs/figures.py
+        # Narrow: a new release of these finds new faults.
+        'lint': [
+            'mypy>=2.4.1,<2.5',
+            'ruff>=0.17.5,<0.18',
+        ],
+        # `setup.py install`, which colcon calls, and wheels without a package `wheel`.
+        'build': ['setuptools>=70.1,<80'],
+        'colcon': [
+            'colcon-core>=0.21,<0.22',
+            'colcon-ros>=0.5,<0.6',
+        ],
+    },
+)

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The IMU: kinematics against differences of the exact pose, noise against its own numbers."""
+
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from reference import SCENES, scene_parameters
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim import solve
+from spinning_top_sim.solvers.propagator import propagate
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.imu import Imu, Sensor
+from spinning_top_sim.streams.pipeline import Simulation
+
+# Central differences of order 8 (Fornberg, Math. Comp. 51 (1988) 699-706).
+FIRST = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
+SECOND = np.array([-1 / 560, 8 / 315, -1 / 5, 8 / 5, -205 / 72, 8 / 5, -1 / 5, 8 / 315, -1 / 560])
+NOISY = {'imu.gyroscope_noise_density': 1e-3, 'imu.gyroscope_random_walk': 2e-4,
+         'imu.accelerometer_noise_density': 2e-2, 'imu.accelerometer_random_walk': 3e-3,
+         'imu.gyroscope_turn_on_bias': 0.01, 'imu.accelerometer_turn_on_bias': 0.05}
+
+
+@pytest.mark.parametrize('scene', SCENES)
+@pytest.mark.parametrize('lever_arm', [(0.0, 0.0, 0.0), (0.1, -0.05, 0.08)])
+def test_readings_are_the_derivatives_of_the_exact_pose(scene, lever_arm):
+    """Rates and specific force at a mounted sensor, where the differences are most exact."""
+    values = parameters.checked({**scene_parameters(scene), 'imu.lever_arm': lever_arm,
+                                 'imu.rpy': (0.3, -0.7, 1.9)})
+    top, start = parameters.top_of(values), parameters.start_state(values)
+    imu, motion = Imu(values), propagate(top, start, method='exact')
+    mounting = Rotation.from_euler('xyz', values['imu.rpy'])
+    for t in (0.31, 1.77, 4.05):
+        state = motion.at_ns(round(t * 1e9))
+        rates, force = imu.true(state)
+        step = 2e-2 / (max(np.abs(state.angular_velocity)) + 20.0)
+        times = round(t * 1e9) * 1e-9 + step * np.arange(-4, 5)
+        turned = Rotation.from_quat(solve(top, start, times).quaternion)
+        middle = turned[4] * mounting
+        vectors = (turned[4].inv() * turned).as_rotvec()
+        expected_rates = mounting.inv().apply(FIRST @ vectors / step)
+        scale = 1.0 + np.linalg.norm(expected_rates)
+        assert rates == pytest.approx(expected_rates, abs=1e-7 * scale)
+        positions = turned.apply(lever_arm)
+        acceleration = SECOND @ positions / step ** 2
+        expected_force = middle.inv().apply(
+            acceleration + np.array((0.0, 0.0, top.gravity)))
+        scale = 1.0 + np.linalg.norm(expected_force)
+        assert force == pytest.approx(expected_force, abs=1e-7 * scale)
+        sensor = Rotation.from_quat(imu.orientation(state))
+        assert (sensor.inv() * middle).magnitude() < 1e-12
+
+
+def readings(values, count, period_ns=5_000_000):
+    """Return what an IMU at rest reads, (count, 6), and its bias."""
+    sensor = Sensor(parameters.checked(values), period_ns)
+    still = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    rows = [np.hstack(sensor.read(still, k)) for k in range(count)]
+    biases = [np.hstack(sensor.bias(k)) for k in range(count)]
+    return np.array(rows), np.array(biases), sensor
+
+
+def test_noise_has_the_covariance_that_is_published():
+    rows, biases, sensor = readings(NOISY, 40_000)
+    white = rows - biases
+    published = np.repeat([sensor.gyroscope.variance, sensor.accelerometer.variance], 3)
+    # A sample variance of n normal numbers has a relative deviation of sqrt(2/n): 5 of them.
+    assert np.var(white, axis=0) == pytest.approx(published, rel=5.0 * math.sqrt(2.0 / 40_000))
+    assert np.abs(np.mean(white, axis=0) / np.sqrt(published)).max() < 5.0 / math.sqrt(40_000)
+    correlation = np.corrcoef(white.T) - np.eye(6)
+    assert np.abs(correlation).max() < 5.0 / math.sqrt(40_000)
+    density = np.repeat([1e-3, 2e-2], 3)
+    assert published == pytest.approx(density ** 2 / 0.005)
+
+
+def test_bias_walks_with_its_own_variance():
+    _, biases, sensor = readings(NOISY, 40_000)
+    steps = np.diff(biases, axis=0)
+    walk = np.repeat([2e-4, 3e-3], 3) * math.sqrt(0.005)
+    assert np.std(steps, axis=0) == pytest.approx(walk, rel=5.0 / math.sqrt(2.0 * 40_000))
+    assert np.abs(np.mean(steps[:, :1] * steps[:, 1:2])) < 5.0 * walk[0] ** 2 / math.sqrt(40_000)
+    # No seam between blocks.
+    assert np.abs(steps[511::512] / walk).max() < 5.0
+
+
+def test_sample_k_depends_on_seed_and_k_alone():
+    forward, _, _ = readings(NOISY, 3000)
+    sensor = Sensor(parameters.checked(NOISY), 5_000_000)
+    still = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    for k in (2999, 0, 511, 512, 1024, 5):
+        assert np.array_equal(np.hstack(sensor.read(still, k)), forward[k])
+    other, _, _ = readings({**NOISY, 'seed': 1}, 3000)
+    assert abs(np.corrcoef(other[:, 0], forward[:, 0])[0, 1]) < 0.1
+    assert not np.array_equal(other, forward)
+
+
+def test_white_noise_and_bias_are_separate_draws():
+    whole, _, _ = readings(NOISY, 600)
+    only_white, _, _ = readings({k: v for k, v in NOISY.items() if 'density' in k}, 600)
+    _, biases, _ = readings(NOISY, 600)
+    assert np.allclose(whole, only_white + biases, rtol=0.0, atol=1e-15)
+
+
+def test_readings_saturate_and_are_rounded():
+    values = parameters.checked({'imu.gyroscope_range': 4.0, 'imu.gyroscope_resolution': 0.25,
+                                 'imu.accelerometer_range': 20.0})
+    sensor = Sensor(values, 5_000_000)
+    rates, force = sensor.read(((1.1, -9.0, 3.99), (1.1, -30.0, 25.0)), 7)
+    assert rates == (1.0, -4.0, 4.0)
+    assert force == (1.1, -20.0, 20.0)
+    assert sensor.gyroscope.variance == pytest.approx(0.25 ** 2 / 12.0)
+
+
+def collect(values, ticks_ns):
+    """Return the bytes of imu/data_raw, whatever else is wanted, however ticks fall."""
+    simulation = Simulation(parameters.checked({**NOISY, **values}))
+    raw = []
+    for stream in simulation.streams:
+        if stream.topic == 'imu/data_raw':
+            stream.publish = raw.append
+    for tick in ticks_ns:
+        simulation.advance(tick)
+    return raw
+
+
+def test_equal_seeds_give_equal_bytes_at_any_tick_rate():
+    every_ms = collect({}, range(0, 2_000_000_001, 1_000_000))
+    at_once = collect({}, [2_000_000_000])
+    assert every_ms == at_once and len(at_once) == 401
+    assert collect({'seed': 5}, [2_000_000_000]) != at_once
+
+
+def test_a_perfect_imu_does_not_import_numpy():
+    code = ('import sys\nfrom spinning_top_sim.streams import parameters\n'
+            'from spinning_top_sim.streams.pipeline import Simulation\n'
+            'simulation = Simulation(parameters.checked({}))\n'
+            'for stream in simulation.streams:\n    stream.publish = id\n'
+            'simulation.advance(10 ** 9)\n'
+            'print(sorted({"numpy", "scipy", "rclpy"} & set(sys.modules)))\n')
+    run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                         timeout=60, check=True)
+    assert run.stdout.strip() == '[]'

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The package as colcon, pip and `ros2 run` see it: manifest, versions, executables, files."""
+
+import os
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+
+import pytest
+import yaml  # type: ignore[import-untyped]
+from catkin_pkg.changelog import get_changelog_from_path
+from catkin_pkg.package import parse_package
+
+from spinning_top_sim.streams import parameters
+
+NAME = 'spinning_top_sim'
+ROOT = Path(__file__).parents[1]
+SCRIPTS = sorted(path for path in (ROOT / 'scripts').iterdir() if path.is_file())
+SCENES = sorted((ROOT / 'config').glob('*.yaml'))
+# What builds, environments and runs leave in a checkout.
+NOT_SOURCES = {'build', 'install', 'log', 'logs'}
+
+
+@pytest.fixture(scope='module')
+def setup_py():
+    """Return what setup.py says, as setuptools understands it."""
+    pytest.importorskip('setuptools')
+    from distutils.core import run_setup  # setuptools has it where Python has not
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(ROOT)
+        return run_setup('setup.py', stop_after='init')
+
+
+@pytest.fixture(scope='module')
+def prefix():
+    """Return where the package is installed: in a workspace, or by pip in this environment."""
+    candidates = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
+    for candidate in filter(None, candidates):
+        if (Path(candidate) / 'share/ament_index/resource_index/packages' / NAME).is_file():
+            return Path(candidate)
+    pytest.skip(f'{NAME} is not installed here, only importable')
+
+
+def sources():
+    for folder in (ROOT, *ROOT.iterdir()):
+        if folder is ROOT or folder.name == '.ci':
+            yield from filter(Path.is_file, folder.iterdir())
+        elif folder.is_dir() and folder.name not in NOT_SOURCES and folder.name[0] != '.':
+            yield from filter(Path.is_file, folder.rglob('*'))
+
+
+def is_program(path):
+    if path.suffix in {'.py', '.sh'} or path.name == 'Makefile':
+        return True
+    with path.open('rb') as file:
+        return file.read(2) == b'#!'
+
+
+# ------------------------------------------------------------------------------- the manifest
+
+
+def test_the_manifest_is_valid():
+    warnings: list[str] = []
+    package = parse_package(str(ROOT / 'package.xml'), warnings=warnings)
+    package.validate(warnings=warnings)
+    assert not warnings
+    assert package.name == NAME
+    assert package.get_build_type() == 'ament_python'
+    assert package.licenses == ['Apache-2.0']
+    assert (ROOT / package.licenses[0].file).is_file()
+
+
+def test_the_manifest_names_every_ros_package_that_is_imported():
+    declared = {dependency.name for dependency in
+                parse_package(str(ROOT / 'package.xml')).exec_depends}
+    imported = set()
+    for path in (ROOT / NAME).rglob('*.py'):
+        for line in path.read_text(encoding='utf-8').splitlines():
+            words = line.split()
+            if words[:1] in (['import'], ['from']) and len(words) > 1:
+                imported.add(words[1].split('.')[0])
+    ros = {name for name in imported
+           if name in {'rclpy', 'launch', 'launch_ros', 'ament_index_python', 'rcl_interfaces'}
+           or name.endswith(('_msgs', '_srvs'))}
+    assert ros <= declared
+
+
+def test_versions_agree(setup_py):
+    package = parse_package(str(ROOT / 'package.xml'))
+    newest = next(iter(get_changelog_from_path(str(ROOT), NAME).foreach_version()))[0]
+    assert package.version == newest == setup_py.get_version()
+
+
+def test_manifest_and_setup_py_tell_the_same(setup_py):
+    package = parse_package(str(ROOT / 'package.xml'))
+    (maintainer,) = package.maintainers
+    assert setup_py.get_name() == package.name
+    assert setup_py.get_license() == package.licenses[0]
+    assert setup_py.get_maintainer() == maintainer.name
+    assert setup_py.get_maintainer_email() == maintainer.email
+
+
+# -------------------------------------------------------------------------------- executables
+
+
+def test_every_script_is_installed_as_data_and_as_a_command(setup_py):
+    names = {path.name for path in SCRIPTS}
+    assert 'sim_node' in names
+    commands = dict(line.split(' = ') for line in setup_py.entry_points['console_scripts'])
+    assert set(commands) == names
+    assert set(dict(setup_py.data_files)[f'lib/{NAME}']) == {f'scripts/{name}' for name in names}
+    for name, target in commands.items():
+        module = target.removesuffix(':main')
+        assert (ROOT / f'{module.replace(".", "/")}.py').is_file()
+        assert f'from {module} import main\n' in (ROOT / 'scripts' / name).read_text()
+
+
+@pytest.mark.parametrize('script', SCRIPTS, ids=lambda path: path.name)
+def test_a_script_can_be_executed(script):
+    assert os.access(script, os.X_OK)
+    assert script.read_text().startswith('#!/usr/bin/env python3\n')
+
+
+@pytest.mark.parametrize('script', SCRIPTS, ids=lambda path: path.name)
+def test_an_installed_executable_runs_where_ros2_run_looks(script, prefix):
+    installed = prefix / 'lib' / NAME / script.name
+    search_path = f'{Path(sys.executable).parent}{os.pathsep}{os.environ.get("PATH", "")}'
+    done = subprocess.run([installed, '--help'], env={**os.environ, 'PATH': search_path},
+                          capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    assert 'usage' in done.stdout.lower()
+
+
+# ------------------------------------------------------------------------------ what is there
+
+
+def test_the_share_folder_is_complete(prefix):
+    share = prefix / 'share' / NAME
+    assert (share / 'package.xml').read_bytes() == (ROOT / 'package.xml').read_bytes()
+    for folder, pattern in (('config', '*.yaml'), ('launch', '*.launch.*'), ('urdf', '*'),
+                            ('rviz', '*.rviz')):
+        there = {path.name for path in (share / folder).glob('*')}
+        assert there == {path.name for path in (ROOT / folder).glob(pattern)}, folder
+
+
+def test_the_metadata_ask_for_little():
+    try:
+        requirements = distribution(NAME).requires or []
+    except PackageNotFoundError:
+        pytest.skip(f'{NAME} is not installed here, only importable')
+    always = [line for line in requirements if 'extra' not in line]
+    assert sorted(line.split('<')[0].split('>')[0] for line in always) == ['mcap', 'numpy']
+
+
+def test_every_source_says_its_license():
+    heads = {path: path.read_text(encoding='utf-8').splitlines()[:2]
+             for path in sources() if is_program(path)}
+    assert len(heads) > 30
+    silent = [str(path.relative_to(ROOT)) for path, head in heads.items()
+              if '# SPDX-License-Identifier: Apache-2.0' not in head]
+    assert not silent
+
+
+# ------------------------------------------------------------------------------------- scenes
+
+
+def flat(values, prefix=''):
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from flat(value, f'{prefix}{name}.')
+        else:
+            yield f'{prefix}{name}', value
+
+
+@pytest.mark.parametrize('scene', SCENES, ids=lambda path: path.stem)
+def test_a_scene_holds_parameters_that_the_node_takes(scene):
+    nodes = yaml.safe_load(scene.read_text(encoding='utf-8'))
+    assert nodes
+    for node in nodes.values():
+        assert set(node) == {'ros__parameters'}
+        values = dict(flat(node['ros__parameters'] or {}))
+        values.pop('use_sim_time', None)
+        parameters.checked({name: value for name, value in values.items()
+                            if not name.startswith('qos_overrides.')})
