@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Which share of the spin the transport form should carry, and what its projection gains:
+Which share of the spin the transport form should carry, and what projection and dense output do:
 
     PYTHONPATH=. python benchmark/gauge.py
 
-Evaluations that an error takes, over c/L3 (spinning_top_sim/solvers/transport.py), and errors
-with and without the projection onto the invariants.
+Evaluations that an error takes, over c/L3 (spinning_top_sim/solvers/transport.py), errors with and
+without the projection onto the invariants, and errors at the ends of steps and between them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from cases import CUSP, HEAVY_TOP, LOOPING, NEAR_POLE, SLOW, TOY_60, TOY_200, Ca
 from peers import angles_between
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.solvers.dormand_prince import Integrator
+from spinning_top_sim.solvers.dormand_prince import Integrator, Vector
 from spinning_top_sim.solvers.transport import TransportForm
 
 CASES = (CUSP, TOY_60, TOY_200, LOOPING, SLOW, NEAR_POLE, HEAVY_TOP)
@@ -78,6 +78,12 @@ def main() -> None:
             print(rows[-1], flush=True)
     parts.append(report.table(('case', 'time [s]', 'projected', 'normalized', 'neither',
                                'error ratio'), rows))
+    parts.append('## Between the steps\n\nLargest error [rad] over 10 s at rtol '
+                 f'{DEFAULT_TOLERANCE:g}, at the ends of the steps and halfway between them, '
+                 'there by the quintic\nHermite polynomial, or by the cubic one, which needs no '
+                 'curvatures.\n')
+    rows = [(case.title, *map(report.number, between_steps(case))) for case in CASES]
+    parts.append(report.table(('case', 'ends', 'halfway, quintic', 'halfway, cubic'), rows))
     report.write('gauge.md', '\n'.join(parts))
 
 
@@ -90,6 +96,34 @@ def evaluations_for(case: Case, share: float) -> float:
     return float(np.exp(np.interp(np.log(TARGET), errors[order], counts[order])))
 
 
+def between_steps(case: Case) -> tuple[float, ...]:
+    """Return the largest errors at the ends of steps, halfway, and halfway by cubics."""
+    form = TransportForm(case.top, case.start, DEFAULT_TOLERANCE, 0.1 * DEFAULT_TOLERANCE)
+    integrator = Integrator(form, form.start, form.first_step)
+    ends, middles = [], []
+    found: tuple[list, ...] = [], [], []
+    while integrator.t1 < 10.0:
+        integrator.step()
+        h, middle = integrator.t1 - integrator.t0, 0.5 * (integrator.t0 + integrator.t1)
+        slopes0, slopes1 = form.rates(*integrator.y0), form.rates(*integrator.y1)
+        cubic = tuple(0.5 * (a + b) + 0.125 * h * (p - q) for a, b, p, q in zip(
+            integrator.y0, integrator.y1, slopes0, slopes1, strict=True))
+        ends.append(integrator.t1)
+        middles.append(middle)
+        for rows, y, t in zip(found, (integrator.y1, integrator.interpolate(middle), cubic),
+                              (integrator.t1, middle, middle), strict=True):
+            rows.append(attitude_of(form, y, t))
+    return tuple(float(angles_between(np.array(rows), case.exact.quaternion(np.array(t))).max())
+                 for rows, t in zip(found, (ends, middles, middles), strict=True))
+
+
+def attitude_of(form: TransportForm, y: Vector, t: float) -> tuple[float, ...]:
+    """Return x, y, z, w of the unknowns at t [s], projected, as the simulator reads them."""
+    alpha, beta, _ = form.project(y)
+    spin = cmath.rect(1.0, 0.5 * form.spin_rate * t)
+    return attitude.quaternion(alpha * spin, beta * spin.conjugate())
+
+
 def run(form: TransportForm, case: Case, duration: int, rate: int) -> tuple[float, int]:
     """Return the largest error of the attitude and the number of evaluations."""
     integrator = Integrator(form, form.start, form.first_step)
@@ -98,9 +132,7 @@ def run(form: TransportForm, case: Case, duration: int, rate: int) -> tuple[floa
     for t in (ns / 1e9).tolist():
         while integrator.t1 < t:
             integrator.step()
-        alpha, beta, _ = form.project(integrator.interpolate(t))
-        spin = cmath.rect(1.0, 0.5 * form.spin_rate * t)
-        attitudes.append(attitude.quaternion(alpha * spin, beta * spin.conjugate()))
+        attitudes.append(attitude_of(form, integrator.interpolate(t), t))
     truth = case.exact.states_at_ns(ns).quaternion
     return float(angles_between(np.array(attitudes), truth).max()), integrator.evaluations
 
