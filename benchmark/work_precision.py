@@ -102,7 +102,7 @@ with {bits}-bit numbers.  Time: processor time of a whole call that returns all 
 by their number; what is done once before, a model's compilation or loading, is a column of its
 own, where a later setting may find in a cache what an earlier one compiled (our exact
 solution prepares each motion anew, some milliseconds, and that is in its time).
-Ratio 1 is {reference} at {tolerance:g}.  Times are medians over interleaved rounds in one
+Ratio 1 is {reference} at {tolerance:g}, if that ran.  Times are medians over interleaved rounds in one
 process, {rounds} here (where 1, at least {retakes} for runs below {short:g} s); a method whose run
 would take more than {longest:g} s is left out and says so.  SciPy, heyoka Euler and `rk45 euler`
 solve the paper's equations (29)-(32); heyoka quadratic and diffrax solve the quaternion form
@@ -179,7 +179,7 @@ def _expected_seconds(runner: Runner, duration: int) -> float:
     return seconds_of(lambda: runner.attitudes(probe))[0] * duration / part
 
 
-_LONG: dict[tuple[str, int], tuple[np.ndarray, np.ndarray]] = {}
+_LONG: dict[tuple[str, int], tuple[np.ndarray, np.ndarray] | None] = {}
 
 
 def _error_of_exact(case: Case, ns: np.ndarray, attitudes: np.ndarray) -> float | None:
@@ -191,7 +191,9 @@ def _error_of_exact(case: Case, ns: np.ndarray, attitudes: np.ndarray) -> float 
             with time_limit(LONGEST_TRUTH):
                 _LONG[key] = at, long_attitudes(case, ns[at])
         except (ImportError, TimeUpError):
-            return None
+            _LONG[key] = None
+    if _LONG[key] is None:
+        return None
     at, truth = _LONG[key]
     return float(angles_between(attitudes[at], truth).max())
 
