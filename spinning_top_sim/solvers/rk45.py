@@ -16,6 +16,7 @@ from spinning_top_sim.solvers.euler_form import EulerForm
 from spinning_top_sim.solvers.phases import (
     MomentumState,
     Polar,
+    StepPhases,
     Winding,
     spin_excess,
     windings,
@@ -172,10 +173,10 @@ class TransportMotion(_Stepped):
         self._top, self._start = top, start
         self._form = TransportForm(top, start, rtol, atol)
         super().__init__(self._form, self._form.start, self._form.first_step)
-        self._alpha, self._beta = windings(start)
-        self._line_rate = 0.5 * spin_excess(top, start.l3)
+        alpha, beta = windings(start)
+        self._phases = StepPhases(0.5 * spin_excess(top, start.l3), alpha, beta,
+                                  0.5 * start.theta)
         self._carried_rate = 0.5 * self._form.spin_carried / top.lambda1
-        self._half_theta = 0.5 * start.theta
 
     def at(self, t: float) -> OneState:
         """Return the state at t [s], on the invariants."""
@@ -184,34 +185,14 @@ class TransportMotion(_Stepped):
             alpha, beta, m = self._form.project((alpha, beta, m))
         spin = cmath.rect(1.0, 0.5 * self._form.spin_rate * t)
         return MomentumState(self._top, self._start, alpha * spin, beta * spin.conjugate(),
-                             -2j * self._top.lambda1 * m, t, self)
-
-    def polar(self, alpha: complex, beta: complex, t: float) -> Polar:
-        """See `phases.Phases`; t lies in the newest step."""
-        line = self._line_rate * t
-        return self._continue(alpha, beta, line)
-
-    def theta(self, half_theta: float, t: float) -> float:
-        """See `phases.Phases`; theta/2 turns by less than pi within a step."""
-        return 2.0 * (half_theta
-                      + math.tau * round((self._half_theta - half_theta) / math.tau))
-
-    def _continue(self, alpha: complex, beta: complex, line: float) -> Polar:
-        a, b = self._alpha, self._beta
-        return (a.on_line(alpha, a.phase + line) if a.crosses
-                else a.onward(alpha, a.phase + line),
-                b.on_line(beta, b.phase - line) if b.crosses
-                else b.onward(beta, b.phase - line))
+                             -2j * self._top.lambda1 * m, t, self._phases)
 
     def _step(self) -> None:
         """Take a step, after moving the phases to where it starts."""
-        integrator, a, b = self._integrator, self._alpha, self._beta
+        integrator = self._integrator
         alpha, beta, _ = integrator.y1
         # The stepped frame lacks the spin of `TransportForm.spin_rate`: so does its line.
-        line = -self._carried_rate * integrator.t1
-        (cosine, phase_a), (sine, phase_b) = self._continue(alpha, beta, line)
-        a.phase, b.phase = phase_a - line, phase_b + line
-        self._half_theta = 0.5 * self.theta(math.atan2(sine, cosine), integrator.t1)
+        self._phases = self._phases.moved_to(alpha, beta, -self._carried_rate * integrator.t1)
         integrator.step()
 
 
