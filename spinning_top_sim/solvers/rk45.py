@@ -11,7 +11,7 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.kinematics import AxisState, OneState
 from spinning_top_sim.physics.regimes import cubic
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.dormand_prince import Form, Integrator, Vector
+from spinning_top_sim.solvers.dormand_prince import Form, IntegrationError, Integrator, Vector
 from spinning_top_sim.solvers.euler_form import EulerForm
 from spinning_top_sim.solvers.phases import (
     MomentumState,
@@ -25,6 +25,10 @@ from spinning_top_sim.solvers.transport import TransportForm
 
 NANOSECONDS = 1_000_000_000
 EQUATIONS = ('transport', 'euler')
+# A time that so many steps of the present size do not reach is refused at once: 3 hours of work.
+MOST_STEPS = 1e9
+# The careful first steps say nothing about that.
+TRIAL_STEPS = 100
 # How many units in the last place count as rounding.
 REST_ULPS = 2.0
 # And how far the axis may swing all the same, in cos(theta) over sin^2(theta).
@@ -38,9 +42,23 @@ def rk45(top: Top, start: State, *, equations: str = 'transport', rtol: float = 
 
     rtol, atol: tolerated error a step.  The transport form scales its unknowns to 1, so there
     the two add up; the Euler form tolerates atol + rtol |angle|.
-    Raises ValueError for a bad setting, IntegrationError where the Euler form cannot start.
+    Raises ValueError for a bad setting or constants that doubles cannot hold, IntegrationError
+    where the Euler form cannot start.
     """
     check_settings(equations, rtol, atol)
+    try:
+        motion = _motion(top, start, equations, rtol, atol)
+        first = motion.at(0.0)
+        held = all(map(math.isfinite, (first.energy, first.phi_dot, first.psi_dot)))
+    except ArithmeticError:
+        held = False
+    if not held:
+        raise ValueError(f'{top} from {start}: the constants are too far apart in size for '
+                         'doubles to hold the motion')
+    return motion
+
+
+def _motion(top: Top, start: State, equations: str, rtol: float, atol: float) -> SteppedOrClosed:
     if equations == 'euler':
         return EulerMotion(top, start, rtol, atol)
     if top.gravity_torque == 0.0:
@@ -140,6 +158,12 @@ class _Stepped(SteppedOrClosed):
                 return False
             self._step()
             taken += 1
+            step = integrator.t1 - integrator.t0
+            if max_steps is None and taken == TRIAL_STEPS and t - integrator.t1 > (
+                    MOST_STEPS * step):
+                raise IntegrationError(
+                    f't = {t:.9g} s is more than {MOST_STEPS:.0e} steps of {step:.3g} s away: '
+                    "use method = 'exact'")
         return True
 
     def _step(self) -> None:
