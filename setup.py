@@ -14,6 +14,7 @@ NAME = 'spinning_top_sim'
 EXECUTABLES = {
     'sim_node': 'spinning_top_sim.nodes.sim_node',
     'replay_node': 'spinning_top_sim.nodes.replay_node',
+    'simulate': 'spinning_top_sim.tools.simulate',
 }
 
 DATA_FILES = {
@@ -61,6 +62,9 @@ setup(
             'rosbags>=0.10.11,<0.12',
             'scipy>=1.11,<2',
         ],
+        # simulate: parameter files, a progress bar, Parquet
+        'tools': ['PyYAML>=6.0,<7', 'tqdm>=4.64,<5'],
+        'parquet': ['pyarrow>=14'],
         'plot': ['matplotlib>=3.6,<4'],
         # Narrow: a new release of these finds new faults.
         'lint': [

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import functools
 import gc
-import json
 import math
 import threading
 import time
@@ -28,7 +27,7 @@ from spinning_top_sim.nodes.message_types import message_type
 from spinning_top_sim.nodes.pacing import DeadlineThread, SimulatedClock
 from spinning_top_sim.nodes.ros_parameters import ParameterChanges, declare, start_values
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.streams import messages
+from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import Simulation
 
@@ -36,6 +35,7 @@ OK, WARN, ERROR = 0, 1, 2
 
 # The stamp of t = 0 is a multiple of this, so that grids meet across streams and runs.
 EPOCH_GRID_NS = 10_000_000
+OPENING_NS = 60_000_000
 # How often subscriptions are counted; a new subscriber waits at most this long.
 LISTENERS_PERIOD_NS = 50_000_000
 # One tick works at most this long before services and signals get their turn.
@@ -102,19 +102,15 @@ class Simulator(Node):
     def _followed_time(self) -> Any:
         """Return ROS time where the node follows a /clock, else steady time."""
         follows = self.get_parameter('use_sim_time').value
-        if follows and not self._enabled('clock'):
+        if follows and not journal.is_enabled('clock', self._values):
             return lambda: self.get_clock().now().nanoseconds
         return time.monotonic_ns
-
-    def _enabled(self, parameter: str) -> bool:
-        if parameter == 'clock' and self._values['publish_clock']:
-            return True
-        return self._values[f'{parameter}.enabled']
 
     def _open_publishers(self) -> None:
         """Have a publisher for each enabled stream, and for no other."""
         for stream in self._simulation.streams:
-            wanted, there = self._enabled(stream.parameter), stream.topic in self._outputs
+            wanted = journal.is_enabled(stream.parameter, self._values)
+            there = stream.topic in self._outputs
             if wanted and not there:
                 self._outputs[stream.topic] = self._publisher(
                     message_type(stream.type_name), stream.topic)
@@ -153,8 +149,13 @@ class Simulator(Node):
     # ---------------------------------------------------------------------- start and stop
 
     def start(self) -> None:
-        """Let time run: simulated t = 0 is the next point of the stamps' grid."""
-        if self._values['record.enabled']:
+        """Let time run: simulated t = 0 is a point of the stamps' grid just ahead."""
+        records = self._values['record.enabled']
+        now = self.get_clock().now().nanoseconds
+        # The log's head tells the epoch, and takes a while to reach the disk.
+        epoch = _ceil_to(now + (OPENING_NS if records else 0), EPOCH_GRID_NS)
+        self._simulation.epoch_ns = epoch
+        if records:
             try:
                 self._start_recording()
             except Exception as error:      # whatever the disk has against it, the motion goes on
@@ -162,12 +163,10 @@ class Simulator(Node):
                 self.get_logger().error(f'not recording: {error}')
         gc.collect()
         gc.freeze()             # what there is now stays: no full collection in the middle of it
-        now = self.get_clock().now().nanoseconds
-        epoch = _ceil_to(now, EPOCH_GRID_NS)
-        if epoch - now < NANOSECONDS and self._clock_is_wall():
-            time.sleep((epoch - now) / NANOSECONDS)
+        wait_ns = epoch - self.get_clock().now().nanoseconds
+        if 0 < wait_ns <= OPENING_NS + EPOCH_GRID_NS and self._clock_is_wall():
+            time.sleep(wait_ns / NANOSECONDS)
         with self._lock:
-            self._simulation.epoch_ns = epoch
             self._speed.read(0)
             if not self._paused:
                 self._simulated_clock.start(0)
@@ -300,8 +299,7 @@ class Simulator(Node):
             self._counters.commands += 1
             at_ns = simulation.history[-1][0]
             self._journal('command', at_ns, l3=l3, lz=lz)
-            self._record('~/commands', at_ns, messages.float64_multi_array(
-                ('l3', 'lz')).encode(0, (l3, lz)))
+            self._record(journal.COMMANDS, at_ns, journal.command(l3, lz))
 
     def _apply(self, values: dict[str, Any], changed: set[str]) -> None:
         """Put a validated change of parameters into effect.  Raises ValueError to refuse."""
@@ -436,23 +434,21 @@ class Simulator(Node):
             if self._recorder is not None:
                 return f'recording already to {self._recorder.path}'
             values, simulation = self._values, self._simulation
-            chosen = values['record.streams']
-            streams = [stream for stream in simulation.streams if stream.topic in self._outputs
-                       and ('all' in chosen or stream.parameter in chosen)]
+            streams = journal.recorded_streams(simulation.streams, values)
             topics = [RecordedTopic(self._outputs[stream.topic].topic_name, stream.type_name,
                                     _rosbag2_qos(self._qos[self._outputs[stream.topic]
                                                            .topic_name]))
                       for stream in streams]
-            for name, type_name in (('~/commands', 'std_msgs/msg/Float64MultiArray'),
-                                    ('~/events', 'std_msgs/msg/String')):
-                topics.append(RecordedTopic(self.resolve_topic_name(name), type_name))
+            topics += [RecordedTopic(self.resolve_topic_name(name), type_name)
+                       for name, type_name in journal.TOPICS]
             recorder = McapRecorder.open(
                 _free_path(values['record.uri']), topics, self._log_metadata(),
                 max_loss=values['record.max_loss'], compression=values['record.compression'],
                 min_free_bytes=values['record.min_free_bytes'])
             for index, stream in enumerate(streams):
                 stream.record = functools.partial(recorder.write, index)
-            self._journal_topics = {'~/commands': len(streams), '~/events': len(streams) + 1}
+            self._journal_topics = {name: len(streams) + i
+                                    for i, (name, _) in enumerate(journal.TOPICS)}
             self._recorder, self._record_error = recorder, None
             self._journal('start', max(simulation.now_ns, 0))
             return f'recording to {recorder.path}'
@@ -487,8 +483,7 @@ class Simulator(Node):
 
     def _journal(self, event: str, at_ns: int, **details: Any) -> None:
         """Log what happened to the motion, so that it can be computed again."""
-        text = json.dumps({'event': event, 't_ns': at_ns, **details}, default=list)
-        self._record('~/events', at_ns, messages.string(text))
+        self._record(journal.EVENTS, at_ns, journal.event(event, at_ns, **details))
 
     def _check_recorder(self) -> None:
         recorder = self._recorder
