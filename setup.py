@@ -2,7 +2,6 @@
 """Build and install by pip, by `colcon build`, by hand; the only place with version ranges."""
 
 from glob import glob
-from pathlib import Path
 
 from setuptools import find_packages, setup
 
@@ -31,8 +30,6 @@ setup(
     name=NAME,
     version='0.1.0',
     description='The heavy symmetric top in real time for ROS 2, with a known exact truth',
-    long_description=Path('README.md').read_text(encoding='utf-8'),
-    long_description_content_type='text/markdown',
     maintainer='spinning_top_sim maintainers',
     maintainer_email='maintainers@spinning-top-sim.example',
     license='Apache-2.0',
@@ -65,7 +62,7 @@ setup(
         # simulate: parameter files, a progress bar, Parquet
         'tools': ['PyYAML>=6.0,<7', 'tqdm>=4.64,<5'],
         'parquet': ['pyarrow>=14'],
-        'plot': ['matplotlib>=3.6,<4'],
+        'plot': ['matplotlib>=3.6,<4'],     # docs/figures.py
         # Narrow: a new release of these finds new faults.
         'lint': [
             'mypy>=2.4.1,<2.5',

@@ -31,6 +31,10 @@ class Propagator(Protocol):
     def evaluations(self) -> int:
         """Evaluations of the right-hand side."""
 
+    @property
+    def earliest_ns(self) -> int:
+        """The first nanosecond that can still be read after the steps taken."""
+
     def reach_ns(self, ns: int, max_steps: int | None = None) -> bool:
         """Compute what the state at `ns` nanoseconds needs; False if max_steps did not do."""
 
@@ -63,6 +67,7 @@ class ExactPropagator:
 
     steps = 0
     evaluations = 0
+    earliest_ns = 0
 
     def __init__(self, top: Top, start: State) -> None:
         # 1.5 ms of long decimals, and their import, for those who ask for it only.

@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.kinematics import AxisState, OneState
+from spinning_top_sim.physics.regimes import cubic
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.dormand_prince import Form, Integrator, Vector
 from spinning_top_sim.solvers.euler_form import EulerForm
@@ -25,6 +26,8 @@ NANOSECONDS = 1_000_000_000
 EQUATIONS = ('transport', 'euler')
 # How many units in the last place count as rounding.
 REST_ULPS = 2.0
+# And how far the axis may swing all the same, in cos(theta) over sin^2(theta).
+REST_SWING = 1e-12
 
 
 def rk45(top: Top, start: State, *, equations: str = 'transport', rtol: float = 1e-11,
@@ -61,7 +64,7 @@ def nutation_rests(top: Top, start: State) -> bool:
     Whether theta stays as it is: sleeping, hanging at a pole, or steady precession.
 
     Steady means theta'' = 0, eq. (30), as nearly as its terms and the given L3 and Lz, doubles
-    all, can say.
+    all, can say.  Next to a pole they say so little that the axis may swing far; then it is not.
     """
     if start.theta_dot != 0.0:
         return False
@@ -75,7 +78,12 @@ def nutation_rests(top: Top, start: State) -> bool:
     if start.lz - start.l3 * cosine:
         rounded_rate = (abs(start.lz) + abs(start.l3)) / (top.lambda1 * sine * sine)
         doubt += abs((2.0 * phi_dot * cosine - gyroscopic) * sine) * rounded_rate
-    return abs(math.fsum(terms)) <= REST_ULPS * math.ulp(1.0) * doubt
+    if abs(math.fsum(terms)) > REST_ULPS * math.ulp(1.0) * doubt:
+        return False
+    # From theta' = 0 cos(theta) swings by f1/f2, where that is small.
+    s0, c0 = half_sine ** 2, half_cosine ** 2
+    _, f1, f2, _ = cubic(top, start, s0, c0)
+    return abs(f1) <= REST_SWING * 4.0 * s0 * c0 * abs(f2)
 
 
 class SteppedOrClosed(ABC):
@@ -83,6 +91,7 @@ class SteppedOrClosed(ABC):
 
     steps = 0
     evaluations = 0
+    earliest_ns = 0
 
     @abstractmethod
     def at(self, t: float) -> OneState:
@@ -114,6 +123,13 @@ class _Stepped(SteppedOrClosed):
     @property
     def evaluations(self) -> int:  # type: ignore[override]
         return self._integrator.evaluations
+
+    @property
+    def earliest_ns(self) -> int:  # type: ignore[override]
+        """See `Propagator`."""
+        start = self._integrator.t0
+        ns = math.ceil(start * NANOSECONDS)
+        return ns if ns / NANOSECONDS >= start else ns + 1
 
     def reach(self, t: float, max_steps: int | None = None) -> bool:
         integrator = self._integrator

@@ -110,7 +110,11 @@ class Simulation:
 
     def state(self) -> OneState:
         """Return the state at `now_ns` (at the start before the first sample)."""
-        return self.solver.at_ns(max(self.now_ns - self.anchor_ns, 0))
+        return self.solver.at_ns(self._readable_ns() - self.anchor_ns)
+
+    def _readable_ns(self) -> int:
+        """Return `now_ns`, or what steps shorter than 1 ns have left of it."""
+        return max(self.now_ns, self.anchor_ns + self.solver.earliest_ns)
 
     def orientation_error(self, state: Columns, t_ns: int) -> float:
         """
@@ -206,6 +210,9 @@ class Simulation:
         local_ns = t_ns - self.anchor_ns
         while not self.solver.reach_ns(local_ns, STEPS_AT_ONCE):
             if give_way():
+                # Nothing is due before t_ns, and the steps taken cannot be taken back.
+                reached_ns = self.anchor_ns + self.solver.earliest_ns
+                self.now_ns = max(self.now_ns, min(reached_ns, t_ns - 1))
                 return False
         return True
 
@@ -235,7 +242,9 @@ class Simulation:
         for name, value in (('l3', l3), ('lz', lz)):
             if not math.isfinite(value):
                 raise ValueError(f'{name} = {value!r} kg m^2/s: must be finite')
-        at_ns = max(self.now_ns, 0)
+        at_ns = max(self._readable_ns(), 0)
+        if at_ns > max(self.now_ns, 0):
+            self.advance(at_ns)
         state = self.solver.at_ns(at_ns - self.anchor_ns)
         pole = pole_momentum(abs(state.theta), l3)
         if pole is not None and lz != pole:
@@ -255,11 +264,22 @@ class Simulation:
 
 def _first_step(top: Top, start: State, values: Mapping[str, Any]) -> tuple[Propagator, OneState]:
     """Return the motion from `start` and its first state; the first step shows if there is one."""
-    solver = propagate(top, start, method=values['solver.method'],
-                       equations=values['solver.equations'], rtol=values['solver.rtol'],
-                       atol=values['solver.atol'])
-    solver.reach_ns(1)
+    def begin() -> Propagator:
+        return propagate(top, start, method=values['solver.method'],
+                         equations=values['solver.equations'], rtol=values['solver.rtol'],
+                         atol=values['solver.atol'])
+
+    solver = begin()
     state = solver.at_ns(0)
     if not math.isfinite(state.energy):
-        raise ValueError(f'the energy would be {state.energy!r} J')
+        raise ValueError(f'the energy would be {state.energy!r} J with {_rates(start)}')
+    if not solver.reach_ns(1, STEPS_AT_ONCE):
+        raise ValueError(f'{_rates(start)} turn the top too fast: over {STEPS_AT_ONCE} steps a '
+                         'nanosecond')
+    if solver.earliest_ns:              # steps shorter than 1 ns have left t = 0 behind
+        solver = begin()
     return solver, state
+
+
+def _rates(start: State) -> str:
+    return f'theta_dot = {start.theta_dot!r} rad/s, l3 = {start.l3!r}, lz = {start.lz!r} kg m^2/s'
