@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,9 @@ from mcap.reader import NonSeekingReader, SeekingReader
 from mcap.records import Channel, Message, Schema
 
 from spinning_top_sim.nodes.playback import Message as Played
+
+# What mcap raises where a record is cut or is none.
+NO_RECORD = (McapError, OSError, ValueError, StopIteration, struct.error)
 
 Record = tuple[Schema | None, Channel, Message]
 
@@ -53,7 +57,7 @@ class PlayableLog:
                 raise ValueError(f'{path} is no MCAP file') from error
             try:
                 summary = reader.get_summary()
-            except (McapError, OSError, ValueError, StopIteration) as error:
+            except NO_RECORD as error:
                 if not partial:
                     raise ValueError(
                         f'{path} is torn: it has no end. `recover` makes a whole log of it, '
@@ -103,6 +107,6 @@ class PlayableLog:
 def _complete_records(path: Path) -> list[Record]:
     """Return the messages of the complete chunks of a torn file."""
     records: list[Record] = []
-    with path.open('rb') as file, contextlib.suppress(McapError):
+    with path.open('rb') as file, contextlib.suppress(*NO_RECORD):
         records.extend(NonSeekingReader(file).iter_messages(log_time_order=False))
     return sorted(records, key=lambda record: record[2].log_time)

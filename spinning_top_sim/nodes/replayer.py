@@ -19,7 +19,7 @@ from rclpy.exceptions import InvalidTopicNameException, ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile, QoSReliabilityPolicy
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.task import Future
 from rclpy.time import Time
@@ -37,8 +37,12 @@ from spinning_top_sim.recording.schemas import find_definition
 
 NANOSECONDS = 1_000_000_000
 SLOWEST, FASTEST = 1e-6, 1e9
-# How long the last messages may take to reach those who listen.
+# How long the last messages may take to reach those who listen: Fast DDS asks every 3 s whether
+# they have.
 LAST_WORD_S = 5.0
+# Messages that a reliable, volatile topic keeps to send again: rates above 1 and late messages make
+# bursts that the recorded publisher never had.  Nobody matches or sees it, but for losing less.
+LONGEST_BURST = 1000
 # How often subscribers are counted while waiting for them, and stops are looked for.
 LOOK_S = 0.02
 # A thread that wants to send gets Python's lock this soon from the one that reads ahead.
@@ -134,8 +138,8 @@ class Replayer(Node):
                              f'{", ".join(sorted(there)) or "none at all"}')
         for name in sorted(wanted - there):
             self.get_logger().warning(f'the log has no topic {name}')
-        if self._options.clock:
-            self._clock_publisher = self.create_publisher(ClockMessage, '/clock', 10)
+        self._clock_publishers = [self.create_publisher(ClockMessage, '/clock', 10)
+                                  ] if self._options.clock else []
         for index, topic in enumerate(self._log.topics):
             if wanted and topic.name not in wanted:
                 continue
@@ -170,14 +174,18 @@ class Replayer(Node):
         """Return the QoS that was recorded; what publishers did not agree on is as usual."""
         profiles = parse_offered_qos(topic.qos)
         if not profiles:
-            return QoSProfile(depth=10)
+            return QoSProfile(depth=LONGEST_BURST)
         if any(profile != profiles[0] for profile in profiles):
             self.get_logger().warning(f'{topic.name} was recorded from publishers with different '
                                       'QoS: published as reliable, volatile')
-            return QoSProfile(depth=10)
+            return QoSProfile(depth=LONGEST_BURST)
         policies = {key: duration(value) if isinstance(value, Mapping) else value
                     for key, value in profiles[0].items()}
-        return QoSProfile(**{**policies, 'depth': policies['depth'] or 10})
+        qos = QoSProfile(**{**policies, 'depth': policies['depth'] or 10})
+        if (qos.reliability, qos.durability) == (QoSReliabilityPolicy.RELIABLE,
+                                                 QoSDurabilityPolicy.VOLATILE):
+            qos.depth = max(qos.depth, LONGEST_BURST)
+        return qos
 
     # ---------------------------------------------------------------------- start and stop
 
@@ -232,7 +240,8 @@ class Replayer(Node):
         return True
 
     def _subscribers(self) -> int:
-        return sum(publisher.get_subscription_count() for publisher in self._outputs.values())
+        publishers = [*self._outputs.values(), *self._clock_publishers]
+        return sum(publisher.get_subscription_count() for publisher in publishers)
 
     def _wait_for_delivery(self) -> None:
         """Wait until all who listen have the last messages, or too long."""
@@ -248,7 +257,7 @@ class Replayer(Node):
     def _publish_clock(self) -> None:
         try:
             message = ClockMessage(clock=Time(nanoseconds=self._playback.now()).to_msg())
-            self._clock_publisher.publish(message)
+            self._clock_publishers[0].publish(message)
         except Exception:
             if self.context.ok():
                 raise
