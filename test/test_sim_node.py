@@ -173,6 +173,7 @@ def the_log(folder):
 def simulated(log, metadata, until_ns):
     """Compute the run of a log in this process; return {topic: [(stamp, bytes)]}."""
     record = metadata['spinning_top_sim']
+    assert 0 <= until_ns < LIFETIME_S * SECOND, 'the stamp of t = 0 in the log is wrong'
     simulation = Simulation(parameters.checked(json.loads(record['parameters'])),
                             int(record['epoch_ns']))
     taken = {}

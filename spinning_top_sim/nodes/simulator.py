@@ -44,6 +44,7 @@ TICK_BUDGET_S = 0.05
 LATEST_NS = 500_000_000
 # A simulation further behind than this lets its clock slip: its real-time factor falls below 1.
 LONGEST_LAG_NS = 1_000_000_000
+NO_CLOCK = 'waiting for the first /clock (use_sim_time is set)'
 
 
 class Simulator(Node):
@@ -80,7 +81,14 @@ class Simulator(Node):
         self._outputs: dict[str, Publisher] = {}
         self._open_publishers()
         self._make_interface()
-        self._simulated_clock = SimulatedClock(self._followed_time(), values['time_scale'])
+        # Another node's /clock is followed; one that is our own cannot be.
+        self._follows = (self.get_parameter('use_sim_time').value
+                         and not journal.is_enabled('clock', self._values))
+        self._date = self.get_clock() if self._follows else Clock(clock_type=ClockType.SYSTEM_TIME)
+        self._simulated_clock = SimulatedClock(
+            (lambda: self._date.now().nanoseconds) if self._follows else time.monotonic_ns,
+            values['time_scale'])
+        self._begun = False
         self._paused = values['start_paused']
         self._listeners_due = 0
         self._last_tick = 0
@@ -98,13 +106,6 @@ class Simulator(Node):
     @property
     def _values(self) -> dict[str, Any]:
         return self._changes.values
-
-    def _followed_time(self) -> Any:
-        """Return ROS time where the node follows a /clock, else steady time."""
-        follows = self.get_parameter('use_sim_time').value
-        if follows and not journal.is_enabled('clock', self._values):
-            return lambda: self.get_clock().now().nanoseconds
-        return time.monotonic_ns
 
     def _open_publishers(self) -> None:
         """Have a publisher for each enabled stream, and for no other."""
@@ -149,27 +150,11 @@ class Simulator(Node):
     # ---------------------------------------------------------------------- start and stop
 
     def start(self) -> None:
-        """Let time run: simulated t = 0 is a point of the stamps' grid just ahead."""
-        records = self._values['record.enabled']
-        now = self.get_clock().now().nanoseconds
-        # The log's head tells the epoch, and takes a while to reach the disk.
-        epoch = _ceil_to(now + (OPENING_NS if records else 0), EPOCH_GRID_NS)
-        self._simulation.epoch_ns = epoch
-        if records:
-            try:
-                self._start_recording()
-            except Exception as error:      # whatever the disk has against it, the motion goes on
-                self._record_error = str(error)
-                self.get_logger().error(f'not recording: {error}')
+        """Let time run: simulated t = 0 is the next point of the stamps' grid."""
         gc.collect()
         gc.freeze()             # what there is now stays: no full collection in the middle of it
-        wait_ns = epoch - self.get_clock().now().nanoseconds
-        if 0 < wait_ns <= OPENING_NS + EPOCH_GRID_NS and self._clock_is_wall():
-            time.sleep(wait_ns / NANOSECONDS)
         with self._lock:
-            self._speed.read(0)
-            if not self._paused:
-                self._simulated_clock.start(0)
+            self._begin()
         tick_rate = self._values['tick_rate']
         if self._values['pacing'] == 'thread':
             self._pacer = DeadlineThread(self._tick_in_thread, tick_rate)
@@ -177,8 +162,28 @@ class Simulator(Node):
         else:
             self._tick_timer = self.create_timer(1.0 / tick_rate, self._tick, clock=self._steady)
 
-    def _clock_is_wall(self) -> bool:
-        return not self.get_parameter('use_sim_time').value
+    def _begin(self) -> bool:
+        """Fix the stamp of t = 0; False as long as the /clock that we follow says nothing."""
+        now = self._date.now().nanoseconds
+        if now == 0:
+            return False
+        records = self._values['record.enabled']
+        # The log's head tells the epoch, and takes a while to reach the disk.
+        epoch = _ceil_to(now + (OPENING_NS if records and not self._follows else 0), EPOCH_GRID_NS)
+        self._simulation.epoch_ns = epoch
+        if records:
+            try:
+                self._start_recording()
+            except Exception as error:      # whatever the disk has against it, the motion goes on
+                self._record_error = str(error)
+                self.get_logger().error(f'not recording: {error}')
+        if not self._follows:
+            time.sleep(max(0.0, (epoch - self._date.now().nanoseconds) / NANOSECONDS))
+        self._speed.read(0)
+        if not self._paused:
+            self._simulated_clock.start(0)
+        self._begun = True
+        return True
 
     def stop(self) -> None:
         """End the motion and close the recording; safe whatever state the context is in."""
@@ -209,6 +214,8 @@ class Simulator(Node):
     def _tick(self) -> None:
         """Send what is due."""
         with self._lock:
+            if not (self._begun or self._begin()):
+                return
             if self._paused or self._failure or self.finished.done():
                 return
             self._count_tick()
@@ -355,7 +362,7 @@ class Simulator(Node):
             elif not request.data and self._paused:
                 self._paused = False
                 self._last_tick = 0
-                if not self._failure:
+                if self._begun and not self._failure:
                     self._simulated_clock.start(max(self._simulation.now_ns, 0))
             response.success = True
             state = 'paused' if self._paused else 'running'
@@ -370,6 +377,9 @@ class Simulator(Node):
             if not self._paused:
                 response.success = False
                 response.message = 'running: ~/step works while paused (~/set_pause true)'
+                return response
+            if not self._begun:
+                response.success, response.message = False, NO_CLOCK
                 return response
             self._look_for_listeners()
             count, dt = self._values['step.count'], self._values['step.dt']
@@ -386,6 +396,9 @@ class Simulator(Node):
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Any:
         with self._lock:
+            if not self._begun:
+                response.success, response.message = False, NO_CLOCK
+                return response
             simulation = self._simulation
             # Back to the spin it was started with, whatever was commanded since.
             values = {**self._values, 'spin.l3': self._start_values['spin.l3'],
@@ -397,7 +410,7 @@ class Simulator(Node):
                 response.success = False
                 response.message = f'not reset: {error}'
                 return response
-            now = self.get_clock().now().nanoseconds
+            now = self._date.now().nanoseconds
             simulation.epoch_ns = _ceil_to(max(last_stamp + 1, now), EPOCH_GRID_NS)
             self._failure = None
             self._simulated_clock.start(0)
@@ -413,6 +426,8 @@ class Simulator(Node):
     def _on_record(self, request: SetBool.Request, response: SetBool.Response) -> Any:
         try:
             if request.data:
+                if not self._begun:
+                    raise RuntimeError(NO_CLOCK)
                 response.message = self._start_recording()
             else:
                 response.message = self._stop_recording() or 'not recording'
