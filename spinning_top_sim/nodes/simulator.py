@@ -25,9 +25,9 @@ from std_srvs.srv import SetBool, Trigger
 from spinning_top_sim.nodes import reports
 from spinning_top_sim.nodes.message_types import message_type
 from spinning_top_sim.nodes.pacing import DeadlineThread, SimulatedClock
-from spinning_top_sim.nodes.ros_parameters import ParameterChanges, declare, start_values
+from spinning_top_sim.nodes.ros_parameters import SPIN, ParameterChanges, declare, start_values
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.streams import journal, parameters
+from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import Simulation
 
@@ -71,11 +71,11 @@ class Simulator(Node):
         self._factor = 0.0
         self._described: object = None          # the motion that `_regime` names
         self._regime = ''
-        # Where `~/reset` goes back to, whatever was commanded since; an unset lz stays unset.
-        self._start_spin = {name: values[name] for name in ('spin.l3', 'spin.lz')}
+        # What a reset goes back to: an unset spin.lz is the cusp, wherever initial.theta is then.
+        start_spin = {name: values[name] for name in SPIN}
         values = {**values, 'spin.lz': self._simulation.lz}
         declare(self, values)
-        self._changes = ParameterChanges(self, values, self._apply)
+        self._changes = ParameterChanges(self, values, start_spin, self._apply)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._qos: dict[str, QoSProfile] = {}
         self._outputs: dict[str, Publisher] = {}
@@ -311,7 +311,6 @@ class Simulator(Node):
     def _apply(self, values: dict[str, Any], changed: set[str]) -> None:
         """Put a validated change of parameters into effect.  Raises ValueError to refuse."""
         with self._lock:
-            parameters.start_state({**values, **self._start_spin})
             if changed & {'spin.l3', 'spin.lz'}:
                 self._refuse_counted(values['spin.l3'], values['spin.lz'])
             rest = changed - {'spin.l3', 'spin.lz'}
@@ -401,7 +400,8 @@ class Simulator(Node):
                 response.success, response.message = False, NO_CLOCK
                 return response
             simulation = self._simulation
-            values = {**self._values, **self._start_spin}
+            # Back to the spin it was started with, whatever was commanded since.
+            values = {**self._values, **self._changes.start_spin}
             last_stamp = simulation.epoch_ns + simulation.now_ns
             try:
                 simulation.restart(values)
@@ -419,7 +419,8 @@ class Simulator(Node):
             self._journal('reset', 0, epoch_ns=simulation.epoch_ns, parameters=values)
             response.success = True
             response.message = f'at t = 0, stamps go on from {simulation.epoch_ns} ns'
-        self._changes.follow(spin__l3=simulation.l3, spin__lz=simulation.lz)
+            l3, lz = simulation.l3, simulation.lz
+        self._changes.follow(spin__l3=l3, spin__lz=lz)
         return response
 
     def _on_record(self, request: SetBool.Request, response: SetBool.Response) -> Any:
