@@ -296,7 +296,8 @@ def test_odometry_rates_are_the_derivative_of_its_attitude(run):
     rates = np.array([xyz(m.twist.twist.angular) for m in messages])
     assert np.abs(rates_by_differences(q, 0.01) - rates[5:-5]).max() < 1e-6
     assert np.ptp(rates, axis=0).max() > 0.1
-    assert {xyz(m.twist.twist.linear) + xyz(m.pose.pose.position) for m in messages} == {6 * (0.0,)}
+    assert {xyz(m.twist.twist.linear) + xyz(m.pose.pose.position)
+            for m in messages} == {6 * (0.0,)}
 
 
 def test_imu_rates_are_the_derivative_of_its_attitude(run):
@@ -332,7 +333,7 @@ def test_the_accelerometer_on_the_body_reads_the_acceleration_of_its_place(both_
     mounting = product(product(about_z(yaw), about_y(pitch)), about_x(roll))
     q_body = product(q_sensor, conjugate(np.tile(mounting, (len(q_sensor), 1))))
     arm = np.tile(RUNS['thread']['imu.lever_arm'], (len(q_body), 1))
-    force = difference(turned(q_body, arm), 0.005, order=2) + [0.0, 0.0, GRAVITY]
+    force = difference(turned(q_body, arm), 0.005, order=2) + np.array((0.0, 0.0, GRAVITY))
     expected = turned(conjugate(q_sensor[5:-5]), force)
     found = np.array([xyz(m.linear_acceleration) for m in messages])[5:-5]
     assert np.abs(found - expected).max() < 1e-6
