@@ -114,7 +114,8 @@ class SimNode:
         with (self.folder / 'out').open('wb') as out, (self.folder / 'err').open('wb') as err:
             self.process = subprocess.Popen(
                 self.command, cwd=self.folder, env=environment, start_new_session=True,
-                stdin=subprocess.DEVNULL, stdout=out, stderr=err, preexec_fn=_die_with_parent)
+                stdin=subprocess.DEVNULL, stdout=out, stderr=err,
+                preexec_fn=_die_with_parent)  # noqa: PLW1509 - one call, takes no lock
         self._killer = threading.Timer(LIFETIME_S, self.kill)
         self._killer.daemon = True
         self._killer.start()

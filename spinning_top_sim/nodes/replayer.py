@@ -41,7 +41,8 @@ SLOWEST, FASTEST = 1e-6, 1e9
 # they have.
 LAST_WORD_S = 5.0
 # Messages that a reliable, volatile topic keeps to send again: rates above 1 and late messages
-# make bursts that the recorded publisher never had.  Nobody matches or sees it, but for losing less.
+# make bursts that the recorded publisher never had.  Nobody matches or sees it, but for losing
+# less.
 LONGEST_BURST = 1000
 # How often subscribers are counted while waiting for them, and stops are looked for.
 LOOK_S = 0.02
