@@ -13,6 +13,7 @@ NAME = 'spinning_top_sim'
 # scripts/ too, installed there as data by pip and by colcon alike.
 EXECUTABLES = {
     'sim_node': 'spinning_top_sim.nodes.sim_node',
+    'recover': 'spinning_top_sim.tools.recover',
 }
 
 DATA_FILES = {
