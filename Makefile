@@ -33,7 +33,7 @@ export PYTHONUNBUFFERED := 1
 PIP := '$(VENV)/bin/python' -m pip --disable-pip-version-check install --quiet --quiet
 SCENES := $(sort $(basename $(notdir $(wildcard config/*.yaml))))
 # Folders too: their time tells of a file that is gone.
-SOURCES := $(shell find setup.py setup.cfg package.xml README.md config launch resource rviz \
+SOURCES := $(shell find setup.py setup.cfg package.xml config launch resource rviz \
     scripts spinning_top_sim urdf -name __pycache__ -prune -o \( -type f -o -type d \) \
     ! -name '.*' ! -name '*~' -print 2>/dev/null)
 
@@ -68,35 +68,46 @@ test: dependencies
 	'$(VENV)/bin/pytest' $(TESTS) $(ARGS)
 
 lint: $(VENV)/.deps-test $(VENV)/.deps-lint $(VENV)/.package
-	'$(VENV)/bin/ruff' check .
+	'$(VENV)/bin/ruff' check . scripts/*
 	'$(VENV)/bin/mypy'
 
 build: $(VENV)/.deps-colcon $(VENV)/.package
 	.ci/colcon-build '$(VENV)'
 
 clean:
-	test ! -e '$(VENV)/pyvenv.cfg' || rm -rf '$(VENV)'
+	test ! -e '$(VENV)/.made' || rm -rf '$(VENV)'
 	rm -rf .mypy_cache .pytest_cache .ruff_cache
 	find $(wildcard benchmark launch spinning_top_sim test) -name __pycache__ -prune -exec rm -rf {} +
 
-# Made anew when it is of another Python than the one asked for, was moved, or does not run.
+# Made anew when it is of another Python than the one asked for, was moved, was left half made or
+# does not run.  An environment that someone else made is used as it is, or left alone.
 PROBE := import sys; print("Python %d.%d" % sys.version_info[:2]); sys.exit(sys.version_info < (3, 11))
 ASKED := $(filter command environment,$(firstword $(origin PYTHON)))
 $(VENV)/.made: FORCE
 	@there=$$('$(VENV)/bin/python' -c '$(PROBE)' 2>/dev/null) || there=; \
+	made=$$(cat '$@' 2>/dev/null) || made=; \
 	wanted=$$there; \
 	if [ -n '$(ASKED)' ] || [ -z "$$there" ]; then \
 	    wanted=$$($(PYTHON) -c '$(PROBE)' 2>&1) || { \
 	        echo 'Python 3.11 or newer is needed, and PYTHON=$(PYTHON) is not that:' "$$wanted" >&2; \
 	        exit 1; }; \
 	fi; \
-	if [ "$$there" != "$$wanted" ] || [ "$$(cat '$@' 2>/dev/null)" != '$(abspath $(VENV))' ]; then \
+	if [ "$$there" = "$$wanted" ] && [ "$$made" = '$(abspath $(VENV))' ]; then exit 0; fi; \
+	if [ -z "$$made" ] && [ -e '$(VENV)' ]; then \
+	    if [ "$$there" != "$$wanted" ]; then \
+	        echo '$(VENV) is there, was not made by make, and is not a' \
+	            "$$wanted environment: remove it, or choose another VENV=..." >&2; \
+	        exit 1; \
+	    fi; \
+	else \
 	    echo "Making $(VENV) with $$wanted"; \
-	    $(PYTHON) -m venv --clear '$(VENV)' && mkdir '$(VENV)/build' && \
-	    printf '[build]\nbuild_base=%s\n[egg_info]\negg_base=%s\n' \
-	        '$(abspath $(VENV))/build' '$(abspath $(VENV))/build' >'$(VENV)/setup.cfg' && \
-	    echo '$(abspath $(VENV))' >'$@'; \
-	fi
+	    rm -rf '$(VENV)' && mkdir -p '$(VENV)' && echo unfinished >'$@' && \
+	    $(PYTHON) -m venv '$(VENV)' || exit 1; \
+	fi; \
+	mkdir -p '$(VENV)/build' && \
+	printf '[build]\nbuild_base=%s\n[egg_info]\negg_base=%s\n' \
+	    '$(abspath $(VENV))/build' '$(abspath $(VENV))/build' >'$(VENV)/setup.cfg' && \
+	echo '$(abspath $(VENV))' >'$@'
 
 # setuptools builds here and not in build/ of the sources, where modules that are gone stay on.
 export DIST_EXTRA_CONFIG := $(abspath $(VENV))/setup.cfg

@@ -2,7 +2,6 @@
 """Build and install by pip, by `colcon build`, by hand; the only place with version ranges."""
 
 from glob import glob
-from pathlib import Path
 
 from setuptools import find_packages, setup
 
@@ -13,6 +12,8 @@ NAME = 'spinning_top_sim'
 # scripts/ too, installed there as data by pip and by colcon alike.
 EXECUTABLES = {
     'sim_node': 'spinning_top_sim.nodes.sim_node',
+    'replay_node': 'spinning_top_sim.nodes.replay_node',
+    'simulate': 'spinning_top_sim.tools.simulate',
     'recover': 'spinning_top_sim.tools.recover',
 }
 
@@ -30,8 +31,6 @@ setup(
     name=NAME,
     version='0.1.0',
     description='The heavy symmetric top in real time for ROS 2, with a known exact truth',
-    long_description=Path('README.md').read_text(encoding='utf-8'),
-    long_description_content_type='text/markdown',
     maintainer='spinning_top_sim maintainers',
     maintainer_email='maintainers@spinning-top-sim.example',
     license='Apache-2.0',
@@ -56,12 +55,16 @@ setup(
             'catkin_pkg>=1.0,<2',
             'docutils>=0.20,<1',
             'mcap-ros2-support>=0.5.5,<0.7',
+            'pyarrow>=14,<30',
             'pytest>=7.4,<10',
             'PyYAML>=6.0,<7',
             'rosbags>=0.10.11,<0.12',
             'scipy>=1.11,<2',
         ],
-        'plot': ['matplotlib>=3.6,<4'],
+        # simulate: parameter files, a progress bar, Parquet
+        'tools': ['PyYAML>=6.0,<7', 'tqdm>=4.64,<5'],
+        'parquet': ['pyarrow>=14,<30'],
+        'plot': ['matplotlib>=3.6,<4'],     # docs/figures.py
         # Narrow: a new release of these finds new faults.
         'lint': [
             'mypy>=2.4.1,<2.5',

@@ -37,12 +37,7 @@ from spinning_top_sim.recording import mcap_file, walk
 from spinning_top_sim.recording.errors import LogAccessError, NotMcapError
 from spinning_top_sim.recording.mcap_file import McapFile, record_bytes
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.rosbag2 import (
-    DEFAULT_QOS,
-    RecordedTopic,
-    offered_qos_yaml,
-    parse_offered_qos,
-)
+from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic
 from spinning_top_sim.recording.schemas import find_definition
 from spinning_top_sim.tools.recover import main
 
@@ -506,15 +501,20 @@ def test_messages_come_in_the_order_of_their_log_times(tmp_path, torn):
     assert read == sorted((stamp, number) for number, stamp in enumerate(stamps))
 
 
-def test_qos_is_read_as_it_was_written():
-    assert parse_offered_qos(offered_qos_yaml(TOPICS[1])) == (dict(DEFAULT_QOS) | TOPICS[1].qos,)
-    two = '- history: keep_last\n  depth: 1\n  lifespan:\n    sec: 5\n    nsec: 0\n- depth: 2\n'
-    assert parse_offered_qos(two) == (
-        {'history': 1, 'depth': 1, 'lifespan': {'sec': 5, 'nsec': 0}}, {'depth': 2})
-    assert parse_offered_qos('') == ()
-    for wrong in ('depth: 1', '- depth: x', '- [1]', '- reliability: 77', '- colour: 1', '\n'):
-        with pytest.raises(ValueError):
-            parse_offered_qos(wrong)
+@pytest.mark.parametrize('text', ['depth: 1', '- [1]', '- reliability: 77', '- lifespan: x',
+                                  '- depth: ²', '- lifespan:\n    sec: ²\n    nsec: x'])
+def test_a_qos_that_means_nothing_is_no_obstacle(tmp_path, text):
+    path, output = tmp_path / 'a.mcap', tmp_path / 'whole.mcap'
+    with open(path, 'wb') as file:
+        writer = Writer(file)
+        writer.start(profile='ros2', library='libmcap')
+        channel = writer.register_channel('/raw', 'cdr', 0, {'offered_qos_profiles': text})
+        writer.add_message(channel, 1, b'1234', 1)
+        writer.finish()
+    assert run(path, '-o', output)[0] == ALL_KEPT
+    assert seen_by_mcap(output) == [('/raw', 1, b'1234')]
+    with LogReader(output) as reader:
+        assert reader.topics[0].metadata == {'offered_qos_profiles': text}
 
 
 # Of strangers

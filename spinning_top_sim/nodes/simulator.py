@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import functools
 import gc
-import json
 import math
 import threading
 import time
@@ -24,10 +23,11 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes import reports
+from spinning_top_sim.nodes.message_types import message_type
 from spinning_top_sim.nodes.pacing import DeadlineThread, SimulatedClock
-from spinning_top_sim.nodes.ros_parameters import ParameterChanges, declare, start_values
+from spinning_top_sim.nodes.ros_parameters import SPIN, ParameterChanges, declare, start_values
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.streams import messages
+from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import Simulation
 
@@ -35,6 +35,7 @@ OK, WARN, ERROR = 0, 1, 2
 
 # The stamp of t = 0 is a multiple of this, so that grids meet across streams and runs.
 EPOCH_GRID_NS = 10_000_000
+OPENING_NS = 60_000_000
 # How often subscriptions are counted; a new subscriber waits at most this long.
 LISTENERS_PERIOD_NS = 50_000_000
 # One tick works at most this long before services and signals get their turn.
@@ -43,6 +44,7 @@ TICK_BUDGET_S = 0.05
 LATEST_NS = 500_000_000
 # A simulation further behind than this lets its clock slip: its real-time factor falls below 1.
 LONGEST_LAG_NS = 1_000_000_000
+NO_CLOCK = 'waiting for the first /clock (use_sim_time is set)'
 
 
 class Simulator(Node):
@@ -69,17 +71,24 @@ class Simulator(Node):
         self._factor = 0.0
         self._described: object = None          # the motion that `_regime` names
         self._regime = ''
-        if values['spin.lz'] is None:
-            values = {**values, 'spin.lz': self._simulation.lz}
+        # What a reset goes back to: an unset spin.lz is the cusp, wherever initial.theta is then.
+        start_spin = {name: values[name] for name in SPIN}
+        values = {**values, 'spin.lz': self._simulation.lz}
         declare(self, values)
-        self._start_values = values
-        self._changes = ParameterChanges(self, values, self._apply)
+        self._changes = ParameterChanges(self, values, start_spin, self._apply)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._qos: dict[str, QoSProfile] = {}
         self._outputs: dict[str, Publisher] = {}
         self._open_publishers()
         self._make_interface()
-        self._simulated_clock = SimulatedClock(self._followed_time(), values['time_scale'])
+        # Another node's /clock is followed; one that is our own cannot be.
+        self._follows = (self.get_parameter('use_sim_time').value
+                         and not journal.is_enabled('clock', self._values))
+        self._date = self.get_clock() if self._follows else Clock(clock_type=ClockType.SYSTEM_TIME)
+        self._simulated_clock = SimulatedClock(
+            (lambda: self._date.now().nanoseconds) if self._follows else time.monotonic_ns,
+            values['time_scale'])
+        self._begun = False
         self._paused = values['start_paused']
         self._listeners_due = 0
         self._last_tick = 0
@@ -98,25 +107,14 @@ class Simulator(Node):
     def _values(self) -> dict[str, Any]:
         return self._changes.values
 
-    def _followed_time(self) -> Any:
-        """Return ROS time where the node follows a /clock, else steady time."""
-        follows = self.get_parameter('use_sim_time').value
-        if follows and not self._enabled('clock'):
-            return lambda: self.get_clock().now().nanoseconds
-        return time.monotonic_ns
-
-    def _enabled(self, parameter: str) -> bool:
-        if parameter == 'clock' and self._values['publish_clock']:
-            return True
-        return self._values[f'{parameter}.enabled']
-
     def _open_publishers(self) -> None:
         """Have a publisher for each enabled stream, and for no other."""
         for stream in self._simulation.streams:
-            wanted, there = self._enabled(stream.parameter), stream.topic in self._outputs
+            wanted = journal.is_enabled(stream.parameter, self._values)
+            there = stream.topic in self._outputs
             if wanted and not there:
                 self._outputs[stream.topic] = self._publisher(
-                    _message_type(stream.type_name), stream.topic)
+                    message_type(stream.type_name), stream.topic)
             elif there and not wanted:
                 stream.publish = None
                 self.destroy_publisher(self._outputs.pop(stream.topic))
@@ -153,23 +151,10 @@ class Simulator(Node):
 
     def start(self) -> None:
         """Let time run: simulated t = 0 is the next point of the stamps' grid."""
-        if self._values['record.enabled']:
-            try:
-                self._start_recording()
-            except Exception as error:      # whatever the disk has against it, the motion goes on
-                self._record_error = str(error)
-                self.get_logger().error(f'not recording: {error}')
         gc.collect()
         gc.freeze()             # what there is now stays: no full collection in the middle of it
-        now = self.get_clock().now().nanoseconds
-        epoch = _ceil_to(now, EPOCH_GRID_NS)
-        if epoch - now < NANOSECONDS and self._clock_is_wall():
-            time.sleep((epoch - now) / NANOSECONDS)
         with self._lock:
-            self._simulation.epoch_ns = epoch
-            self._speed.read(0)
-            if not self._paused:
-                self._simulated_clock.start(0)
+            self._begin()
         tick_rate = self._values['tick_rate']
         if self._values['pacing'] == 'thread':
             self._pacer = DeadlineThread(self._tick_in_thread, tick_rate)
@@ -177,8 +162,28 @@ class Simulator(Node):
         else:
             self._tick_timer = self.create_timer(1.0 / tick_rate, self._tick, clock=self._steady)
 
-    def _clock_is_wall(self) -> bool:
-        return not self.get_parameter('use_sim_time').value
+    def _begin(self) -> bool:
+        """Fix the stamp of t = 0; False as long as the /clock that we follow says nothing."""
+        now = self._date.now().nanoseconds
+        if now == 0:
+            return False
+        records = self._values['record.enabled']
+        # The log's head tells the epoch, and takes a while to reach the disk.
+        epoch = _ceil_to(now + (OPENING_NS if records and not self._follows else 0), EPOCH_GRID_NS)
+        self._simulation.epoch_ns = epoch
+        if records:
+            try:
+                self._start_recording()
+            except Exception as error:      # whatever the disk has against it, the motion goes on
+                self._record_error = str(error)
+                self.get_logger().error(f'not recording: {error}')
+        if not self._follows:
+            time.sleep(max(0.0, (epoch - self._date.now().nanoseconds) / NANOSECONDS))
+        self._speed.read(0)
+        if not self._paused:
+            self._simulated_clock.start(0)
+        self._begun = True
+        return True
 
     def stop(self) -> None:
         """End the motion and close the recording; safe whatever state the context is in."""
@@ -209,6 +214,8 @@ class Simulator(Node):
     def _tick(self) -> None:
         """Send what is due."""
         with self._lock:
+            if not (self._begun or self._begin()):
+                return
             if self._paused or self._failure or self.finished.done():
                 return
             self._count_tick()
@@ -299,8 +306,7 @@ class Simulator(Node):
             self._counters.commands += 1
             at_ns = simulation.history[-1][0]
             self._journal('command', at_ns, l3=l3, lz=lz)
-            self._record('~/commands', at_ns, messages.float64_multi_array(
-                ('l3', 'lz')).encode(0, (l3, lz)))
+            self._record(journal.COMMANDS, at_ns, journal.command(l3, lz))
 
     def _apply(self, values: dict[str, Any], changed: set[str]) -> None:
         """Put a validated change of parameters into effect.  Raises ValueError to refuse."""
@@ -356,7 +362,7 @@ class Simulator(Node):
             elif not request.data and self._paused:
                 self._paused = False
                 self._last_tick = 0
-                if not self._failure:
+                if self._begun and not self._failure:
                     self._simulated_clock.start(max(self._simulation.now_ns, 0))
             response.success = True
             state = 'paused' if self._paused else 'running'
@@ -371,6 +377,9 @@ class Simulator(Node):
             if not self._paused:
                 response.success = False
                 response.message = 'running: ~/step works while paused (~/set_pause true)'
+                return response
+            if not self._begun:
+                response.success, response.message = False, NO_CLOCK
                 return response
             self._look_for_listeners()
             count, dt = self._values['step.count'], self._values['step.dt']
@@ -387,10 +396,12 @@ class Simulator(Node):
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Any:
         with self._lock:
+            if not self._begun:
+                response.success, response.message = False, NO_CLOCK
+                return response
             simulation = self._simulation
             # Back to the spin it was started with, whatever was commanded since.
-            values = {**self._values, 'spin.l3': self._start_values['spin.l3'],
-                      'spin.lz': self._start_values['spin.lz']}
+            values = {**self._values, **self._changes.start_spin}
             last_stamp = simulation.epoch_ns + simulation.now_ns
             try:
                 simulation.restart(values)
@@ -398,7 +409,7 @@ class Simulator(Node):
                 response.success = False
                 response.message = f'not reset: {error}'
                 return response
-            now = self.get_clock().now().nanoseconds
+            now = self._date.now().nanoseconds
             simulation.epoch_ns = _ceil_to(max(last_stamp + 1, now), EPOCH_GRID_NS)
             self._failure = None
             self._simulated_clock.start(0)
@@ -408,12 +419,15 @@ class Simulator(Node):
             self._journal('reset', 0, epoch_ns=simulation.epoch_ns, parameters=values)
             response.success = True
             response.message = f'at t = 0, stamps go on from {simulation.epoch_ns} ns'
-        self._changes.follow(spin__l3=values['spin.l3'], spin__lz=values['spin.lz'])
+            l3, lz = simulation.l3, simulation.lz
+        self._changes.follow(spin__l3=l3, spin__lz=lz)
         return response
 
     def _on_record(self, request: SetBool.Request, response: SetBool.Response) -> Any:
         try:
             if request.data:
+                if not self._begun:
+                    raise RuntimeError(NO_CLOCK)
                 response.message = self._start_recording()
             else:
                 response.message = self._stop_recording() or 'not recording'
@@ -435,23 +449,21 @@ class Simulator(Node):
             if self._recorder is not None:
                 return f'recording already to {self._recorder.path}'
             values, simulation = self._values, self._simulation
-            chosen = values['record.streams']
-            streams = [stream for stream in simulation.streams if stream.topic in self._outputs
-                       and ('all' in chosen or stream.parameter in chosen)]
+            streams = journal.recorded_streams(simulation.streams, values)
             topics = [RecordedTopic(self._outputs[stream.topic].topic_name, stream.type_name,
                                     _rosbag2_qos(self._qos[self._outputs[stream.topic]
                                                            .topic_name]))
                       for stream in streams]
-            for name, type_name in (('~/commands', 'std_msgs/msg/Float64MultiArray'),
-                                    ('~/events', 'std_msgs/msg/String')):
-                topics.append(RecordedTopic(self.resolve_topic_name(name), type_name))
+            topics += [RecordedTopic(self.resolve_topic_name(name), type_name)
+                       for name, type_name in journal.TOPICS]
             recorder = McapRecorder.open(
                 _free_path(values['record.uri']), topics, self._log_metadata(),
                 max_loss=values['record.max_loss'], compression=values['record.compression'],
                 min_free_bytes=values['record.min_free_bytes'])
             for index, stream in enumerate(streams):
                 stream.record = functools.partial(recorder.write, index)
-            self._journal_topics = {'~/commands': len(streams), '~/events': len(streams) + 1}
+            self._journal_topics = {name: len(streams) + i
+                                    for i, (name, _) in enumerate(journal.TOPICS)}
             self._recorder, self._record_error = recorder, None
             self._journal('start', max(simulation.now_ns, 0))
             return f'recording to {recorder.path}'
@@ -486,8 +498,7 @@ class Simulator(Node):
 
     def _journal(self, event: str, at_ns: int, **details: Any) -> None:
         """Log what happened to the motion, so that it can be computed again."""
-        text = json.dumps({'event': event, 't_ns': at_ns, **details}, default=list)
-        self._record('~/events', at_ns, messages.string(text))
+        self._record(journal.EVENTS, at_ns, journal.event(event, at_ns, **details))
 
     def _check_recorder(self) -> None:
         recorder = self._recorder
@@ -579,14 +590,6 @@ class Simulator(Node):
             if description is not None:
                 self._terminal.tell(str(description))
         return self._regime
-
-
-def _message_type(type_name: str) -> type:
-    """Import the Python class of a message type when a stream of it is enabled."""
-    import importlib  # noqa: PLC0415
-
-    package, _, name = type_name.split('/')
-    return getattr(importlib.import_module(f'{package}.msg'), name)
 
 
 def _rosbag2_qos(qos: QoSProfile) -> dict[str, Any]:

@@ -65,6 +65,8 @@ class Columns:
     l3: Any
     lz: Any
     transverse_rate: Any
+    quaternion: Any
+    norm_error: Any
 
     @lazy
     def phi(self) -> Any:
@@ -99,11 +101,30 @@ class Columns:
         return attitude.vertical_in_body(self.alpha, self.beta)
 
     @lazy
+    def body_rates(self) -> tuple[Any, Any, Any]:
+        """omega_1, omega_2 and the constant omega_3 in the body frame [rad/s]."""
+        rate = self.transverse_rate
+        return rate.real, rate.imag, self.l3_start / self.top.lambda3
+
+    @lazy
+    def body_acceleration(self) -> tuple[Any, Any, float]:
+        """Angular acceleration in the body frame [rad/s^2]."""
+        rate = attitude.angular_acceleration(self.top, self.body_rates, self.vertical[0])
+        return rate.real, rate.imag, 0.0
+
+    def specific_force(self, point: tuple[float, float, float]) -> tuple[Any, Any, Any]:
+        """Return the specific force at a body point r [m], in the body frame [m/s^2]."""
+        transverse, along = self.vertical
+        return attitude.specific_force(
+            self.top.gravity, point, self.body_rates, self.body_acceleration,
+            (transverse.real, transverse.imag, along))
+
+    @lazy
     def energy(self) -> Any:
         """E = kinetic energy + P cos(theta) [J]."""
-        top = self.top
+        top, l3 = self.top, self.l3_start
         return (0.5 * top.lambda1 * attitude.squared_modulus(self.transverse_rate)
-                + 0.5 * self.l3 * self.l3 / top.lambda3 + top.gravity_torque * self.axis[1])
+                + 0.5 * l3 * l3 / top.lambda3 + top.gravity_torque * self.axis[1])
 
 
 class OneState(Columns):
@@ -118,24 +139,15 @@ class OneState(Columns):
         """Attitude q(world <- body), sign continuous in time."""
         return attitude.quaternion(self.alpha, self.beta)
 
-    @lazy
+    @property
     def angular_velocity(self) -> tuple[float, float, float]:
         """Body rates [rad/s]."""
-        rate = self.transverse_rate
-        return rate.real, rate.imag, self.l3 / self.top.lambda3
+        return self.body_rates
 
-    @lazy
-    def angular_acceleration(self) -> tuple[float, float, float]:
-        """Body angular acceleration [rad/s^2]."""
-        rate = attitude.angular_acceleration(self.top, self.angular_velocity, self.vertical[0])
-        return rate.real, rate.imag, 0.0
-
-    def specific_force(self, point: tuple[float, float, float]) -> tuple[float, float, float]:
-        """Return the specific force at a body point r [m], in the body frame [m/s^2]."""
-        transverse, along = self.vertical
-        return attitude.specific_force(
-            self.top.gravity, point, self.angular_velocity, self.angular_acceleration,
-            (transverse.real, transverse.imag, along))
+    @property
+    def norm_error(self) -> float:
+        """|q| - 1."""
+        return math.hypot(*self.quaternion) - 1.0
 
 
 class AxisState(OneState):

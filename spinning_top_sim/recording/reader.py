@@ -356,7 +356,4 @@ def _loose_messages(records: bytes) -> Iterator[StoredMessage]:
 
 def qos_profiles(channel: Channel) -> tuple[Mapping[str, Any], ...]:
     """Return what a channel says its publishers offer; nothing where that cannot be read."""
-    try:
-        return parse_offered_qos(channel.metadata.get('offered_qos_profiles', ''))
-    except ValueError:
-        return ()
+    return tuple(parse_offered_qos(channel.metadata.get('offered_qos_profiles', '')))

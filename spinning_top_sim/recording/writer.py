@@ -146,31 +146,8 @@ class McapRecorder:
         _check_arguments(
             topics, metadata, max_loss=max_loss, compression=compression,
             min_free_bytes=min_free_bytes, queue_bytes=queue_bytes)
-        definitions = {
-            name: find_definition(name) for name in {topic.type_name for topic in topics}}
-        try:
-            from spinning_top_sim.recording.mcap_file import McapFile  # noqa: PLC0415
-        except ImportError as error:
-            raise RecordingError(
-                f'recording needs the Python package mcap with zstandard and lz4: {error}'
-            ) from error
-        try:
-            disk = os.statvfs(path.parent)
-            free = disk.f_bavail * disk.f_frsize
-            if free < min_free_bytes:
-                raise OSError(_too_little_space(free, min_free_bytes))
-            file = McapFile(
-                path, topics, definitions, {METADATA_NAME: metadata},
-                library=f'spinning_top_sim {_version()}', compression=compression)
-        except FileExistsError as error:
-            raise RecordingError(
-                f'cannot record to {path}: it exists, and a recording overwrites nothing'
-            ) from error
-        except FileNotFoundError as error:
-            raise RecordingError(
-                f'cannot record to {path}: there is no directory {path.parent}') from error
-        except (OSError, ValueError) as error:
-            raise RecordingError(f'cannot record to {path}: {_reason(error)}') from error
+        file = create_file(path, topics, metadata, compression=compression,
+                           min_free_bytes=min_free_bytes)
         return cls(path, topics, file, max_loss=max_loss, min_free_bytes=min_free_bytes,
                    queue_bytes=queue_bytes)
 
@@ -342,6 +319,41 @@ class McapRecorder:
         with contextlib.suppress(Exception):
             self._file.finish()
             self._indexed = True
+
+
+def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[str, str], *,
+                compression: str, min_free_bytes: int = 0) -> McapFile:
+    """
+    Create a log with its head, for one thread to write; see `McapRecorder.open`.
+
+    Raises RecordingError, naming path or type and the reason.
+    """
+    definitions = {
+        name: find_definition(name) for name in {topic.type_name for topic in topics}}
+    try:
+        from spinning_top_sim.recording.mcap_file import McapFile  # noqa: PLC0415
+    except ImportError as error:
+        raise RecordingError(
+            f'recording needs the Python package mcap with zstandard and lz4: {error}'
+        ) from error
+    try:
+        disk = os.statvfs(path.parent)
+        free = disk.f_bavail * disk.f_frsize
+        if free < min_free_bytes:
+            raise OSError(_too_little_space(free, min_free_bytes))
+        file = McapFile(
+            path, topics, definitions, {METADATA_NAME: metadata},
+            library=f'spinning_top_sim {_version()}', compression=compression)
+    except FileExistsError as error:
+        raise RecordingError(
+            f'cannot record to {path}: it exists, and a recording overwrites nothing'
+        ) from error
+    except FileNotFoundError as error:
+        raise RecordingError(
+            f'cannot record to {path}: there is no directory {path.parent}') from error
+    except (OSError, ValueError) as error:
+        raise RecordingError(f'cannot record to {path}: {_reason(error)}') from error
+    return file
 
 
 def _check_arguments(

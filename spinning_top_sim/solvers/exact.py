@@ -17,12 +17,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from decimal import Decimal, localcontext
+from decimal import Decimal
 from math import cos, sin, sinh, sqrt
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.long_decimals import pi
+from spinning_top_sim.solvers.long_decimals import ZERO, pi, precision
 from spinning_top_sim.solvers.theta_series import TERMS, Series
 from spinning_top_sim.solvers.theta_setup import Branch, ThetaMotion, set_up
 
@@ -50,118 +50,6 @@ MOST = Decimal('1e290')
 LEAST_M1 = Decimal('1e-290')
 
 
-class Functions(NamedTuple):
-    """The functions that `nutation_at` takes from `math` or from numpy."""
-
-    sin: Callable[[Any], Any]
-    sinh: Callable[[Any], Any]
-    sqrt: Callable[[Any], Any]
-    hypot: Callable[[Any, Any], Any]
-    atan2: Callable[[Any, Any], Any]
-
-
-SCALAR = Functions(sin, sinh, sqrt, math.hypot, math.atan2)
-
-
-class FactorBranch(NamedTuple):
-    """
-    Alpha or beta over even or odd quarter periods, in doubles.
-
-    real, imag: coefficients in xi, highest first.  Their prefactors are indices into
-    (1, cos y, sin y, sin y cos y), or the hyperbolic ones.  A real factor has sense 0.
-    """
-
-    real_prefactor: int
-    real: tuple[float, ...]
-    imag_prefactor: int
-    imag: tuple[float, ...]
-    sense: int
-    drift: float
-    crosses: bool
-    has_zero: bool
-
-
-class NutationBranch(NamedTuple):
-    alpha: FactorBranch
-    beta: FactorBranch
-    u_dot: float                    # times `magnifier`, a power of 2: near a pole all is small
-    magnifier: float
-    u_dot_series: tuple[float, ...]
-    imaginary: bool
-    stretch: float
-
-
-class NutationPoint(NamedTuple):
-    """Moduli of alpha D and beta D (signed if real), their arguments less rotations, theta'."""
-
-    alpha: Any
-    beta: Any
-    alpha_argument: Any
-    beta_argument: Any
-    theta_dot: Any
-
-
-def nutation_at(branch: NutationBranch, y: Any, flip: Any, functions: Functions) -> NutationPoint:
-    """
-    Evaluate the theta functions at the phase y from the nearest quarter period, |y| <= pi/4.
-
-    y and flip = (-1)^floor(N/2) are floats, or arrays together with numpy's functions.
-    D = hypot(alpha, beta).
-    """
-    if branch.imaginary:
-        s = functions.sinh(y * branch.stretch)
-        xi = -s * s
-    else:
-        s = functions.sin(y)
-        xi = s * s
-    c = functions.sqrt(1.0 - xi)        # cos y > 0, or cosh x
-    prefactors = (1.0, c, s, s * c)
-    alpha, alpha_argument, alpha_slope = _factor_at(
-        branch.alpha, y, flip, xi, prefactors, functions)
-    beta, beta_argument, beta_slope = _factor_at(
-        branch.beta, y, flip, xi, prefactors, functions)
-    if not branch.u_dot:                # resting, perhaps at a pole
-        return NutationPoint(alpha, beta, alpha_argument, beta_argument, 0.0 * y)
-    # theta' = -u'/sin(theta), with the zero that u' shares with a factor at a pole divided out.
-    c3, c2, c1, c0 = branch.u_dot_series
-    has_zero = branch.alpha.has_zero or branch.beta.has_zero
-    sin_2y = 2.0 * c if has_zero else 2.0 * s * c
-    xi_2y = 4.0 * xi * (1.0 - xi)
-    theta1 = sin_2y * (((c3 * xi_2y + c2) * xi_2y + c1) * xi_2y + c0)
-    # In this order nothing overflows on the separatrix, where all grow like cosh x.
-    theta_dot = (-0.5 * branch.u_dot * (theta1 / (alpha * alpha + beta * beta))
-                 / (branch.magnifier * alpha_slope * beta_slope))
-    return NutationPoint(alpha, beta, alpha_argument, beta_argument, theta_dot)
-
-
-def _factor_at(factor: FactorBranch, y: Any, flip: Any, xi: Any, prefactors: tuple[Any, ...],
-               functions: Functions) -> tuple[Any, Any, Any]:
-    """Return modulus (signed if real), argument, and the modulus less the factor sin y."""
-    a3, a2, a1, a0 = factor.real
-    polynomial = ((a3 * xi + a2) * xi + a1) * xi + a0
-    if not factor.sense:
-        if factor.crosses:
-            polynomial = flip * polynomial
-        real = prefactors[factor.real_prefactor] * polynomial
-        return real, 0.0 * y, polynomial if factor.has_zero else real
-    real = prefactors[factor.real_prefactor] * polynomial
-    b3, b2, b1, b0 = factor.imag
-    imag = prefactors[factor.imag_prefactor] * (((b3 * xi + b2) * xi + b1) * xi + b0)
-    modulus = functions.hypot(real, imag)       # its square may be too small for a double
-    return modulus, factor.drift * y + factor.sense * functions.atan2(imag, real), modulus
-
-
-class FixedRate(NamedTuple):
-    """A rate per nanosecond and a start, in fixed point."""
-
-    rate: int
-    start: int
-
-    @classmethod
-    def of(cls, per_second: Decimal, start: Decimal = Decimal(0)) -> FixedRate:
-        return cls(int(per_second * FIXED_ONE / 10 ** 9), int(start * FIXED_ONE))
-
-
 class ExactSolution:
     """
     The motion of `top` that is in the state `start` at t = 0.
@@ -172,7 +60,8 @@ class ExactSolution:
 
     Attributes: nutation_period [s], None if the nutation rests; mean_precession_rate and
     mean_spin_rate [rad/s]; theta_min and theta_max [rad], of theta folded into [0, pi];
-    m and m1 = 1 - m, the parameter of the elliptic functions: m1 -> 0 on the separatrix.
+    m and m1 = 1 - m, the parameter of the elliptic functions: m1 -> 0 on the separatrix;
+    time_limit [s] and ns_limit [ns], the farthest time either way.
 
     Raises ValueError for motions whose constants doubles cannot hold, and, from every evaluation,
     for times at which a phase exceeds 2^52 turns.
@@ -181,8 +70,7 @@ class ExactSolution:
     def __init__(self, top: Top, start: State):
         self.top, self.start = top, start
         self.theta_motion = motion = set_up(top, start)
-        with localcontext() as context:
-            context.prec = motion.digits
+        with precision(motion.digits):
             self._take_over(motion, top, start)
         self._check_start()
         self._arrays: ArrayEvaluator | None = None
@@ -230,30 +118,31 @@ class ExactSolution:
         fastest = max(abs(motion.quarter_rate), abs(alpha.rate / two_pi), abs(beta.rate / two_pi),
                       Decimal('1e-300'))
         self.time_limit = min(float(Decimal(MOST_TURNS) / fastest), 1e300)   # [s]
-        self.ns_limit = int(Decimal(MOST_TURNS) / fastest * 10 ** 9)
-        self._quarter_rate = FixedRate.of(motion.quarter_rate).rate
-        self._offset0 = int(motion.offset0 * FIXED_ONE)
+        self.ns_limit = min(int(Decimal(MOST_TURNS) / fastest * 10 ** 9), 2 ** 63 - 1)
+        self._quarter_rate, self._offset0 = FixedRate.of(motion.quarter_rate, motion.offset0)
         self._offset_rest = float(motion.offset0 - Decimal(self._offset0) / FIXED_ONE)
         self._alpha_turns = FixedRate.of(alpha.rate / two_pi, alpha.phase_turns)
         self._beta_turns = FixedRate.of(beta.rate / two_pi, beta.phase_turns)
-        self._phi = FixedRate.of(motion.mean_precession_rate)
-        self._psi = FixedRate.of(motion.mean_spin_rate)
+        self._phi = FixedRate.of(motion.mean_precession_rate, ZERO)
+        self._psi = FixedRate.of(motion.mean_spin_rate, ZERO)
 
     # ------------------------------------------------------------------------------ one state
 
     def quaternion_at(self, ns: int) -> tuple[float, float, float, float]:
         """
-        Return the attitude (x, y, z, w) at `ns` integer nanoseconds after the start.
+        Return the attitude (x, y, z, w) at `ns` nanoseconds, a Python int, after the start.
 
         The formulas of `nutation_at`, with alpha and beta as complex numbers: no angles.
+        Raises ValueError for a time too far away.
         """
         if not -self.ns_limit <= ns <= self.ns_limit:
-            raise self._too_late(ns * 1e-9)
+            raise self.too_late(f'{ns} ns')
         # As in _nutation_phase, without the call.
         phase = ns * self._quarter_rate + self._offset0
         whole = phase + FIXED_HALF >> FIXED_BITS
         quarters = self.quarter0 + whole
-        y = QUARTER_PERIOD_ANGLE * ((phase - (whole << FIXED_BITS)) * FIXED_UNIT + self._offset_rest)
+        part = (phase - (whole << FIXED_BITS)) * FIXED_UNIT + self._offset_rest
+        y = QUARTER_PERIOD_ANGLE * part
         (alpha_real_prefactor, a3, a2, a1, a0, alpha_imag_prefactor, b3, b2, b1, b0,
          alpha_drift, alpha_crosses,
          beta_real_prefactor, c3, c2, c1, c0, beta_imag_prefactor, d3, d2, d1, d0,
@@ -300,14 +189,14 @@ class ExactSolution:
         return self.quarter0 + whole, QUARTER_PERIOD_ANGLE * part
 
     def state_at(self, ns: int) -> tuple[float, float, float, float, float, float, float, float]:
-        """Return (theta, theta_dot, phi, psi, x, y, z, w) at `ns` nanoseconds [rad, rad/s]."""
+        """Return (theta, theta_dot, phi, psi, x, y, z, w) at `ns`, an int [rad, rad/s]."""
         return self.full_state_at(ns)[:8]
 
     def full_state_at(self, ns: int) -> tuple[
             float, float, float, float, float, float, float, float, float, float, float]:
         """Return what `state_at` does, and the body's angular velocity in its frame [rad/s]."""
         if not -self.ns_limit <= ns <= self.ns_limit:
-            raise self._too_late(ns * 1e-9)
+            raise self.too_late(f'{ns} ns')
         quarters, y = self._nutation_phase(ns)
         point = nutation_at(self.branches[quarters & 1], y, -1.0 if quarters & 2 else 1.0, SCALAR)
         alpha, beta, alpha_argument, beta_argument, theta_dot = point
@@ -350,9 +239,10 @@ class ExactSolution:
             precession = precession + self.top_rate * (alpha / beta)
         return precession
 
-    def _too_late(self, seconds: float) -> ValueError:
-        return ValueError(f't = {seconds!r} s: must be finite and within {self.time_limit:.6g} s, '
-                          f'where phases reach 2^52 turns')
+    def too_late(self, time: str) -> ValueError:
+        """Return the refusal of a time at which nothing is left of a phase."""
+        return ValueError(f't = {time}: must be finite and within {self.time_limit:.6g} s, '
+                          f'where a phase of this motion reaches 2^52 turns')
 
     # ---------------------------------------------------------------------------- many states
 
@@ -366,18 +256,28 @@ class ExactSolution:
         return self.arrays.states(t)
 
     def states_at_ns(self, ns: np.ndarray) -> ExactStates:
-        """Return the states at ns, (n,) int64 nanoseconds, exact where seconds would round."""
+        """
+        Return the states at ns, (n,) int64 nanoseconds: exact where seconds would be rounded.
+
+        Raises ValueError for an array of another kind, or a time too far away.
+        """
         return self.arrays.states_at_ns(ns)
 
     def quaternion(self, t: np.ndarray) -> np.ndarray:
-        """Return the attitudes (n, 4) x, y, z, w at t, (n,) float64 seconds, in any order."""
+        """
+        Return the attitudes (n, 4) x, y, z, w at t, (n,) float64 seconds, in any order.
+
+        Raises ValueError for a time that is not finite or too far.
+        """
         return self.arrays.quaternion(t)
 
     def quaternion_grid(self, start_ns: int, step_ns: int, count: int) -> np.ndarray:
         """
         Return the attitudes (count, 4) x, y, z, w at start_ns + k step_ns, in nanoseconds.
 
-        Several times faster than `quaternion`, most so when called again with the same step.
+        Several times faster than `quaternion`, most so when called again with the same step;
+        near the separatrix (m1 < 2e-4) as fast as that.
+        Raises ValueError for a negative count, or a time too far away.
         """
         return self.arrays.quaternion_grid(start_ns, step_ns, count)
 
@@ -388,6 +288,125 @@ class ExactSolution:
             from spinning_top_sim.solvers.exact_arrays import ArrayEvaluator  # noqa: PLC0415
             self._arrays = ArrayEvaluator(self)
         return self._arrays
+
+
+class Functions(NamedTuple):
+    """The functions that `nutation_at` takes from `math` or from numpy."""
+
+    sin: Callable[[Any], Any]
+    sinh: Callable[[Any], Any]
+    sqrt: Callable[[Any], Any]
+    hypot: Callable[[Any, Any], Any]
+    atan2: Callable[[Any, Any], Any]
+
+
+SCALAR = Functions(sin, sinh, sqrt, math.hypot, math.atan2)
+
+
+class FactorBranch(NamedTuple):
+    """
+    Alpha or beta over even or odd quarter periods, in doubles.
+
+    real, imag: coefficients in xi, highest first.  Their prefactors are indices into
+    (1, cos y, sin y, sin y cos y), or the hyperbolic ones.  A real factor has sense 0.
+    """
+
+    real_prefactor: int
+    real: tuple[float, ...]
+    imag_prefactor: int
+    imag: tuple[float, ...]
+    sense: int
+    drift: float
+    crosses: bool
+    has_zero: bool
+
+
+class NutationBranch(NamedTuple):
+    """Both factors and cos(theta)' over even or odd quarter periods."""
+
+    alpha: FactorBranch
+    beta: FactorBranch
+    u_dot: float                    # times `magnifier`, a power of 2: near a pole all is small
+    magnifier: float
+    u_dot_series: tuple[float, ...]
+    imaginary: bool
+    stretch: float
+
+
+class NutationPoint(NamedTuple):
+    """Moduli of alpha D and beta D (signed if real), their arguments less rotations, theta'."""
+
+    alpha: Any
+    beta: Any
+    alpha_argument: Any
+    beta_argument: Any
+    theta_dot: Any
+
+
+def nutation_at(branch: NutationBranch, y: Any, flip: Any, functions: Functions) -> NutationPoint:
+    """
+    Evaluate the theta functions at the phase y from the nearest quarter period, |y| <= pi/4.
+
+    y and flip = (-1)^floor(N/2) are floats, or arrays together with numpy's functions.
+    D = hypot(alpha, beta).
+    """
+    if branch.imaginary:
+        s = functions.sinh(y * branch.stretch)
+        xi = -s * s
+    else:
+        s = functions.sin(y)
+        xi = s * s
+    c = functions.sqrt(1.0 - xi)        # cos y > 0, or cosh x
+    prefactors = (1.0, c, s, s * c)
+    alpha, alpha_argument, alpha_slope = _factor_at(
+        branch.alpha, y, flip, xi, prefactors, functions=functions)
+    beta, beta_argument, beta_slope = _factor_at(
+        branch.beta, y, flip, xi, prefactors, functions=functions)
+    if not branch.u_dot:                # resting, perhaps at a pole
+        return NutationPoint(alpha, beta, alpha_argument, beta_argument, 0.0 * y)
+    # theta' = -u'/sin(theta), with the zero that u' shares with a factor at a pole divided out.
+    c3, c2, c1, c0 = branch.u_dot_series
+    has_zero = branch.alpha.has_zero or branch.beta.has_zero
+    sin_2y = 2.0 * c if has_zero else 2.0 * s * c
+    xi_2y = 4.0 * xi * (1.0 - xi)
+    theta1 = sin_2y * (((c3 * xi_2y + c2) * xi_2y + c1) * xi_2y + c0)
+    # In this order nothing overflows on the separatrix, where all grow like cosh x.
+    theta_dot = (-0.5 * branch.u_dot * (theta1 / (alpha * alpha + beta * beta))
+                 / (branch.magnifier * alpha_slope * beta_slope))
+    return NutationPoint(alpha, beta, alpha_argument, beta_argument, theta_dot)
+
+
+def _factor_at(factor: FactorBranch, y: Any, flip: Any, xi: Any, prefactors: tuple[Any, ...],
+               *, functions: Functions) -> tuple[Any, Any, Any]:
+    """Return modulus (signed if real), argument, and the modulus less the factor sin y."""
+    a3, a2, a1, a0 = factor.real
+    polynomial = ((a3 * xi + a2) * xi + a1) * xi + a0
+    if not factor.sense:
+        if factor.crosses:
+            polynomial = flip * polynomial
+        real = prefactors[factor.real_prefactor] * polynomial
+        return real, 0.0 * y, polynomial if factor.has_zero else real
+    real = prefactors[factor.real_prefactor] * polynomial
+    b3, b2, b1, b0 = factor.imag
+    imag = prefactors[factor.imag_prefactor] * (((b3 * xi + b2) * xi + b1) * xi + b0)
+    modulus = functions.hypot(real, imag)       # its square may be too small for a double
+    return modulus, factor.drift * y + factor.sense * functions.atan2(imag, real), modulus
+
+
+class FixedRate(NamedTuple):
+    """A rate per nanosecond and a start, in fixed point."""
+
+    rate: int
+    start: int
+
+    @classmethod
+    def of(cls, per_second: Decimal, start: Decimal) -> FixedRate:
+        """Round a rate per second and a start."""
+        return cls(int(per_second * FIXED_ONE / 10 ** 9), int(start * FIXED_ONE))
+
+    def at(self, ns: int) -> int:
+        """Return start + rate ns, in fixed point."""
+        return self.start + self.rate * ns
 
 
 def transverse_rates(precession: Any, theta_dot: Any, cos_psi: Any, sin_psi: Any
@@ -435,9 +454,9 @@ def _nutation_branch(motion: ThetaMotion, odd: int) -> NutationBranch:
     alpha, beta = factor('alpha'), factor('beta')
     smallest = min(max(map(abs, x.real + x.imag)) for x in (alpha, beta))
     magnifier = 2.0 ** -math.frexp(smallest)[1] if smallest else 1.0
-    return NutationBranch(alpha, beta, _in_range("cos(theta)'", motion.u_dot[odd] * Decimal(magnifier)),
-                          magnifier, _coefficients(motion.u_dot_series), motion.imaginary,
-                          float(motion.stretch))
+    u_dot = _in_range("cos(theta)'", motion.u_dot[odd] * Decimal(magnifier))
+    return NutationBranch(alpha, beta, u_dot, magnifier, _coefficients(motion.u_dot_series),
+                          motion.imaginary, float(motion.stretch))
 
 
 def _in_range(name: str, value: Decimal) -> float:

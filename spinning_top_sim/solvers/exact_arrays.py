@@ -3,17 +3,18 @@
 The exact motion for arrays of times.
 
 Two ways lead to a quaternion.  `ExactStates` evaluates the formulas of `exact.nutation_at`, even
-and odd quarter periods apart, for every column.  For quaternions alone, and away from the
-separatrix (m1 >= 1e-5), `_FullCircle` uses the theta series of the even quarter periods all
-round, so that a block of times goes through without a case distinction; and as such a series
-is a sum of a few sinusoids, a block of a uniform grid is a product of two small matrices.
+and odd quarter periods apart, for every column.  For quaternions alone `_Attitudes` stays with the
+series of the even quarter periods, all round in the real form, or from one passage of u2 to the
+next in the imaginary form, so that blocks of times go through without a case distinction.  And as
+a series in the real form is a sum of a few sinusoids, a block of a uniform grid is a product
+of two small matrices (`_Grid`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from decimal import Decimal, localcontext
+from decimal import Decimal
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +29,7 @@ from spinning_top_sim.solvers.exact import (
     nutation_at,
     transverse_rates,
 )
-from spinning_top_sim.solvers.long_decimals import double_double, pi
+from spinning_top_sim.solvers.long_decimals import ONE, double_double, pi, precision, sinh_cosh
 from spinning_top_sim.solvers.theta_series import Series
 from spinning_top_sim.solvers.theta_setup import Factor, ThetaMotion
 
@@ -36,95 +37,55 @@ if TYPE_CHECKING:
     from spinning_top_sim.solvers.exact import ExactSolution
 
 ARRAY = Functions(np.sin, np.sinh, np.sqrt, np.hypot, np.arctan2)
-CHUNK = 4096                # times in a block: its temporaries stay in the cache
+CHUNK = 8192                # times in a block: its temporaries stay in the cache
 TWO_PI = 2.0 * math.pi
 NEGLIGIBLE = 1e-18          # beside the largest coefficient
 
-TABLE_STEPS = 2048          # of a turn; within a step five powers reach 1e-17
+TABLE_STEPS = 2048          # of a turn; within a step the fifth power of the rest is 6e-17
 STEP_ANGLE = TWO_PI / TABLE_STEPS
-SHORT_TURNS = 2.0 ** 24     # so many turns are counted right with a rate split in two
+SHORT_TURNS = 2.0 ** 22     # so many turns are counted right with a rate split in two
 
 GRID_BLOCK = 512            # states in a row of the grid's product
 GRID_ROWS = 16              # rows that are worked on together
+KEPT_GRIDS = 16             # steps whose factor matrices are kept, 0.1 MB each
 MOST_ROWS = 1 << 15         # whose count times a limb fits 64 bits
 LIMB = 48                   # bits: two limbs are the fraction of a turn
 
 
-def _blocks(n: int) -> Iterator[slice]:
-    for first in range(0, n, CHUNK):
-        yield slice(first, min(first + CHUNK, n))
-
-
-def _halves(x: Any) -> tuple[Any, Any]:
-    """Split doubles into two of 26 bits each, whose products are exact [Dekker 1971]."""
-    big = 134217729.0 * x   # 2^27 + 1
-    high = big - (big - x)
-    return high, x - high
-
-
-class Rate:
-    """
-    A rate in double-double; its product with a time has no rounding that grows with the time.
-
-    Times are pairs of arrays: the doubles, and what they leave out (None: nothing).
-    """
-
-    def __init__(self, per_second: Decimal):
-        self.high, self.low = double_double(per_second)
-        self.halves = _halves(self.high)
-
-    def product(self, t: np.ndarray, t_rest: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Return rate * t as nearest double and rest."""
-        t1, t2 = _halves(t)
-        r1, r2 = self.halves
-        high = self.high * t
-        rest = ((r1 * t1 - high) + r1 * t2 + r2 * t1) + r2 * t2 + self.low * t
-        if t_rest is not None:
-            rest += self.high * t_rest
-        return high, rest
-
-    def whole_and_part(self, t: np.ndarray, t_rest: np.ndarray | None
-                       ) -> tuple[np.ndarray, np.ndarray]:
-        high, rest = self.product(t, t_rest)
-        whole = np.rint(high)
-        return whole, (high - whole) + rest
-
-
 class ExactStates:
-    """
-    States at many times; every column is an array (n,) or (n, k) computed when first asked for.
-
-    theta [rad], continued through poles; theta_dot [rad/s]; phi, psi [rad], unwrapped;
-    quaternion (n, 4) x, y, z, w, body to world; angular_velocity (n, 3), body frame [rad/s].
-    """
+    """States at many times; a column is computed when it is first asked for, and kept."""
 
     def __init__(self, evaluator: ArrayEvaluator, t: np.ndarray, t_rest: np.ndarray | None = None):
         self._evaluator, self._t, self._t_rest = evaluator, t, t_rest
 
     @cached_property
     def quaternion(self) -> np.ndarray:
-        if self._t_rest is None and self._evaluator.full_circle:
-            return self._evaluator.full_circle.quaternion(self._t)
-        return self._evaluator.general_quaternion(self._nutation, self._t, self._t_rest)
+        """(n, 4) x, y, z, w: body to world, the sign continuous in time."""
+        return self._evaluator.attitudes.quaternion(self._t, self._t_rest)
 
     @cached_property
     def theta(self) -> np.ndarray:
+        """(n,) [rad]: smooth through a pole that is passed exactly, so it may leave [0, pi]."""
         return self._evaluator.theta(self._nutation)
 
     @property
     def theta_dot(self) -> np.ndarray:
+        """(n,) [rad/s]."""
         return self._nutation[4]
 
     @cached_property
     def phi(self) -> np.ndarray:
+        """(n,) [rad], unwrapped."""
         return self._evaluator.phi(self._nutation, self._t, self._t_rest)
 
     @cached_property
     def psi(self) -> np.ndarray:
+        """(n,) [rad], unwrapped."""
         return self._evaluator.psi(self._nutation, self._t, self._t_rest)
 
     @cached_property
     def angular_velocity(self) -> np.ndarray:
+        """(n, 3) [rad/s], of the body, in its own frame."""
         return self._evaluator.angular_velocity(self._nutation, self._t, self._t_rest)
 
     @cached_property
@@ -138,27 +99,25 @@ class ArrayEvaluator:
     def __init__(self, solution: ExactSolution):
         self.solution = solution
         motion = solution.theta_motion
-        with localcontext() as context:
-            context.prec = motion.digits
+        with precision(motion.digits):
             two_pi = 2 * pi()
             alpha, beta = motion.alpha, motion.beta
             self.quarters = Rate(motion.quarter_rate)
             self.offset0 = double_double(motion.offset0)
             self.precession, self.spin = (
                 Rate(motion.mean_precession_rate), Rate(motion.mean_spin_rate))
-            self.alpha_turns, self.beta_turns, self.spin_turns = (
-                Rate(x / two_pi) for x in (alpha.rate, beta.rate, motion.mean_spin_rate))
-            self.alpha_phase, self.beta_phase, self.spin_phase = (
-                float(x * two_pi) for x in (alpha.phase_turns, beta.phase_turns,
-                                            alpha.phase_turns - beta.phase_turns))
-            self.full_circle = _FullCircle(motion) if alpha.full_circle else None
+            self.spin_turns = Rate(motion.mean_spin_rate / two_pi)
+            self.spin_phase = float(two_pi * (alpha.phase_turns - beta.phase_turns))
+            self.attitudes = _Attitudes(motion)
 
     # ------------------------------------------------------------------------- what is offered
 
     def states(self, t: Any) -> ExactStates:
-        return ExactStates(self, self._checked(t))
+        """See ExactSolution.states."""
+        return ExactStates(self, self._checked(t).copy())     # columns come later
 
     def states_at_ns(self, ns: Any) -> ExactStates:
+        """See ExactSolution.states_at_ns."""
         ns = np.asarray(ns)
         if ns.ndim != 1 or ns.dtype.kind not in 'iu':
             raise ValueError(
@@ -169,15 +128,17 @@ class ArrayEvaluator:
         return ExactStates(self, *_seconds(ns.astype(np.int64)))
 
     def quaternion(self, t: Any) -> np.ndarray:
-        return self.states(t).quaternion
+        """See ExactSolution.quaternion."""
+        return self.attitudes.quaternion(self._checked(t), None)
 
     def quaternion_grid(self, start_ns: int, step_ns: int, count: int) -> np.ndarray:
+        """See ExactSolution.quaternion_grid."""
         if count < 0:
             raise ValueError(f'count = {count!r}: must be >= 0')
         for extreme in (start_ns, start_ns + step_ns * max(0, count - 1)):
             self._check_ns(extreme)
-        if self.full_circle:
-            return self.full_circle.quaternion_grid(start_ns, step_ns, count)
+        if not self.attitudes.imaginary:
+            return self.attitudes.quaternion_grid(start_ns, step_ns, count)
         out = np.empty((count, 4))
         for block in _blocks(count):
             ns = start_ns + step_ns * np.arange(block.start, block.stop)
@@ -222,6 +183,7 @@ class ArrayEvaluator:
                 QUARTER_PERIOD_ANGLE * (nearest + (left_out + (rest + offset_rest))))
 
     def theta(self, nutation: np.ndarray) -> np.ndarray:
+        """Return 2 atan2(|beta|, |alpha|), and the whole turns of a planar rotation."""
         alpha, beta, *_, turns = nutation
         half_theta = np.arctan2(beta, alpha)
         if self.solution.turning:
@@ -229,11 +191,13 @@ class ArrayEvaluator:
         return 2.0 * half_theta
 
     def phi(self, nutation: np.ndarray, t: np.ndarray, t_rest: np.ndarray | None) -> np.ndarray:
+        """Return arg alpha + arg beta."""
         _, _, alpha_argument, beta_argument, *_ = nutation
         return self._unwrapped(self.precession, self.solution.phi_phase, t, t_rest,
                                alpha_argument + beta_argument)
 
     def psi(self, nutation: np.ndarray, t: np.ndarray, t_rest: np.ndarray | None) -> np.ndarray:
+        """Return arg alpha - arg beta."""
         _, _, alpha_argument, beta_argument, *_ = nutation
         return self._unwrapped(self.spin, self.solution.psi_phase, t, t_rest,
                                alpha_argument - beta_argument)
@@ -246,30 +210,14 @@ class ArrayEvaluator:
             out[block] = high + (rest + (phase + nutation[block]))
         return out
 
-    def general_quaternion(self, nutation: np.ndarray, t: np.ndarray, t_rest: np.ndarray | None
-                           ) -> np.ndarray:
-        out = np.empty((len(t), 4))
-        for block in _blocks(len(t)):
-            alpha, beta, alpha_argument, beta_argument, *_ = nutation[:, block]
-            times = t[block], _part_of(t_rest, block)
-            scale = 1.0 / np.sqrt(alpha * alpha + beta * beta)
-            angle = TWO_PI * self.alpha_turns.whole_and_part(*times)[1] + (
-                self.alpha_phase + alpha_argument)
-            cos_half = scale * alpha
-            out[block, 3], out[block, 2] = cos_half * np.cos(angle), cos_half * np.sin(angle)
-            angle = TWO_PI * self.beta_turns.whole_and_part(*times)[1] + (
-                self.beta_phase + beta_argument)
-            sin_half = scale * beta
-            out[block, 1], out[block, 0] = sin_half * np.cos(angle), -sin_half * np.sin(angle)
-        return out
-
     def angular_velocity(self, nutation: np.ndarray, t: np.ndarray, t_rest: np.ndarray | None
                          ) -> np.ndarray:
+        """Return (n, 3) in the body's frame."""
         out = np.empty((len(t), 3))
         for block in _blocks(len(t)):
             alpha, beta, alpha_argument, beta_argument, theta_dot, _ = nutation[:, block]
-            _, part = self.spin_turns.whole_and_part(t[block], _part_of(t_rest, block))
-            psi = TWO_PI * part + (self.spin_phase + (alpha_argument - beta_argument))
+            part, rest = self.spin_turns.fraction(t[block], _part_of(t_rest, block))
+            psi = TWO_PI * (part + rest) + (self.spin_phase + (alpha_argument - beta_argument))
             out[block, 0], out[block, 1] = transverse_rates(
                 self.solution.precession_across_axis(alpha, beta), theta_dot,
                 np.cos(psi), np.sin(psi))
@@ -285,12 +233,17 @@ class ArrayEvaluator:
         if t.size:
             latest = max(float(t.max()), -float(t.min()))
             if not latest <= self.solution.time_limit:      # catches NaN too
-                raise self.solution._too_late(latest)
+                raise self.solution.too_late(f'{latest!r} s')
         return t
 
     def _check_ns(self, ns: int) -> None:
         if abs(ns) > self.solution.ns_limit:
-            raise self.solution._too_late(ns * 1e-9)
+            raise self.solution.too_late(f'{ns} ns')
+
+
+def _blocks(n: int) -> Iterator[slice]:
+    for first in range(0, n, CHUNK):
+        yield slice(first, min(first + CHUNK, n))
 
 
 def _part_of(t_rest: np.ndarray | None, block: slice) -> np.ndarray | None:
@@ -300,9 +253,47 @@ def _part_of(t_rest: np.ndarray | None, block: slice) -> np.ndarray | None:
 def _seconds(ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return int64 nanoseconds in seconds, as nearest doubles and rests."""
     whole, count = (x.astype(np.float64) for x in np.divmod(ns, 10 ** 9))
-    part, part_rest = Rate(Decimal('1e-9')).product(count, None)
+    part, part_rest = NANOSECOND.product(count, None)
     total = whole + part                            # Dekker's sum: whole is 0 or the larger
     return total, (part - (total - whole)) + part_rest
+
+
+def _halves(x: Any) -> tuple[Any, Any]:
+    """Split doubles into two of 26 bits each, whose products are exact [Dekker 1971]."""
+    big = 134217729.0 * x   # 2^27 + 1
+    high = big - (big - x)
+    return high, x - high
+
+
+class Rate:
+    """
+    A rate in double-double; its product with a time has no rounding that grows with the time.
+
+    Times are pairs of arrays: the doubles, and what they leave out (None: nothing).
+    """
+
+    def __init__(self, per_second: Decimal):
+        self.high, self.low = double_double(per_second)
+        self.halves = _halves(self.high)
+
+    def product(self, t: np.ndarray, t_rest: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """Return rate * t as nearest double and rest."""
+        t1, t2 = _halves(t)
+        r1, r2 = self.halves
+        high = self.high * t
+        rest = ((r1 * t1 - high) + r1 * t2 + r2 * t1) + r2 * t2 + self.low * t
+        if t_rest is not None:
+            rest += self.high * t_rest
+        return high, rest
+
+    def fraction(self, t: np.ndarray, t_rest: np.ndarray | None
+                 ) -> tuple[np.ndarray, np.ndarray]:
+        """Return rate * t less whole numbers, as a double in [-1/2, 1/2] and a small rest."""
+        high, rest = self.product(t, t_rest)
+        return high - np.rint(high), rest
+
+
+NANOSECOND = Rate(Decimal('1e-9'))
 
 
 # -------------------------------------------------------------------------- one form all round
@@ -320,21 +311,27 @@ def _sine_table() -> tuple[np.ndarray, np.ndarray]:
 SINES, COSINES = _sine_table()
 
 
-class _Block:
-    """Named buffers for a block of n times; everything below is computed in place in them."""
+class _FactorBuffers:
+    """Alpha or beta in a block: R, s J, and sine and cosine of the rotation."""
 
     def __init__(self, n: int):
+        self.real, self.imag, self.sine, self.cosine = np.empty((4, n))
+
+
+class _Block:
+    """Named buffers for a block of n times: all is computed in place, in the cache."""
+
+    def __init__(self, n: int, latest: float):
+        self.latest = latest            # the largest |t| of the call
         (self.t1, self.t2, self.rest, self.step, self.work, self.square,
          self.table_sine, self.table_cosine,
-         self.sin_v, self.cos_v, self.sin_alpha, self.cos_alpha, self.sin_beta, self.cos_beta,
-         self.alpha_real, self.alpha_imag, self.beta_real, self.beta_imag,
-         self.scale) = np.empty((19, n))
+         self.y, self.flip, self.sin, self.cos, self.scale) = np.empty((13, n))
         self.index = np.empty(n, np.int64)
-        self.latest = 0.0       # the largest |t| of the call
+        self.alpha, self.beta = _FactorBuffers(n), _FactorBuffers(n)
 
-    def load(self, t: np.ndarray) -> None:
-        """Take the times and split them as `_halves` does."""
-        self.t = t
+    def load(self, t: np.ndarray, t_rest: np.ndarray | None) -> None:
+        """Take the times, and split them as `_halves` does."""
+        self.t, self.t_rest = t, t_rest
         np.multiply(t, 134217729.0, out=self.work)
         np.subtract(self.work, t, out=self.rest)
         np.subtract(self.work, self.rest, out=self.t1)
@@ -342,29 +339,52 @@ class _Block:
 
 
 class _Rotor:
-    """The angle 2 pi (rate t + start), rate and start in turns: its sine and cosine."""
+    """The angle 2 pi (rate t + start) + drift y, rate and start in turns."""
 
-    def __init__(self, rate: Decimal, start: Decimal):
+    def __init__(self, rate: Decimal, start: Decimal, drift: float = 0.0):
         self.fixed = FixedRate.of(rate, start)
         self.turns = Rate(rate)
         in_steps = rate * TABLE_STEPS
         self.rate = float(in_steps)
         self.rate1, _ = _halves(self.rate)
         self.rate2 = float(in_steps - Decimal(self.rate1))
-        self.start = float((start - start.to_integral_value()) * TABLE_STEPS)
+        start = (start - start.to_integral_value()) * TABLE_STEPS
+        self.start_step = float(start.to_integral_value())
+        self.start_rest = float(start - start.to_integral_value())
+        self.drift = drift / STEP_ANGLE
+
+    def count_steps(self, b: _Block) -> None:
+        """Set b.step to the nearest whole number of steps, b.rest to what remains."""
+        if b.t_rest is not None or b.latest * abs(self.turns.high) > SHORT_TURNS:
+            part, rest = self.turns.fraction(b.t, b.t_rest)
+            np.multiply(part, TABLE_STEPS, out=b.rest)
+            np.multiply(rest, TABLE_STEPS, out=b.work)
+        else:
+            # t1 rate1 is exact, and so is its difference from a near whole number.
+            np.multiply(b.t1, self.rate2, out=b.work)
+            np.multiply(b.t2, self.rate, out=b.rest)
+            np.add(b.work, b.rest, out=b.work)
+            np.multiply(b.t1, self.rate1, out=b.rest)
+        np.add(b.work, self.start_rest, out=b.work)
+        if self.drift:
+            np.multiply(b.y, self.drift, out=b.step)
+            np.add(b.work, b.step, out=b.work)
+        np.add(b.rest, b.work, out=b.step)
+        np.rint(b.step, out=b.step)
+        np.subtract(b.rest, b.step, out=b.rest)
+        np.add(b.rest, b.work, out=b.rest)
+        np.add(b.step, self.start_step, out=b.step)
 
     def sin_cos(self, b: _Block, sine: np.ndarray, cosine: np.ndarray) -> None:
         """Look up the nearest step of the table, and turn on by the rest of the angle."""
-        self._count_steps(b)
+        self.count_steps(b)
         np.copyto(b.index, b.step, casting='unsafe')
         np.bitwise_and(b.index, TABLE_STEPS - 1, out=b.index)
         np.take(SINES, b.index, out=b.table_sine, mode='clip')
         np.take(COSINES, b.index, out=b.table_cosine, mode='clip')
         # Sine of the rest, and cosine less 1, by their power series.
         np.multiply(b.rest, b.rest, out=b.square)
-        np.multiply(b.square, STEP_ANGLE ** 5 / 120.0, out=b.work)
-        np.subtract(b.work, STEP_ANGLE ** 3 / 6.0, out=b.work)
-        np.multiply(b.work, b.square, out=b.work)
+        np.multiply(b.square, -STEP_ANGLE ** 3 / 6.0, out=b.work)
         np.add(b.work, STEP_ANGLE, out=b.work)
         np.multiply(b.rest, b.work, out=b.rest)
         np.multiply(b.square, STEP_ANGLE ** 4 / 24.0, out=b.work)
@@ -380,43 +400,75 @@ class _Rotor:
         np.subtract(cosine, b.work, out=cosine)
         np.add(cosine, b.table_cosine, out=cosine)
 
-    def _count_steps(self, b: _Block) -> None:
-        """Set b.step to the nearest whole number of steps, b.rest to what remains."""
-        if b.latest * abs(self.turns.high) > SHORT_TURNS:
-            _, part = self.turns.whole_and_part(b.t, None)
-            np.multiply(part, TABLE_STEPS, out=b.rest)
-            np.add(b.rest, self.start, out=b.rest)
-            np.rint(b.rest, out=b.step)
-            np.subtract(b.rest, b.step, out=b.rest)
-            return
-        # t1 rate1 is exact, and so is its difference from a near whole number.
-        np.multiply(b.t1, self.rate2, out=b.work)
-        np.multiply(b.t2, self.rate, out=b.rest)
-        np.add(b.work, b.rest, out=b.work)
-        np.add(b.work, self.start, out=b.work)
-        np.multiply(b.t1, self.rate1, out=b.rest)
-        np.add(b.rest, b.work, out=b.step)
-        np.rint(b.step, out=b.step)
-        np.subtract(b.rest, b.step, out=b.rest)
-        np.add(b.rest, b.work, out=b.rest)
+
+class _Polynomial:
+    """A theta series as prefactor * polynomial in xi."""
+
+    def __init__(self, series: Series, largest_xi: Decimal):
+        self.prefactor = series.prefactor
+        exact = series.polynomial()
+        sizes = [abs(c) * largest_xi ** i for i, c in enumerate(exact)]
+        while len(exact) > 1 and sizes[len(exact) - 1] < Decimal(NEGLIGIBLE) * max(sizes):
+            exact.pop()
+        self.coefficients = [float(x) for x in exact]
+
+    def evaluate(self, b: _Block, out: np.ndarray) -> None:
+        """From b.square = xi, b.sin and b.cos."""
+        *lower, highest = self.coefficients
+        if not lower:
+            out[...] = highest
+        else:
+            np.multiply(b.square, highest, out=out)
+            np.add(out, lower[-1], out=out)
+        for coefficient in reversed(lower[:-1]):
+            np.multiply(out, b.square, out=out)
+            np.add(out, coefficient, out=out)
+        for factor in ((), (b.cos,), (b.sin,), (b.sin, b.cos))[self.prefactor]:
+            np.multiply(out, factor, out=out)
 
 
-class _FullCircleFactor:
-    """Alpha or beta: a series for R and one for J (none if it is real), and the rotation."""
+class _AttitudeFactor:
+    """Alpha or beta over the even quarter periods: series for R and s J, and the rotation."""
 
-    def __init__(self, factor: Factor, v_rate: Decimal, v_start: Decimal):
-        branch = factor.full_circle
-        assert branch is not None
-        # exp i(drift y) with y = v and drift = -s in the real form.
-        self.rotor = _Rotor(factor.rate / (2 * pi()) - factor.sense * v_rate,
-                            factor.phase_turns - factor.sense * v_start)
+    def __init__(self, factor: Factor, v_rate: Decimal, v_start: Decimal,
+                 largest_xi: Decimal):
+        branch = factor.full_circle or factor.even
+        self.flips = factor.crosses and not factor.full_circle
+        if factor.full_circle:          # the drift -s y, with y = v, is part of the rotation
+            self.rotor = _Rotor(factor.rate / (2 * pi()) - factor.sense * v_rate,
+                                factor.phase_turns - factor.sense * v_start)
+        else:
+            self.rotor = _Rotor(factor.rate / (2 * pi()), factor.phase_turns, float(factor.drift))
         self.real = branch.real.scaled(Decimal(factor.sign))
         self.imag = branch.imag.scaled(Decimal(factor.sense)) if branch.imag else None
-        self.real_polynomial = _Polynomial(self.real)
-        self.imag_polynomial = _Polynomial(self.imag) if self.imag else None
+        self.real_polynomial = _Polynomial(self.real, largest_xi)
+        self.imag_polynomial = _Polynomial(self.imag, largest_xi) if self.imag else None
+
+    def evaluate(self, b: _Block, f: _FactorBuffers) -> None:
+        """Leave R and s J in f, and add their squares to b.scale."""
+        self.real_polynomial.evaluate(b, f.real)
+        if self.flips:
+            np.multiply(f.real, b.flip, out=f.real)
+        np.multiply(f.real, f.real, out=b.work)
+        np.add(b.scale, b.work, out=b.scale)
+        if self.imag_polynomial:
+            self.imag_polynomial.evaluate(b, f.imag)
+            np.multiply(f.imag, f.imag, out=b.work)
+            np.add(b.scale, b.work, out=b.scale)
+
+    def rotate(self, b: _Block, f: _FactorBuffers) -> tuple[np.ndarray, np.ndarray]:
+        """Return real and imaginary part of (R + i s J) exp(i rotation), in buffers of b."""
+        np.multiply(f.real, f.cosine, out=b.step)
+        np.multiply(f.real, f.sine, out=b.rest)
+        if self.imag_polynomial:
+            np.multiply(f.imag, f.sine, out=b.work)
+            np.subtract(b.step, b.work, out=b.step)
+            np.multiply(f.imag, f.cosine, out=b.work)
+            np.add(b.rest, b.work, out=b.rest)
+        return b.step, b.rest
 
     def modes(self) -> dict[int, complex]:
-        """Return c_n with R + i s J = sum of c_n exp(i n v)."""
+        """Return c_n with R + i s J = sum of c_n exp(i n v), in the real form."""
         modes: dict[int, complex] = {}
         for series, unit in ((self.real, 1.0), (self.imag, 1.0j)):
             if series is None:
@@ -428,98 +480,91 @@ class _FullCircleFactor:
                 modes[n] = modes.get(n, 0.0) + half
                 modes[-n] = modes.get(-n, 0.0) + (-half if is_sine else half)
         largest = max(abs(c) for c in modes.values())
-        return {n: c for n, c in modes.items() if abs(c) > NEGLIGIBLE * largest}
+        return {n: c for n, c in modes.items() if abs(c) > NEGLIGIBLE * largest} or {0: 0.0}
 
 
-class _Polynomial:
-    """A theta series as prefactor * polynomial in sin^2 v."""
-
-    def __init__(self, series: Series):
-        self.prefactor = series.prefactor
-        exact = series.polynomial()
-        least = Decimal(NEGLIGIBLE) * max(abs(x) for x in exact)
-        while len(exact) > 1 and abs(exact[-1]) < least:
-            exact.pop()
-        self.coefficients = [float(x) for x in exact]
-
-    def evaluate(self, b: _Block, out: np.ndarray) -> None:
-        """From b.square = sin^2 v, b.sin_v and b.cos_v."""
-        *rest, last = self.coefficients
-        out[...] = last
-        for coefficient in reversed(rest):
-            np.multiply(out, b.square, out=out)
-            np.add(out, coefficient, out=out)
-        prefactor = (None, b.cos_v, b.sin_v, None)[self.prefactor]
-        if prefactor is not None:
-            np.multiply(out, prefactor, out=out)
-
-
-class _FullCircle:
+class _Attitudes:
     """
-    Quaternions from the real form of the theta series, at any phase v = (pi/2) Z.
+    Quaternions from the series of the even quarter periods.
 
-    alpha = (R + i s J)(v) / D(v) exp i(rotation), with D from |alpha|^2 + |beta|^2 = 1.
+    alpha = (R + i s J)(y)/D(y) exp i(rotation), with D from |alpha|^2 + |beta|^2 = 1.  In the real
+    form y = v = (pi/2) Z, at any Z; the imaginary form, near the separatrix, reaches
+    from Z = -1 to 1 about the nearest even Z, where D = cosh x and more than e^14.
     """
 
     def __init__(self, motion: ThetaMotion):
+        self.imaginary = motion.alpha.full_circle is None
+        self.stretch = float(motion.stretch)
         v_rate, v_start = motion.quarter_rate / 4, (motion.quarter0 + motion.offset0) / 4
         self.phase = _Rotor(v_rate, v_start)
-        self.alpha = _FullCircleFactor(motion.alpha, v_rate, v_start)
-        self.beta = _FullCircleFactor(motion.beta, v_rate, v_start)
-        self._grid: _Grid | None = None
+        largest_xi = sinh_cosh(motion.stretch * pi() / 2)[0] ** 2 if self.imaginary else ONE
+        self.alpha, self.beta = (_AttitudeFactor(factor, v_rate, v_start, largest_xi)
+                                 for factor in (motion.alpha, motion.beta))
+        self._grids: dict[int, _Grid] = {}
 
-    def quaternion(self, t: np.ndarray) -> np.ndarray:
+    def quaternion(self, t: np.ndarray, t_rest: np.ndarray | None) -> np.ndarray:
+        """Return (n, 4) x, y, z, w."""
         out = np.empty((len(t), 4))
-        block = _Block(0)
-        for part in _blocks(len(t)):
-            if part.stop - part.start != len(block.t1):
-                block = _Block(part.stop - part.start)
-                block.latest = max(float(t.max()), -float(t.min()))
-            self._quaternion_block(block, t[part], out[part])
+        latest = max(float(t.max()), -float(t.min())) if t.size else 0.0
+        buffers = _Block(min(len(t), CHUNK), latest)
+        for block in _blocks(len(t)):
+            if block.stop - block.start < len(buffers.t1):
+                buffers = _Block(block.stop - block.start, latest)
+            buffers.load(t[block], _part_of(t_rest, block))
+            self._quaternion(buffers, out[block])
         return out
 
-    def _quaternion_block(self, b: _Block, t: np.ndarray, out: np.ndarray) -> None:
-        b.load(t)
-        self.phase.sin_cos(b, b.sin_v, b.cos_v)
-        self.alpha.rotor.sin_cos(b, b.sin_alpha, b.cos_alpha)
-        self.beta.rotor.sin_cos(b, b.sin_beta, b.cos_beta)
-        np.multiply(b.sin_v, b.sin_v, out=b.square)
+    def _quaternion(self, b: _Block, out: np.ndarray) -> None:
+        if self.imaginary:
+            self._hyperbolic_phase(b)
+        else:
+            self.phase.sin_cos(b, b.sin, b.cos)
+        self.alpha.rotor.sin_cos(b, b.alpha.sine, b.alpha.cosine)
+        self.beta.rotor.sin_cos(b, b.beta.sine, b.beta.cosine)
+        np.multiply(b.sin, b.sin, out=b.square)
+        if self.imaginary:
+            np.negative(b.square, out=b.square)
         b.scale[...] = 0.0
-        for factor, real, imag in ((self.alpha, b.alpha_real, b.alpha_imag),
-                                   (self.beta, b.beta_real, b.beta_imag)):
-            factor.real_polynomial.evaluate(b, real)
-            np.multiply(real, real, out=b.work)
-            np.add(b.scale, b.work, out=b.scale)
-            if factor.imag_polynomial:
-                factor.imag_polynomial.evaluate(b, imag)
-                np.multiply(imag, imag, out=b.work)
-                np.add(b.scale, b.work, out=b.scale)
+        self.alpha.evaluate(b, b.alpha)
+        self.beta.evaluate(b, b.beta)
         np.sqrt(b.scale, out=b.scale)
         np.divide(1.0, b.scale, out=b.scale)
-        _rotate(b, self.alpha, b.alpha_real, b.alpha_imag, b.sin_alpha, b.cos_alpha)
-        out[:, 3], out[:, 2] = b.step, b.rest
-        _rotate(b, self.beta, b.beta_real, b.beta_imag, b.sin_beta, b.cos_beta)
-        out[:, 1] = b.step
-        np.negative(b.rest, out=out[:, 0])
+        w, z = self.alpha.rotate(b, b.alpha)
+        np.multiply(w, b.scale, out=out[:, 3])
+        np.multiply(z, b.scale, out=out[:, 2])
+        y, minus_x = self.beta.rotate(b, b.beta)
+        np.multiply(y, b.scale, out=out[:, 1])
+        np.negative(b.scale, out=b.scale)
+        np.multiply(minus_x, b.scale, out=out[:, 0])
+
+    def _hyperbolic_phase(self, b: _Block) -> None:
+        """Set b.y in [-pi/2, pi/2], b.flip = (-1)^(N/2), b.sin = sinh x and b.cos = cosh x."""
+        self.phase.count_steps(b)
+        half_turn = TABLE_STEPS // 2
+        np.multiply(b.step, 1.0 / half_turn, out=b.work)
+        np.rint(b.work, out=b.work)
+        np.copyto(b.index, b.work, casting='unsafe')
+        np.bitwise_and(b.index, 1, out=b.index)
+        np.multiply(b.index, -2.0, out=b.flip)
+        np.add(b.flip, 1.0, out=b.flip)
+        np.multiply(b.work, half_turn, out=b.work)
+        np.subtract(b.step, b.work, out=b.step)
+        np.add(b.step, b.rest, out=b.y)
+        np.multiply(b.y, STEP_ANGLE, out=b.y)
+        np.multiply(b.y, self.stretch, out=b.work)
+        np.exp(b.work, out=b.work)
+        np.divide(0.5, b.work, out=b.rest)
+        np.multiply(b.work, 0.5, out=b.work)
+        np.subtract(b.work, b.rest, out=b.sin)
+        np.add(b.work, b.rest, out=b.cos)
 
     def quaternion_grid(self, start_ns: int, step_ns: int, count: int) -> np.ndarray:
-        if self._grid is None or self._grid.step_ns != step_ns:
-            self._grid = _Grid(self, step_ns)
-        return self._grid.quaternion(start_ns, count)
-
-
-def _rotate(b: _Block, factor: _FullCircleFactor, real: np.ndarray, imag: np.ndarray,
-            sine: np.ndarray, cosine: np.ndarray) -> None:
-    """Leave (real + i imag) exp(i rotation) * scale in b.step + i b.rest."""
-    np.multiply(sine, b.scale, out=sine)
-    np.multiply(cosine, b.scale, out=cosine)
-    np.multiply(real, cosine, out=b.step)
-    np.multiply(real, sine, out=b.rest)
-    if factor.imag_polynomial:
-        np.multiply(imag, sine, out=b.work)
-        np.subtract(b.step, b.work, out=b.step)
-        np.multiply(imag, cosine, out=b.work)
-        np.add(b.rest, b.work, out=b.rest)
+        """Return (count, 4) x, y, z, w; in the real form only."""
+        if step_ns not in self._grids:
+            if len(self._grids) == KEPT_GRIDS:
+                self._grids.clear()
+            self._grids[step_ns] = _Grid(self, step_ns)
+        return self._grids[step_ns].quaternion(start_ns, count)
 
 
 # ------------------------------------------------------------------------------ uniform grids
@@ -527,18 +572,20 @@ def _rotate(b: _Block, factor: _FullCircleFactor, real: np.ndarray, imag: np.nda
 
 class _Grid:
     """
-    The full circle on times start + k step: alpha D = sum over modes of c_n exp i(nu_n t).
+    The real form on times start + k step: alpha D = sum over modes of c_n exp i(nu_n t).
 
     As exp i nu (T + s) = exp(i nu T) exp(i nu s), a block of states is the product of a matrix
     (starts of rows x modes) and a matrix (modes x times within a row), which is kept.  Phases are
     products of integers, so that no error grows along the grid.
     """
 
-    def __init__(self, circle: _FullCircle, step_ns: int):
-        self.circle, self.step_ns = circle, step_ns
-        self.offsets = tuple(self._within_row(factor) for factor in (circle.alpha, circle.beta))
+    def __init__(self, attitudes: _Attitudes, step_ns: int):
+        self.attitudes, self.step_ns = attitudes, step_ns
+        self.offsets = tuple(
+            self._within_row(factor) for factor in (attitudes.alpha, attitudes.beta))
 
     def quaternion(self, start_ns: int, count: int) -> np.ndarray:
+        """Return (count, 4) x, y, z, w."""
         rows = -(-count // GRID_BLOCK)
         out = np.empty((rows, min(count, GRID_BLOCK), 4))
         for first in range(0, rows, MOST_ROWS):
@@ -550,7 +597,7 @@ class _Grid:
         rows, width, _ = out.shape
         alpha_rows, beta_rows = (
             self._row_starts(factor, start_ns, rows)
-            for factor in (self.circle.alpha, self.circle.beta))
+            for factor in (self.attitudes.alpha, self.attitudes.beta))
         alpha_offsets, beta_offsets = (x[:, :width] for x in self.offsets)
         for first in range(0, rows, GRID_ROWS):
             group = slice(first, first + GRID_ROWS)
@@ -569,46 +616,42 @@ class _Grid:
             np.negative(scale, out=scale)
             np.multiply(minus_x, scale, out=out[group, :, 0])
 
-    def _within_row(self, factor: _FullCircleFactor) -> np.ndarray:
+    def _within_row(self, factor: _AttitudeFactor) -> np.ndarray:
         """Return real over imaginary parts of c_n exp(i nu_n k step), k within a row."""
         modes = factor.modes()
-        waves = self._waves(factor, modes, 0, self.step_ns, GRID_BLOCK, with_start=False)
-        waves *= np.array(list(modes.values()))[:, None]
+        phase = self.attitudes.phase.fixed
+        waves = np.array(list(modes.values()))[:, None] * _waves(
+            modes, _fractions(0, factor.rotor.fixed.rate * self.step_ns, GRID_BLOCK),
+            _fractions(0, phase.rate * self.step_ns, GRID_BLOCK))
         return np.concatenate((waves.real, waves.imag))
 
-    def _row_starts(self, factor: _FullCircleFactor, start_ns: int, rows: int
+    def _row_starts(self, factor: _AttitudeFactor, start_ns: int, rows: int
                     ) -> tuple[np.ndarray, np.ndarray]:
         """Return exp(i nu_n T) so that products with `_within_row` are real, imaginary parts."""
-        waves = self._waves(factor, factor.modes(), start_ns, self.step_ns * GRID_BLOCK, rows,
-                            with_start=True).T
+        row_ns = self.step_ns * GRID_BLOCK
+        rotation, phase = (_fractions(fixed.at(start_ns), fixed.rate * row_ns, rows)
+                           for fixed in (factor.rotor.fixed, self.attitudes.phase.fixed))
+        waves = _waves(factor.modes(), rotation, phase).T
         return (np.concatenate((waves.real, -waves.imag), axis=1),
                 np.concatenate((waves.imag, waves.real), axis=1))
 
-    def _waves(self, factor: _FullCircleFactor, modes: dict[int, complex], start_ns: int,
-               step_ns: int, count: int, with_start: bool) -> np.ndarray:
-        """Return exp 2 pi i (rotation + n v), a row for every mode n."""
-        (turn_high, turn_low), (v_high, v_low) = (
-            _fractions(rotor.fixed, start_ns, step_ns, count, with_start)
-            for rotor in (factor.rotor, self.circle.phase))
-        numbers = np.array(list(modes))[:, None]
-        turns = turn_high + numbers * v_high        # 48-bit fractions: exact
-        turns -= np.rint(turns)
-        turns += turn_low + numbers * v_low
-        return np.exp(2.0j * np.pi * turns)
+
+def _waves(modes: dict[int, complex], rotation: tuple[np.ndarray, np.ndarray],
+           phase: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Return exp 2 pi i (rotation + n phase), a row for every mode n."""
+    numbers = np.array(list(modes))[:, None]
+    turns = rotation[0] + numbers * phase[0]        # fractions of 48 bits: exact
+    turns -= np.rint(turns)
+    turns += rotation[1] + numbers * phase[1]
+    return np.exp(2.0j * np.pi * turns)
 
 
-def _fractions(fixed: FixedRate, start_ns: int, step_ns: int, count: int, with_start: bool
-               ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the fractions of rate * (start + k step), k < count, as exact and small parts."""
-    start = fixed.rate * start_ns + (fixed.start if with_start else 0)
-    start, step = ((x % FIXED_ONE) >> (FIXED_BITS - 2 * LIMB) for x in (
-        start, fixed.rate * step_ns))
-    mask = np.uint64((1 << LIMB) - 1)
+def _fractions(start: int, step: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return start + k step, k < count, less whole turns, as 48-bit fractions and what is left."""
+    start, step = ((x % FIXED_ONE) >> (FIXED_BITS - 2 * LIMB) for x in (start, step))
+    mask = (1 << LIMB) - 1
     k = np.arange(count, dtype=np.uint64)
-
-    def limb(number: int, shift: int) -> np.uint64:
-        return np.uint64(number >> shift & int(mask))
-    low = k * limb(step, 0) + limb(start, 0)
-    high = k * limb(step, LIMB) + limb(start, LIMB) + (low >> np.uint64(LIMB))
-    return ((high & mask).astype(np.float64) * 2.0 ** -LIMB,
-            (low & mask).astype(np.float64) * 2.0 ** -(2 * LIMB))
+    low = k * np.uint64(step & mask) + np.uint64(start & mask)
+    high = (k * np.uint64(step >> LIMB) + np.uint64(start >> LIMB)) + (low >> np.uint64(LIMB))
+    return ((high & np.uint64(mask)).astype(np.float64) * 2.0 ** -LIMB,
+            (low & np.uint64(mask)).astype(np.float64) * 2.0 ** -(2 * LIMB))

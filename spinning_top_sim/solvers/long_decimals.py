@@ -11,11 +11,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from decimal import Decimal, getcontext, localcontext
+from contextlib import AbstractContextManager
+from decimal import Context, Decimal, getcontext, localcontext
 from functools import lru_cache
 
 ZERO, ONE = Decimal(0), Decimal(1)
 HALVINGS = 8
+
+
+def precision(digits: int) -> AbstractContextManager[Context]:
+    """Return a context manager: so many digits, and room for any exponent, whatever was set."""
+    return localcontext(Context(prec=digits, Emin=-10 ** 12, Emax=10 ** 12))
 
 
 def pi() -> Decimal:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,9 @@ from spinning_top_sim.physics.kinematics import Columns, lazy
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.rk45 import SteppedOrClosed
+
+if TYPE_CHECKING:
+    from spinning_top_sim.solvers.propagator import Branch
 
 Column = NDArray[Any]
 
@@ -72,15 +75,18 @@ class Motion(Columns):
     @lazy
     def angular_velocity(self) -> Column:
         """Body rates (n, 3) [rad/s]."""
-        rate = self.transverse_rate
-        return np.stack((rate.real, rate.imag, self.l3 / self.top.lambda3), axis=-1)
+        return np.stack(np.broadcast_arrays(*self.body_rates), axis=-1)
 
     @lazy
     def angular_acceleration(self) -> Column:
         """Body angular acceleration (n, 3) [rad/s^2]."""
-        rate = attitude.angular_acceleration(
-            self.top, tuple(self.angular_velocity.T), self.vertical[0])
-        return np.stack((rate.real, rate.imag, np.zeros(len(self.t))), axis=-1)
+        across1, across2, along = self.body_acceleration
+        return np.stack((across1, across2, np.full(len(self.t), along)), axis=-1)
+
+    @lazy
+    def norm_error(self) -> Column:
+        """|q| - 1 (n,)."""
+        return np.linalg.norm(self.quaternion, axis=1) - 1.0
 
 
 class SteppedMotion(Motion):
@@ -136,3 +142,39 @@ class ExactMotion(Motion):
     def transverse_rate(self) -> Column:
         rates = self.angular_velocity
         return rates[:, 0] + 1j * rates[:, 1]
+
+
+class ExactGrid(ExactMotion):
+    """
+    Samples of the closed form at start_ns + k step_ns, k = 0 .. count - 1.
+
+    branch: where its angles are put, see `propagator.Branch`.
+    """
+
+    def __init__(self, solution: ExactSolution, branch: Branch, start_ns: int, step_ns: int,
+                 count: int) -> None:
+        ns = start_ns + step_ns * np.arange(count, dtype=np.int64)
+        Motion.__init__(self, solution.top, solution.start, ns * 1e-9)
+        self.solution, self._branch = solution, branch
+        self._grid = (start_ns, step_ns, count)
+        self._states = solution.states_at_ns(ns)
+
+    @lazy
+    def quaternion(self) -> Column:
+        return self._branch.sign * self.solution.quaternion_grid(*self._grid)
+
+    @lazy
+    def theta(self) -> Column:
+        return self._branch.side * self._states.theta + self._branch.offset
+
+    @lazy
+    def theta_dot(self) -> Column:
+        return self._branch.side * self._states.theta_dot
+
+    @lazy
+    def phi(self) -> Column:
+        return self._states.phi - self._branch.half_turn
+
+    @lazy
+    def psi(self) -> Column:
+        return self._states.psi + self._branch.half_turn

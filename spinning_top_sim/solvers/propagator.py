@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from spinning_top_sim.physics.kinematics import OneState, lazy
 from spinning_top_sim.physics.top import ContinuedState, State, Top
 from spinning_top_sim.solvers.rk45 import rk45
+
+if TYPE_CHECKING:
+    from spinning_top_sim.solvers.motion import ExactGrid
 
 METHODS = ('rk45', 'exact')
 
@@ -27,6 +30,10 @@ class Propagator(Protocol):
     @property
     def evaluations(self) -> int:
         """Evaluations of the right-hand side."""
+
+    @property
+    def earliest_ns(self) -> int:
+        """The first nanosecond that can still be read after the steps taken."""
 
     def reach_ns(self, ns: int, max_steps: int | None = None) -> bool:
         """Compute what the state at `ns` nanoseconds needs; False if max_steps did not do."""
@@ -60,6 +67,7 @@ class ExactPropagator:
 
     steps = 0
     evaluations = 0
+    earliest_ns = 0
 
     def __init__(self, top: Top, start: State) -> None:
         # 1.5 ms of long decimals, and their import, for those who ask for it only.
@@ -83,6 +91,12 @@ class ExactPropagator:
     def at_ns(self, ns: int) -> OneState:
         """Return the state at `ns` nanoseconds, before or after the start."""
         return ExactState(self, ns)
+
+    def grid(self, start_ns: int, step_ns: int, count: int) -> ExactGrid:
+        """Return the states at start_ns + k step_ns, k < count, as numpy columns."""
+        from spinning_top_sim.solvers.motion import ExactGrid  # noqa: PLC0415
+
+        return ExactGrid(self.solution, self.branch, start_ns, step_ns, count)
 
 
 class Branch:

@@ -61,6 +61,7 @@ class Series:
         return sum(self.weights, ZERO)
 
     def __call__(self, sin: Decimal, cos: Decimal, xi: Decimal) -> Decimal:
+        """Return the sum at the y of these sine and cosine."""
         value = ZERO
         for coefficient in reversed(self.polynomial()):
             value = value * xi + coefficient
@@ -135,17 +136,17 @@ class ThetaForm:
         return self._power(k * (k + 1))
 
     def denominator_even(self) -> Series:
-        """theta4(y), D over even quarter periods."""
+        """Return theta4, D over even quarter periods."""
         if self.imaginary:
             return Series('cos odd', self._weights(self._pronic))
         return Series('cos even', self._weights(self._square, alternating=True))
 
     def denominator_odd(self) -> Series:
-        """theta3(y), D over odd quarter periods."""
+        """Return theta3, D over odd quarter periods."""
         return Series('cos even', self._weights(self._square))
 
     def theta1(self) -> Series:
-        """theta1(y) less 2 nome^(1/4)."""
+        """Return theta1, less 2 nome^(1/4)."""
         return Series('sin odd', self._weights(self._pronic, alternating=True))
 
     @property

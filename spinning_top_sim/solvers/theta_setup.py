@@ -10,13 +10,13 @@ Cayley-Klein parameters
 
 are each a theta function of the nutation's phase over a common one, times a uniform rotation:
 
-    alpha = (A_alpha/D(y)) (R + i s J)(y) exp i(rate t + phase + s kappa y),     R + i s J = theta(y - i s a)
+    alpha = (R + i s J)(y)/D(y) exp i(rate t + phase + s kappa y),   R + i s J ~ theta(y - i s a)
 
 (F. Klein, A. Sommerfeld, Ueber die Theorie des Kreisels, ch. VI;  E. T. Whittaker, Analytical
-Dynamics, sect. 72-76;  theta functions, nome and quarter periods K, K' as in DLMF ch. 20 and 22,
-R_F as in DLMF ch. 19: https://dlmf.nist.gov).  So a state costs the same at every t.  The phase is counted in quarter
-periods, Z = N + 2y/pi with N whole and |y| <= pi/4: over even N (u near u1) alpha is theta1 and
-beta theta2, over odd N (u near u2) the other way round.
+Dynamics, ch. VI;  theta functions, nome and quarter periods K, K' as in DLMF ch. 20 and 22, R_F
+as in DLMF ch. 19: https://dlmf.nist.gov).  So a state costs the same at every t.  The phase
+is counted in quarter periods, Z = N + 2y/pi with N whole and |y| <= pi/4: over even N (u near u1)
+alpha is theta1 and beta theta2, over odd N (u near u2) the other way round.
 
 The work is done in long decimals, 60 digits and more if two roots of the cubic are close, because
 everything that cancels, cancels here: close to a pole, to the separatrix, to steady precession.
@@ -26,7 +26,7 @@ What comes out are coefficients, frequencies and phases for evaluation in double
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from decimal import Context, Decimal, DecimalException, getcontext, localcontext
+from decimal import Decimal, DecimalException, getcontext, localcontext
 
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.long_decimals import (
@@ -35,6 +35,7 @@ from spinning_top_sim.solvers.long_decimals import (
     atan2,
     carlson_rf,
     pi,
+    precision,
     reduced_turns,
     sign,
     sin_cos,
@@ -44,8 +45,10 @@ from spinning_top_sim.solvers.theta_series import Series, ThetaForm
 
 FIRST_DIGITS = 60
 MOST_DIGITS = 480
+MOST_NEWTON_STEPS = 5000
 KEPT_DIGITS = 40        # what must be left of the digits after the discriminant has cancelled
-FULL_CIRCLE_M1 = Decimal('1e-5')    # below, the real form takes too many terms and cancels
+DIGITS_OF_SUMS = 1400   # the sum of any two doubles is exact
+FULL_CIRCLE_M1 = Decimal('2e-4')    # below, the series of the real form cancels too much
 
 
 class _RootsTooCloseError(ArithmeticError):
@@ -106,7 +109,7 @@ class ThetaMotion:
     quarter_rate: Decimal       # quarter periods per second, w/K
     quarter0: int               # phase at t = 0 in quarter periods: whole part,
     offset0: Decimal            # and a rest in [-1/2, 1/2], accurate relative to itself
-    u_dot: tuple[Decimal, Decimal]      # cos(theta)' = u_dot * u_dot_series(2y)/D^4 over even, odd N
+    u_dot: tuple[Decimal, Decimal]      # u' = u_dot u_dot_series(2y)/D^4 over even and odd N
     u_dot_series: Series
     turning: tuple[int, int] | None     # planar rotation: theta/2 follows (pi/2)(i + j Z)
     a_plus: Decimal             # Lz + L3
@@ -143,7 +146,7 @@ def set_up(top: Top, start: State) -> ThetaMotion:
     """
     digits = FIRST_DIGITS
     while digits <= MOST_DIGITS:
-        with localcontext(Context(prec=digits, Emin=-10 ** 12, Emax=10 ** 12)):
+        with precision(digits):
             try:
                 return _set_up(top, start)
             except _RootsTooCloseError:
@@ -168,8 +171,7 @@ def _set_up(top: Top, start: State) -> ThetaMotion:
         sin_half, cos_half = cos_half, sin_half
     # Half of phi + psi and of phi - psi, exact sums reduced to one turn; seen upside down they
     # change places.
-    with localcontext() as context:
-        context.prec = 2000
+    with precision(DIGITS_OF_SUMS):
         angles = ((Decimal(start.phi) + Decimal(start.psi)) / 2,
                   (Decimal(start.phi) - Decimal(start.psi)) / 2)
     alpha_turns, beta_turns = (reduced_turns(x) for x in (angles[::-1] if upside_down else angles))
@@ -230,11 +232,12 @@ def _isolated_root(a2: Decimal, a1: Decimal, a0: Decimal) -> tuple[Decimal, int]
         context.prec = 8
         y = side * Decimal('2.001') * max(abs(a2), abs(a1).sqrt(), abs(a0) ** (ONE / 3))
     resolution = Decimal(10) ** (3 - getcontext().prec)
-    while True:
+    for _ in range(MOST_NEWTON_STEPS):
         step = (((y + a2) * y + a1) * y + a0) / ((3 * y + 2 * a2) * y + a1)
         y -= step
         if step * side <= abs(y) * resolution:
             return y, side
+    raise _RootsTooCloseError
 
 
 def _cubic_roots(f0: Decimal, f1: Decimal, f2: Decimal, f3: Decimal) -> _Roots:

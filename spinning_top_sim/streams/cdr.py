@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 ENCAPSULATION = b'\x00\x01\x00\x00'
 NANOSECONDS = 1_000_000_000
@@ -82,8 +83,14 @@ class Template:
         """
         self._buffer = writer.buffer
         self._stamp_at = stamp_at
+        self._fields = tuple(fields)
+        self._rows: Any = None
         self._stamp = struct.Struct('<iI')
         self._runs = [(struct.Struct(f'<{count}d').pack_into, at) for at, count in fields]
+
+    def __len__(self) -> int:
+        """Return the size of every message [bytes]."""
+        return len(self._buffer)
 
     def encode(self, stamp_ns: int, *runs: Sequence[float]) -> bytes:
         """Return the message with this stamp [ns] and one sequence of numbers a run."""
@@ -93,3 +100,37 @@ class Template:
         for (pack_into, at), values in zip(self._runs, runs, strict=True):
             pack_into(buffer, at, *values)
         return bytes(buffer)
+
+    def encode_many(self, stamps_ns: Any, *runs: Any) -> Any:
+        """
+        Return n messages of equal length as rows of bytes, (n, size) uint8.
+
+        stamps_ns: (n,) int64 [ns];  runs: (n, count) arrays, or sequences of `count` columns or
+        numbers.  The rows are valid until the next call.
+        """
+        import numpy  # noqa: PLC0415 - offline only
+
+        count = len(stamps_ns)
+        if self._rows is None or len(self._rows) < count:
+            names = [f'run{i}' for i in range(len(self._fields))]
+            formats: list[Any] = [('<f8', (number,)) for _, number in self._fields]
+            offsets = [at for at, _ in self._fields]
+            if self._stamp_at is not None:
+                names += ['sec', 'nanosec']
+                formats += ['<i4', '<u4']
+                offsets += [self._stamp_at, self._stamp_at + 4]
+            self._rows = numpy.empty(count, numpy.dtype({
+                'names': names, 'formats': formats, 'offsets': offsets,
+                'itemsize': len(self._buffer)}))
+            self._rows.view('u1').reshape(count, -1)[:] = numpy.frombuffer(self._buffer, 'u1')
+        rows = self._rows[:count]
+        if self._stamp_at is not None:
+            rows['sec'], rows['nanosec'] = numpy.divmod(stamps_ns, NANOSECONDS)
+        for i, run in enumerate(runs):
+            field = rows[f'run{i}']
+            if isinstance(run, numpy.ndarray) and run.ndim == 2 and len(run) == count:
+                field[:] = run
+            else:
+                for column, values in enumerate(run):
+                    field[:, column] = values
+        return rows.view('u1').reshape(count, -1)

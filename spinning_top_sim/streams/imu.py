@@ -10,15 +10,17 @@ kalibr's model, with its names and units.  Conventions: REP-145
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
-from spinning_top_sim.physics.kinematics import OneState
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.kinematics import Columns
 
-Vector = tuple[float, float, float]
+# Three, or four, numbers or columns of numbers.
+Vector = tuple[Any, Any, Any]
+Quaternion = tuple[Any, Any, Any, Any]
 Matrix = tuple[Vector, Vector, Vector]
-Quaternion = tuple[float, float, float, float]
 ZERO: Vector = (0.0, 0.0, 0.0)
 NO_NOISE = 12 * (0.0,)
 
@@ -36,13 +38,15 @@ class Imu:
         self._to_sensor = _transposed(_rotation(*values['imu.rpy']))
         self._mounting = _quaternion(*values['imu.rpy'])
 
-    def orientation(self, state: OneState) -> Quaternion:
-        """Return q(world <- IMU) as x, y, z, w."""
-        return _product(state.quaternion, self._mounting) if self._turned else state.quaternion
+    def orientation(self, state: Columns) -> Any:
+        """Return q(world <- IMU) as x, y, z, w: four numbers or columns, or (n, 4)."""
+        if not self._turned:
+            return state.quaternion
+        return _product(attitude.quaternion(state.alpha, state.beta), self._mounting)
 
-    def true(self, state: OneState) -> tuple[Vector, Vector]:
+    def true(self, state: Columns) -> tuple[Vector, Vector]:
         """Return angular velocity [rad/s] and specific force [m/s^2] in the IMU's frame."""
-        rates = state.angular_velocity
+        rates = state.body_rates
         force = state.specific_force(self._lever_arm)
         if self._turned:
             return _apply(self._to_sensor, rates), _apply(self._to_sensor, force)
@@ -87,16 +91,26 @@ class Axes:
         """Of what is added to a sample besides the bias: white noise and rounding."""
         return self.white ** 2 + self.resolution ** 2 / 12.0
 
-    def read(self, exact: Vector, white: Sequence[float], bias: Sequence[float]) -> Vector:
+    def read(self, exact: Vector, white: Sequence[Any], bias: Sequence[Any],
+             functions: Functions) -> Vector:
         """Return the readings: noise and bias added, cut at the range, rounded."""
-        x, y, z = (max(-self.limit, min(self.limit, value + noise + offset))
+        x, y, z = (functions.clip(value + noise + offset, -self.limit, self.limit)
                    for value, noise, offset in zip(exact, white, bias, strict=True))
         step = self.resolution
         if step:
-            return round(x / step) * step, round(y / step) * step, round(z / step) * step
+            nearest = functions.round
+            return nearest(x / step) * step, nearest(y / step) * step, nearest(z / step) * step
         return x, y, z
 
 
+class Functions(NamedTuple):
+    """What `Axes.read` takes from Python for one sample, from numpy for many."""
+
+    clip: Callable[[Any, float, float], Any]
+    round: Callable[[Any], Any]
+
+
+ONE = Functions(lambda x, low, high: max(low, min(high, x)), round)
 PERFECT = Axes(white=0.0, walk=0.0, turn_on=0.0, limit=math.inf, resolution=0.0)
 
 
@@ -116,18 +130,28 @@ class Sensor:
         if self.gyroscope.is_random or self.accelerometer.is_random:
             self._noise = Noise(values['seed'], self.gyroscope, self.accelerometer)
 
-    def read(self, exact: tuple[Vector, Vector], index: int) -> tuple[Vector, Vector]:
-        """Return the readings of rates [rad/s] and force [m/s^2] in sample `index`."""
+    def read(self, exact: tuple[Vector, Vector], index: int | range) -> tuple[Vector, Vector]:
+        """Return the readings of rates [rad/s] and force [m/s^2] in sample `index`, or in many."""
         if self._perfect:
             return exact
-        row = NO_NOISE if self._noise is None else self._noise.sample(index)
-        return (self.gyroscope.read(exact[0], row[0:3], row[6:9]),
-                self.accelerometer.read(exact[1], row[3:6], row[9:12]))
+        row, functions = self._drawn(index), ONE
+        if isinstance(index, range):
+            import numpy  # noqa: PLC0415
+            functions = Functions(numpy.clip, numpy.rint)
+        return (self.gyroscope.read(exact[0], row[0:3], row[6:9], functions),
+                self.accelerometer.read(exact[1], row[3:6], row[9:12], functions))
 
-    def bias(self, index: int) -> tuple[Sequence[float], Sequence[float]]:
-        """Return the bias in sample `index`: [rad/s], [m/s^2]."""
-        row = NO_NOISE if self._noise is None else self._noise.sample(index)
+    def bias(self, index: int | range) -> tuple[Sequence[Any], Sequence[Any]]:
+        """Return the bias in sample `index`, or in many: [rad/s], [m/s^2]."""
+        row = self._drawn(index)
         return row[6:9], row[9:12]
+
+    def _drawn(self, index: int | range) -> Sequence[Any]:
+        if self._noise is None:
+            return NO_NOISE
+        if isinstance(index, range):
+            return self._noise.samples(index)
+        return self._noise.sample(index)
 
 
 class Noise:
@@ -162,15 +186,29 @@ class Noise:
             self._load(block)
         return self._rows[row]
 
-    def _load(self, block: int) -> None:
+    def samples(self, indices: range) -> Any:
+        """Return the same of consecutive samples, (12, n)."""
         numpy = self._numpy
+        first, last = indices[0] // self.BLOCK, indices[-1] // self.BLOCK
+        drawn = numpy.vstack([numpy.hstack(self._drawn(block))
+                              for block in range(first, last + 1)])
+        begin = indices[0] - first * self.BLOCK
+        return drawn[begin:begin + len(indices)].T
+
+    def _load(self, block: int) -> None:
+        self._rows = self._numpy.hstack(self._drawn(block)).tolist()
+        self._block = block
+
+    def _drawn(self, block: int) -> tuple[Any, Any]:
+        """Return white noise and bias of a block, with the biases of those before it."""
         while len(self._bias_starts) <= block:
             before = len(self._bias_starts) - 1
             _, bias = self._draw(before)
             self._bias_starts.append(bias[-1])
         white, bias = self._draw(block)
-        self._rows = numpy.hstack((white, bias)).tolist()
-        self._block = block
+        if len(self._bias_starts) == block + 1:
+            self._bias_starts.append(bias[-1])
+        return white, bias
 
     def _draw(self, block: int) -> tuple[Any, Any]:
         """Return white noise and bias of a block, (512, 6) each."""

@@ -11,10 +11,10 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.kinematics import OneState
+from spinning_top_sim.physics.kinematics import Columns, OneState
 from spinning_top_sim.physics.regimes import Description, describe
 from spinning_top_sim.physics.top import State, Top, pole_momentum
 from spinning_top_sim.solvers.propagator import (
@@ -27,6 +27,9 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.topics import Invariants, Stream, all_streams
 
+if TYPE_CHECKING:
+    from spinning_top_sim.solvers.motion import ExactGrid
+
 # Integration steps between two looks at whether to give way: about 5 ms.
 STEPS_AT_ONCE = 500
 
@@ -37,7 +40,8 @@ class Simulation:
 
     streams: all of them, whose `publish` and `record` the caller sets;  now_ns: simulated time up
     to which every sample has been sent (-1: not even that of t = 0);  l3, lz: as last commanded;
-    history: applied commands since the start as (t_ns, l3, lz).
+    solver: the present motion, whose t = 0 is anchor_ns;  history: applied commands since the
+    start as (t_ns, l3, lz).
     """
 
     def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
@@ -79,7 +83,7 @@ class Simulation:
 
     def _begin(self, solver: Propagator, start: State, state: OneState, at_ns: int) -> None:
         """Let a motion begin at a time."""
-        self._solver, self._anchor, self._anchor_ns, self._first = solver, start, at_ns, state
+        self.solver, self._anchor, self.anchor_ns, self._first = solver, start, at_ns, state
         self._reference: ExactPropagator | None = None
         self._invariants.orientation_error = self.orientation_error
         self.l3, self.lz = state.l3_start, state.lz_start
@@ -97,28 +101,32 @@ class Simulation:
     @property
     def steps(self) -> int:
         """Integration steps taken so far."""
-        return self._steps_before + self._solver.steps
+        return self._steps_before + self.solver.steps
 
     @property
     def evaluations(self) -> int:
         """Evaluations of the right-hand side so far."""
-        return self._evaluations_before + self._solver.evaluations
+        return self._evaluations_before + self.solver.evaluations
 
     def state(self) -> OneState:
         """Return the state at `now_ns` (at the start before the first sample)."""
-        return self._solver.at_ns(max(self.now_ns - self._anchor_ns, 0))
+        return self.solver.at_ns(self._readable_ns() - self.anchor_ns)
 
-    def orientation_error(self, state: OneState, t_ns: int) -> float:
+    def _readable_ns(self) -> int:
+        """Return `now_ns`, or what steps shorter than 1 ns have left of it."""
+        return max(self.now_ns, self.anchor_ns + self.solver.earliest_ns)
+
+    def orientation_error(self, state: Columns, t_ns: int) -> float:
         """
         Return the angle between a state at t_ns and the exact solution there [rad].
 
         0 for the exact solution itself; NaN for a motion that it cannot hold.
         """
         exact = self._exact()
-        if exact is None or exact is self._solver:
+        if exact is None or exact is self.solver:
             return math.nan if exact is None else 0.0
         return attitude.angle_between(state.quaternion,
-                                      exact.at_ns(t_ns - self._anchor_ns).quaternion)
+                                      exact.at_ns(t_ns - self.anchor_ns).quaternion)
 
     def describe(self) -> Description | None:
         """Return the present motion in numbers; None where the closed form cannot hold it."""
@@ -129,8 +137,8 @@ class Simulation:
 
     def _exact(self) -> ExactPropagator | None:
         """Return the closed form of the present motion, set up when first asked for."""
-        if isinstance(self._solver, ExactPropagator):
-            return self._solver
+        if isinstance(self.solver, ExactPropagator):
+            return self.solver
         if self._reference is None:
             with contextlib.suppress(ValueError):
                 self._reference = ExactPropagator(self.top, self._anchor)
@@ -167,15 +175,49 @@ class Simulation:
             if give_way():
                 return False
 
+    def advance_in_columns(self, target_ns: int,
+                           send: Callable[[Stream, Any, Any], None]) -> None:
+        """
+        Send every sample due up to `target_ns`, whole columns of a stream at a time.
+
+        For the exact solution, which knows all times at once; offline only.
+        send: takes the stream, its stamps (n,) int64 [ns], and the messages as rows of bytes
+            (n, size) uint8, valid until the next call
+        Raises ValueError for a solver that takes steps.
+        """
+        import numpy  # noqa: PLC0415
+
+        if not isinstance(self.solver, ExactPropagator):
+            raise ValueError("solver.method: columns need 'exact'")
+        grids: dict[tuple[int, int], ExactGrid] = {}
+        for stream in self.streams:
+            if not stream.wanted:
+                continue
+            if stream.next_ns <= self.now_ns:
+                stream.resume(self.now_ns)
+            first, period = stream.next_ns, stream.period_ns
+            count = (target_ns - first) // period + 1
+            if count <= 0:
+                continue
+            if (first, period) not in grids:
+                grids[first, period] = self.solver.grid(first - self.anchor_ns, period, count)
+            stamps = self.epoch_ns + first + period * numpy.arange(count, dtype=numpy.int64)
+            send(stream, stamps, stream.encode_many(grids[first, period], stamps))
+            stream.next_ns += count * period
+        self.now_ns = target_ns
+
     def _reach(self, t_ns: int, give_way: Callable[[], bool]) -> bool:
-        local_ns = t_ns - self._anchor_ns
-        while not self._solver.reach_ns(local_ns, STEPS_AT_ONCE):
+        local_ns = t_ns - self.anchor_ns
+        while not self.solver.reach_ns(local_ns, STEPS_AT_ONCE):
             if give_way():
+                # Nothing is due before t_ns, and the steps taken cannot be taken back.
+                reached_ns = self.anchor_ns + self.solver.earliest_ns
+                self.now_ns = max(self.now_ns, min(reached_ns, t_ns - 1))
                 return False
         return True
 
     def _send(self, t_ns: int, streams: list[Stream], in_time: bool) -> None:
-        state = self._solver.at_ns(t_ns - self._anchor_ns)
+        state = self.solver.at_ns(t_ns - self.anchor_ns)
         stamp_ns = self.epoch_ns + t_ns
         for stream in streams:
             if stream.next_ns != t_ns:
@@ -200,8 +242,10 @@ class Simulation:
         for name, value in (('l3', l3), ('lz', lz)):
             if not math.isfinite(value):
                 raise ValueError(f'{name} = {value!r} kg m^2/s: must be finite')
-        at_ns = max(self.now_ns, 0)
-        state = self._solver.at_ns(at_ns - self._anchor_ns)
+        at_ns = max(self._readable_ns(), 0)
+        if at_ns > max(self.now_ns, 0):
+            self.advance(at_ns)
+        state = self.solver.at_ns(at_ns - self.anchor_ns)
         pole = pole_momentum(abs(state.theta), l3)
         if pole is not None and lz != pole:
             raise ValueError(
@@ -220,11 +264,22 @@ class Simulation:
 
 def _first_step(top: Top, start: State, values: Mapping[str, Any]) -> tuple[Propagator, OneState]:
     """Return the motion from `start` and its first state; the first step shows if there is one."""
-    solver = propagate(top, start, method=values['solver.method'],
-                       equations=values['solver.equations'], rtol=values['solver.rtol'],
-                       atol=values['solver.atol'])
-    solver.reach_ns(1)
+    def begin() -> Propagator:
+        return propagate(top, start, method=values['solver.method'],
+                         equations=values['solver.equations'], rtol=values['solver.rtol'],
+                         atol=values['solver.atol'])
+
+    solver = begin()
     state = solver.at_ns(0)
     if not math.isfinite(state.energy):
-        raise ValueError(f'the energy would be {state.energy!r} J')
+        raise ValueError(f'the energy would be {state.energy!r} J with {_rates(start)}')
+    if not solver.reach_ns(1, STEPS_AT_ONCE):
+        raise ValueError(f'{_rates(start)} turn the top too fast: over {STEPS_AT_ONCE} steps a '
+                         'nanosecond')
+    if solver.earliest_ns:              # steps shorter than 1 ns have left t = 0 behind
+        solver = begin()
     return solver, state
+
+
+def _rates(start: State) -> str:
+    return f'theta_dot = {start.theta_dot!r} rad/s, l3 = {start.l3!r}, lz = {start.lz!r} kg m^2/s'

@@ -12,9 +12,9 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from spinning_top_sim.physics.kinematics import OneState
+from spinning_top_sim.physics.kinematics import Columns, OneState
 from spinning_top_sim.streams import messages
-from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.cdr import NANOSECONDS, Template
 from spinning_top_sim.streams.imu import Imu, Sensor
 
 JOINTS = ('precession_joint', 'nutation_joint', 'spin_joint')
@@ -35,6 +35,7 @@ class Stream:
     parameter: str
     topic: str
     type_name: str
+    template: Template
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self.publish: Callable[[bytes], None] | None = None
@@ -57,8 +58,27 @@ class Stream:
         """Whether anybody takes the samples: else nothing is computed."""
         return self.publish is not None or self.record is not None
 
+    @property
+    def index(self) -> int:
+        """Number k of the next sample."""
+        return self.next_ns // self.period_ns
+
     def encode(self, state: OneState, stamp_ns: int) -> bytes:
-        """Return the serialized message for a state, with its stamp [ns]."""
+        """Return the serialized message of the next sample: a state, and its stamp [ns]."""
+        return self.template.encode(stamp_ns, *self.runs(state, self.index))
+
+    def encode_many(self, states: Columns, stamps_ns: Any) -> Any:
+        """Return the messages of the next n samples as rows of bytes, (n, size) uint8."""
+        first = self.index
+        return self.template.encode_many(
+            stamps_ns, *self.runs(states, range(first, first + len(stamps_ns))))
+
+    def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
+        """
+        Return the numbers that go into `template`, for one state or for many.
+
+        index: number k of the sample, or the range of many
+        """
         raise NotImplementedError
 
 
@@ -69,10 +89,10 @@ class Pose(Stream):
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         super().__init__(values)
-        self._encode = messages.pose_stamped(values['world_frame']).encode
+        self.template = messages.pose_stamped(values['world_frame'])
 
-    def encode(self, state: OneState, stamp_ns: int) -> bytes:
-        return self._encode(stamp_ns, state.quaternion)
+    def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
+        return (state.quaternion,)
 
 
 class JointStates(Stream):
@@ -82,11 +102,11 @@ class JointStates(Stream):
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         super().__init__(values)
-        self._encode = messages.joint_state(JOINTS).encode
+        self.template = messages.joint_state(JOINTS)
 
-    def encode(self, state: OneState, stamp_ns: int) -> bytes:
-        return self._encode(stamp_ns, (state.phi, state.theta, state.psi),
-                            (state.phi_dot, state.theta_dot, state.psi_dot))
+    def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
+        return ((state.phi, state.theta, state.psi),
+                (state.phi_dot, state.theta_dot, state.psi_dot))
 
 
 class GroundTruthOdometry(Stream):
@@ -97,10 +117,10 @@ class GroundTruthOdometry(Stream):
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         super().__init__(values)
-        self._encode = messages.odometry(values['world_frame'], values['body_frame']).encode
+        self.template = messages.odometry(values['world_frame'], values['body_frame'])
 
-    def encode(self, state: OneState, stamp_ns: int) -> bytes:
-        return self._encode(stamp_ns, state.quaternion, state.angular_velocity)
+    def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
+        return state.quaternion, state.body_rates
 
 
 class ImuStream(Stream):
@@ -118,19 +138,14 @@ class ImuStream(Stream):
         # A density says how much noise a sample has at a rate.
         self._sensor = Sensor(self._values, self.period_ns)
         gyroscope, accelerometer = self._variances()
-        self._encode = messages.imu(
+        self.template = messages.imu(
             self._values['imu.frame_id'],
             messages.EXACT if self.oriented else messages.UNKNOWN_ORIENTATION,
-            messages.diagonal(gyroscope), messages.diagonal(accelerometer)).encode
+            messages.diagonal(gyroscope), messages.diagonal(accelerometer))
 
     def _variances(self) -> tuple[float, float]:
         """Return the variances of angular velocity and linear acceleration."""
         return 0.0, 0.0
-
-    @property
-    def _index(self) -> int:
-        """Number k of the sample that is being encoded."""
-        return self.next_ns // self.period_ns
 
 
 class ImuRaw(ImuStream):
@@ -141,11 +156,10 @@ class ImuRaw(ImuStream):
     def _variances(self) -> tuple[float, float]:
         return self._sensor.gyroscope.variance, self._sensor.accelerometer.variance
 
-    def encode(self, state: OneState, stamp_ns: int) -> bytes:
-        rates, force = self._sensor.read(self._imu.true(state), self._index)
-        return self._encode(stamp_ns, self._orientation(state), rates, force)
+    def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
+        return (self._orientation(state), *self._sensor.read(self._imu.true(state), index))
 
-    def _orientation(self, state: OneState) -> tuple[float, ...]:
+    def _orientation(self, state: Columns) -> Any:
         return IDENTITY
 
 
@@ -154,7 +168,7 @@ class ImuData(ImuRaw):
 
     parameter, topic, oriented = 'imu_data', 'imu/data', True
 
-    def _orientation(self, state: OneState) -> tuple[float, ...]:
+    def _orientation(self, state: Columns) -> Any:
         return self._imu.orientation(state)
 
 
@@ -163,8 +177,8 @@ class ImuBias(ImuStream):
 
     parameter, topic, oriented = 'imu', 'ground_truth/imu_bias', False
 
-    def encode(self, state: OneState, stamp_ns: int) -> bytes:
-        return self._encode(stamp_ns, IDENTITY, *self._sensor.bias(self._index))
+    def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
+        return (IDENTITY, *self._sensor.bias(index))
 
 
 class GroundTruthImu(ImuStream):
@@ -172,8 +186,8 @@ class GroundTruthImu(ImuStream):
 
     parameter, topic = 'ground_truth_imu', 'ground_truth/imu'
 
-    def encode(self, state: OneState, stamp_ns: int) -> bytes:
-        return self._encode(stamp_ns, self._imu.orientation(state), *self._imu.true(state))
+    def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
+        return (self._imu.orientation(state), *self._imu.true(state))
 
 
 class Invariants(Stream):
@@ -188,21 +202,20 @@ class Invariants(Stream):
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         super().__init__(values)
-        self._encode = messages.float64_multi_array(INVARIANTS).encode
+        self.template = messages.float64_multi_array(INVARIANTS)
         self._start = (0.0, 0.0, 0.0)
-        self.orientation_error: Callable[[OneState, int], float] = lambda state, t_ns: NAN
+        self.orientation_error: Callable[[Columns, int], Any] = lambda state, t_ns: NAN
 
     def start_from(self, state: OneState) -> None:
         """Measure drifts from this state on."""
         self._start = (state.energy, state.l3_start, state.lz_start)
 
-    def encode(self, state: OneState, stamp_ns: int) -> bytes:
+    def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
         now = (state.energy, state.l3, state.lz)
         drifts = [(value - start) / (abs(start) or 1.0)
                   for value, start in zip(now, self._start, strict=True)]
-        norm_error = math.hypot(*state.quaternion) - 1.0
-        return self._encode(stamp_ns, (*now, *drifts, norm_error,
-                                       self.orientation_error(state, self.next_ns)))
+        return ((*now, *drifts, state.norm_error,
+                 self.orientation_error(state, self.next_ns)),)
 
 
 class Clock(Stream):
@@ -212,10 +225,10 @@ class Clock(Stream):
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         super().__init__(values)
-        self._encode = messages.clock().encode
+        self.template = messages.clock()
 
-    def encode(self, state: OneState, stamp_ns: int) -> bytes:
-        return self._encode(stamp_ns)
+    def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
+        return ()
 
 
 def all_streams(values: Mapping[str, Any], imu: Imu) -> list[Stream]:

@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a log holds besides the streams: the commands and events that shaped the run.
+
+With the parameters in the log's metadata they are enough to compute every message again.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from spinning_top_sim.streams import messages
+from spinning_top_sim.streams.topics import Stream
+
+COMMANDS, EVENTS = '~/commands', '~/events'
+# Recorded behind the streams, in this order.
+TOPICS = ((COMMANDS, 'std_msgs/msg/Float64MultiArray'), (EVENTS, 'std_msgs/msg/String'))
+
+
+def recorded_streams(streams: Sequence[Stream], values: Mapping[str, Any]) -> list[Stream]:
+    """Return the streams that `record.streams` chooses among those there are."""
+    chosen = values['record.streams']
+    return [stream for stream in streams if is_enabled(stream.parameter, values)
+            and ('all' in chosen or stream.parameter in chosen)]
+
+
+def is_enabled(parameter: str, values: Mapping[str, Any]) -> bool:
+    """Return whether a stream is switched on; /clock has two switches."""
+    if parameter == 'clock' and values['publish_clock']:
+        return True
+    return bool(values[f'{parameter}.enabled'])
+
+
+def command(l3: float, lz: float) -> bytes:
+    """Return an applied command as it is logged: std_msgs/Float64MultiArray [L3, Lz]."""
+    return messages.float64_multi_array(('l3', 'lz')).encode(0, (l3, lz))
+
+
+def event(name: str, t_ns: int, **details: Any) -> bytes:
+    """Return an event as it is logged: std_msgs/String of JSON; t_ns is simulated time."""
+    return messages.string(json.dumps({'event': name, 't_ns': t_ns, **details}, default=list))

@@ -1,0 +1,342 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What tests of running nodes need: a node in a process of its own, and a peer who talks to it.
+
+Importing this keeps the traffic on this machine and takes a domain that no other test process
+here has, so it is imported before anything is made with rclpy.  Whatever a test waits for, it
+waits for its arrival, PATIENCE_S long: how fast this machine is decides nothing.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import ctypes
+import fcntl
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+PATIENCE_S = 60.0           # for what takes a second on an idle machine
+LIFETIME_S = 170.0          # a node that is still there is killed
+DOMAINS = range(1, 101)
+
+
+def _own_domain() -> tuple[int, object]:
+    """Return a domain id and what keeps it ours as long as this process lives."""
+    folder = Path(tempfile.gettempdir()) / f'spinning_top_sim_domains_{os.getuid()}'
+    folder.mkdir(exist_ok=True)
+    for offset in DOMAINS:
+        domain = 1 + (os.getpid() + offset) % len(DOMAINS)
+        handle = (folder / str(domain)).open('w')
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            handle.close()
+        else:
+            return domain, handle
+    raise RuntimeError('all domains are taken')
+
+
+DOMAIN_ID, _DOMAIN_LOCK = _own_domain()
+os.environ['ROS_DOMAIN_ID'] = str(DOMAIN_ID)
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+os.environ.pop('ROS_LOCALHOST_ONLY', None)
+os.environ['ROS_LOG_DIR'] = tempfile.mkdtemp(prefix='spinning_top_sim_log_')
+atexit.register(shutil.rmtree, os.environ['ROS_LOG_DIR'], ignore_errors=True)
+
+import rclpy  # noqa: E402
+from rcl_interfaces.msg import Parameter as ParameterMessage  # noqa: E402
+from rcl_interfaces.srv import (  # noqa: E402
+    GetParameters,
+    SetParameters,
+    SetParametersAtomically,
+)
+from rclpy.context import Context  # noqa: E402
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor  # noqa: E402
+from rclpy.node import Node  # noqa: E402
+from rclpy.parameter import Parameter, parameter_value_to_python  # noqa: E402
+from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
+from rclpy.serialization import deserialize_message  # noqa: E402
+from std_msgs.msg import Float64MultiArray  # noqa: E402
+from std_srvs.srv import SetBool, Trigger  # noqa: E402
+
+import spinning_top_sim  # noqa: E402
+
+
+def wait_for(what, condition, timeout=PATIENCE_S):
+    """Wait until the condition holds, and return what it returned; fail saying what did not."""
+    end = time.monotonic() + timeout
+    while not (result := condition()):
+        assert time.monotonic() < end, f'{timeout:g} s and still not: {what}'
+        time.sleep(0.005)
+    return result
+
+
+def _die_with_parent():
+    """In the child: be killed when the test process is, whatever kills it."""
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)      # PR_SET_PDEATHSIG
+
+
+class SimNode:
+    """
+    A sim_node in its own process group; ends with the `with` at the latest.
+
+    parameters: by name;  arguments: more of --ros-args;  program: what python is given instead of
+    the module;  out, err: what it has printed.
+    """
+
+    def __init__(self, folder, parameters=None, *, namespace='/', arguments=(), program=None):
+        self.folder = Path(folder) / (namespace.strip('/') or 'root')
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.name = f'{namespace.rstrip("/")}/spinning_top'
+        self.namespace = namespace.rstrip('/')
+        options = [item for name, value in (parameters or {}).items()
+                   for item in ('-p', f'{name}:={as_yaml(value)}')]
+        self.command = [
+            sys.executable, *(program or ('-m', 'spinning_top_sim.nodes.sim_node')), '--ros-args',
+            '-r', f'__ns:={namespace}', *options, *arguments]
+        self.seconds_to_end = None
+
+    def __enter__(self):
+        source = str(Path(spinning_top_sim.__file__).parents[1])
+        paths = [source, *filter(None, [os.environ.get('PYTHONPATH')])]
+        environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(paths)}
+        if 'LD_LIBRARY_PATH' not in environment:        # then the wheels must start python anew
+            environment.pop('_ROS_WHEELS_BOOTSTRAP_COMPLETE', None)
+        with (self.folder / 'out').open('wb') as out, (self.folder / 'err').open('wb') as err:
+            self.process = subprocess.Popen(
+                self.command, cwd=self.folder, env=environment, start_new_session=True,
+                stdin=subprocess.DEVNULL, stdout=out, stderr=err,
+                preexec_fn=_die_with_parent)  # noqa: PLW1509 - one call, takes no lock
+        self._killer = threading.Timer(LIFETIME_S, self.kill)
+        self._killer.daemon = True
+        self._killer.start()
+        return self
+
+    def __exit__(self, *_):
+        self.kill()
+        self._killer.cancel()
+
+    def kill(self):
+        """Kill the group for good, if it is there."""
+        if self.process.poll() is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.wait()
+
+    @property
+    def out(self):
+        return (self.folder / 'out').read_text()
+
+    @property
+    def err(self):
+        return (self.folder / 'err').read_text()
+
+    @property
+    def alive(self):
+        return self.process.poll() is None
+
+    def wait(self, timeout=PATIENCE_S):
+        """Wait for the end by itself; return the exit code (-9: it had to be killed)."""
+        try:
+            return self.process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            return -signal.SIGKILL
+
+    def end(self, number=signal.SIGINT, times=1, gap=0.0):
+        """Signal the group, wait, and return the exit code; `seconds_to_end` says how long."""
+        begun = time.monotonic()
+        for _ in range(times):
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.process.pid, number)
+            if times > 1:
+                time.sleep(gap)
+        code = self.wait(10.0)
+        self.seconds_to_end = time.monotonic() - begun
+        return code
+
+    def memory(self):
+        """Return the resident set [bytes]."""
+        for line in Path(f'/proc/{self.process.pid}/status').read_text().splitlines():
+            if line.startswith('VmRSS:'):
+                return 1024 * int(line.split()[1])
+        raise AssertionError('no VmRSS')
+
+    def topic(self, name):
+        """Return the full name of a topic or service, `~` for the node's own."""
+        if name.startswith('~'):
+            return self.name + name[1:]
+        return name if name.startswith('/') else f'{self.namespace}/{name}'
+
+
+def as_yaml(value):
+    """Return a parameter's value as the command line takes it."""
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+class Topic:
+    """What has arrived on one topic, serialized, in order."""
+
+    def __init__(self, kind):
+        self.kind = kind
+        self.raw = []
+
+    def receive(self, data):
+        self.raw.append(data)
+
+    def wait(self, count, timeout=PATIENCE_S):
+        """Wait until so many have arrived in all."""
+        wait_for(f'{count} messages of {self.kind.__name__} (there are {len(self.raw)})',
+                 lambda: len(self.raw) >= count, timeout)
+        return self
+
+    def wait_more(self, count, timeout=PATIENCE_S):
+        """Wait until so many more have arrived."""
+        return self.wait(len(self.raw) + count, timeout)
+
+    def messages(self, start=0):
+        """Return what has arrived, deserialized."""
+        return [deserialize_message(data, self.kind) for data in self.raw[start:]]
+
+    def last(self):
+        return deserialize_message(self.raw[-1], self.kind)
+
+
+class Peer:
+    """A node in the test's process, with a thread that listens."""
+
+    def __init__(self, name='peer'):
+        self._context = Context()
+        rclpy.init(context=self._context)
+        self.node = Node(name, context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+        self._clients = {}
+        self._publishers = {}
+
+    def _spin(self):
+        with contextlib.suppress(ExternalShutdownException):
+            self._executor.spin()
+
+    def close(self):
+        self._executor.shutdown()
+        self._thread.join(PATIENCE_S)
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+    def listen(self, name, kind, reliability=ReliabilityPolicy.RELIABLE):
+        """Subscribe; the queue holds whatever may come."""
+        topic = Topic(kind)
+        topic.subscription = self.node.create_subscription(
+            kind, name, topic.receive, QoSProfile(depth=20_000, reliability=reliability),
+            raw=True)
+        return topic
+
+    def stop_listening(self, topic):
+        self.node.destroy_subscription(topic.subscription)
+
+    def call(self, kind, name, request, timeout=PATIENCE_S):
+        """Call a service and return its answer."""
+        client = self._clients.get(name)
+        if client is None:
+            client = self._clients[name] = self.node.create_client(kind, name)
+        assert client.wait_for_service(timeout), f'no service {name}'
+        done = threading.Event()
+        future = client.call_async(request)
+        future.add_done_callback(lambda _: done.set())
+        assert done.wait(timeout), f'no answer from {name}'
+        return future.result()
+
+    def trigger(self, node, name):
+        return self.call(Trigger, node.topic(f'~/{name}'), Trigger.Request())
+
+    def switch(self, node, name, on):
+        return self.call(SetBool, node.topic(f'~/{name}'), SetBool.Request(data=on))
+
+    def set_together(self, node, **values):
+        """Set parameters all or none (`__` for the dot); return the one result."""
+        request = SetParametersAtomically.Request(parameters=_parameters(values))
+        return self.call(SetParametersAtomically, node.topic('~/set_parameters_atomically'),
+                         request).result
+
+    def set_each(self, node, **values):
+        """Set parameters one by one (`__` for the dot); return a result for each."""
+        request = SetParameters.Request(parameters=_parameters(values))
+        return self.call(SetParameters, node.topic('~/set_parameters'), request).results
+
+    def get(self, node, *names):
+        answer = self.call(GetParameters, node.topic('~/get_parameters'),
+                           GetParameters.Request(names=list(names)))
+        return [parameter_value_to_python(value) for value in answer.values]
+
+    def send_command(self, node, *data):
+        """Publish on ~/commands, where `introduce` was called before."""
+        self._publishers[node.name].publish(Float64MultiArray(data=[float(d) for d in data]))
+
+    def introduce(self, node, diagnostics):
+        """Publish commands that are refused until one has arrived."""
+        publisher = self.node.create_publisher(Float64MultiArray, node.topic('~/commands'), 10)
+        self._publishers[node.name] = publisher
+        before = diagnostics.number(node, 'rejected commands')
+        end = time.monotonic() + PATIENCE_S
+        while diagnostics.number(node, 'rejected commands') == before:
+            assert time.monotonic() < end, 'no command has arrived'
+            publisher.publish(Float64MultiArray())
+            time.sleep(0.05)
+
+
+def _parameters(values):
+    return [value if isinstance(value, ParameterMessage)
+            else Parameter(name.replace('__', '.'), value=value).to_parameter_msg()
+            for name, value in values.items()]
+
+
+class Diagnostics:
+    """The newest /diagnostics of every node."""
+
+    def __init__(self, peer):
+        from diagnostic_msgs.msg import DiagnosticArray
+        self._topic = peer.listen('/diagnostics', DiagnosticArray)
+
+    def statuses(self, node):
+        """Return all that the node has said."""
+        return [status for message in self._topic.messages() for status in message.status
+                if status.name == node.name.lstrip('/')]
+
+    def wait_for(self, node, what, condition):
+        """Wait for a status for which the condition holds; return it."""
+        def newest():
+            said = self.statuses(node)
+            return said[-1] if said and condition(said[-1]) else None
+        return wait_for(f'/diagnostics with {what}', newest)
+
+    def next(self, node):
+        """Return the numbers of the next status but one: all of it is of later than now."""
+        count = len(self.statuses(node))
+        wait_for('two /diagnostics', lambda: len(self.statuses(node)) >= count + 2)
+        return numbers(self.statuses(node)[-1])
+
+    def number(self, node, key):
+        """Return the newest number of this name."""
+        return float(numbers(self.wait_for(node, key, lambda _: True))[key])
+
+
+def numbers(status):
+    return {pair.key: pair.value for pair in status.values}

@@ -1,0 +1,431 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pipeline without ROS: what is sent depends on the parameters and the commands alone."""
+
+import math
+import random
+import struct
+
+import pytest
+
+from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.solvers.phases import MomentumState
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.pipeline import Simulation
+
+SECOND = 1_000_000_000
+EPOCH_NS = 1_700_000_000 * SECOND
+POSE_RATE_NS = 10_000_000
+VARIANTS = {
+    'rk45': {},
+    'exact': {'solver.method': 'exact'},
+    'euler': {'solver.equations': 'euler'},
+    'wild': {'initial.theta': 2.5, 'initial.theta_dot': 3.0, 'spin.l3': 0.3, 'spin.lz': -0.1},
+    'near a pole': {'initial.theta': 1e-7, 'spin.l3': 0.5, 'spin.lz': 0.5},
+    'sleeping': {'initial.theta': 0.0, 'spin.l3': 3.0},
+    'no gravity': {'top.gravity': 0.0, 'spin.lz': 0.2},
+    'uneven rates': {'pose.rate': 333.0, 'imu.rate': 77.7, 'joint_states.rate': 7.0},
+}
+
+
+def simulate(**values):
+    dotted = {name.replace('__', '.'): value for name, value in values.items()}
+    return Simulation(parameters.checked(dotted), EPOCH_NS)
+
+
+def stream(simulation, topic):
+    return next(stream for stream in simulation.streams if stream.topic == topic)
+
+
+def listen(simulation, *topics, sink='record'):
+    """Take what these streams (all where none is named) send: [(topic, stamp, bytes)]."""
+    taken = []
+
+    def attach(one):
+        if sink == 'record':
+            one.record = lambda stamp, data: taken.append((one.topic, stamp, data))
+        else:
+            one.publish = lambda data: taken.append((one.topic, None, data))
+
+    for one in simulation.streams:
+        if not topics or one.topic in topics:
+            attach(one)
+    return taken
+
+
+def stamps(taken, topic):
+    return [stamp - EPOCH_NS for name, stamp, _ in taken if name == topic]
+
+
+def doubles(data, count):
+    """Return the last doubles of a message."""
+    return struct.unpack(f'<{count}d', data[-8 * count:])
+
+
+# ------------------------------------------------------------------------- independent of ticks
+
+@pytest.mark.parametrize('name', VARIANTS)
+def test_what_is_sent_does_not_depend_on_how_ticks_fall(name):
+    """One call, random ticks, and ticks that give way at random: the same bytes in order."""
+    duration, commands = 3 * SECOND, ((SECOND, 0.7), (2 * SECOND + 1, 1.1))
+
+    def run(ticks, give_way=lambda: False):
+        simulation = Simulation(parameters.checked(VARIANTS[name]), EPOCH_NS)
+        taken = listen(simulation)
+        for at_ns, factor in (*commands, (duration, 0.0)):
+            for tick in sorted({*(t for t in ticks if t < at_ns), at_ns}):
+                if tick > simulation.now_ns:
+                    while not simulation.advance(tick, give_way=give_way):
+                        pass
+            if factor:
+                simulation.command(factor * simulation.l3, factor * simulation.lz)
+        return taken
+
+    whole = run([])
+    assert len(whole) > 900 or name == 'uneven rates'
+    for seed in range(3):
+        dice = random.Random(seed)
+        ticks = [dice.randrange(duration) for _ in range(dice.choice((5, 100, 2000)))]
+        parts = run(ticks, lambda: dice.random() < 0.3)     # noqa: B023 - called in this turn
+        assert parts == whole
+
+
+def test_a_stream_sends_the_same_whoever_else_listens():
+    alone = simulate()
+    taken_alone = listen(alone, 'pose')
+    alone.advance(2 * SECOND)
+    crowd = simulate()
+    taken = listen(crowd)
+    crowd.advance(2 * SECOND)
+    assert [entry for entry in taken if entry[0] == 'pose'] == taken_alone
+
+
+def test_samples_are_on_the_grid_and_in_order_of_time():
+    simulation = simulate()
+    taken = listen(simulation)
+    simulation.advance(2 * SECOND)
+    times = [stamp for _, stamp, _ in taken]
+    assert times == sorted(times)
+    for one in simulation.streams:
+        period = round(SECOND / parameters.defaults()[f'{one.parameter}.rate'])
+        assert stamps(taken, one.topic) == list(range(0, 2 * SECOND + 1, period))
+
+
+def test_giving_way_in_a_long_integration_loses_nothing_and_leaves_a_state_to_read():
+    """A wheel so fast that a sample takes thousands of steps; ticks end in their midst."""
+    fast = {'spin__l3': 1e4, 'joint_states__rate': 500.0}
+    whole = simulate(**fast)
+    expected = listen(whole, 'joint_states')
+    whole.advance(6_000_000)
+    assert whole.steps > 5000
+    broken = simulate(**fast)
+    taken = listen(broken, 'joint_states')
+    gave_way = 0
+    while not broken.advance(6_000_000, give_way=lambda: True):
+        gave_way += 1
+        state = broken.state()
+        assert math.isfinite(broken.energy_drift(state))
+        assert broken.now_ns <= 6_000_000
+    assert gave_way > 6
+    assert taken == expected
+
+
+def test_giving_way_goes_on_without_listeners_too():
+    simulation = simulate(spin__l3=1e4)
+    calls = 0
+    while not simulation.advance(2_000_000, give_way=lambda: True):
+        calls += 1
+        before = simulation.now_ns
+        simulation.state()
+    assert calls > 2
+    assert before > 0
+    assert simulation.now_ns == 2_000_000
+
+
+def test_a_command_in_the_midst_of_a_long_integration_is_taken():
+    simulation = simulate(spin__l3=1e4)
+    taken = listen(simulation, 'joint_states')
+    assert not simulation.advance(SECOND, give_way=lambda: simulation.steps > 800)
+    simulation.command(1.0, 0.5)
+    at_ns = simulation.history[-1][0]
+    assert simulation.now_ns >= at_ns > 0
+    simulation.advance(SECOND)
+    assert stamps(taken, 'joint_states') == list(range(0, SECOND + 1, POSE_RATE_NS))
+
+
+# --------------------------------------------------------------------- nothing for nobody
+
+class Counting:
+    """Counts the calls of a method of one object."""
+
+    def __init__(self, owner, name):
+        self._call, self.count = getattr(owner, name), 0
+        setattr(owner, name, self)
+
+    def __call__(self, *args, **kwargs):
+        self.count += 1
+        return self._call(*args, **kwargs)
+
+
+def test_without_a_listener_nothing_is_encoded_and_the_solver_is_not_sampled():
+    simulation = simulate()
+    encodes = {one.topic: Counting(one, 'encode') for one in simulation.streams}
+    samples = Counting(simulation.solver, 'at_ns')
+    for tick in range(1, 101):
+        simulation.advance(tick * POSE_RATE_NS)
+    assert simulation.now_ns == SECOND
+    assert samples.count == 0
+    assert {topic: counted.count for topic, counted in encodes.items()} == dict.fromkeys(
+        encodes, 0)
+    assert all(one.sent == one.skipped == 0 for one in simulation.streams)
+
+
+@pytest.mark.parametrize('topic', ['pose', 'imu/data_raw', '~/invariants', '/clock'])
+def test_only_the_stream_that_is_listened_to_is_encoded(topic):
+    simulation = simulate()
+    encodes = {one.topic: Counting(one, 'encode') for one in simulation.streams}
+    samples = Counting(simulation.solver, 'at_ns')
+    simulation.advance(SECOND)
+    taken = listen(simulation, topic, sink='publish')
+    simulation.advance(2 * SECOND)
+    rate = parameters.defaults()[f'{stream(simulation, topic).parameter}.rate']
+    assert len(taken) == rate
+    assert encodes.pop(topic).count == samples.count == rate
+    assert all(counted.count == 0 for counted in encodes.values())
+
+
+def test_a_column_that_nobody_needs_is_not_computed(monkeypatch):
+    """A pose needs no angle and no rate, joints no body rate, odometry no angle."""
+    computed = set()
+
+    def watch(name):
+        original = getattr(MomentumState, name)
+        monkeypatch.setattr(MomentumState, name, property(
+            lambda self: (computed.add(name), original._compute(self))[1]))
+
+    watch('_polar')
+    watch('transverse_rate')
+    for topic, needed in (('pose', set()), ('joint_states', {'_polar'}),
+                          ('ground_truth/odom', {'transverse_rate'})):
+        simulation = simulate()
+        taken = listen(simulation, topic)
+        computed.clear()
+        simulation.advance(SECOND)
+        assert len(taken) == 101
+        assert computed == needed, topic
+
+
+def test_equilibria_and_free_motion_take_no_steps():
+    for name in ('sleeping', 'no gravity'):
+        simulation = Simulation(parameters.checked(VARIANTS[name]))
+        listen(simulation)
+        simulation.advance(SECOND)
+        assert simulation.steps == simulation.evaluations == 0, name
+
+
+def test_a_listener_who_comes_late_gets_the_next_sample_of_the_grid_not_the_past():
+    simulation = simulate()
+    simulation.advance(SECOND + 3)
+    taken = listen(simulation, 'pose')
+    simulation.advance(SECOND + 2 * POSE_RATE_NS)
+    assert stamps(taken, 'pose') == [SECOND + POSE_RATE_NS, SECOND + 2 * POSE_RATE_NS]
+
+
+def test_a_listener_who_goes_and_comes_back_gets_no_backlog():
+    simulation = simulate()
+    taken = listen(simulation, 'pose')
+    simulation.advance(SECOND)
+    stream(simulation, 'pose').record = None
+    simulation.advance(5 * SECOND)
+    listen(simulation, 'pose')
+    again = listen(simulation, 'pose')
+    simulation.advance(5 * SECOND + POSE_RATE_NS)
+    assert len(taken) == 101
+    assert stamps(again, 'pose') == [5 * SECOND + POSE_RATE_NS]
+
+
+# ------------------------------------------------------------------------------- coming late
+
+def test_late_samples_are_not_published_but_counted():
+    simulation = simulate()
+    published = listen(simulation, 'pose', sink='publish')
+    simulation.advance(0)
+    assert simulation.advance(10 * SECOND, publish_from_ns=9 * SECOND)
+    pose = stream(simulation, 'pose')
+    assert pose.sent == len(published) == 102       # t = 0 and [9 s, 10 s]
+    assert pose.skipped == 899
+    assert pose.sent + pose.skipped == 1001
+
+
+def test_late_samples_are_recorded_all_the_same():
+    simulation = simulate()
+    published = listen(simulation, 'pose', 'joint_states', sink='publish')
+    recorded = listen(simulation, 'pose')
+    simulation.advance(10 * SECOND, publish_from_ns=9 * SECOND + 1)
+    assert stamps(recorded, 'pose') == list(range(0, 10 * SECOND + 1, POSE_RATE_NS))
+    for topic in ('pose', 'joint_states'):
+        assert len([entry for entry in published if entry[0] == topic]) == 100
+        one = stream(simulation, topic)
+        assert (one.sent, one.skipped) == (100, 901)
+
+
+def test_skipping_keeps_the_grid_of_any_rate():
+    simulation = simulate(pose__rate=333.0)
+    taken = listen(simulation, 'pose')
+    stream(simulation, 'pose').publish = lambda data: None
+    stream(simulation, 'pose').record = None
+    simulation.advance(SECOND, publish_from_ns=SECOND // 2)
+    del taken[:]
+    listen(simulation, 'pose')
+    more = listen(simulation, 'pose')
+    simulation.advance(2 * SECOND)
+    period = round(SECOND / 333.0)
+    assert {stamp % period for stamp in stamps(more, 'pose')} == {0}
+
+
+# ------------------------------------------------------------------------ rates and commands
+
+@pytest.mark.parametrize(('before', 'after'), [(100.0, 200.0), (200.0, 100.0), (100.0, 33.0),
+                                               (1.0, 1000.0), (10000.0, 10.0)])
+def test_a_change_of_rate_goes_on_on_the_new_grid(before, after):
+    simulation = simulate(pose__rate=before)
+    taken = listen(simulation, 'pose')
+    changed_at = 123_456_789
+    simulation.advance(changed_at)
+    pose = stream(simulation, 'pose')
+    pose.set_rate(after)
+    pose.resume(simulation.now_ns)
+    simulation.advance(SECOND)
+    old, new = round(SECOND / before), round(SECOND / after)
+    expected = [*range(0, changed_at + 1, old),
+                *(t for t in range(0, SECOND + 1, new) if t > changed_at)]
+    assert stamps(taken, 'pose') == expected
+
+
+def test_a_command_keeps_the_angles_and_the_nutation_rate_and_sets_the_momenta():
+    simulation = simulate()
+    simulation.advance(777_777_777)
+    before = simulation.state()
+    angles = before.theta, before.phi, before.psi, before.theta_dot
+    simulation.command(2.0, -0.5)
+    after = simulation.state()
+    assert (after.theta, after.phi, after.psi) == pytest.approx(angles[:3], abs=1e-14)
+    assert after.theta_dot == pytest.approx(angles[3], abs=1e-12)   # rtol is 1e-11
+    assert (after.l3_start, after.lz_start) == (simulation.l3, simulation.lz) == (2.0, -0.5)
+    assert simulation.history == [(777_777_777, 2.0, -0.5)]
+
+
+def test_commands_are_applied_at_their_time_again_with_the_same_bytes():
+    dice = random.Random(3)
+    first = simulate()
+    taken = listen(first)
+    for _ in range(10):
+        first.advance(first.now_ns + dice.randrange(1, SECOND // 3))
+        first.command(dice.uniform(-3.0, 3.0), dice.uniform(-2.0, 2.0))
+    end_ns = first.now_ns + SECOND
+    first.advance(end_ns)
+    again = simulate()
+    taken_again = listen(again)
+    for at_ns, l3, lz in first.history:
+        again.advance(at_ns)
+        again.command(l3, lz)
+    again.advance(end_ns)
+    assert taken_again == taken
+
+
+@pytest.mark.parametrize(('l3', 'lz', 'named'), [
+    (math.nan, 0.0, 'l3 = nan'), (0.0, math.inf, 'lz = inf'), (-math.inf, 0.0, 'l3 = -inf'),
+    (1e300, 1e300, '1e+300'), (1e100, 0.5, '1e+100'), (1e20, 1e20, '1e+20'),
+    (1e16, -1e16, '1e+16')])
+def test_a_refused_command_names_the_value_and_changes_nothing(l3, lz, named):
+    undisturbed = simulate()
+    expected = listen(undisturbed)
+    undisturbed.advance(SECOND)
+    simulation = simulate()
+    taken = listen(simulation)
+    simulation.advance(SECOND // 3)
+    momenta = simulation.l3, simulation.lz
+    with pytest.raises(ValueError, match=r'must be finite|no motion from') as refusal:
+        simulation.command(l3, lz)
+    assert named in str(refusal.value)
+    simulation.advance(SECOND)
+    assert taken == expected
+    assert (simulation.l3, simulation.lz) == momenta
+    assert simulation.history == []
+
+
+@pytest.mark.parametrize(('theta', 'sign'), [(0.0, 1.0), (math.pi, -1.0)])
+def test_at_a_pole_only_lz_of_the_pole_is_taken(theta, sign):
+    simulation = simulate(initial__theta=theta, spin__l3=3.0, spin__lz=sign * 3.0)
+    simulation.advance(SECOND)
+    for lz in (-sign * 2.0, 0.0, sign * 2.0000001):
+        with pytest.raises(ValueError, match=r'lz = .*pole'):
+            simulation.command(2.0, lz)
+    simulation.command(2.0, sign * 2.0)
+    assert simulation.lz == sign * 2.0
+
+
+# --------------------------------------------------------------------------- restart, failure
+
+def test_a_restart_gives_the_same_bytes_again_but_for_stamps():
+    simulation = simulate()
+    taken = listen(simulation)
+    simulation.advance(SECOND)
+    first = list(taken)
+    simulation.command(0.5, 0.1)
+    simulation.advance(2 * SECOND)
+    simulation.restart(parameters.checked({}))
+    del taken[:]
+    simulation.advance(SECOND)
+    assert taken == first
+    assert simulation.history == []
+
+
+def test_a_restart_keeps_sinks_counts_and_steps():
+    simulation = simulate()
+    listen(simulation, 'pose', sink='publish')
+    simulation.advance(SECOND)
+    steps = simulation.steps
+    assert steps > 0
+    simulation.restart(parameters.checked({'pose.rate': 50.0}))
+    simulation.advance(SECOND)
+    assert stream(simulation, 'pose').sent == 101 + 51
+    assert simulation.steps == 2 * steps
+
+
+def test_a_restart_that_is_refused_leaves_the_motion_as_it_was():
+    undisturbed = simulate()
+    expected = listen(undisturbed)
+    undisturbed.advance(SECOND)
+    simulation = simulate()
+    taken = listen(simulation)
+    simulation.advance(SECOND // 2)
+    bad = {**parameters.checked({}), 'initial.theta': 0.0, 'spin.lz': 0.5}
+    with pytest.raises(ValueError, match='pole'):
+        simulation.restart(bad)
+    with pytest.raises(ValueError, match=r'1e\+20'):
+        simulation.restart({**parameters.checked({}), 'spin.l3': 1e20, 'spin.lz': 1e20})
+    simulation.advance(SECOND)
+    assert taken == expected
+
+
+def test_the_euler_form_fails_at_a_pole_with_a_reason_and_can_be_restarted():
+    through = {'solver__equations': 'euler', 'initial__theta': 0.5, 'initial__theta_dot': -3.0,
+               'spin__l3': 0.2, 'spin__lz': -0.2}
+    simulation = simulate(**through)
+    taken = listen(simulation, 'joint_states')
+    with pytest.raises(IntegrationError, match='leapt over a pole'):
+        simulation.advance(60 * SECOND)
+    assert 0 <= simulation.now_ns < 60 * SECOND
+    assert stamps(taken, 'joint_states') == list(
+        range(0, len(taken) * POSE_RATE_NS, POSE_RATE_NS))
+    assert math.isfinite(simulation.state().energy)
+    with pytest.raises(IntegrationError):           # it does not go on by itself
+        simulation.advance(60 * SECOND)
+    simulation.restart(parameters.checked({'initial.theta': 0.5, 'initial.theta_dot': -3.0,
+                                           'spin.l3': 0.2, 'spin.lz': -0.2}))
+    assert simulation.advance(5 * SECOND)
+
+
+def test_the_euler_form_cannot_start_at_a_pole():
+    with pytest.raises((ValueError, IntegrationError), match='theta'):
+        simulate(solver__equations='euler', initial__theta=0.0, spin__l3=1.0, spin__lz=1.0)
