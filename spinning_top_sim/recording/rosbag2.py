@@ -40,6 +40,7 @@ _POLICY_NAMES = {
 }
 
 
+_INTEGER = re.compile(r'-?[0-9]+')
 _QOS_LINE = re.compile(r'(- | {2,})(\w+): *(\S*) *', re.ASCII)
 
 
@@ -114,7 +115,7 @@ def parse_offered_qos(text: str) -> list[dict[str, Any]]:
         if indent == '- ':
             profiles.append({})
         value: Any = {'': {}, 'true': True, 'false': False}.get(word, word)
-        if isinstance(value, str) and value.lstrip('-').isdigit():
+        if isinstance(value, str) and _INTEGER.fullmatch(value):
             value = int(value)
         nested = profiles[-1].get(key) if len(indent) > 2 else None
         if isinstance(nested, dict):
