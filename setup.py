@@ -14,6 +14,7 @@ EXECUTABLES = {
     'sim_node': 'spinning_top_sim.nodes.sim_node',
     'replay_node': 'spinning_top_sim.nodes.replay_node',
     'simulate': 'spinning_top_sim.tools.simulate',
+    'recover': 'spinning_top_sim.tools.recover',
 }
 
 DATA_FILES = {

@@ -30,14 +30,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from spinning_top_sim.nodes import playback
 from spinning_top_sim.nodes.message_types import message_type
-from spinning_top_sim.nodes.playable_log import PlayableLog
 from spinning_top_sim.nodes.playback import ROUND_GAP_NS, Playback, ReadAhead, rounds
-from spinning_top_sim.recording.rosbag2 import (
-    DEFAULT_QOS,
-    RecordedTopic,
-    offered_qos_yaml,
-    parse_offered_qos,
-)
+from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.schemas import find_definition
 from spinning_top_sim.recording.writer import McapRecorder
 
@@ -213,28 +207,6 @@ def test_stopping_wakes_who_waits_for_a_reader():
     block.set()
 
 
-# ------------------------------------------------------------------------- recorded QoS
-
-
-def test_recorded_qos_is_read_as_it_is_written():
-    qos = {'depth': 3, 'reliability': 2, 'durability': 1, 'deadline': {'sec': 1, 'nsec': 5}}
-    text = offered_qos_yaml(RecordedTopic('/a', 'std_msgs/msg/String', qos))
-    assert parse_offered_qos(text) == [{**DEFAULT_QOS, **qos}]
-
-
-def test_recorded_qos_takes_names_and_makes_do_with_what_is_missing():
-    text = ('- history: keep_all\n  reliability: best_effort\n  durability: 9\n  depth: many\n'
-            '- history: 3\n  liveliness: unknown')
-    first, second = parse_offered_qos(text)
-    assert first == {**DEFAULT_QOS, 'history': 2, 'reliability': 2}
-    assert second == dict(DEFAULT_QOS)
-
-
-@pytest.mark.parametrize('text', ['', '[]', 'reliable', '{a: 1}', '- [', '- 3'])
-def test_a_text_that_is_no_qos_has_no_profiles(text):
-    assert parse_offered_qos(text) == []
-
-
 # --------------------------------------------------------------------------- logs to play
 
 STRING, TWIST, THING = 'std_msgs/msg/String', 'geometry_msgs/msg/Twist', 'nowhere_msgs/msg/Thing'
@@ -299,18 +271,6 @@ def assert_same(found, wanted):
     for of_found, of_wanted in zip(found, wanted, strict=True):
         for number, pair in enumerate(zip(of_found, of_wanted, strict=True)):
             assert pair[0] == pair[1], f'message {number}'
-
-
-def test_a_log_is_read_in_the_order_of_time_whatever_its_own(strangers_log):
-    path, wanted = strangers_log
-    log = PlayableLog(path)
-    found = list(log.messages({0, 1}, log.begin_ns))
-    assert [at for at, _, _ in found] == [EPOCH_NS + n * 20_000_000 for n in range(60)]
-    assert [[data for _, index, data in found if index == topic] for topic in (0, 1)] == wanted
-    assert (log.begin_ns, log.end_ns) == (found[0][0], found[-1][0])
-    assert [(topic.name, topic.type_name) for topic in log.topics] == list(STRANGERS)
-    late = list(log.messages({1}, EPOCH_NS + 58 * 20_000_000))
-    assert late == [(EPOCH_NS + 59 * 20_000_000, 1, wanted[1][-1])]
 
 
 # ------------------------------------------------------------------------------- nodes

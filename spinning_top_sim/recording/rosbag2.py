@@ -96,38 +96,6 @@ def offered_qos_yaml(topic: RecordedTopic) -> str:
     return '\n'.join(_qos_lines(topic.qos, as_names=False))
 
 
-def parse_offered_qos(text: str) -> list[dict[str, Any]]:
-    """
-    Return the profiles of an `offered_qos_profiles`: the keys of DEFAULT_QOS, policies as in rmw.
-
-    Takes policies by number and by name.  What is missing, unknown or not understood is as in
-    DEFAULT_QOS; a text that is no list of profiles has none.
-    """
-    import yaml  # type: ignore[import-untyped]  # noqa: PLC0415 - only for reading
-
-    try:
-        profiles = yaml.safe_load(text)
-    except yaml.YAMLError:
-        return []
-    if not isinstance(profiles, list):
-        return []
-    return [{key: _parsed_policy(key, profile.get(key)) for key in DEFAULT_QOS}
-            for profile in profiles if isinstance(profile, dict)]
-
-
-def _parsed_policy(key: str, value: Any) -> Any:
-    default, names = DEFAULT_QOS[key], _POLICY_NAMES.get(key)
-    if isinstance(default, Mapping):
-        parts = value if isinstance(value, Mapping) else {}
-        return value if all(isinstance(parts.get(part), int) for part in default) else default
-    if names is not None:
-        if value in names:
-            value = names.index(value)
-        known = type(value) is int and 0 <= value < len(names) and names[value] != 'unknown'
-        return value if known else default
-    return value if type(value) is type(default) else default
-
-
 def bag_metadata_yaml(
     topics: Sequence[BagTopic],
     *,
