@@ -105,7 +105,7 @@ class ParameterChanges:
             for name, value in ours.items():
                 if value is None:
                     raise ValueError(f'{name}: cannot be unset while the node runs')
-            values = parameters.checked({**self.values, **ours})
+            values = parameters.checked_each({**self.values, **ours})
             self._apply(values, set(ours))
         except (ValueError, RuntimeError) as error:
             return SetParametersResult(successful=False, reason=str(error))

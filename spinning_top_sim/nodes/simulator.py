@@ -27,7 +27,7 @@ from spinning_top_sim.nodes.message_types import message_type
 from spinning_top_sim.nodes.pacing import DeadlineThread, SimulatedClock
 from spinning_top_sim.nodes.ros_parameters import ParameterChanges, declare, start_values
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.streams import journal
+from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import Simulation
 
@@ -71,10 +71,10 @@ class Simulator(Node):
         self._factor = 0.0
         self._described: object = None          # the motion that `_regime` names
         self._regime = ''
-        if values['spin.lz'] is None:
-            values = {**values, 'spin.lz': self._simulation.lz}
+        # Where `~/reset` goes back to, whatever was commanded since; an unset lz stays unset.
+        self._start_spin = {name: values[name] for name in ('spin.l3', 'spin.lz')}
+        values = {**values, 'spin.lz': self._simulation.lz}
         declare(self, values)
-        self._start_values = values
         self._changes = ParameterChanges(self, values, self._apply)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._qos: dict[str, QoSProfile] = {}
@@ -311,6 +311,7 @@ class Simulator(Node):
     def _apply(self, values: dict[str, Any], changed: set[str]) -> None:
         """Put a validated change of parameters into effect.  Raises ValueError to refuse."""
         with self._lock:
+            parameters.start_state({**values, **self._start_spin})
             if changed & {'spin.l3', 'spin.lz'}:
                 self._refuse_counted(values['spin.l3'], values['spin.lz'])
             rest = changed - {'spin.l3', 'spin.lz'}
@@ -400,9 +401,7 @@ class Simulator(Node):
                 response.success, response.message = False, NO_CLOCK
                 return response
             simulation = self._simulation
-            # Back to the spin it was started with, whatever was commanded since.
-            values = {**self._values, 'spin.l3': self._start_values['spin.l3'],
-                      'spin.lz': self._start_values['spin.lz']}
+            values = {**self._values, **self._start_spin}
             last_stamp = simulation.epoch_ns + simulation.now_ns
             try:
                 simulation.restart(values)
@@ -420,7 +419,7 @@ class Simulator(Node):
             self._journal('reset', 0, epoch_ns=simulation.epoch_ns, parameters=values)
             response.success = True
             response.message = f'at t = 0, stamps go on from {simulation.epoch_ns} ns'
-        self._changes.follow(spin__l3=values['spin.l3'], spin__lz=values['spin.lz'])
+        self._changes.follow(spin__l3=simulation.l3, spin__lz=simulation.lz)
         return response
 
     def _on_record(self, request: SetBool.Request, response: SetBool.Response) -> Any:
