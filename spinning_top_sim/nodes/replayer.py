@@ -110,7 +110,7 @@ class Replayer(Node):
         self._told_damage = False
         self._playback: Playback
         self._thread = threading.Thread(target=self._play, name='playback', daemon=True)
-        self._clock: DeadlineThread | None = None
+        self._clock_thread: DeadlineThread | None = None
         self.create_service(SetBool, '~/set_pause', self._on_pause)
         self.create_timer(1.0, self._show_status, clock=self._steady)
 
@@ -221,8 +221,8 @@ class Replayer(Node):
                                   lambda index, data: publish[index](data),
                                   paused=self._options.paused)
         if self._options.clock:
-            self._clock = DeadlineThread(self._publish_clock, self._options.clock, 'clock')
-            self._clock.start()
+            self._clock_thread = DeadlineThread(self._publish_clock, self._options.clock, 'clock')
+            self._clock_thread.start()
         self._thread.start()
 
     def stop(self) -> None:
@@ -231,8 +231,8 @@ class Replayer(Node):
             return
         self._playback.stop()
         self._ahead.stop()
-        if self._clock is not None:
-            self._clock.stop()
+        if self._clock_thread is not None:
+            self._clock_thread.stop()
         self._thread.join(1.0)
         self._log.close()
         self._terminal.end()
