@@ -14,6 +14,7 @@ from spinning_top_sim.nodes import executable
 
 if TYPE_CHECKING:
     from spinning_top_sim.nodes.replayer import Replayer
+    from spinning_top_sim.recording.reader import LogReader
 
 DESCRIPTION = """\
 Publish the messages of a ROS 2 log (.mcap) with their recorded spacing, then end.
@@ -50,12 +51,7 @@ def _prepare(argv: list[str]) -> Callable[[], Replayer]:
 
     arguments = _parser().parse_args(remove_ros_args(argv)[1:])
 
-    from spinning_top_sim.nodes.playable_log import PlayableLog  # noqa: PLC0415
-
-    log = PlayableLog(arguments.file, partial=arguments.partial)
-    if log.damage:
-        print(f'replay_node: {arguments.file}: {log.damage}; playing what is whole',
-              file=sys.stderr)
+    log = _open(arguments.file, partial=arguments.partial)
 
     def make_node() -> Replayer:
         from spinning_top_sim.nodes.replayer import Options, Replayer  # noqa: PLC0415
@@ -63,10 +59,30 @@ def _prepare(argv: list[str]) -> Callable[[], Replayer]:
         return Replayer(log, Options(
             rate=arguments.rate, loop=arguments.loop, start=arguments.start,
             topics=tuple(arguments.topics), clock=arguments.clock,
-            paused=arguments.start_paused, delay=arguments.delay,
+            partial=arguments.partial, paused=arguments.start_paused, delay=arguments.delay,
             subscribers=arguments.wait_for_subscribers))
 
     return make_node
+
+
+def _open(path: Path, *, partial: bool) -> LogReader:
+    """Open a log.  Raises ValueError for what is none, and for a torn one unless `partial`."""
+    from spinning_top_sim.recording.errors import LogError  # noqa: PLC0415
+    from spinning_top_sim.recording.reader import LogReader  # noqa: PLC0415
+
+    try:
+        log = LogReader(path)
+        damage = None if log.whole else log.damage
+    except LogError as error:
+        raise ValueError(error) from error
+    if damage is not None and (damage.torn or damage.losses):
+        if not partial:
+            raise ValueError(f'{path} is torn: `recover` makes a whole log of it, --partial plays '
+                             'what is whole')
+        said = '; '.join(damage.lines()[:1])
+        print(f'replay_node: {path} is torn, playing what is whole{said and "; "}{said}',
+              file=sys.stderr)
+    return log
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -97,10 +97,13 @@ class LogReader:
 
     Raises LogAccessError when the file cannot be opened or read, at any call, and NotMcapError
     when it is none.  Damage raises nothing.
+
+    left_out: pieces of the file that `messages` came upon and left out, damaged
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
+        self.left_out = 0
         self._reading = Reading(self.path)
         try:
             self._header = self._check_beginning()
@@ -181,6 +184,13 @@ class LogReader:
         """What is wrong with the file; reads all of it at the first use."""
         return self._survey.damage
 
+    @property
+    def span(self) -> tuple[int, int]:
+        """Log times of the first and of the last message [ns]; both 0 without any."""
+        spans = [span for span in self._spans if span.end_ns]
+        return (min((span.start_ns for span in spans), default=0),
+                max((span.end_ns for span in spans), default=0))
+
     def messages(
         self, topics: Iterable[str] | None = None, start: int | None = None,
         end: int | None = None,
@@ -190,7 +200,7 @@ class LogReader:
 
         topics: names, None for all;  start, end: log times [ns], from and up to but without
 
-        What is damaged is left out, and told by `damage`.
+        What is damaged is left out, counted in `left_out`, and told by `damage`.
         """
         schemas, known = self._declared
         names = None if topics is None else frozenset(topics)
@@ -308,6 +318,7 @@ class LogReader:
                 return contents.plain, contents.messages
         except Damaged:
             pass
+        self.left_out += 1
         return b'', []
 
 
