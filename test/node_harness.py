@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import ctypes
 import fcntl
+import itertools
 import json
 import os
 import shutil
@@ -24,7 +26,8 @@ import time
 from pathlib import Path
 
 PATIENCE_S = 60.0           # for what takes a second on an idle machine
-LIFETIME_S = 170.0          # a node that is still there is killed
+LIFETIME_S = 300.0          # a node that is still there is killed
+PR_SET_PDEATHSIG = 1
 DOMAINS = range(1, 101)
 
 
@@ -79,6 +82,14 @@ def wait_for(what, condition, timeout=PATIENCE_S):
     return result
 
 
+_libc = ctypes.CDLL(None)
+
+
+def _die_with_parent():
+    """Ask Linux to kill the child when this process is killed before it can."""
+    _libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
 class SimNode:
     """
     A sim_node in its own process group; ends with the `with` at the latest.
@@ -87,7 +98,11 @@ class SimNode:
     the module;  out, err: what it has printed.
     """
 
-    def __init__(self, folder, parameters=None, *, namespace='/', arguments=(), program=None):
+    _number = itertools.count(1)
+
+    def __init__(self, folder, parameters=None, *, namespace=None, arguments=(), program=None):
+        if namespace is None:
+            namespace = f'/top{next(self._number)}'     # tests share a domain, not names
         self.folder = Path(folder) / (namespace.strip('/') or 'root')
         self.folder.mkdir(parents=True, exist_ok=True)
         self.name = f'{namespace.rstrip("/")}/spinning_top'
@@ -108,7 +123,7 @@ class SimNode:
         with (self.folder / 'out').open('wb') as out, (self.folder / 'err').open('wb') as err:
             self.process = subprocess.Popen(
                 self.command, cwd=self.folder, env=environment, start_new_session=True,
-                stdin=subprocess.DEVNULL, stdout=out, stderr=err)
+                preexec_fn=_die_with_parent, stdin=subprocess.DEVNULL, stdout=out, stderr=err)
         self._killer = threading.Timer(LIFETIME_S, self.kill)
         self._killer.daemon = True
         self._killer.start()
