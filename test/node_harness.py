@@ -13,6 +13,7 @@ import atexit
 import contextlib
 import ctypes
 import fcntl
+import itertools
 import json
 import os
 import shutil
@@ -25,7 +26,8 @@ import time
 from pathlib import Path
 
 PATIENCE_S = 60.0           # for what takes a second on an idle machine
-LIFETIME_S = 170.0          # a node that is still there is killed
+LIFETIME_S = 300.0          # a node that is still there is killed
+PR_SET_PDEATHSIG = 1
 DOMAINS = range(1, 101)
 
 
@@ -80,9 +82,12 @@ def wait_for(what, condition, timeout=PATIENCE_S):
     return result
 
 
+_libc = ctypes.CDLL(None)
+
+
 def _die_with_parent():
-    """In the child: be killed when the test process is, whatever kills it."""
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)      # PR_SET_PDEATHSIG
+    """Ask Linux to kill the child when this process is killed before it can."""
+    _libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 class SimNode:
@@ -93,7 +98,11 @@ class SimNode:
     the module;  out, err: what it has printed.
     """
 
-    def __init__(self, folder, parameters=None, *, namespace='/', arguments=(), program=None):
+    _number = itertools.count(1)
+
+    def __init__(self, folder, parameters=None, *, namespace=None, arguments=(), program=None):
+        if namespace is None:
+            namespace = f'/top{next(self._number)}'     # tests share a domain, not names
         self.folder = Path(folder) / (namespace.strip('/') or 'root')
         self.folder.mkdir(parents=True, exist_ok=True)
         self.name = f'{namespace.rstrip("/")}/spinning_top'
