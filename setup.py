@@ -13,6 +13,7 @@ NAME = 'spinning_top_sim'
 EXECUTABLES = {
     'sim_node': 'spinning_top_sim.nodes.sim_node',
     'simulate': 'spinning_top_sim.tools.simulate',
+    'recover': 'spinning_top_sim.tools.recover',
 }
 
 DATA_FILES = {
