@@ -187,7 +187,7 @@ def write_log(path: Path, values: Mapping[str, Any], duration_ns: int,
 
     for index, stream in enumerate(streams):
         stream.record = partial(write, index)
-    write(events_topic, epoch_ns, journal.event('start', 0))
+    write(events_topic, epoch_ns, journal.event('start', 0, -1))
     try:
         for target_ns, command in _stretches(duration_ns, commands,
                                              _stride(streams) if columns else STRIDE_NS):
@@ -197,7 +197,7 @@ def write_log(path: Path, values: Mapping[str, Any], duration_ns: int,
                 simulation.command(l3, lz)
                 at_ns = simulation.history[-1][0]
                 write(events_topic, epoch_ns + at_ns,
-                      journal.event('command', at_ns, l3=l3, lz=lz))
+                      journal.event('command', at_ns, simulation.now_ns, l3=l3, lz=lz))
                 write(commands_topic, epoch_ns + at_ns, journal.command(l3, lz))
             show(target_ns)
     finally:
