@@ -122,7 +122,7 @@ class Simulation:
 
         0 for the exact solution itself; NaN for a motion that it cannot hold.
         """
-        exact = self._exact()
+        exact = self.exact()
         if exact is None or exact is self.solver:
             return math.nan if exact is None else 0.0
         return attitude.angle_between(state.quaternion,
@@ -130,13 +130,17 @@ class Simulation:
 
     def describe(self) -> Description | None:
         """Return the present motion in numbers; None where the closed form cannot hold it."""
-        exact = self._exact()
+        exact = self.exact()
         if exact is None:
             return None
         return describe(self.top, exact.solution.start, exact.solution)
 
-    def _exact(self) -> ExactPropagator | None:
-        """Return the closed form of the present motion, set up when first asked for."""
+    def exact(self) -> ExactPropagator | None:
+        """
+        Return the closed form of the present motion, set up when first asked for.
+
+        Its t = 0 is `anchor_ns`.  None for a motion that it cannot hold.
+        """
         if isinstance(self.solver, ExactPropagator):
             return self.solver
         if self._reference is None:
