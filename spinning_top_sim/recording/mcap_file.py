@@ -384,7 +384,7 @@ class McapFile(IndexedFile):
             records = plain[at:at + count * length].reshape(count, length)
             heads = records[:, :head.itemsize].view(head)[:, 0]
             heads['opcode'] = Opcode.MESSAGE
-            heads['length'] = _MESSAGE_FIELDS + size
+            heads['length'] = MESSAGE_FIELDS + size
             heads['channel'] = topic_index + 1
             sequence = self._sequences[topic_index]
             heads['sequence'] = numpy.arange(sequence, sequence + count) & 0xFFFFFFFF
