@@ -147,11 +147,12 @@ class Template:
         return numpy.dtype({'names': names, 'formats': formats, 'offsets': offsets,
                             'itemsize': len(self._buffer)})
 
-    def field_at(self, offset: int) -> tuple[int, int] | None:
-        """Return run and element of the number at a byte; -1 for the stamp; None elsewhere."""
-        if self._stamp_at is not None and 0 <= offset - self._stamp_at < 8:
-            return -1, 0
-        for run, (at, count) in enumerate(self._fields):
-            if 0 <= offset - at < 8 * count:
-                return run, (offset - at) // 8
+    def field_at(self, at: int) -> tuple[int, int, int] | None:
+        """Return run, element and offset of what holds a byte: run -1 is the stamp."""
+        if self._stamp_at is not None and 0 <= at - self._stamp_at < 8:
+            return -1, 0, self._stamp_at
+        for run, (begin, count) in enumerate(self._fields):
+            if 0 <= at - begin < 8 * count:
+                element = (at - begin) // 8
+                return run, element, begin + 8 * element
         return None
