@@ -94,6 +94,11 @@ class Simulation:
         """Something that is the same as long as the same motion goes on."""
         return self._first
 
+    @property
+    def start_energy(self) -> float:
+        """Of the present motion [J], as it began."""
+        return self._first.energy
+
     def energy_drift(self, state: OneState) -> float:
         """Return the energy's relative drift since then (absolute where it was 0)."""
         return (state.energy - self._first.energy) / (abs(self._first.energy) or 1.0)
