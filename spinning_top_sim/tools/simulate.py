@@ -108,7 +108,7 @@ def _run(arguments: argparse.Namespace, values: dict[str, Any]) -> None:
     output = Path(arguments.output)
     kind = arguments.format or {'.csv': 'csv', '.parquet': 'parquet'}.get(output.suffix, 'mcap')
     duration_ns = round(values['duration'] * NANOSECONDS)
-    with _progress(values['duration'], arguments.quiet) as show:
+    with progress(values['duration'], arguments.quiet) as show:
         if kind == 'mcap':
             summary = write_log(output, values, duration_ns, commands,
                                 epoch_ns=round(arguments.epoch * NANOSECONDS),
@@ -121,7 +121,7 @@ def _run(arguments: argparse.Namespace, values: dict[str, Any]) -> None:
         print(f'{output}: {summary}')
 
 
-class _progress:  # noqa: N801 - a context manager, used like a function
+class progress:  # noqa: N801 - a context manager, used like a function
     """Shows simulated seconds on a terminal: `show(t)`."""
 
     def __init__(self, total: float, quiet: bool) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import struct
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -71,18 +71,20 @@ class Verdict:
                     or (self.missing and self.whole))
 
 
-def verify(reader: LogReader, account: Account, end_ns: int) -> Verdict:
+def verify(reader: LogReader, account: Account, end_ns: int,
+           show: Callable[[int], None] = lambda stamp_ns: None) -> Verdict:
     """
     Compare a log of ours with its run computed again, side by side.
 
-    end_ns: log time of the last message
+    end_ns: log time of the last message;  show: takes the log time reached, now and then
     """
-    return _Comparison(reader, account, end_ns).run()
+    return _Comparison(reader, account, end_ns, show).run()
 
 
 class _Comparison:
-    def __init__(self, reader: LogReader, account: Account, end_ns: int) -> None:
-        self._reader, self._account, self._end_ns = reader, account, end_ns
+    def __init__(self, reader: LogReader, account: Account, end_ns: int,
+                 show: Callable[[int], None]) -> None:
+        self._reader, self._account, self._end_ns, self._show = reader, account, end_ns, show
         self._names = {name: topic for topic, name in account.topics.items()}
         topics = list(account.topics)
         if account.commands_topic is not None:
@@ -124,6 +126,7 @@ class _Comparison:
         except (DepartureError, ValueError) as error:
             self._verdict.stopped = self._verdict.stopped or str(error)
             return False
+        self._show(self._rerun.stamp_ns)
         if event is not None and event.name == 'command' and journal.COMMANDS in self._names:
             self._take(journal.COMMANDS, event.stamp_ns,
                        journal.command(event.details['l3'], event.details['lz']))
