@@ -7,6 +7,7 @@ Everything here takes columns of samples; where they come from is not its busine
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -131,6 +132,15 @@ class Tilts:
                 self.phi_dot = (one * z1 + two * z2) / (z1 * z1 + z2 * z2)
                 self.theta_dot = 2.0 * self.slope / np.sqrt(z1 * z1 + z2 * z2)
 
+    def first(self, seconds: float) -> Tilts:
+        """Return the samples of the first seconds, two at least."""
+        count = max(2, int(np.searchsorted(self.time, seconds, 'right')))
+        part = copy.copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                setattr(part, name, value[:count])
+        return part
+
     @property
     def height(self) -> Column:
         """cos(theta)."""
@@ -186,7 +196,7 @@ def measure(tilts: Tilts) -> Measured:
     """
     missing: list[str] = []
     low, high = (_extreme(tilts, sign) for sign in (1.0, -1.0))
-    precession = (None, None)
+    precession: tuple[float | None, float | None] = (None, None)
     if tilts.phi_dot is not None:
         precession = (float(np.min(tilts.phi_dot)), float(np.max(tilts.phi_dot)))
     nutations, period, begin, end = 0, None, 0.0, len(tilts.time) - 1.0

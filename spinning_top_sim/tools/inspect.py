@@ -195,7 +195,7 @@ class Table:
 
     title: str
     head: tuple[str, ...]
-    rows: list[tuple[str, ...]]
+    rows: Sequence[tuple[str, ...]]
 
 
 def report(path: Path, found: Survey, verdict: Verdict | None) -> Iterator[str | Table]:
@@ -284,7 +284,7 @@ def _motion_report(number: int, motion: Motion, begin_ns: int) -> Iterator[str |
     source = f'from {motion.source}' if motion.source else 'measured'
     yield Table(head, ('', 'exact', source, 'relative difference'), rows)
     if measured is None:
-        yield ('not measured: too few samples' if motion.source or until <= since else
+        yield ('not measured: too few samples' if motion.source else
                'not measured: no topic with an attitude (joint_states, pose, ground_truth/...)')
     else:
         if measured.nutations:

@@ -7,6 +7,7 @@ Samples are looked at in blocks; of each motion the samples of one topic are kep
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -30,8 +31,7 @@ MOST_GAPS = 10              # told one by one
 # Which samples measure a motion, the best first: angles of their own, exact rates, neither.
 SOURCES = ('joint_states', 'ground_truth/imu', 'ground_truth/odom', 'imu/data', 'pose')
 ENOUGH_SAMPLES = 12.0       # in a nutation: more from another topic show nothing new
-PICTURED_NUTATIONS = 8.0
-PICTURED_S = 5.0            # of a motion without nutations
+PICTURED_NUTATIONS, PICTURED_S = 8.0, 10.0      # kept for pictures: whichever is longer
 
 
 @dataclass
@@ -172,7 +172,7 @@ class Survey:
     drifts: dict[str, dict[str, Curve]] = field(default_factory=dict)
     errors: dict[str, Curve] = field(default_factory=dict)
     tilts: analysis.Tilts | None = None
-    readings: dict[str, tuple[Any, Any, Any]] = field(default_factory=dict)
+    readings: dict[str, tuple[Any, ...]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -302,9 +302,10 @@ class _Pass:
         if stream.topic in ('imu/data_raw', 'ground_truth/imu', 'ground_truth/imu_bias') and (
                 window.any()):
             old = found.readings.get(topic)
-            new = (stamps[window], runs[1][window], runs[2][window])
-            found.readings[topic] = new if old is None else tuple(
-                np.concatenate(pair) for pair in zip(old, new, strict=True))
+            new: tuple[Any, ...] = (stamps[window], runs[1][window], runs[2][window])
+            if old is not None:
+                new = tuple(np.concatenate(pair) for pair in zip(old, new, strict=True))
+            found.readings[topic] = new
         data = _attitudes(stream, section.imu, stamps, runs)
         if data is None:
             return
@@ -326,20 +327,20 @@ class _Pass:
     def _pictured_until(self) -> float:
         motion = self._found.motions[0]
         period = None if motion.described is None else motion.described.nutation_period
-        return motion.begin_ns + 1e9 * (PICTURED_S if period is None
-                                        else max(1.0, PICTURED_NUTATIONS * period))
+        return motion.begin_ns + 1e9 * max(PICTURED_S, PICTURED_NUTATIONS * (period or 0.0))
 
     def _measure(self) -> None:
         """Measure the motion that is over."""
         motion, kept = self._sections[self._index].motion, self._kept
         self._kept = []
+        motion.source = self._source
         if not kept:
             return
         data = _longest_run(kept)
         if len(data.stamps_ns) < 2:
             return
         tilts = analysis.Tilts(data)
-        motion.measured, motion.source = analysis.measure(tilts), self._source
+        motion.measured = analysis.measure(tilts)
         values = analysis.constants(motion.top, data)
         if values is not None and tilts.theta_dot is not None:
             _, l3, lz = (float(np.median(value)) for value in values)
@@ -436,16 +437,18 @@ def _attitudes(stream: Stream, imu: Imu, stamps: Any,
 
 def _longest_run(parts: list[analysis.Attitudes]) -> analysis.Attitudes:
     """Return the longest stretch without gaps, its rate the same throughout."""
+    def joined_columns(name: str) -> Any:
+        if getattr(parts[0], name) is None:
+            return None
+        return tuple(np.concatenate(columns) for columns in zip(
+            *(getattr(part, name) for part in parts), strict=True))
     joined = analysis.Attitudes(
-        *(np.concatenate([getattr(part, name) for part in parts])
-          for name in ('stamps_ns', 'quaternion')),
-        *(None if getattr(parts[0], name) is None else tuple(
-            np.concatenate(columns) for columns in zip(
-                *(getattr(part, name) for part in parts), strict=True))
-          for name in ('rates', 'angles')))
+        np.concatenate([part.stamps_ns for part in parts]),
+        np.concatenate([part.quaternion for part in parts]),
+        joined_columns('rates'), joined_columns('angles'))
     steps = np.diff(joined.stamps_ns)
     cuts = [0, *(np.flatnonzero(np.diff(steps)) + 1).tolist(), len(steps)]
-    begin, end = max(zip(cuts[:-1], cuts[1:], strict=True), key=lambda pair: pair[1] - pair[0])
+    begin, end = max(itertools.pairwise(cuts), key=lambda pair: pair[1] - pair[0])
     return _cut(joined, begin, end + 1)
 
 
