@@ -12,6 +12,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from spinning_top_sim.recording.damage import count
+
 if TYPE_CHECKING:
     from spinning_top_sim.tools.survey import Motion, Survey
     from spinning_top_sim.tools.verify import Verdict
@@ -288,7 +290,7 @@ def _motion_report(number: int, motion: Motion, begin_ns: int) -> Iterator[str |
                'not measured: no topic with an attitude (joint_states, pose, ground_truth/...)')
     else:
         if measured.nutations:
-            yield f'{measured.nutations} whole nutations'
+            yield count(measured.nutations, 'whole nutation')
         yield from (f'not measured: {reason}' for reason in measured.missing)
 
 
