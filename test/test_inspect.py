@@ -54,7 +54,8 @@ def stepped(folder):
 @pytest.fixture(scope='module')
 def columns(folder):
     """The exact solution in columns, with commands between the stretches."""
-    return log_of(folder / 'columns.mcap', '--duration', 20, '--command', '7.7:2.0:1.5',
+    return log_of(folder / 'columns.mcap', '--duration', 12, '--command', '1.7:2.0:1.5',
+                  '--command', '3.1:1.7:1.4',
                   '-p', 'solver.method:=exact', '-p', 'imu.accelerometer_random_walk:=0.01')
 
 
@@ -126,7 +127,7 @@ def test_every_scene_is_measured_from_its_data(tmp_path, scene, method):
     if scene in RESTING:
         assert measured.nutation_period is None and measured.nutations == 0
     else:
-        assert measured.nutations >= 3
+        assert measured.nutations >= 2
         assert measured.nutation_period == pytest.approx(truth.nutation_period, rel=1e-9)
     assert measured.mean_precession_rate == pytest.approx(
         truth.mean_precession_rate, rel=1e-9, abs=1e-9 if scene == 'free_top' else 0.0)
@@ -340,7 +341,7 @@ def test_an_euler_form_that_stops_verifies(tmp_path, capsys):
                           '-p', 'solver.equations:=euler', '-p', 'spin.lz:=1.6']) == 1
     capsys.readouterr()
     verdict = verified(capsys, path)
-    assert verdict['identical'] and 100 < sum(verdict['compared'].values())
+    assert verdict['identical'] and sum(verdict['compared'].values()) > 100
 
 
 # ------------------------------------------------------------------------------ what is told
@@ -348,7 +349,9 @@ def test_an_euler_form_that_stops_verifies(tmp_path, capsys):
 
 def test_a_torn_file_is_told_and_what_is_left_verifies(columns, tmp_path, capsys):
     torn = tmp_path / 'torn.mcap'
-    torn.write_bytes(columns.read_bytes()[:columns.stat().st_size * 2 // 3])
+    with open(columns, 'rb') as file:
+        last = make_reader(file).get_summary().chunk_indexes[-1]
+    torn.write_bytes(columns.read_bytes()[:last.chunk_start_offset + last.chunk_length // 2])
     code, out, _ = told(capsys, torn, '--verify')
     assert code == 1
     assert 'torn.mcap: torn' in out and 'lost: ' in out
@@ -356,7 +359,7 @@ def test_a_torn_file_is_told_and_what_is_left_verifies(columns, tmp_path, capsys
     code, content = as_json(capsys, torn)
     assert code == 1 and not content['whole'] and content['damage']['torn']
     assert content['damage']['lost_bytes'] > 0
-    assert content['motions'][0]['measured']['nutations'] > 5
+    assert content['motions'][2]['measured']['nutations'] > 5
 
 
 def test_text_tells_the_numbers_with_and_without_rich(stepped, capsys, monkeypatch):
@@ -366,14 +369,14 @@ def test_text_tells_the_numbers_with_and_without_rich(stepped, capsys, monkeypat
     for text in texts:
         assert 'whole, 3 s' in text and '/a/b/ground_truth/imu' in text
         assert 'motion 3 (command), 1 to 2.0031 s: loops' in text
-        assert re.search(r'nutation period \[s\] +0\.416351\d+ +0\.416351\d+ +-?\d\.\de-1\d', text)
+        assert re.search(r'nutation period \[s\] +0\.433970\d+ +0\.433970\d+ +-?\d\.\de-1\d', text)
         assert 'orientation error against the exact solution' in text
         assert 'journal: 3 commands, 0 resets' in text
 
 
 def test_json_is_strict_and_documented(columns, capsys):
     _, out, _ = told(capsys, columns, '--json', '--verify')
-    content = json.loads(out, parse_constant=lambda name: pytest.fail(name))
+    content = json.loads(out, parse_constant=pytest.fail)
     page = (ROOT / 'docs/inspect.md').read_text()
     keys = set(content) | {key for name in ('damage', 'run', 'verify') for key in content[name]}
     keys |= set(content['motions'][0]) | set(content['motions'][0]['measured'])

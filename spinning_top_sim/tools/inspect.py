@@ -353,6 +353,7 @@ def _show(content: Iterator[str | Table]) -> None:
         from rich import box  # noqa: PLC0415
         from rich.console import Console  # noqa: PLC0415
         from rich.table import Table as RichTable  # noqa: PLC0415
+        from rich.text import Text  # noqa: PLC0415
     except ImportError:
         for item in content:
             print(item if isinstance(item, str) else _plain_table(item))
@@ -362,12 +363,12 @@ def _show(content: Iterator[str | Table]) -> None:
         if isinstance(item, str):
             console.print(item, markup=False, soft_wrap=True)
             continue
-        table = RichTable(title=item.title, title_justify='left', box=box.SIMPLE_HEAD,
+        table = RichTable(title=Text(item.title), title_justify='left', box=box.SIMPLE_HEAD,
                           title_style='bold')
         for number, name in enumerate(item.head):
-            table.add_column(name, justify='left' if number == 0 else 'right', overflow='fold')
+            table.add_column(Text(name), justify='left' if number == 0 else 'right', overflow='fold')
         for row in item.rows:
-            table.add_row(*row)
+            table.add_row(*map(Text, row))
         console.print(table)
 
 
