@@ -12,6 +12,7 @@ NAME = 'spinning_top_sim'
 # scripts/ too, installed there as data by pip and by colcon alike.
 EXECUTABLES = {
     'sim_node': 'spinning_top_sim.nodes.sim_node',
+    'replay_node': 'spinning_top_sim.nodes.replay_node',
     'simulate': 'spinning_top_sim.tools.simulate',
     'recover': 'spinning_top_sim.tools.recover',
     'inspect': 'spinning_top_sim.tools.inspect',

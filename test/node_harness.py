@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import ctypes
 import fcntl
 import json
 import os
@@ -79,6 +80,11 @@ def wait_for(what, condition, timeout=PATIENCE_S):
     return result
 
 
+def _die_with_parent():
+    """In the child: be killed when the test process is, whatever kills it."""
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)      # PR_SET_PDEATHSIG
+
+
 class SimNode:
     """
     A sim_node in its own process group; ends with the `with` at the latest.
@@ -108,7 +114,8 @@ class SimNode:
         with (self.folder / 'out').open('wb') as out, (self.folder / 'err').open('wb') as err:
             self.process = subprocess.Popen(
                 self.command, cwd=self.folder, env=environment, start_new_session=True,
-                stdin=subprocess.DEVNULL, stdout=out, stderr=err)
+                stdin=subprocess.DEVNULL, stdout=out, stderr=err,
+                preexec_fn=_die_with_parent)  # noqa: PLW1509 - one call, takes no lock
         self._killer = threading.Timer(LIFETIME_S, self.kill)
         self._killer.daemon = True
         self._killer.start()

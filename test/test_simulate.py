@@ -51,8 +51,7 @@ def in_memory(values, commands, duration_ns):
                       parameters.BY_NAME[f'{stream.parameter}.enabled'].default):
             name = stream.topic.replace('~', 'spinning_top')
             topic = name if name.startswith('/') else f'/{name}'
-            stream.record = lambda stamp, data, to=found.setdefault(topic, {}): to.update(
-                {stamp: data})
+            stream.record = found.setdefault(topic, {}).__setitem__
     rng = np.random.default_rng(1)
     now = 0
     for at_ns, l3, lz in (*commands, (duration_ns, None, None)):

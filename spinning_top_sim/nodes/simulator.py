@@ -23,8 +23,9 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes import reports
+from spinning_top_sim.nodes.message_types import message_type
 from spinning_top_sim.nodes.pacing import DeadlineThread, SimulatedClock
-from spinning_top_sim.nodes.ros_parameters import ParameterChanges, declare, start_values
+from spinning_top_sim.nodes.ros_parameters import SPIN, ParameterChanges, declare, start_values
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -70,11 +71,11 @@ class Simulator(Node):
         self._factor = 0.0
         self._described: object = None          # the motion that `_regime` names
         self._regime = ''
-        if values['spin.lz'] is None:
-            values = {**values, 'spin.lz': self._simulation.lz}
+        # What a reset goes back to: an unset spin.lz is the cusp, wherever initial.theta is then.
+        start_spin = {name: values[name] for name in SPIN}
+        values = {**values, 'spin.lz': self._simulation.lz}
         declare(self, values)
-        self._start_values = values
-        self._changes = ParameterChanges(self, values, self._apply)
+        self._changes = ParameterChanges(self, values, start_spin, self._apply)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._qos: dict[str, QoSProfile] = {}
         self._outputs: dict[str, Publisher] = {}
@@ -113,7 +114,7 @@ class Simulator(Node):
             there = stream.topic in self._outputs
             if wanted and not there:
                 self._outputs[stream.topic] = self._publisher(
-                    _message_type(stream.type_name), stream.topic)
+                    message_type(stream.type_name), stream.topic)
             elif there and not wanted:
                 stream.publish = None
                 self.destroy_publisher(self._outputs.pop(stream.topic))
@@ -401,8 +402,7 @@ class Simulator(Node):
                 return response
             simulation = self._simulation
             # Back to the spin it was started with, whatever was commanded since.
-            values = {**self._values, 'spin.l3': self._start_values['spin.l3'],
-                      'spin.lz': self._start_values['spin.lz']}
+            values = {**self._values, **self._changes.start_spin}
             sent_ns = simulation.now_ns
             last_stamp = simulation.epoch_ns + sent_ns
             try:
@@ -422,7 +422,8 @@ class Simulator(Node):
                           parameters=values)
             response.success = True
             response.message = f'at t = 0, stamps go on from {simulation.epoch_ns} ns'
-        self._changes.follow(spin__l3=values['spin.l3'], spin__lz=values['spin.lz'])
+            l3, lz = simulation.l3, simulation.lz
+        self._changes.follow(spin__l3=l3, spin__lz=lz)
         return response
 
     def _on_record(self, request: SetBool.Request, response: SetBool.Response) -> Any:
@@ -592,14 +593,6 @@ class Simulator(Node):
             if description is not None:
                 self._terminal.tell(str(description))
         return self._regime
-
-
-def _message_type(type_name: str) -> type:
-    """Import the Python class of a message type when a stream of it is enabled."""
-    import importlib  # noqa: PLC0415
-
-    package, _, name = type_name.split('/')
-    return getattr(importlib.import_module(f'{package}.msg'), name)
 
 
 def _rosbag2_qos(qos: QoSProfile) -> dict[str, Any]:

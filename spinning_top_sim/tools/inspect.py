@@ -366,7 +366,8 @@ def _show(content: Iterator[str | Table]) -> None:
         table = RichTable(title=Text(item.title), title_justify='left', box=box.SIMPLE_HEAD,
                           title_style='bold')
         for number, name in enumerate(item.head):
-            table.add_column(Text(name), justify='left' if number == 0 else 'right', overflow='fold')
+            table.add_column(Text(name), justify='left' if number == 0 else 'right',
+                             overflow='fold')
         for row in item.rows:
             table.add_row(*map(Text, row))
         console.print(table)
