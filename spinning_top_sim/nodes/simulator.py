@@ -39,6 +39,8 @@ OPENING_NS = 60_000_000
 LISTENERS_PERIOD_NS = 50_000_000
 # One tick works at most this long before services and signals get their turn.
 TICK_BUDGET_S = 0.05
+# One ~/step works at most this long.
+STEP_BUDGET_S = 2.0
 # Samples later than this are not published any more.
 LATEST_NS = 500_000_000
 # A simulation further behind than this lets its clock slip: its real-time factor falls below 1.
@@ -383,14 +385,27 @@ class Simulator(Node):
             self._look_for_listeners()
             count, dt = self._values['step.count'], self._values['step.dt']
             target = max(self._simulation.now_ns, 0) + count * round(dt * NANOSECONDS)
+            arrived = False
+            stop_at = time.monotonic() + STEP_BUDGET_S
+            recorder = self._recorder
+
+            def give_way() -> bool:
+                if recorder is not None and not recorder.room:
+                    recorder.wait_for_room(0.1)
+                return time.monotonic() > stop_at or not self.context.ok()
+
             try:
-                self._simulation.advance(target)
+                arrived = self._simulation.advance(target, give_way=give_way)
             except IntegrationError as error:
                 self._fail(str(error))
             self._simulated_clock.start(max(self._simulation.now_ns, 0))
             self._simulated_clock.stop()
-            response.success = self._failure is None
+            response.success = arrived
             response.message = self._failure or f'at t = {self._seconds():.9g} s'
+            if not arrived and self._failure is None:
+                response.message += (f': after {STEP_BUDGET_S:g} s of computing there are '
+                                     f'{(target - self._simulation.now_ns) / NANOSECONDS:.9g} s '
+                                     'left; others want to be served too')
         return response
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Any:
