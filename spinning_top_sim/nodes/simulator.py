@@ -24,7 +24,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes import reports
 from spinning_top_sim.nodes.pacing import DeadlineThread, SimulatedClock
-from spinning_top_sim.nodes.ros_parameters import ParameterChanges, declare, start_values
+from spinning_top_sim.nodes.ros_parameters import SPIN, ParameterChanges, declare, start_values
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -72,11 +72,11 @@ class Simulator(Node):
         self._factor = 0.0
         self._described: object = None          # the motion that `_regime` names
         self._regime = ''
-        if values['spin.lz'] is None:
-            values = {**values, 'spin.lz': self._simulation.lz}
+        # What a reset goes back to: an unset spin.lz is the cusp, wherever initial.theta is then.
+        start_spin = {name: values[name] for name in SPIN}
+        values = {**values, 'spin.lz': self._simulation.lz}
         declare(self, values)
-        self._start_values = values
-        self._changes = ParameterChanges(self, values, self._apply)
+        self._changes = ParameterChanges(self, values, start_spin, self._apply)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._qos: dict[str, QoSProfile] = {}
         self._outputs: dict[str, Publisher] = {}
@@ -415,8 +415,7 @@ class Simulator(Node):
                 return response
             simulation = self._simulation
             # Back to the spin it was started with, whatever was commanded since.
-            values = {**self._values, 'spin.l3': self._start_values['spin.l3'],
-                      'spin.lz': self._start_values['spin.lz']}
+            values = {**self._values, **self._changes.start_spin}
             last_stamp = simulation.epoch_ns + simulation.now_ns
             try:
                 simulation.restart(values)
@@ -434,7 +433,8 @@ class Simulator(Node):
             self._journal('reset', 0, epoch_ns=simulation.epoch_ns, parameters=values)
             response.success = True
             response.message = f'at t = 0, stamps go on from {simulation.epoch_ns} ns'
-        self._changes.follow(spin__l3=values['spin.l3'], spin__lz=values['spin.lz'])
+            l3, lz = simulation.l3, simulation.lz
+        self._changes.follow(spin__l3=l3, spin__lz=lz)
         return response
 
     def _on_record(self, request: SetBool.Request, response: SetBool.Response) -> Any:
