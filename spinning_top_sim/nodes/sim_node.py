@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import sys
 
@@ -43,24 +44,21 @@ def _show_help() -> None:
 
 def _run(argv: list[str]) -> int:
     import rclpy  # noqa: PLC0415 - so that Ctrl-C while rclpy is imported ends quietly too
+    from rclpy.exceptions import ParameterException  # noqa: PLC0415
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor  # noqa: PLC0415
 
     try:
         rclpy.init(args=argv)
     except Exception as error:          # a params file that is missing or no YAML, a bad remapping
-        print(f'sim_node: cannot start: {error}', file=sys.stderr)
-        return 2
+        return _cannot_start(error)
     node = None
     try:
         from spinning_top_sim.nodes.simulator import Simulator  # noqa: PLC0415
 
         try:
             node = Simulator()
-        except (ValueError, RuntimeError) as error:
-            if not rclpy.ok():
-                return 0
-            print(f'sim_node: cannot start: {error}', file=sys.stderr)
-            return 2
+        except (ValueError, RuntimeError, ParameterException) as error:
+            return _cannot_start(error) if rclpy.ok() else 0
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         node.start()
@@ -79,6 +77,13 @@ def _run(argv: list[str]) -> int:
             node.destroy_node()
         rclpy.try_shutdown()
     return 0
+
+
+def _cannot_start(error: Exception) -> int:
+    """Say why in one line, without the places in the sources of rcl; return the exit code."""
+    text = re.sub(r',\s*at \S+:\d+', '', str(error))
+    print(f'sim_node: cannot start: {" ".join(text.split())}', file=sys.stderr)
+    return 2
 
 
 if __name__ == '__main__':
