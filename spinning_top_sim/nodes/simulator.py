@@ -23,6 +23,7 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes import reports
+from spinning_top_sim.nodes.message_types import message_type
 from spinning_top_sim.nodes.pacing import DeadlineThread, SimulatedClock
 from spinning_top_sim.nodes.ros_parameters import SPIN, ParameterChanges, declare, start_values
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
@@ -115,7 +116,7 @@ class Simulator(Node):
             there = stream.topic in self._outputs
             if wanted and not there:
                 self._outputs[stream.topic] = self._publisher(
-                    _message_type(stream.type_name), stream.topic)
+                    message_type(stream.type_name), stream.topic)
             elif there and not wanted:
                 stream.publish = None
                 self.destroy_publisher(self._outputs.pop(stream.topic))
@@ -604,14 +605,6 @@ class Simulator(Node):
             if description is not None:
                 self._terminal.tell(str(description))
         return self._regime
-
-
-def _message_type(type_name: str) -> type:
-    """Import the Python class of a message type when a stream of it is enabled."""
-    import importlib  # noqa: PLC0415
-
-    package, _, name = type_name.split('/')
-    return getattr(importlib.import_module(f'{package}.msg'), name)
 
 
 def _rosbag2_qos(qos: QoSProfile) -> dict[str, Any]:

@@ -115,4 +115,4 @@ def angle_between(p: tuple[float, float, float, float],
 
 
 def _over(momentum: float, square: Scalar) -> Scalar:
-    return momentum / square if momentum != 0.0 else 0.0
+    return momentum / square if momentum != 0.0 else 0.0 * square

@@ -7,16 +7,18 @@ the file is laid out here, from mcap's record classes; only the two records that
 message are packed by hand, for speed (MCAP specification, "Message" and "Message Index").
 
 Layout: header, metadata of the run, schemas, channels | chunk, its message indexes | ... |
-`rosbag2` metadata, data end | summary, footer.  Imported when a recording starts.
+`rosbag2` metadata, data end | summary, footer.  Recordings and recovered logs are written by the
+same code.  Imported when a recording starts.
 """
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
 import struct
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +27,7 @@ import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
+    AttachmentIndex,
     Channel,
     Chunk,
     ChunkIndex,
@@ -41,6 +44,7 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording.rosbag2 import (
+    BagTopic,
     RecordedTopic,
     bag_metadata_yaml,
     offered_qos_yaml,
@@ -52,8 +56,11 @@ if TYPE_CHECKING:
 
 CHUNK_BYTES = 1 << 20  # uncompressed; a single larger message still makes a chunk of its own
 
-_MESSAGE = struct.Struct('<BQHIQQ')  # opcode, length, channel, sequence, log and publish time
-_MESSAGE_FIELDS = 2 + 4 + 8 + 8      # what `length` counts besides the data
+# What a chunk holds, by channel: log time, offset in the uncompressed chunk, log time, offset, ...
+Entries = Mapping[int, Sequence[int]]
+
+MESSAGE = struct.Struct('<BQHIQQ')  # opcode, length, channel, sequence, log and publish time
+MESSAGE_FIELDS = 2 + 4 + 8 + 8      # what `length` counts besides the data
 _INDEX = struct.Struct('<BQHI')      # opcode, length, channel, length of the entries
 
 
@@ -66,11 +73,239 @@ def _compressor(compression: str) -> Callable[[bytes | memoryview], bytes]:
     return bytes
 
 
-class McapFile:
+class IndexedFile:
     """
-    A new file, written by one thread; every method that touches the disk may raise OSError.
+    A new MCAP file, written by one thread; every method that touches the disk may raise OSError.
 
-    After an OSError the file ends behind the last whole chunk, and `finish` may still be tried.
+    After an OSError the file ends behind the last whole record, and `finish` may still be tried.
+    """
+
+    def __init__(self, path: Path, *, profile: str, library: str, compression: str) -> None:
+        """
+        Create the file with its header.
+
+        compression: of chunks made here: 'zstd', 'lz4' or 'none'
+
+        Raises FileExistsError rather than overwrite anything, and other OSErrors.
+        """
+        self._path = path
+        self._compression = '' if compression == 'none' else compression
+        self._compress = _compressor(compression)
+
+        self.message_counts: dict[int, int] = {}  # messages in the file, by channel
+        self.chunk_count = 0
+        self.start_ns = self.end_ns = 0      # earliest and latest stamp; both 0 without messages
+        self.size = 0                        # bytes in the file, all of them whole records
+        self.synced_size = 0                 # how much of it is surely on the disk
+        self._data_crc = 0
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._chunk_indexes: list[ChunkIndex] = []
+        self._metadata_indexes: list[MetadataIndex] = []
+        self._attachment_indexes: list[AttachmentIndex] = []
+        self._clear_chunk()
+
+        self._file = open(path, 'xb', buffering=0)  # noqa: SIM115
+        with self.discarded_on_failure():
+            self._put(MCAP0_MAGIC + record_bytes(Header(profile=profile, library=library)))
+
+    @contextlib.contextmanager
+    def discarded_on_failure(self) -> Iterator[None]:
+        """Close and remove the file when what is done meanwhile raises anything."""
+        try:
+            yield
+        except BaseException:
+            self._file.close()
+            with contextlib.suppress(OSError):
+                self._path.unlink()
+            raise
+
+    def put_schema(self, schema: Schema) -> None:
+        """Write a schema; the first of an id is the one that the summary repeats."""
+        self._put(record_bytes(schema))
+        self._schemas.setdefault(schema.id, schema)
+
+    def put_channel(self, channel: Channel) -> None:
+        """Write a channel; the first of an id is the one that the summary repeats."""
+        self._put(record_bytes(channel))
+        self._channels.setdefault(channel.id, channel)
+        self.message_counts.setdefault(channel.id, 0)
+
+    def put_metadata(self, metadata: Metadata) -> None:
+        """Write a metadata record."""
+        record = record_bytes(metadata)
+        index = MetadataIndex(offset=self.size, length=len(record), name=metadata.name)
+        self._put(record)
+        self._metadata_indexes.append(index)
+
+    def put_attachment(self, index: AttachmentIndex, blocks: Iterable[bytes]) -> None:
+        """
+        Write an attachment.
+
+        index: what the summary says of it; where it stands is filled in here
+        blocks: the whole record, `index.length` bytes in pieces of any size
+        """
+        index = dataclasses.replace(index, offset=self.size)
+        self._put_blocks(blocks)
+        self._attachment_indexes.append(index)
+
+    def add_message(
+        self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int, data: bytes,
+    ) -> bool:
+        """Add a message to the chunk in memory; return whether the chunk is full."""
+        self._chunk_parts.append(MESSAGE.pack(
+            Opcode.MESSAGE, MESSAGE_FIELDS + len(data), channel_id, sequence, log_time_ns,
+            publish_time_ns))
+        self._chunk_parts.append(data)
+        entries = self._chunk_entries.get(channel_id)
+        if entries is None:
+            entries = self._chunk_entries[channel_id] = []
+        entries.append(log_time_ns)
+        entries.append(self._chunk_size)
+        self._chunk_size += MESSAGE.size + len(data)
+        return self._chunk_size >= CHUNK_BYTES
+
+    def write_chunk(self) -> None:
+        """Compress and write the chunk in memory, if it holds anything."""
+        if not self._chunk_size:
+            return
+        self._put_plain_chunk(b''.join(self._chunk_parts), self._chunk_entries)
+        self._clear_chunk()
+
+    def _put_plain_chunk(self, plain: bytes | memoryview, entries: Entries) -> None:
+        start_ns, end_ns = time_span(entries)
+        self.put_chunk(Chunk(
+            compression=self._compression, data=self._compress(plain),
+            uncompressed_size=len(plain), uncompressed_crc=zlib.crc32(plain),
+            message_start_time=start_ns, message_end_time=end_ns), entries)
+
+    def put_chunk(self, chunk: Chunk, entries: Entries) -> None:
+        """Write a chunk as it is, and the message indexes that belong to its `entries`."""
+        record = record_bytes(chunk)
+        indexes = message_indexes(entries)
+        index_start = self.size + len(record)
+        index_offsets = {}
+        for channel_id, index in indexes.items():
+            index_offsets[channel_id] = index_start
+            index_start += len(index)
+        chunk_index = ChunkIndex(
+            chunk_start_offset=self.size, chunk_length=len(record),
+            message_index_offsets=index_offsets,
+            message_index_length=index_start - self.size - len(record),
+            compression=chunk.compression, compressed_size=len(chunk.data),
+            uncompressed_size=chunk.uncompressed_size,
+            message_start_time=chunk.message_start_time, message_end_time=chunk.message_end_time)
+
+        self._put(b''.join((record, *indexes.values())))
+        self._chunk_indexes.append(chunk_index)
+        self.chunk_count += 1
+        if not indexes:
+            return
+        start_ns, end_ns = time_span(entries)
+        first = not any(self.message_counts.values())
+        self.start_ns = start_ns if first else min(self.start_ns, start_ns)
+        self.end_ns = max(self.end_ns, end_ns)
+        for channel_id in indexes:
+            self.message_counts[channel_id] += len(entries[channel_id]) // 2
+
+    def sync(self) -> None:
+        """Wait until everything written is on the disk."""
+        os.fsync(self._file.fileno())
+        self.synced_size = self.size
+
+    def free_bytes(self) -> int:
+        """Return what is left for us on the disk [bytes]."""
+        disk = os.fstatvfs(self._file.fileno())
+        return disk.f_bavail * disk.f_frsize
+
+    def close(self, last_metadata: Metadata | None) -> None:
+        """Write a last record and the summary, bring all to disk and close the file."""
+        try:
+            self._put(self._tail(last_metadata))
+            self.sync()
+            sync_directory(self._path.parent)
+        finally:
+            self._file.close()
+
+    def _tail(self, last_metadata: Metadata | None) -> bytes:
+        """Return everything behind the last chunk: the last record, summary, footer."""
+        data = b''
+        metadata_indexes = self._metadata_indexes
+        if last_metadata is not None:
+            data = record_bytes(last_metadata)
+            metadata_indexes = [*metadata_indexes, MetadataIndex(
+                offset=self.size, length=len(data), name=last_metadata.name)]
+        data += record_bytes(DataEnd(zlib.crc32(data, self._data_crc)))
+
+        statistics = Statistics(
+            message_count=sum(self.message_counts.values()), schema_count=len(self._schemas),
+            channel_count=len(self._channels), attachment_count=len(self._attachment_indexes),
+            metadata_count=len(metadata_indexes), chunk_count=len(self._chunk_indexes),
+            message_start_time=self.start_ns, message_end_time=self.end_ns,
+            channel_message_counts=self.message_counts)
+        summary_start = self.size + len(data)
+        tail = RecordBuilder()
+        offsets = []
+        groups: list[tuple[Opcode, Sequence[McapRecord]]] = [
+            (Opcode.SCHEMA, list(self._schemas.values())),
+            (Opcode.CHANNEL, list(self._channels.values())),
+            (Opcode.STATISTICS, [statistics]),
+            (Opcode.CHUNK_INDEX, self._chunk_indexes),
+            (Opcode.ATTACHMENT_INDEX, self._attachment_indexes),
+            (Opcode.METADATA_INDEX, metadata_indexes),
+        ]
+        for opcode, records in groups:
+            group_start = tail.count
+            for record in records:
+                record.write(tail)
+            if records:
+                offsets.append(SummaryOffset(
+                    group_opcode=opcode, group_start=summary_start + group_start,
+                    group_length=tail.count - group_start))
+        offsets_start = summary_start + tail.count
+        for offset in offsets:
+            offset.write(tail)
+        summary: bytes = tail.end()
+
+        # The summary's checksum runs on into the footer, up to the checksum itself.
+        footer_head = struct.pack('<BQQQ', Opcode.FOOTER, 8 + 8 + 4, summary_start, offsets_start)
+        footer = Footer(
+            summary_start=summary_start, summary_offset_start=offsets_start,
+            summary_crc=zlib.crc32(footer_head, zlib.crc32(summary)))
+        return data + summary + record_bytes(footer) + MCAP0_MAGIC
+
+    def _clear_chunk(self) -> None:
+        self._chunk_parts: list[bytes] = []
+        self._chunk_size = 0  # uncompressed
+        self._chunk_entries: dict[int, list[int]] = {}
+
+    def _put(self, records: bytes) -> None:
+        """Write whole records, or none of them."""
+        self._put_blocks((records,))
+
+    def _put_blocks(self, blocks: Iterable[bytes]) -> None:
+        """Write whole records that come in pieces, or none of them."""
+        size, crc = self.size, self._data_crc
+        try:
+            for block in blocks:
+                rest = memoryview(block)
+                while rest:
+                    rest = rest[self._file.write(rest):]
+                size += len(block)
+                crc = zlib.crc32(block, crc)
+        except OSError:
+            with contextlib.suppress(OSError):
+                self._file.truncate(self.size)
+                self._file.seek(self.size)
+            raise
+        self.size, self._data_crc = size, crc
+
+
+class McapFile(IndexedFile):
+    """
+    The file of a recording: its topics are known from the start.
+
+    All topics stand before the first chunk, so that a torn file tells them in any case.
     """
 
     def __init__(
@@ -92,79 +327,38 @@ class McapFile:
 
         Raises FileExistsError rather than overwrite anything, and other OSErrors.
         """
-        self._path = path
+        super().__init__(path, profile='ros2', library=library, compression=compression)
         self._topics = topics
-        self._hashes = [definitions[topic.type_name].type_hash for topic in topics]
-        self._compression = '' if compression == 'none' else compression
-        self._compress = _compressor(compression)
-
+        self._sequences = [0] * len(topics)
         schema_ids = {name: number for number, name in enumerate(
             dict.fromkeys(topic.type_name for topic in topics), start=1)}
-        self._schemas = [
-            Schema(id=number, name=name, encoding='ros2msg', data=definitions[name].text.encode())
-            for name, number in schema_ids.items()]
-        self._channels = [
-            Channel(
-                id=number, topic=topic.name, message_encoding='cdr',
-                schema_id=schema_ids[topic.type_name],
-                metadata={'offered_qos_profiles': offered_qos_yaml(topic),
-                          'topic_type_hash': definitions[topic.type_name].type_hash})
-            for number, topic in enumerate(topics, start=1)]
-
-        self.counts = [0] * len(topics)      # messages in the file, per topic
-        self.size = 0                        # bytes in the file, all of them whole records
-        self.synced_size = 0                 # how much of it is surely on the disk
-        self._data_crc = 0
-        self._chunk_indexes: list[ChunkIndex] = []
-        self._metadata_indexes: list[MetadataIndex] = []
-        self._sequences = [0] * len(topics)
-        self._clear_chunk()
-
-        # Schemas and channels stand before the first chunk: a torn file tells them in any case.
-        head = RecordBuilder()
-        head.write(MCAP0_MAGIC)
-        Header(profile='ros2', library=library).write(head)
-        for name, record in metadata.items():
-            self._add_metadata(head, 0, name, dict(record))
-        for schema in self._schemas:
-            schema.write(head)
-        for channel in self._channels:
-            channel.write(head)
-        self._file = open(path, 'xb', buffering=0)  # noqa: SIM115
-        try:
-            self._put(head.end())
+        with self.discarded_on_failure():
+            for name, record in metadata.items():
+                self.put_metadata(Metadata(name=name, metadata=dict(record)))
+            for name, number in schema_ids.items():
+                self.put_schema(Schema(
+                    id=number, name=name, encoding='ros2msg',
+                    data=definitions[name].text.encode()))
+            for number, topic in enumerate(topics, start=1):
+                self.put_channel(Channel(
+                    id=number, topic=topic.name, message_encoding='cdr',
+                    schema_id=schema_ids[topic.type_name],
+                    metadata={'offered_qos_profiles': offered_qos_yaml(topic),
+                              'topic_type_hash': definitions[topic.type_name].type_hash}))
             self.sync()
-            _sync_directory(path.parent)
-        except BaseException:
-            self._file.close()
-            with contextlib.suppress(OSError):
-                path.unlink()
-            raise
+            sync_directory(path.parent)
+
+    @property
+    def counts(self) -> list[int]:
+        """Messages in the file, per topic."""
+        return [self.message_counts[number] for number in range(1, len(self._topics) + 1)]
 
     def append(self, topic_index: int, log_time_ns: int, data: bytes) -> bool:
         """Add a message to the chunk in memory; return whether the chunk is full."""
         sequence = self._sequences[topic_index]
         self._sequences[topic_index] = sequence + 1
-        self._chunk_parts.append(_MESSAGE.pack(
-            Opcode.MESSAGE, _MESSAGE_FIELDS + len(data), topic_index + 1, sequence & 0xFFFFFFFF,
-            log_time_ns, log_time_ns))
-        self._chunk_parts.append(data)
-        entries = self._chunk_entries[topic_index]
-        entries.append(log_time_ns)
-        entries.append(self._chunk_size)
-        self._chunk_size += _MESSAGE.size + len(data)
-        return self._chunk_size >= CHUNK_BYTES
-
-    def write_chunk(self) -> None:
-        """Compress and write the chunk in memory, if it holds anything."""
-        if not self._chunk_size:
-            return
-        times = [time for entries in self._chunk_entries for time in entries[::2]]
-        self._write_chunk(
-            b''.join(self._chunk_parts), min(times), max(times),
-            [(topic_index, len(entries) // 2, struct.pack(f'<{len(entries)}Q', *entries))
-             for topic_index, entries in enumerate(self._chunk_entries) if entries])
-        self._clear_chunk()
+        return self.add_message(
+            topic_index + 1, sequence & 0xFFFFFFFF, log_time_ns, log_time_ns, data)
 
     def write_rows(self, parts: Sequence[tuple[int, NDArray[Any], NDArray[Any]]]) -> None:
         """
@@ -183,157 +377,60 @@ class McapFile:
         plain = numpy.empty(sum(len(times) * (head.itemsize + rows.shape[1])
                                 for _, times, rows in parts), 'u1')
         at = 0
-        indexes = []
+        entries = {}
         for topic_index, times, rows in parts:
             count, size = rows.shape
             length = head.itemsize + size
             records = plain[at:at + count * length].reshape(count, length)
             heads = records[:, :head.itemsize].view(head)[:, 0]
             heads['opcode'] = Opcode.MESSAGE
-            heads['length'] = _MESSAGE_FIELDS + size
+            heads['length'] = MESSAGE_FIELDS + size
             heads['channel'] = topic_index + 1
             sequence = self._sequences[topic_index]
             heads['sequence'] = numpy.arange(sequence, sequence + count) & 0xFFFFFFFF
             heads['log_time'] = heads['publish_time'] = times
             records[:, head.itemsize:] = rows
             self._sequences[topic_index] = sequence + count
-            entries = numpy.empty((count, 2), '<u8')
-            entries[:, 0] = times
-            entries[:, 1] = at + length * numpy.arange(count)
-            indexes.append((topic_index, count, entries.tobytes()))
+            offsets = at + length * numpy.arange(count)
+            entries[topic_index + 1] = numpy.stack((times, offsets), axis=-1).ravel().tolist()
             at += count * length
-        self._write_chunk(plain.data, min(int(times.min()) for _, times, _ in parts),
-                          max(int(times.max()) for _, times, _ in parts), indexes)
-
-    def _write_chunk(self, plain: bytes | memoryview, start_ns: int, end_ns: int,
-                     indexes: Sequence[tuple[int, int, bytes]]) -> None:
-        """Write a chunk and its message indexes: (topic index, message count, entries)."""
-        packed = self._compress(plain)
-        chunk = Chunk(
-            compression=self._compression, data=packed, uncompressed_size=len(plain),
-            uncompressed_crc=zlib.crc32(plain),
-            message_start_time=start_ns, message_end_time=end_ns)
-        records = RecordBuilder()
-        chunk.write(records)
-        chunk_length = records.count
-        index_offsets = {}
-        for topic_index, _, entries in indexes:
-            index_offsets[topic_index + 1] = self.size + records.count
-            records.write(_INDEX.pack(
-                Opcode.MESSAGE_INDEX, 2 + 4 + len(entries), topic_index + 1, len(entries)))
-            records.write(entries)
-        index = ChunkIndex(
-            chunk_start_offset=self.size, chunk_length=chunk_length,
-            message_index_offsets=index_offsets,
-            message_index_length=records.count - chunk_length,
-            compression=self._compression, compressed_size=len(packed),
-            uncompressed_size=len(plain),
-            message_start_time=start_ns, message_end_time=end_ns)
-
-        self._put(records.end())
-        self._chunk_indexes.append(index)
-        for topic_index, count, _ in indexes:
-            self.counts[topic_index] += count
-
-    def sync(self) -> None:
-        """Wait until everything written is on the disk."""
-        os.fsync(self._file.fileno())
-        self.synced_size = self.size
-
-    def free_bytes(self) -> int:
-        """Return what is left for us on the disk [bytes]."""
-        disk = os.fstatvfs(self._file.fileno())
-        return disk.f_bavail * disk.f_frsize
+        self._put_plain_chunk(plain.data, entries)
 
     def finish(self) -> None:
         """Write the summary of the chunks that are in the file, bring it to disk and close it."""
-        try:
-            self._put(self._tail())
-            self.sync()
-            _sync_directory(self._path.parent)
-        finally:
-            self._file.close()
-
-    def _tail(self) -> bytes:
-        """Return everything behind the last chunk: bag metadata, summary, footer."""
-        start_ns = min((index.message_start_time for index in self._chunk_indexes), default=0)
-        end_ns = max((index.message_end_time for index in self._chunk_indexes), default=0)
-        bag = bag_metadata_yaml(
-            self._topics, self._hashes, self.counts, file_name=self._path.name,
-            start_ns=start_ns, end_ns=end_ns)
-        tail = RecordBuilder()
-        self._add_metadata(tail, self.size, 'rosbag2', {'serialized_metadata': bag})
-        data: bytes = tail.end()
-        DataEnd(zlib.crc32(data, self._data_crc)).write(tail)
-        data += tail.end()
-
-        statistics = Statistics(
-            message_count=sum(self.counts), schema_count=len(self._schemas),
-            channel_count=len(self._channels), attachment_count=0,
-            metadata_count=len(self._metadata_indexes), chunk_count=len(self._chunk_indexes),
-            message_start_time=start_ns, message_end_time=end_ns,
-            channel_message_counts=dict(enumerate(self.counts, start=1)))
-        summary_start = self.size + len(data)
-        offsets = []
-        groups: list[tuple[Opcode, Sequence[McapRecord]]] = [
-            (Opcode.SCHEMA, self._schemas),
-            (Opcode.CHANNEL, self._channels),
-            (Opcode.STATISTICS, [statistics]),
-            (Opcode.CHUNK_INDEX, self._chunk_indexes),
-            (Opcode.METADATA_INDEX, self._metadata_indexes),
-        ]
-        for opcode, records in groups:
-            group_start = tail.count
-            for record in records:
-                record.write(tail)
-            if records:
-                offsets.append(SummaryOffset(
-                    group_opcode=opcode, group_start=summary_start + group_start,
-                    group_length=tail.count - group_start))
-        offsets_start = summary_start + tail.count
-        for offset in offsets:
-            offset.write(tail)
-        summary: bytes = tail.end()
-
-        # The summary's checksum runs on into the footer, up to the checksum itself.
-        footer_head = struct.pack('<BQQQ', Opcode.FOOTER, 8 + 8 + 4, summary_start, offsets_start)
-        Footer(
-            summary_start=summary_start, summary_offset_start=offsets_start,
-            summary_crc=zlib.crc32(footer_head, zlib.crc32(summary))).write(tail)
-        footer: bytes = tail.end()
-        return data + summary + footer + MCAP0_MAGIC
-
-    def _add_metadata(
-        self, records: RecordBuilder, offset: int, name: str, content: dict[str, str],
-    ) -> None:
-        """Append a metadata record; `offset` is where `records` will stand in the file."""
-        start = records.count
-        Metadata(name=name, metadata=content).write(records)
-        self._metadata_indexes.append(MetadataIndex(
-            offset=offset + start, length=records.count - start, name=name))
-
-    def _clear_chunk(self) -> None:
-        self._chunk_parts: list[bytes] = []
-        self._chunk_size = 0  # uncompressed
-        # per topic: stamp, offset in the chunk, stamp, offset, ...
-        self._chunk_entries: list[list[int]] = [[] for _ in self._topics]
-
-    def _put(self, records: bytes) -> None:
-        """Write whole records, or none of them."""
-        try:
-            rest = memoryview(records)
-            while rest:
-                rest = rest[self._file.write(rest):]
-        except OSError:
-            with contextlib.suppress(OSError):
-                self._file.truncate(self.size)
-                self._file.seek(self.size)
-            raise
-        self.size += len(records)
-        self._data_crc = zlib.crc32(records, self._data_crc)
+        bag_topics = [
+            BagTopic(topic.name, topic.type_name, channel.metadata['topic_type_hash'],
+                     (topic.qos,), count)
+            for topic, channel, count in zip(
+                self._topics, self._channels.values(), self.counts, strict=True)]
+        self.close(Metadata(name='rosbag2', metadata={'serialized_metadata': bag_metadata_yaml(
+            bag_topics, file_name=self._path.name, start_ns=self.start_ns, end_ns=self.end_ns)}))
 
 
-def _sync_directory(directory: Path) -> None:
+def record_bytes(record: McapRecord) -> bytes:
+    """Return a record as it stands in a file."""
+    builder = RecordBuilder()
+    record.write(builder)
+    written: bytes = builder.end()
+    return written
+
+
+def message_indexes(entries: Entries) -> dict[int, bytes]:
+    """Return the message index records behind a chunk, by channel and in its order."""
+    return {
+        channel_id: _INDEX.pack(
+            Opcode.MESSAGE_INDEX, 2 + 4 + 8 * len(numbers), channel_id, 8 * len(numbers))
+        + struct.pack(f'<{len(numbers)}Q', *numbers)
+        for channel_id, numbers in sorted(entries.items()) if numbers}
+
+
+def time_span(entries: Entries) -> tuple[int, int]:
+    """Return the earliest and the latest stamp in the entries of a chunk; (0, 0) in none."""
+    times = [time for numbers in entries.values() for time in numbers[::2]]
+    return min(times, default=0), max(times, default=0)
+
+
+def sync_directory(directory: Path) -> None:
     """Bring the names in a directory to the disk, where the file system can and lets us."""
     with contextlib.suppress(OSError):
         descriptor = os.open(directory, os.O_RDONLY)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -39,6 +40,10 @@ _POLICY_NAMES = {
 }
 
 
+_INTEGER = re.compile(r'-?[0-9]+')
+_QOS_LINE = re.compile(r'(- | {2,})(\w+): *(\S*) *', re.ASCII)
+
+
 @dataclass(frozen=True)
 class RecordedTopic:
     """
@@ -65,32 +70,93 @@ class RecordedTopic:
                     f'qos of {self.name}: {key} = {value!r}: must be in [0, {len(names) - 1}]')
 
 
+@dataclass(frozen=True)
+class BagTopic:
+    """
+    What the bag metadata say of a topic.
+
+    name, type_name: as of RecordedTopic;  type_hash: 'RIHS01_...' or ''
+    profiles: what its publishers offer, each as the `qos` of a RecordedTopic
+    messages: how many there are;  encoding: of the messages
+    """
+
+    name: str
+    type_name: str
+    type_hash: str
+    profiles: Sequence[Mapping[str, Any]]
+    messages: int
+    encoding: str = 'cdr'
+
+
 def offered_qos_yaml(topic: RecordedTopic) -> str:
     """
     Return the `offered_qos_profiles` of a channel: a list of one profile, policies as integers.
 
     Names would do for jazzy; integers are what older releases read, and jazzy too.
     """
-    return '\n'.join(_qos_lines(topic, as_names=False))
+    return '\n'.join(_qos_lines(topic.qos, as_names=False))
+
+
+def parse_offered_qos(text: str) -> list[dict[str, Any]]:
+    """
+    Return the profiles of an `offered_qos_profiles`: the keys of DEFAULT_QOS, policies as in rmw.
+
+    Understands what rosbag2 and this package write, in block style, policies by number or name.
+    A policy that is missing or not understood is as in DEFAULT_QOS; a text that is no list of
+    profiles has none.
+    """
+    profiles: list[dict[str, Any]] = []
+    key = ''
+    for line in text.splitlines():
+        match = _QOS_LINE.fullmatch(line)
+        if match is None or not (profiles or match[1] == '- '):
+            return []
+        indent, name, word = match.groups()
+        if indent == '- ':
+            profiles.append({})
+        value: Any = {'': {}, 'true': True, 'false': False}.get(word, word)
+        if isinstance(value, str) and _INTEGER.fullmatch(value):
+            value = int(value)
+        nested = profiles[-1].get(key) if len(indent) > 2 else None
+        if isinstance(nested, dict):
+            nested[name] = value
+        else:
+            key = name
+            profiles[-1][key] = value
+    return [{key: _parsed_policy(key, profile.get(key)) for key in DEFAULT_QOS}
+            for profile in profiles]
+
+
+def _parsed_policy(key: str, value: Any) -> Any:
+    default, names = DEFAULT_QOS[key], _POLICY_NAMES.get(key)
+    if isinstance(default, Mapping):
+        parts = value if isinstance(value, Mapping) else {}
+        return value if all(isinstance(parts.get(part), int) for part in default) else default
+    if names is not None:
+        if value in names:
+            value = names.index(value)
+        known = type(value) is int and 0 <= value < len(names) and names[value] != 'unknown'
+        return value if known else default
+    return value if type(value) is type(default) else default
 
 
 def bag_metadata_yaml(
-    topics: Sequence[RecordedTopic],
-    type_hashes: Sequence[str],
-    counts: Sequence[int],
+    topics: Sequence[BagTopic],
     *,
     file_name: str,
     start_ns: int,
     end_ns: int,
+    former: str = '',
 ) -> str:
     """
     Return the `serialized_metadata` of the `rosbag2` record.
 
-    type_hashes, counts: one per topic, in their order
     file_name: without its directory
     start_ns, end_ns: earliest and latest stamp [ns since the epoch]; both 0 in an empty log
+    former: the metadata of the log that this one is made from, whose ROS distribution and custom
+        data stay
     """
-    total = sum(counts)
+    total = sum(topic.messages for topic in topics)
     lines = [
         f'version: {_METADATA_VERSION}',
         'storage_identifier: mcap',
@@ -101,16 +167,19 @@ def bag_metadata_yaml(
         f'message_count: {total}',
         'topics_with_message_count:' if topics else 'topics_with_message_count: []',
     ]
-    for topic, type_hash, count in zip(topics, type_hashes, counts, strict=True):
+    for topic in topics:
+        profiles = [line for profile in topic.profiles
+                    for line in _qos_lines(profile, as_names=True)]
         lines += [
             '  - topic_metadata:',
             f'      name: {_quoted(topic.name)}',
             f'      type: {_quoted(topic.type_name)}',
-            '      serialization_format: cdr',
-            '      offered_qos_profiles:',
-            *(f'        {line}' for line in _qos_lines(topic, as_names=True)),
-            f'      type_description_hash: {_quoted(type_hash)}',
-            f'    message_count: {count}',
+            '      serialization_format: '
+            + (topic.encoding if topic.encoding == 'cdr' else _quoted(topic.encoding)),
+            '      offered_qos_profiles:' if profiles else '      offered_qos_profiles: []',
+            *(f'        {line}' for line in profiles),
+            f'      type_description_hash: {_quoted(topic.type_hash)}',
+            f'    message_count: {topic.messages}',
         ]
     lines += [
         'compression_format: ""',
@@ -124,17 +193,24 @@ def bag_metadata_yaml(
         '    duration:',
         f'      nanoseconds: {end_ns - start_ns}',
         f'    message_count: {total}',
-        'custom_data: ~',
-        f'ros_distro: {_quoted(os.environ.get("ROS_DISTRO") or "jazzy")}',
+        _block(former, 'custom_data') or 'custom_data: ~',
+        _block(former, 'ros_distro')
+        or f'ros_distro: {_quoted(os.environ.get("ROS_DISTRO") or "jazzy")}',
     ]
     return '\n'.join(lines)
 
 
-def _qos_lines(topic: RecordedTopic, *, as_names: bool) -> list[str]:
-    """Return the one profile of a topic as a YAML list, line by line."""
+def _block(text: str, key: str) -> str:
+    """Return the lines of a key at the top of a YAML text, as they are."""
+    match = re.search(rf'^{key}:.*(?:\n[ \t].*)*', text, re.MULTILINE)
+    return match.group() if match else ''
+
+
+def _qos_lines(profile: Mapping[str, Any], *, as_names: bool) -> list[str]:
+    """Return a profile as a YAML list of one, line by line."""
     lines = []
     for key, default in DEFAULT_QOS.items():
-        value = topic.qos.get(key, default)
+        value = profile.get(key, default)
         if isinstance(default, Mapping):
             lines += [f'{key}:', f'  sec: {int(value["sec"])}', f'  nsec: {int(value["nsec"])}']
         elif isinstance(default, bool):
