@@ -194,7 +194,7 @@ class Simulator(Node):
         self._terminal.end()
         summary = self._stop_recording()
         if summary:
-            print(summary, flush=True)
+            self._terminal.tell(summary)
 
     def _finish(self) -> None:
         """The duration has passed: let the last messages arrive, then end the spin."""
