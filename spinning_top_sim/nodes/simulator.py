@@ -23,8 +23,9 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes import reports
+from spinning_top_sim.nodes.message_types import message_type
 from spinning_top_sim.nodes.pacing import DeadlineThread, SimulatedClock
-from spinning_top_sim.nodes.ros_parameters import ParameterChanges, declare, start_values
+from spinning_top_sim.nodes.ros_parameters import SPIN, ParameterChanges, declare, start_values
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -39,10 +40,13 @@ OPENING_NS = 60_000_000
 LISTENERS_PERIOD_NS = 50_000_000
 # One tick works at most this long before services and signals get their turn.
 TICK_BUDGET_S = 0.05
+# One ~/step works at most this long.
+STEP_BUDGET_S = 2.0
 # Samples later than this are not published any more.
 LATEST_NS = 500_000_000
 # A simulation further behind than this lets its clock slip: its real-time factor falls below 1.
 LONGEST_LAG_NS = 1_000_000_000
+NO_CLOCK = 'waiting for the first /clock (use_sim_time is set)'
 
 
 class Simulator(Node):
@@ -69,17 +73,24 @@ class Simulator(Node):
         self._factor = 0.0
         self._described: object = None          # the motion that `_regime` names
         self._regime = ''
-        if values['spin.lz'] is None:
-            values = {**values, 'spin.lz': self._simulation.lz}
+        # What a reset goes back to: an unset spin.lz is the cusp, wherever initial.theta is then.
+        start_spin = {name: values[name] for name in SPIN}
+        values = {**values, 'spin.lz': self._simulation.lz}
         declare(self, values)
-        self._start_values = values
-        self._changes = ParameterChanges(self, values, self._apply)
+        self._changes = ParameterChanges(self, values, start_spin, self._apply)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._qos: dict[str, QoSProfile] = {}
         self._outputs: dict[str, Publisher] = {}
         self._open_publishers()
         self._make_interface()
-        self._simulated_clock = SimulatedClock(self._followed_time(), values['time_scale'])
+        # Another node's /clock is followed; one that is our own cannot be.
+        self._follows = (self.get_parameter('use_sim_time').value
+                         and not journal.is_enabled('clock', self._values))
+        self._date = self.get_clock() if self._follows else Clock(clock_type=ClockType.SYSTEM_TIME)
+        self._simulated_clock = SimulatedClock(
+            (lambda: self._date.now().nanoseconds) if self._follows else time.monotonic_ns,
+            values['time_scale'])
+        self._begun = False
         self._paused = values['start_paused']
         self._listeners_due = 0
         self._last_tick = 0
@@ -98,13 +109,6 @@ class Simulator(Node):
     def _values(self) -> dict[str, Any]:
         return self._changes.values
 
-    def _followed_time(self) -> Any:
-        """Return ROS time where the node follows a /clock, else steady time."""
-        follows = self.get_parameter('use_sim_time').value
-        if follows and not journal.is_enabled('clock', self._values):
-            return lambda: self.get_clock().now().nanoseconds
-        return time.monotonic_ns
-
     def _open_publishers(self) -> None:
         """Have a publisher for each enabled stream, and for no other."""
         for stream in self._simulation.streams:
@@ -112,7 +116,7 @@ class Simulator(Node):
             there = stream.topic in self._outputs
             if wanted and not there:
                 self._outputs[stream.topic] = self._publisher(
-                    _message_type(stream.type_name), stream.topic)
+                    message_type(stream.type_name), stream.topic)
             elif there and not wanted:
                 stream.publish = None
                 self.destroy_publisher(self._outputs.pop(stream.topic))
@@ -148,27 +152,11 @@ class Simulator(Node):
     # ---------------------------------------------------------------------- start and stop
 
     def start(self) -> None:
-        """Let time run: simulated t = 0 is a point of the stamps' grid just ahead."""
-        records = self._values['record.enabled']
-        now = self.get_clock().now().nanoseconds
-        # The log's head tells the epoch, and takes a while to reach the disk.
-        epoch = _ceil_to(now + (OPENING_NS if records else 0), EPOCH_GRID_NS)
-        self._simulation.epoch_ns = epoch
-        if records:
-            try:
-                self._start_recording()
-            except Exception as error:      # whatever the disk has against it, the motion goes on
-                self._record_error = str(error)
-                self.get_logger().error(f'not recording: {error}')
+        """Let time run: simulated t = 0 is the next point of the stamps' grid."""
         gc.collect()
         gc.freeze()             # what there is now stays: no full collection in the middle of it
-        wait_ns = epoch - self.get_clock().now().nanoseconds
-        if 0 < wait_ns <= OPENING_NS + EPOCH_GRID_NS and self._clock_is_wall():
-            time.sleep(wait_ns / NANOSECONDS)
         with self._lock:
-            self._speed.read(0)
-            if not self._paused:
-                self._simulated_clock.start(0)
+            self._begin()
         tick_rate = self._values['tick_rate']
         if self._values['pacing'] == 'thread':
             self._pacer = DeadlineThread(self._tick_in_thread, tick_rate)
@@ -176,8 +164,28 @@ class Simulator(Node):
         else:
             self._tick_timer = self.create_timer(1.0 / tick_rate, self._tick, clock=self._steady)
 
-    def _clock_is_wall(self) -> bool:
-        return not self.get_parameter('use_sim_time').value
+    def _begin(self) -> bool:
+        """Fix the stamp of t = 0; False as long as the /clock that we follow says nothing."""
+        now = self._date.now().nanoseconds
+        if now == 0:
+            return False
+        records = self._values['record.enabled']
+        # The log's head tells the epoch, and takes a while to reach the disk.
+        epoch = _ceil_to(now + (OPENING_NS if records and not self._follows else 0), EPOCH_GRID_NS)
+        self._simulation.epoch_ns = epoch
+        if records:
+            try:
+                self._start_recording()
+            except Exception as error:      # whatever the disk has against it, the motion goes on
+                self._record_error = str(error)
+                self.get_logger().error(f'not recording: {error}')
+        if not self._follows:
+            time.sleep(max(0.0, (epoch - self._date.now().nanoseconds) / NANOSECONDS))
+        self._speed.read(0)
+        if not self._paused:
+            self._simulated_clock.start(0)
+        self._begun = True
+        return True
 
     def stop(self) -> None:
         """End the motion and close the recording; safe whatever state the context is in."""
@@ -186,7 +194,7 @@ class Simulator(Node):
         self._terminal.end()
         summary = self._stop_recording()
         if summary:
-            print(summary, flush=True)
+            self._terminal.tell(summary)
 
     def _finish(self) -> None:
         """The duration has passed: let the last messages arrive, then end the spin."""
@@ -208,6 +216,8 @@ class Simulator(Node):
     def _tick(self) -> None:
         """Send what is due."""
         with self._lock:
+            if not (self._begun or self._begin()):
+                return
             if self._paused or self._failure or self.finished.done():
                 return
             self._count_tick()
@@ -297,7 +307,7 @@ class Simulator(Node):
             simulation.command(l3, lz)
             self._counters.commands += 1
             at_ns = simulation.history[-1][0]
-            self._journal('command', at_ns, l3=l3, lz=lz)
+            self._journal('command', at_ns, simulation.now_ns, l3=l3, lz=lz)
             self._record(journal.COMMANDS, at_ns, journal.command(l3, lz))
 
     def _apply(self, values: dict[str, Any], changed: set[str]) -> None:
@@ -307,7 +317,8 @@ class Simulator(Node):
                 self._refuse_counted(values['spin.l3'], values['spin.lz'])
             rest = changed - {'spin.l3', 'spin.lz'}
             if rest:
-                self._journal('parameters', max(self._simulation.now_ns, 0),
+                now_ns = self._simulation.now_ns
+                self._journal('parameters', max(now_ns, 0), now_ns,
                               **{name: values[name] for name in sorted(rest)})
             # `self._changes` takes the values over only after this.
             before, self._changes.values = self._changes.values, values
@@ -354,7 +365,7 @@ class Simulator(Node):
             elif not request.data and self._paused:
                 self._paused = False
                 self._last_tick = 0
-                if not self._failure:
+                if self._begun and not self._failure:
                     self._simulated_clock.start(max(self._simulation.now_ns, 0))
             response.success = True
             state = 'paused' if self._paused else 'running'
@@ -370,48 +381,71 @@ class Simulator(Node):
                 response.success = False
                 response.message = 'running: ~/step works while paused (~/set_pause true)'
                 return response
+            if not self._begun:
+                response.success, response.message = False, NO_CLOCK
+                return response
             self._look_for_listeners()
             count, dt = self._values['step.count'], self._values['step.dt']
             target = max(self._simulation.now_ns, 0) + count * round(dt * NANOSECONDS)
+            arrived = False
+            stop_at = time.monotonic() + STEP_BUDGET_S
+            recorder = self._recorder
+
+            def give_way() -> bool:
+                if recorder is not None and not recorder.room:
+                    recorder.wait_for_room(0.1)
+                return time.monotonic() > stop_at or not self.context.ok()
+
             try:
-                self._simulation.advance(target)
+                arrived = self._simulation.advance(target, give_way=give_way)
             except IntegrationError as error:
                 self._fail(str(error))
             self._simulated_clock.start(max(self._simulation.now_ns, 0))
             self._simulated_clock.stop()
-            response.success = self._failure is None
+            response.success = arrived
             response.message = self._failure or f'at t = {self._seconds():.9g} s'
+            if not arrived and self._failure is None:
+                response.message += (f': after {STEP_BUDGET_S:g} s of computing there are '
+                                     f'{(target - self._simulation.now_ns) / NANOSECONDS:.9g} s '
+                                     'left; others want to be served too')
         return response
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Any:
         with self._lock:
+            if not self._begun:
+                response.success, response.message = False, NO_CLOCK
+                return response
             simulation = self._simulation
             # Back to the spin it was started with, whatever was commanded since.
-            values = {**self._values, 'spin.l3': self._start_values['spin.l3'],
-                      'spin.lz': self._start_values['spin.lz']}
-            last_stamp = simulation.epoch_ns + simulation.now_ns
+            values = {**self._values, **self._changes.start_spin}
+            sent_ns = simulation.now_ns
+            last_stamp = simulation.epoch_ns + sent_ns
             try:
                 simulation.restart(values)
             except (ValueError, RuntimeError) as error:
                 response.success = False
                 response.message = f'not reset: {error}'
                 return response
-            now = self.get_clock().now().nanoseconds
+            now = self._date.now().nanoseconds
             simulation.epoch_ns = _ceil_to(max(last_stamp + 1, now), EPOCH_GRID_NS)
             self._failure = None
             self._simulated_clock.start(0)
             if self._paused:
                 self._simulated_clock.stop()
             self._speed.read(0)
-            self._journal('reset', 0, epoch_ns=simulation.epoch_ns, parameters=values)
+            self._journal('reset', 0, sent_ns, epoch_ns=simulation.epoch_ns,
+                          parameters=values)
             response.success = True
             response.message = f'at t = 0, stamps go on from {simulation.epoch_ns} ns'
-        self._changes.follow(spin__l3=values['spin.l3'], spin__lz=values['spin.lz'])
+            l3, lz = simulation.l3, simulation.lz
+        self._changes.follow(spin__l3=l3, spin__lz=lz)
         return response
 
     def _on_record(self, request: SetBool.Request, response: SetBool.Response) -> Any:
         try:
             if request.data:
+                if not self._begun:
+                    raise RuntimeError(NO_CLOCK)
                 response.message = self._start_recording()
             else:
                 response.message = self._stop_recording() or 'not recording'
@@ -449,7 +483,7 @@ class Simulator(Node):
             self._journal_topics = {name: len(streams) + i
                                     for i, (name, _) in enumerate(journal.TOPICS)}
             self._recorder, self._record_error = recorder, None
-            self._journal('start', max(simulation.now_ns, 0))
+            self._journal('start', max(simulation.now_ns, 0), simulation.now_ns)
             return f'recording to {recorder.path}'
 
     def _log_metadata(self) -> dict[str, str]:
@@ -480,9 +514,9 @@ class Simulator(Node):
             self._recorder.write(self._journal_topics[topic],
                                  self._simulation.epoch_ns + at_ns, data)
 
-    def _journal(self, event: str, at_ns: int, **details: Any) -> None:
+    def _journal(self, event: str, at_ns: int, sent_ns: int, **details: Any) -> None:
         """Log what happened to the motion, so that it can be computed again."""
-        self._record(journal.EVENTS, at_ns, journal.event(event, at_ns, **details))
+        self._record(journal.EVENTS, at_ns, journal.event(event, at_ns, sent_ns, **details))
 
     def _check_recorder(self) -> None:
         recorder = self._recorder
@@ -574,14 +608,6 @@ class Simulator(Node):
             if description is not None:
                 self._terminal.tell(str(description))
         return self._regime
-
-
-def _message_type(type_name: str) -> type:
-    """Import the Python class of a message type when a stream of it is enabled."""
-    import importlib  # noqa: PLC0415
-
-    package, _, name = type_name.split('/')
-    return getattr(importlib.import_module(f'{package}.msg'), name)
 
 
 def _rosbag2_qos(qos: QoSProfile) -> dict[str, Any]:

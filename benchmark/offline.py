@@ -1,0 +1,144 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""
+How fast `simulate` goes from the exact solution to a file, beside writers that only write.
+
+    python benchmark/offline.py             # ratios, a few seconds a round
+    python benchmark/offline.py --hour      # also one hour at 1 kHz: 10.8 million messages
+
+Three streams at 1 kHz: pose, joint_states, imu/data_raw, zstd.  The other writers are handed the
+very messages that we compute, as ready-made bytes: mcap's own `Writer.add_message`, and rosbags'.
+All take turns in one process; what is reported are medians, and ratios within a round.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagsWriter
+from rosbags.typesys import Stores, get_typestore
+
+from spinning_top_sim.tools.simulate import main as simulate
+
+STREAMS = ('pose', 'joint_states', 'imu')
+PARAMETERS = [argument for name, value in (
+    ('solver.method', 'exact'), ('record.streams', '[pose, joint_states, imu]'),
+    ('ground_truth_imu.enabled', 'false'), ('ground_truth_odom.enabled', 'false'),
+    ('invariants.enabled', 'false'), *((f'{stream}.rate', '1000.0') for stream in STREAMS),
+) for argument in ('-p', f'{name}:={value}')]
+# imu/data_raw comes with the truth of its bias on a topic of its own.
+TOPICS = ('/pose', '/joint_states', '/imu/data_raw')
+
+
+def run_ours(path: Path, seconds: float) -> None:
+    """Simulate into `path`."""
+    if simulate(['-o', str(path), '--duration', str(seconds), '--quiet', *PARAMETERS]):
+        raise SystemExit('simulate failed')
+
+
+def ready_made(path: Path) -> list[tuple[str, str, int, bytes]]:
+    """Return topic, type, stamp and bytes of every message of a log of ours."""
+    with open(path, 'rb') as file:
+        return [(channel.topic, schema.name, message.log_time, message.data)
+                for schema, channel, message in make_reader(file).iter_messages()
+                if channel.topic.startswith(TOPICS) or 'bias' in channel.topic]
+
+
+def write_with_mcap(path: Path, messages: list[tuple[str, str, int, bytes]]) -> None:
+    """Write them in a loop of `Writer.add_message`."""
+    with open(path, 'wb') as file:
+        writer = Writer(file, compression=CompressionType.ZSTD)
+        writer.start(profile='ros2', library='benchmark')
+        channels = {}
+        for topic, type_name, _, _ in messages[:100]:
+            if topic not in channels:
+                schema = writer.register_schema(type_name, 'ros2msg', b'')
+                channels[topic] = writer.register_channel(topic, 'cdr', schema)
+        for topic, _, stamp, data in messages:
+            writer.add_message(channels[topic], stamp, data, stamp)
+        writer.finish()
+
+
+def write_with_rosbags(path: Path, messages: list[tuple[str, str, int, bytes]]) -> None:
+    """Write them with rosbags' MCAP writer."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with RosbagsWriter(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections = {}
+        for topic, type_name, stamp, data in messages:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, type_name, typestore=store)
+            writer.write(connections[topic], stamp, data)
+
+
+def timed(function, *arguments) -> float:
+    start = time.perf_counter()
+    function(*arguments)
+    return time.perf_counter() - start
+
+
+def rounds(folder: Path, seconds: float, count: int) -> None:
+    """Let all take turns; print medians and ratios."""
+    first = folder / 'first.mcap'
+    run_ours(first, seconds)
+    messages = ready_made(first)
+    times: dict[str, list[float]] = {'simulate': [], 'mcap add_message': [], 'rosbags': []}
+    for turn in range(count):
+        times['simulate'].append(timed(run_ours, folder / f'ours{turn}.mcap', seconds))
+        times['mcap add_message'].append(
+            timed(write_with_mcap, folder / f'mcap{turn}.mcap', messages))
+        times['rosbags'].append(timed(write_with_rosbags, folder / f'bag{turn}', messages))
+    print(f'{len(messages)} messages a run, {count} rounds in turns')
+    print(f'{"":18}{"messages/s":>12}{"ratio to ours":>16}')
+    for name, taken in times.items():
+        ratio = statistics.median(other / ours for other, ours in
+                                  zip(taken, times['simulate'], strict=True))
+        print(f'{name:18}{len(messages) / statistics.median(taken):12,.0f}{ratio:16.2f}')
+
+
+def one_hour(folder: Path, seconds: float) -> None:
+    """Run it in a process of its own; print rate and peak memory."""
+    start = time.perf_counter()
+    subprocess.run([sys.executable, '-m', 'spinning_top_sim.tools.simulate', '-o',
+                    str(folder / 'hour.mcap'), '--duration', str(seconds), '--quiet',
+                    *PARAMETERS], check=True, timeout=3600)
+    taken = time.perf_counter() - start
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e3
+    with open(folder / 'hour.mcap', 'rb') as file:
+        statistics_record = make_reader(file).get_summary().statistics
+    count = statistics_record.message_count
+    size = (folder / 'hour.mcap').stat().st_size
+    print(f'{seconds:g} s simulated: {count} messages in {taken:.1f} s from start to exit: '
+          f'{count / taken:,.0f} messages/s, {size / 1e6:.0f} MB, peak memory {peak:.0f} MB')
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('--seconds', type=float, default=60.0, help='simulated, a round')
+    parser.add_argument('--rounds', type=int, default=5)
+    parser.add_argument('--hour', action='store_true', help='also an hour, and its memory')
+    arguments = parser.parse_args()
+    print(f'{platform.machine()}, Python {platform.python_version()}, numpy '
+          f'{version("numpy")}, mcap {version("mcap")}, rosbags {version("rosbags")}')
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        rounds(folder, arguments.seconds, arguments.rounds)
+        if arguments.hour:
+            for seconds in (60.0, 600.0, 3600.0):
+                one_hour(folder, seconds)
+                (folder / 'hour.mcap').unlink()
+
+
+if __name__ == '__main__':
+    main()

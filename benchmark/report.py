@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every generated table begins with, and how its rows are written."""
+
+from __future__ import annotations
+
+import datetime
+import importlib.metadata
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from cases import ROOT
+
+PACKAGES = ('numpy', 'scipy', 'heyoka', 'mujoco', 'jax', 'diffrax', 'matplotlib')
+
+
+def preamble(title: str) -> str:
+    """Return the heading: which command wrote this, when, with what, on what."""
+    command = ' '.join(['python', os.path.relpath(sys.argv[0], ROOT), *sys.argv[1:]])
+    now = datetime.datetime.now(datetime.UTC).strftime('%Y-%m-%d %H:%M UTC')
+    return (f'# {title}\n\nWritten by `{command}` on {now}, commit {_commit()}: do not edit.\n\n'
+            f'{_processor()}, {os.cpu_count()} cores, {platform.system()}; '
+            f'Python {platform.python_version()}, {versions()}.\n')
+
+
+def versions() -> str:
+    """Return the versions of the libraries, the absent ones as such."""
+    found = []
+    for name in PACKAGES:
+        try:
+            found.append(f'{name} {importlib.metadata.version(name)}')
+        except importlib.metadata.PackageNotFoundError:
+            found.append(f'{name} absent')
+    return ', '.join(found)
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    lines = [heads, ['---'] * len(heads), *rows]
+    return '\n'.join('| ' + ' | '.join(line) + ' |' for line in lines) + '\n'
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """Return a number in few digits, or a dash where there is none."""
+    return '–' if value is None else f'{value:.{digits}g}'
+
+
+def write(name: str, text: str) -> None:
+    """Write docs/<name> and say so."""
+    path = ROOT / 'docs' / name
+    path.write_text(text)
+    print(f'wrote {path.relative_to(ROOT)}')
+
+
+def _commit() -> str:
+    run = subprocess.run(['git', 'describe', '--always', '--dirty'], cwd=ROOT,
+                         capture_output=True, text=True, check=False)
+    return run.stdout.strip() or 'unknown'
+
+
+def _processor() -> str:
+    cpuinfo = Path('/proc/cpuinfo')
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith('model name'):
+                return line.split(':', 1)[1].strip()
+    return platform.processor() or 'unknown processor'

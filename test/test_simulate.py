@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The offline simulation: files, refusals, and the same bytes as the node's own pipeline."""
+
+import csv
+import json
+import resource
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from reference import ROOT, SCENES, scene_parameters
+from rosbags.highlevel import AnyReader
+
+from spinning_top_sim import solve
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.tools.simulate import main
+
+EVERYTHING = ['-p', 'imu_data.enabled:=true', '-p', 'clock.enabled:=true',
+              '-p', 'imu.gyroscope_noise_density:=0.001', '-p', 'imu.lever_arm:=[0.1, 0.0, 0.2]',
+              '-p', 'imu.accelerometer_random_walk:=0.01', '-p', 'imu.rpy:=[0.1, 0.2, 0.3]']
+
+
+def simulate(path, *arguments):
+    assert main(['-o', str(path), '--quiet', *map(str, arguments)]) == 0
+    return path
+
+
+def read(path):
+    """Return the bytes of each message by topic and simulated time, and our metadata."""
+    with open(path, 'rb') as file:
+        reader = make_reader(file)
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+        epoch = int(metadata['spinning_top_sim']['epoch_ns'])
+        found = {}
+        for _, channel, message in reader.iter_messages():
+            assert message.log_time == message.publish_time
+            found.setdefault(channel.topic, {})[message.log_time - epoch] = message.data
+    return found, metadata['spinning_top_sim']
+
+
+def in_memory(values, commands, duration_ns):
+    """Return the same from the pipeline as the node drives it: tick by tick, bytes to a sink."""
+    simulation = Simulation(parameters.checked(values))
+    found = {}
+    for stream in simulation.streams:
+        if values.get(f'{stream.parameter}.enabled',
+                      parameters.BY_NAME[f'{stream.parameter}.enabled'].default):
+            name = stream.topic.replace('~', 'spinning_top')
+            topic = name if name.startswith('/') else f'/{name}'
+            stream.record = found.setdefault(topic, {}).__setitem__
+    rng = np.random.default_rng(1)
+    now = 0
+    for at_ns, l3, lz in (*commands, (duration_ns, None, None)):
+        while now < at_ns:
+            now = min(now + int(rng.integers(1, 20_000_000)), at_ns)
+            simulation.advance(now)
+        if l3 is not None:
+            simulation.command(l3, lz)
+    return found
+
+
+SCENE = {'spin.l3': 1.6, 'imu_data.enabled': True, 'clock.enabled': True,
+         'imu.gyroscope_noise_density': 0.001, 'imu.lever_arm': (0.1, 0.0, 0.2),
+         'imu.accelerometer_random_walk': 0.01, 'imu.rpy': (0.1, 0.2, 0.3)}
+COMMANDS = [(700_000_001, 2.0, 1.5), (1_234_567_890, -1.0, 0.5)]
+
+
+def without_stamp(topic, data):
+    has_header = any(name in topic for name in ('pose', 'joint', 'imu', 'odom', 'clock'))
+    return data[12:] if has_header else data
+
+
+def test_rk45_gives_the_bytes_of_the_live_pipeline(tmp_path):
+    """However ticks fall, with commands at odd times, noise, a lever arm and every stream."""
+    log, metadata = read(simulate(
+        tmp_path / 'run.mcap', '--duration', 2, *EVERYTHING,
+        '--command', '1.23456789:-1.0:0.5', '--command', '0.700000001:2.0:1.5'))
+    assert metadata['evaluation'] == 'one state at a time'
+    live = in_memory(SCENE, COMMANDS, 2_000_000_000)
+    assert set(live) == set(log) - {'/spinning_top/commands', '/spinning_top/events'}
+    for topic, messages in live.items():
+        assert list(messages) == list(log[topic]), topic
+        for t, data in messages.items():
+            assert without_stamp(topic, data) == without_stamp(topic, log[topic][t])
+    assert list(log['/spinning_top/commands']) == [t for t, _, _ in COMMANDS]
+
+
+def numbers(topic, data):
+    """Return the doubles at the end of a message, or in the middle of joint states."""
+    end = len(data) - (4 if 'joint' in topic else 0)
+    count = 6 if 'joint' in topic else 4 if 'pose' in topic else 8 if 'inv' in topic else 37
+    if 'joint' in topic:                 # the sequence of velocities has a count and a gap
+        return np.concatenate((np.frombuffer(data[end - 56:end - 32], '<f8'),
+                               np.frombuffer(data[end - 24:end], '<f8')))
+    if 'odom' in topic or 'clock' in topic:
+        return np.zeros(0)
+    return np.frombuffer(data[len(data) - 8 * count:], '<f8')
+
+
+def test_columns_of_the_exact_solution_are_its_states(tmp_path):
+    log, metadata = read(simulate(
+        tmp_path / 'run.mcap', '--duration', 2, *EVERYTHING, '-p', 'solver.method:=exact',
+        '--command', '1.23456789:-1.0:0.5', '--command', '0.700000001:2.0:1.5'))
+    assert metadata['evaluation'] == 'columns'
+    live = in_memory({**SCENE, 'solver.method': 'exact'}, COMMANDS, 2_000_000_000)
+    worst = 0.0
+    for topic, messages in live.items():
+        assert sorted(messages) == sorted(log[topic]), topic
+        for t, data in messages.items():
+            ours, theirs = numbers(topic, log[topic][t]), numbers(topic, data)
+            # Relative to the vectors they are components of: g, or the fastest rate.
+            scale = np.maximum(1.0, np.abs(theirs).max(initial=0.0))
+            worst = max(worst, (np.abs(ours - theirs) / scale).max(initial=0.0))
+    assert worst < 5e-15
+
+
+def test_the_same_command_line_gives_the_same_file(tmp_path):
+    for method in ('rk45', 'exact'):
+        arguments = ('--duration', 3, '-p', f'solver.method:={method}', *EVERYTHING)
+        first = simulate(tmp_path / f'{method}1.mcap', *arguments)
+        second = simulate(tmp_path / f'{method}2.mcap', *arguments)
+        (a, _), (b, _) = read(first), read(second)
+        assert a == b
+        (c, _) = read(simulate(tmp_path / f'{method}3.mcap', *arguments, '--seed', 7))
+        assert c['/imu/data_raw'] != a['/imu/data_raw']
+        assert c['/pose'] == a['/pose']
+
+
+@pytest.mark.parametrize('scene', SCENES)
+def test_every_scene_is_read_by_rosbags_and_mcap_ros2_support(tmp_path, scene):
+    path = simulate(tmp_path / 'run.mcap', '--params', ROOT / 'config' / f'{scene}.yaml',
+                    '--duration', 1, '-p', 'solver.method:=exact', '--namespace', '/lab')
+    with open(path, 'rb') as file:
+        decoded = [(channel.topic, message.log_time, ros) for _, channel, message, ros in
+                   make_reader(
+                       file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()]
+    with AnyReader([path]) as reader:
+        other = [(connection.topic, stamp, reader.deserialize(data, connection.msgtype))
+                 for connection, stamp, data in reader.messages()]
+    assert len(decoded) == len(other) > 500
+    poses = [ros for topic, _, ros in decoded if topic == '/lab/pose']
+    also = [ros for topic, _, ros in other if topic == '/lab/pose']
+    assert len(poses) == 101
+    assert [p.pose.orientation.w for p in poses] == [p.pose.orientation.w for p in also]
+    values = parameters.checked(scene_parameters(scene))
+    truth = solve(parameters.top_of(values), parameters.start_state(values),
+                  np.arange(101) / 100.0)
+    assert [p.pose.orientation.w for p in poses] == pytest.approx(
+        truth.quaternion[:, 3], abs=1e-12)
+
+
+def test_a_table_of_the_truth(tmp_path):
+    path = simulate(tmp_path / 'truth.csv', '--duration', 2, '--command', '1:2.0:1.5')
+    with open(path, newline='') as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 201 and rows[100]['t [s]'] == '1.0'
+    l3 = [float(row['l3 [kg m^2/s]']) for row in rows]
+    assert l3[:101] == pytest.approx([1.6] * 101) and l3[101:] == pytest.approx([2.0] * 100)
+    exact = simulate(tmp_path / 'exact.csv', '--duration', 2, '--command', '1:2.0:1.5',
+                     '-p', 'solver.method:=exact')
+    table = np.loadtxt(path, delimiter=',', skiprows=1)
+    assert table == pytest.approx(np.loadtxt(exact, delimiter=',', skiprows=1), abs=1e-9)
+
+
+def test_parquet(tmp_path):
+    parquet = pytest.importorskip('pyarrow.parquet')
+    path = simulate(tmp_path / 'truth.parquet', '--duration', 1)
+    table = parquet.read_table(path)
+    assert table.num_rows == 101 and table.column_names[:2] == ['t', 'theta']
+
+
+@pytest.mark.parametrize(('arguments', 'message'), [
+    (['--duration', '0'], 'duration = 0.0 s'), ([], 'duration = 0.0 s'),
+    (['--duration', '1', '-p', 'top.lambda1:=-1'], 'top.lambda1 = -1'),
+    (['--duration', '1', '-p', 'spin.l3=2'], "'spin.l3=2'"),
+    (['--duration', '1', '--params', '/nowhere.yaml'], '/nowhere.yaml'),
+    (['--duration', '1', '--command', '1:2'], '--command 1:2'),
+    (['--duration', '1', '--command=-1:2:2'], '--command -1:2:2'),
+    (['--duration', '1', '-p', 'initial.theta:=0.0', '--command', '0.5:2.0:1.0'], 'at a pole'),
+    (['--duration', '1', '-p', 'initial.theta:=0.0', '-p', 'solver.equations:=euler'],
+     'transport'),
+    (['--duration', '1', '-o', '/nowhere/run.mcap'], '/nowhere'),
+])
+def test_what_cannot_be_simulated_is_told_in_a_line(tmp_path, capsys, arguments, message):
+    assert main(['-o', str(tmp_path / 'run.mcap'), '--quiet', *arguments]) == 1
+    error = capsys.readouterr().err
+    assert message in error and error.count('\n') == 1 and 'Traceback' not in error
+
+
+def test_a_params_file_that_is_no_yaml_or_of_another_node(tmp_path, capsys):
+    broken = tmp_path / 'broken.yaml'
+    for text, message in ((': : [', 'no YAML'), ('other:\n  ros__parameters:\n    a: 1\n',
+                                                 'no parameters for the node spinning_top')):
+        broken.write_text(text)
+        assert main(['-o', str(tmp_path / 'r.mcap'), '--params', str(broken), '--duration', '1',
+                     '--quiet']) == 1
+        assert message in capsys.readouterr().err
+
+
+def test_nothing_is_overwritten(tmp_path, capsys):
+    for name in ('run.mcap', 'run.csv'):
+        path = tmp_path / name
+        path.write_text('precious')
+        assert main(['-o', str(path), '--duration', '1', '--quiet']) == 1
+        assert path.read_text() == 'precious' and str(path) in capsys.readouterr().err
+
+
+def test_a_full_disk_leaves_a_readable_log(tmp_path):
+    path = tmp_path / 'run.mcap'
+
+    def small_files():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
+    run = subprocess.run(
+        [sys.executable, '-c', 'import signal, sys\nsignal.signal(signal.SIGXFSZ, signal.SIG_IGN)'
+         '\nfrom spinning_top_sim.tools.simulate import main\nsys.exit(main())',
+         '-o', path, '--duration', '200', '--quiet', '-p', 'solver.method:=exact'],
+        preexec_fn=small_files, capture_output=True, text=True, timeout=120, check=False)
+    assert run.returncode == 1 and 'Traceback' not in run.stderr
+    assert 'File too large' in run.stderr
+    found, _ = read(path)
+    assert len(found['/pose']) > 100
+
+
+def test_events_tell_the_run(tmp_path):
+    log, metadata = read(simulate(tmp_path / 'run.mcap', '--duration', 1,
+                                  '--command', '0.5:2.0:1.5'))
+    events = [json.loads(data[8:].rstrip(b'\0')) for data in log['/spinning_top/events'].values()]
+    assert [event['event'] for event in events] == ['start', 'command']
+    assert events[1] == {'event': 'command', 't_ns': 500_000_000, 'sent_ns': 500_000_000,
+                         'l3': 2.0, 'lz': 1.5}
+    assert json.loads(metadata['parameters'])['spin.l3'] == 1.6
+
+
+def test_rclpy_and_scipy_are_not_imported():
+    code = ('import sys\nfrom spinning_top_sim.tools.simulate import main\n'
+            'import tempfile, os\n'
+            'main(["-o", os.path.join(tempfile.mkdtemp(), "r.mcap"), "--duration", "1", '
+            '"--quiet"])\nprint(sorted({"rclpy", "scipy", "numpy"} & set(sys.modules)))')
+    run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                         timeout=60, check=True)
+    assert run.stdout.strip() == '[]'
