@@ -159,6 +159,8 @@ def meet(case: Case, name: str, setting: float) -> Outcome:
         return Outcome('NaN', seconds=seconds, work=runner.work)
     exact = case.exact.states_at_ns(ns)
     if name.startswith('exact'):
+        if reason := peer('heyoka quadratic').missing():
+            return Outcome(f'not judged: {reason}', work=runner.work, seconds=seconds)
         truth = long_attitudes(case, ns[::RATE])
         error = float(angles_between(samples.quaternion[::RATE], truth).max())
     else:

@@ -32,6 +32,7 @@ CASES = (*WORK_PRECISION, TOY_200)
 REFERENCE = ('SciPy DOP853', 1e-9)
 # Simulated time [s] and samples a second.
 SPANS = ((10, 512), (1000, 64))
+FEW = grid_ns(1, 1)
 # At how many instants the exact solution is held against long numbers.
 PROBES = 16
 # Long numbers are given so long [s]; where that does not do, the error stays unknown.
@@ -55,30 +56,37 @@ class Row:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument('--quick', action='store_true', help='10 s only, three rounds')
+    parser.add_argument('--only', type=int, choices=[span for span, _ in SPANS],
+                        help='simulated time [s]; default all')
     parser.add_argument('--output', type=Path, help='folder; default docs, quick: build/benchmark')
-    parser.add_argument('--longest', type=float, default=3.0,
+    parser.add_argument('--longest', type=float, default=4.0,
                         help='skip what takes longer than this for one run [s]')
     options = parser.parse_args()
     one_thread()
     folder = options.output or ROOT / ('build/benchmark' if options.quick else 'docs')
     folder.mkdir(parents=True, exist_ok=True)
     rounds = 3 if options.quick else 5
-    parts = [report.preamble('Work and precision'), INTRODUCTION.format(
-        reference=REFERENCE[0], tolerance=REFERENCE[1], longest=options.longest, bits=BITS,
-        rounds=rounds), _missing()]
     for duration, rate in SPANS[:1 if options.quick else 2]:
-        results = {}
-        for case in CASES:
-            begin = time.perf_counter()
-            results[case] = measure(case, duration, rate, rounds if duration == SPANS[0][0] else 1,
-                                    options.longest)
-            print(f'{duration} s of {case.title}: {time.perf_counter() - begin:.0f} s', flush=True)
-        for case, rows in results.items():
-            parts.append(_section(case, duration, rate, rows))
-        name = 'work_precision' + ('' if duration == SPANS[0][0] else f'_{duration}s') + '.png'
-        draw(results, duration, rate, folder / name)
-        (folder / 'work_precision.md').write_text('\n'.join(parts))
-        print(f'wrote {folder}/work_precision.md and {name}', flush=True)
+        if options.only in (None, duration):
+            compare(duration, rate, rounds if duration == SPANS[0][0] else 1, options.longest,
+                    folder)
+
+
+def compare(duration: int, rate: int, rounds: int, longest: float, folder: Path) -> None:
+    """Measure every case over one time span, and write its page and its figure."""
+    results = {}
+    for case in CASES:
+        begin = time.perf_counter()
+        results[case] = measure(case, duration, rate, rounds, longest)
+        print(f'{duration} s of {case.title}: {time.perf_counter() - begin:.0f} s', flush=True)
+    name = 'work_precision' + ('' if duration == SPANS[0][0] else f'_{duration}s')
+    page = [report.preamble(f'Work and precision over {duration} s'),
+            INTRODUCTION.format(reference=REFERENCE[0], tolerance=REFERENCE[1], longest=longest,
+                                bits=BITS, rounds=rounds), _missing()]
+    page += [_section(case, duration, rate, rows) for case, rows in results.items()]
+    draw(results, duration, rate, folder / f'{name}.png')
+    (folder / f'{name}.md').write_text('\n'.join(page))
+    print(f'wrote {name}.md and {name}.png in {folder}', flush=True)
 
 
 INTRODUCTION = """
@@ -86,10 +94,11 @@ Error: the largest rotation angle [rad] between an attitude and the true one, ov
 Truth: `method='exact'`, whose own error is measured at some of the instants against heyoka
 with {bits}-bit numbers.  Time: processor time of a whole call that returns all attitudes, divided
 by their number; what is done once before, a model's compilation or loading, is a column of its
-own (our exact solution prepares each motion anew, some milliseconds, and that is in its time).
-Ratio 1 is {reference} at {tolerance:g}.  Times over 10 s are medians of {rounds} interleaved
-rounds in one process; those over 1000 s are of one run, and a method whose run would take more
-than {longest:g} s is left out there and says so.  SciPy, heyoka Euler and `rk45 euler` solve the
+own, where a later setting may find in a cache what an earlier one compiled (our exact
+solution prepares each motion anew, some milliseconds, and that is in its time).
+Ratio 1 is {reference} at {tolerance:g}.  Times are medians over interleaved rounds in one
+process, {rounds} here; a method whose run would take more than {longest:g} s is left out and says
+so.  SciPy, heyoka Euler and `rk45 euler` solve the
 paper's equations (29)-(32); heyoka quadratic and diffrax solve the quaternion form without poles.
 MuJoCo's setting is its fixed step.
 
@@ -118,12 +127,11 @@ def measure(case: Case, duration: int, rate: int, rounds: int, longest: float) -
             row = Row(peer, setting)
             rows.append(row)
             try:
-                row.ready, runner = seconds_of(lambda p=peer, s=setting: p.ready(case, s))
+                row.ready, runner = seconds_of(lambda p=peer, s=setting: _ready(p, case, s, ns))
                 expected = _expected_seconds(runner, duration)
                 if expected > longest:
-                    row.failure = f'left out: about {expected:.0f} s a run'
+                    row.failure = f'left out: about {expected:.2g} s a run'
                     continue
-                runner.compile(ns)
                 with time_limit(2.0 * longest):
                     row.seconds, attitudes = seconds_of(lambda r=runner: r.attitudes(ns))
             except TimeUpError as problem:
@@ -145,6 +153,14 @@ def measure(case: Case, duration: int, rate: int, rounds: int, longest: float) -
         for row in rows:
             row.seconds = seconds.get(id(row), row.seconds)
     return rows
+
+
+def _ready(peer: Peer, case: Case, setting: float, ns: np.ndarray) -> Runner:
+    """Load and compile all that a run over ns needs; some compile at their first call only."""
+    runner = peer.ready(case, setting)
+    runner.attitudes(FEW)
+    runner.compile(ns)
+    return runner
 
 
 def _expected_seconds(runner: Runner, duration: int) -> float:
@@ -224,8 +240,8 @@ def draw(results: dict[Case, list[Row]], duration: int, rate: int, path: Path) -
                          {other.peer.name for other in rows if other.error is not None}})
         panel.set_title(case.title, fontsize=11)
         if absent:
-            panel.text(0.98, 0.98, 'fails, or takes too long:\n' + '\n'.join(absent), ha='right',
-                       transform=panel.transAxes, va='top', fontsize=8, color='#444444')
+            panel.text(0.98, 0.02, 'fails, or takes too long:\n' + '\n'.join(absent), ha='right',
+                       transform=panel.transAxes, va='bottom', fontsize=8, color='#444444')
         panel.set_xscale('log')
         panel.set_yscale('log')
         panel.grid(which='major', color='#DDDDDD', linewidth=0.6)

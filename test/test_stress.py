@@ -10,9 +10,11 @@ import math
 import os
 import re
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from random_tops import random_case
 from reference import scene_parameters
 from stress import (
     COLUMNS,
@@ -22,12 +24,14 @@ from stress import (
     check_block,
     natural_rate,
     report,
+    state_of,
     time_limit,
 )
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics.top import ContinuedState
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.propagator import ExactPropagator
 from spinning_top_sim.solvers.rk45 import rk45
 from spinning_top_sim.streams import parameters
@@ -303,3 +307,86 @@ def test_a_sleeping_top_takes_commands_of_its_pole_only():
         assert simulation.state().quaternion == before.quaternion
         simulation.command(2.0, 2.0)
         assert math.dist(simulation.state().quaternion, before.quaternion) < 1e-14
+
+
+# ------------------------------------------------------------------- symmetries of the steps
+
+def stepped_and_changed(seed, change):
+    """Return the quaternions of 2 nutations by rk45, and those of the changed top."""
+    case = random_case(seed)
+    period = ExactSolution(case.top, case.start).nutation_period
+    if period is None or case.start.theta in (0.0, math.pi):
+        return None
+    t = np.array([0.3, 1.1, 2.0]) * period
+    top, start, t_changed = change(case.top, case.start, t)
+    return (solve(case.top, case.start, t, method='rk45', rtol=1e-9),
+            solve(top, start, t_changed, method='rk45', rtol=1e-9))
+
+
+def heavier(top, start, t):
+    return (replace(top, lambda1=8.0 * top.lambda1, lambda3=8.0 * top.lambda3,
+                    mass=8.0 * top.mass),
+            replace(start, l3=8.0 * start.l3, lz=8.0 * start.lz), t)
+
+
+def faster(top, start, t):
+    return (replace(top, gravity=16.0 * top.gravity),
+            replace(start, theta_dot=4.0 * start.theta_dot, l3=4.0 * start.l3,
+                    lz=4.0 * start.lz), 0.25 * t)
+
+
+def mirrored(top, start, t):
+    return top, replace(start, phi=-start.phi, psi=-start.psi, l3=-start.l3, lz=-start.lz), t
+
+
+@pytest.mark.parametrize(('change', 'signs'), [
+    (heavier, (1.0, 1.0, 1.0, 1.0)), (faster, (1.0, 1.0, 1.0, 1.0)),
+    (mirrored, (-1.0, 1.0, -1.0, 1.0))])
+def test_steps_of_a_scaled_or_mirrored_top_are_the_same_to_the_last_bit(change, signs):
+    """Powers of 2 and signs do not round: so no absolute tolerance and no handedness hides."""
+    compared = 0
+    for seed in range(120):
+        pair = stepped_and_changed(seed, change)
+        if pair is None:
+            continue
+        one, other = pair
+        assert np.array_equal(one.quaternion, other.quaternion * signs), random_case(seed)
+        assert one.evaluations == other.evaluations
+        compared += 1
+    assert compared > 80
+
+
+@pytest.mark.parametrize('method', ['exact', 'rk45'])
+def test_a_motion_turned_upside_down_or_restarted_is_the_same(method):
+    """
+    Theta -> pi - theta, psi -> -psi, L3 -> -L3, P -> -P; and from any state on.
+
+    Both round the start, which grows as neighbours do: by a thousand at most where this is
+    tried, away from the separatrix (m1 > 1e-2).
+    """
+    bound, compared = {'exact': 1e-11, 'rk45': 1e-5}[method], 0
+    for seed in range(200):
+        case = random_case(seed)
+        top, start = case.top, case.start
+        solution = ExactSolution(top, start)
+        tilted = 1e-3 < start.theta < math.pi - 1e-3
+        if not solution.nutation_period or solution.m1 < 1e-2 or not tilted:
+            continue
+        t = np.array([0.3, 1.1, 2.0]) * solution.nutation_period
+        motion = solve(top, start, t, method=method, rtol=1e-9)
+        turned = replace(start, theta=math.pi - start.theta, theta_dot=-start.theta_dot,
+                         psi=-start.psi, l3=-start.l3)
+        other = solve(replace(top, com_distance=-top.com_distance), turned, t, method=method,
+                      rtol=1e-9)
+        x, y, z, w = other.quaternion.T         # theta and psi as above: alpha and beta change
+        assert np.abs(np.stack((-z, w, -x, y), -1) - motion.quaternion).max() <= bound, case
+        middle = state_of(case, motion, 1)
+        if middle is not None:
+            again = solve(top, middle, t[1:] - t[1], method=method, rtol=1e-9)
+            apart = [min(np.abs(p - q).max(), np.abs(p + q).max()) for p, q in zip(
+                again.quaternion, motion.quaternion[1:], strict=True)]
+            # The angles of the start are large numbers in some tops, and rounded.
+            rounded = math.ulp(abs(middle.phi) + abs(middle.psi))
+            assert max(apart) <= bound + rounded, case
+        compared += 1
+    assert compared > 50

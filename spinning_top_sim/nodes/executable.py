@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import sys
 from collections.abc import Callable
@@ -52,12 +53,15 @@ def run(name: str, argv: list[str],
 
 
 def _cannot_start(name: str, error: Exception) -> int:
-    print(f'{name}: cannot start: {error}', file=sys.stderr)
+    """Say why in one line, without the places in the sources of rcl; return the exit code."""
+    text = re.sub(r',\s*at \S+:\d+', '', str(error))
+    print(f'{name}: cannot start: {" ".join(text.split())}', file=sys.stderr)
     return 2
 
 
 def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode]) -> int:
     import rclpy  # noqa: PLC0415 - so that Ctrl-C while rclpy is imported ends quietly too
+    from rclpy.exceptions import ParameterException  # noqa: PLC0415
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor  # noqa: PLC0415
 
     try:
@@ -68,7 +72,7 @@ def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode]) -> i
     try:
         try:
             node = make_node()
-        except (ValueError, RuntimeError, OSError) as error:
+        except (ValueError, RuntimeError, OSError, ParameterException) as error:
             return _cannot_start(name, error) if rclpy.ok() else 0
         executor = SingleThreadedExecutor()
         executor.add_node(node)

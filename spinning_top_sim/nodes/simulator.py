@@ -25,9 +25,9 @@ from std_srvs.srv import SetBool, Trigger
 from spinning_top_sim.nodes import reports
 from spinning_top_sim.nodes.message_types import message_type
 from spinning_top_sim.nodes.pacing import DeadlineThread, SimulatedClock
-from spinning_top_sim.nodes.ros_parameters import ParameterChanges, declare, start_values
+from spinning_top_sim.nodes.ros_parameters import SPIN, ParameterChanges, declare, start_values
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.streams import journal, parameters
+from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import Simulation
 
@@ -40,6 +40,8 @@ OPENING_NS = 60_000_000
 LISTENERS_PERIOD_NS = 50_000_000
 # One tick works at most this long before services and signals get their turn.
 TICK_BUDGET_S = 0.05
+# One ~/step works at most this long.
+STEP_BUDGET_S = 2.0
 # Samples later than this are not published any more.
 LATEST_NS = 500_000_000
 # A simulation further behind than this lets its clock slip: its real-time factor falls below 1.
@@ -71,11 +73,11 @@ class Simulator(Node):
         self._factor = 0.0
         self._described: object = None          # the motion that `_regime` names
         self._regime = ''
-        # Where `~/reset` goes back to, whatever was commanded since; an unset lz stays unset.
-        self._start_spin = {name: values[name] for name in ('spin.l3', 'spin.lz')}
+        # What a reset goes back to: an unset spin.lz is the cusp, wherever initial.theta is then.
+        start_spin = {name: values[name] for name in SPIN}
         values = {**values, 'spin.lz': self._simulation.lz}
         declare(self, values)
-        self._changes = ParameterChanges(self, values, self._apply)
+        self._changes = ParameterChanges(self, values, start_spin, self._apply)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._qos: dict[str, QoSProfile] = {}
         self._outputs: dict[str, Publisher] = {}
@@ -192,7 +194,7 @@ class Simulator(Node):
         self._terminal.end()
         summary = self._stop_recording()
         if summary:
-            print(summary, flush=True)
+            self._terminal.tell(summary)
 
     def _finish(self) -> None:
         """The duration has passed: let the last messages arrive, then end the spin."""
@@ -305,18 +307,18 @@ class Simulator(Node):
             simulation.command(l3, lz)
             self._counters.commands += 1
             at_ns = simulation.history[-1][0]
-            self._journal('command', at_ns, l3=l3, lz=lz)
+            self._journal('command', at_ns, simulation.now_ns, l3=l3, lz=lz)
             self._record(journal.COMMANDS, at_ns, journal.command(l3, lz))
 
     def _apply(self, values: dict[str, Any], changed: set[str]) -> None:
         """Put a validated change of parameters into effect.  Raises ValueError to refuse."""
         with self._lock:
-            parameters.start_state({**values, **self._start_spin})
             if changed & {'spin.l3', 'spin.lz'}:
                 self._refuse_counted(values['spin.l3'], values['spin.lz'])
             rest = changed - {'spin.l3', 'spin.lz'}
             if rest:
-                self._journal('parameters', max(self._simulation.now_ns, 0),
+                now_ns = self._simulation.now_ns
+                self._journal('parameters', max(now_ns, 0), now_ns,
                               **{name: values[name] for name in sorted(rest)})
             # `self._changes` takes the values over only after this.
             before, self._changes.values = self._changes.values, values
@@ -385,14 +387,27 @@ class Simulator(Node):
             self._look_for_listeners()
             count, dt = self._values['step.count'], self._values['step.dt']
             target = max(self._simulation.now_ns, 0) + count * round(dt * NANOSECONDS)
+            arrived = False
+            stop_at = time.monotonic() + STEP_BUDGET_S
+            recorder = self._recorder
+
+            def give_way() -> bool:
+                if recorder is not None and not recorder.room:
+                    recorder.wait_for_room(0.1)
+                return time.monotonic() > stop_at or not self.context.ok()
+
             try:
-                self._simulation.advance(target)
+                arrived = self._simulation.advance(target, give_way=give_way)
             except IntegrationError as error:
                 self._fail(str(error))
             self._simulated_clock.start(max(self._simulation.now_ns, 0))
             self._simulated_clock.stop()
-            response.success = self._failure is None
+            response.success = arrived
             response.message = self._failure or f'at t = {self._seconds():.9g} s'
+            if not arrived and self._failure is None:
+                response.message += (f': after {STEP_BUDGET_S:g} s of computing there are '
+                                     f'{(target - self._simulation.now_ns) / NANOSECONDS:.9g} s '
+                                     'left; others want to be served too')
         return response
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Any:
@@ -401,8 +416,10 @@ class Simulator(Node):
                 response.success, response.message = False, NO_CLOCK
                 return response
             simulation = self._simulation
-            values = {**self._values, **self._start_spin}
-            last_stamp = simulation.epoch_ns + simulation.now_ns
+            # Back to the spin it was started with, whatever was commanded since.
+            values = {**self._values, **self._changes.start_spin}
+            sent_ns = simulation.now_ns
+            last_stamp = simulation.epoch_ns + sent_ns
             try:
                 simulation.restart(values)
             except (ValueError, RuntimeError) as error:
@@ -416,10 +433,12 @@ class Simulator(Node):
             if self._paused:
                 self._simulated_clock.stop()
             self._speed.read(0)
-            self._journal('reset', 0, epoch_ns=simulation.epoch_ns, parameters=values)
+            self._journal('reset', 0, sent_ns, epoch_ns=simulation.epoch_ns,
+                          parameters=values)
             response.success = True
             response.message = f'at t = 0, stamps go on from {simulation.epoch_ns} ns'
-        self._changes.follow(spin__l3=simulation.l3, spin__lz=simulation.lz)
+            l3, lz = simulation.l3, simulation.lz
+        self._changes.follow(spin__l3=l3, spin__lz=lz)
         return response
 
     def _on_record(self, request: SetBool.Request, response: SetBool.Response) -> Any:
@@ -464,7 +483,7 @@ class Simulator(Node):
             self._journal_topics = {name: len(streams) + i
                                     for i, (name, _) in enumerate(journal.TOPICS)}
             self._recorder, self._record_error = recorder, None
-            self._journal('start', max(simulation.now_ns, 0))
+            self._journal('start', max(simulation.now_ns, 0), simulation.now_ns)
             return f'recording to {recorder.path}'
 
     def _log_metadata(self) -> dict[str, str]:
@@ -495,9 +514,9 @@ class Simulator(Node):
             self._recorder.write(self._journal_topics[topic],
                                  self._simulation.epoch_ns + at_ns, data)
 
-    def _journal(self, event: str, at_ns: int, **details: Any) -> None:
+    def _journal(self, event: str, at_ns: int, sent_ns: int, **details: Any) -> None:
         """Log what happened to the motion, so that it can be computed again."""
-        self._record(journal.EVENTS, at_ns, journal.event(event, at_ns, **details))
+        self._record(journal.EVENTS, at_ns, journal.event(event, at_ns, sent_ns, **details))
 
     def _check_recorder(self) -> None:
         recorder = self._recorder

@@ -132,12 +132,12 @@ class LogReader:
 
     @property
     def profile(self) -> str:
-        """What the header says of the content, such as 'ros2'; '' where it cannot be read."""
+        """What the header says of the content; 'ros2' where it cannot be read."""
         return self._header.profile
 
     @property
     def library(self) -> str:
-        """What the header says of the program that wrote the file."""
+        """What the header says of the program that wrote the file; '' where it cannot be read."""
         return self._header.library
 
     @property
@@ -276,7 +276,7 @@ class LogReader:
             return header
         if magic != MCAP0_MAGIC:
             raise NotMcapError(f'cannot read {self.path}: it is no MCAP file')
-        return Header(profile='', library='')
+        return Header(profile='ros2', library='')
 
     @property
     def _declared(self) -> tuple[dict[int, Any], dict[int, Channel]]:
@@ -297,13 +297,10 @@ class LogReader:
         """Whether the summary does not lead to all messages, metadata and channels."""
         summary = self._summary
         statistics = summary.statistics
-        if summary.missing or statistics is None:
+        if statistics is None:
             return True
-        # Each index record is 15 bytes and 16 for every message.
-        indexed = sum((index.message_index_length - 15 * len(index.message_index_offsets)) // 16
-                      for index in summary.chunks)
         return (
-            indexed != statistics.message_count
+            not summary.all_in_chunks
             or len(summary.metadata) != statistics.metadata_count
             or len(summary.channels) != statistics.channel_count
             or any(channel.schema_id not in {0, *summary.schemas}
@@ -370,7 +367,4 @@ def _loose_messages(records: bytes) -> Iterator[StoredMessage]:
 
 def qos_profiles(channel: Channel) -> tuple[Mapping[str, Any], ...]:
     """Return what a channel says its publishers offer; nothing where that cannot be read."""
-    try:
-        return parse_offered_qos(channel.metadata.get('offered_qos_profiles', ''))
-    except ValueError:
-        return ()
+    return tuple(parse_offered_qos(channel.metadata.get('offered_qos_profiles', '')))

@@ -18,7 +18,6 @@ from spinning_top_sim.recording.reader import LogReader, qos_profiles
 from spinning_top_sim.recording.rosbag2 import BagTopic, bag_metadata_yaml
 from spinning_top_sim.recording.walk import BAG_METADATA, Piece, Walk
 
-_PROFILE = 'ros2'
 _COMPRESSION = 'zstd'  # of messages that were in no chunk
 
 
@@ -72,7 +71,7 @@ def _recover(
 ) -> Recovered:
     walk = reader.walk()
     file = IndexedFile(
-        draft, profile=reader.profile or _PROFILE, library=reader.library,
+        draft, profile=reader.profile, library=reader.library,
         compression=_COMPRESSION)
     with file.discarded_on_failure():
         copy = _Copy(reader, walk, file)
@@ -86,7 +85,7 @@ def _recover(
             raise NothingToSaveError(
                 f'nothing to save in {reader.path}: there is no whole message in it')
         bag = _bag_metadata(walk, file, output, copy.former_bag)
-        is_bag = (reader.profile or _PROFILE) == _PROFILE or copy.former_bag
+        is_bag = reader.profile == 'ros2' or copy.former_bag
         file.close(bag if is_bag else None)
         _publish(draft, output)
     progress(reader.size, reader.size)

@@ -18,6 +18,7 @@ How damage is met (MCAP specification, "Records", "Data section", "Summary secti
 from __future__ import annotations
 
 import contextlib
+import operator
 import os
 import re
 import stat
@@ -73,6 +74,7 @@ BLOCK = 1 << 20  # bytes read at a time where a record is not needed whole
 
 _ATTACHMENT_HEAD = 1 << 16  # more than anyone's name and media type
 _CHUNK_START = 64           # all of a chunk before its data
+_FEW_BYTES = 8              # wrong in a message index that is known for what it is
 _LONGEST_NAME = 1 << 12
 _LARGEST_DECLARATION = 1 << 24
 
@@ -107,6 +109,14 @@ class Summary:
     chunks: list[ChunkIndex] = field(default_factory=list)
     metadata: list[MetadataIndex] = field(default_factory=list)
     attachments: list[AttachmentIndex] = field(default_factory=list)
+
+    @property
+    def all_in_chunks(self) -> bool:
+        """Whether the chunk indexes lead to as many messages as the statistics count."""
+        # Each index record is 15 bytes and 16 for every message.
+        indexed = sum((index.message_index_length - 15 * len(index.message_index_offsets)) // 16
+                      for index in self.chunks)
+        return self.statistics is not None and indexed == self.statistics.message_count
 
 
 @dataclass(frozen=True)
@@ -283,6 +293,7 @@ class Walk:
         self.channels = dict(summary.channels)
 
         self._torn = not summary.ended
+        self._all_in_chunks = summary.all_in_chunks
         self._losses: list[Loss] = []
         self._defects: list[str] = []
         self._counts: dict[int, int] = {}       # whole messages by channel
@@ -303,28 +314,39 @@ class Walk:
             self._defects.append('the first eight bytes are not those of an MCAP file')
         self._crc = zlib.crc32(MCAP0_MAGIC)
         offset = MAGIC_SIZE
+        suspect: int | None = None  # where a damaged record was that only its length led beyond
         while offset < self._limit:
+            reason = ''
             head = self._reading.head(offset, self._limit)
-            if head is None:
-                offset = yield from self._resume(offset)
-                continue
-            opcode, length = head
-            if opcode == Opcode.DATA_END and length == DATA_END_SIZE - HEAD.size:
-                break
-            try:
-                piece = self._piece(offset, opcode, length)
-            except _DataIsOverError:
-                break
-            except Damaged as damage:
+            if head is not None:
+                opcode, length = head
                 following = offset + HEAD.size + length
-                if following != self._limit and self._reading.head(following, self._limit) is None:
-                    offset = yield from self._resume(offset, str(damage))
+                if opcode == Opcode.DATA_END and length == DATA_END_SIZE - HEAD.size:
+                    break
+                try:
+                    piece = self._piece(offset, opcode, length)
+                except _DataIsOverError:
+                    break
+                except Damaged as damage:
+                    reason = str(damage)
+                else:
+                    if piece is not None:
+                        yield piece
+                    offset, suspect = following, None
                     continue
-                self._leave_out(offset, opcode, length, str(damage))
-            else:
-                if piece is not None:
-                    yield piece
-            offset += HEAD.size + length
+            index_size = self._correct_index(offset)
+            if index_size:
+                offset += index_size
+                continue
+            if head is not None and suspect is None and self._may_begin(following):
+                self._lose(offset, following - offset, opcode, reason)
+                offset, suspect = following, offset
+                continue
+            # The length of the one before led to what is no record: it was wrong too.
+            start = offset if suspect is None else suspect
+            self._losses = [loss for loss in self._losses if loss.offset < start]
+            offset = yield from self._resume(start, reason)
+            suspect = None
         self._end(offset)
 
     def damage(self) -> Damage:
@@ -376,7 +398,7 @@ class Walk:
         if isinstance(record, Chunk):
             return self._chunk(offset, whole, record)
         if isinstance(record, MessageIndex):
-            self._message_index(offset, record)
+            self._message_index(offset, record, HEAD.pack(opcode, length) + content)
             return None
         self._no_more_indexes()
         if isinstance(record, Schema | Channel):
@@ -403,13 +425,12 @@ class Walk:
                 self._defects.append(f'the chunk at byte {offset} has wrong times in its head')
                 chunk = replace(chunk, message_start_time=start, message_end_time=end)
         self._add_to_crc(record_bytes(chunk))
-        known = [message for message in contents.messages if self._take(offset, message)]
-        foreign = len(contents.messages) - len(known)
-        contents.messages = known
-        return Piece(offset, length, chunk, contents, foreign)
+        return self._taken(Piece(offset, length, chunk, contents))
 
-    def _message(self, offset: int, content: bytes) -> Piece | None:
+    def _message(self, offset: int, content: bytes) -> Piece:
         message = parse_message(content)
+        if self._all_in_chunks or self._ours:
+            raise Damaged('all messages of the file are in chunks')
         following = offset + HEAD.size + len(content)
         after = self._reading.at(following, 1)
         # Nothing in a message proves its length but the record that follows.
@@ -417,9 +438,8 @@ class Walk:
             raise Damaged('no record follows it')
         self._no_more_indexes()
         self._add_to_crc(HEAD.pack(Opcode.MESSAGE, len(content)) + content)
-        if not self._take(offset, message):
-            return None
-        return Piece(offset, HEAD.size + len(content), None, ChunkContents(content, [], [message]))
+        return self._taken(Piece(
+            offset, HEAD.size + len(content), None, ChunkContents(content, [], [message])))
 
     def _attachment(self, offset: int, length: int) -> Piece:
         head = self._reading.at(offset + HEAD.size, min(length, _ATTACHMENT_HEAD))
@@ -435,7 +455,7 @@ class Walk:
             self._add_to_crc(block)
         return Piece(offset, HEAD.size + length, index)
 
-    def _message_index(self, offset: int, index: MessageIndex) -> None:
+    def _message_index(self, offset: int, index: MessageIndex, found: bytes) -> None:
         """Compare an index with its chunk; after a lost chunk, learn what that held."""
         number = len(index.records)
         if self._lost_chunk is not None:
@@ -443,25 +463,32 @@ class Walk:
             self._indexed_lost[index.channel_id] = (
                 self._indexed_lost.get(index.channel_id, 0) + number)
             return
-        found = record_bytes(index)
         expected = self._indexes.get(index.channel_id, b'')
         # The entries may be in any order, and a channel without messages may have an index.
-        if number and sorted(index.records) != sorted(
+        if number and found != expected and sorted(index.records) != sorted(
                 struct.iter_unpack('<QQ', expected[-16 * number:])):
-            self._correct_index(offset, len(found))
-            return
+            if self._correct_index(offset):
+                return
+            self._defects.append(f'the message index at byte {offset} is wrong')
         self._indexes.pop(index.channel_id, None)
         self._add_to_crc(found)
 
-    def _correct_index(self, offset: int, size: int) -> bool:
-        """Take what is there as the index of its size that should be; whether there is one."""
-        for channel_id, expected in self._indexes.items():
-            if len(expected) == size:
-                self._defects.append(f'the message index at byte {offset} is wrong')
-                self._add_to_crc(expected)
-                del self._indexes[channel_id]
-                return True
-        return False
+    def _correct_index(self, offset: int) -> int:
+        """Return the size of the index that should be there, if what is there resembles one."""
+        best, channel_id = _FEW_BYTES + 1, None
+        for number, expected in self._indexes.items():
+            found = self._reading.at(offset, len(expected))
+            wrong = sum(map(operator.ne, found, expected))
+            if found[:HEAD.size] == expected[:HEAD.size]:
+                wrong = min(wrong, _FEW_BYTES)
+            if len(found) == len(expected) and wrong < best:
+                best, channel_id = wrong, number
+        if channel_id is None:
+            return 0
+        self._defects.append(f'the message index at byte {offset} is wrong')
+        expected = self._indexes.pop(channel_id)
+        self._add_to_crc(expected)
+        return len(expected)
 
     def _no_more_indexes(self) -> None:
         """Note that a record is not about the chunk before it."""
@@ -487,30 +514,49 @@ class Walk:
         return channel is not None and (
             channel.schema_id == 0 or channel.schema_id in self.schemas)
 
-    def _take(self, offset: int, message: StoredMessage) -> bool:
-        """Count a whole message; return whether its channel is known."""
-        number = message.channel_id
-        if not self._knows(number):
-            loss = self._foreign.setdefault(number, Loss(
-                offset, 0, f'messages of channel {number}',
-                'the record of their channel or schema is lost', messages=0))
-            loss.bytes += message.end - message.start
-            loss.messages = (loss.messages or 0) + 1
-            return False
-        self._counts[number] = self._counts.get(number, 0) + 1
-        if not self._times:
-            self._times = [message.log_time, message.log_time]
-        elif message.log_time < self._times[0]:
-            self._times[0] = message.log_time
-        elif message.log_time > self._times[1]:
-            self._times[1] = message.log_time
+    def _taken(self, piece: Piece) -> Piece:
+        """Count the messages of a piece, and return it with those of known channels."""
+        contents = piece.contents
+        assert contents is not None
+        foreign = [number for number in contents.entries if not self._knows(number)]
+        if foreign:
+            known = []
+            for message in contents.messages:
+                if message.channel_id in foreign:
+                    self._leave_out_foreign(piece.offset, message)
+                else:
+                    known.append(message)
+            piece = replace(
+                piece, contents=ChunkContents(contents.plain, contents.declared, known),
+                foreign=len(contents.messages) - len(known))
+            return self._taken(piece)
+        for number, entries in contents.entries.items():
+            self._counts[number] = self._counts.get(number, 0) + len(entries) // 2
+        if contents.messages:
+            self._times += time_span(contents.entries)
+            self._times = [min(self._times), max(self._times)]
         if self._ours:
-            gap = (message.sequence - self._next_sequence.get(number, 0)) & 0xFFFFFFFF
+            self._count_gaps(contents.messages)
+        return piece
+
+    def _leave_out_foreign(self, offset: int, message: StoredMessage) -> None:
+        """Note a message that nothing tells how to understand."""
+        number = message.channel_id
+        loss = self._foreign.setdefault(number, Loss(
+            offset, 0, f'messages of channel {number}',
+            'the record of their channel or schema is lost', messages=0))
+        loss.bytes += message.end - message.start
+        loss.messages = (loss.messages or 0) + 1
+
+    def _count_gaps(self, messages: list[StoredMessage]) -> None:
+        """Count what is missing between messages that were numbered without gaps."""
+        following = self._next_sequence
+        for _, number, sequence, _, _, _ in messages:
+            gap = (sequence - following.get(number, 0)) & 0xFFFFFFFF
             if gap < 1 << 31:  # else it is out of order
                 if gap:
                     self._gaps[number] = self._gaps.get(number, 0) + gap
-                self._next_sequence[number] = message.sequence + 1
-        return True
+                following[number] = sequence + 1
 
     @property
     def _ours(self) -> bool:
@@ -521,12 +567,12 @@ class Walk:
         if self._crc is not None:
             self._crc = zlib.crc32(data, self._crc)
 
-    def _leave_out(self, offset: int, opcode: int, length: int, reason: str) -> None:
-        """Note a record that is damaged between two that can be read."""
-        whole = HEAD.size + length
-        if self._correct_index(offset, whole):
-            return
-        self._lose(offset, whole, opcode, reason)
+    def _may_begin(self, offset: int) -> bool:
+        """Return whether a record of the known kinds can begin there, or the end is reached."""
+        if offset == self._limit:
+            return True
+        head = self._reading.head(offset, self._limit)
+        return head is not None and head[0] <= Opcode.DATA_END
 
     def _lose(self, offset: int, size: int, opcode: int, reason: str) -> None:
         """Note that bytes are lost that begin where a record of this kind should."""
@@ -551,7 +597,7 @@ class Walk:
 
     def _resume(self, offset: int, reason: str = '') -> _Resuming:
         """Go on behind what cannot be read at all: yield what is found, return where to go on."""
-        first = self._reading.at(offset, 1)[0]
+        first = int.from_bytes(self._reading.at(offset, 1), 'little')
         following = self._limit
         found = False
         for place, proven in self._proven_after(offset):
@@ -644,7 +690,7 @@ class Walk:
         if isinstance(end, DataEnd):
             if self._crc is not None and end.data_section_crc not in (0, self._crc):
                 self._losses.append(Loss(
-                    0, 0, 'something outside of chunks',
+                    0, 0, 'something besides the messages',
                     'the checksum of the data section is wrong'))
         elif not self._torn:
             self._defects.append('the end of the data section is damaged')

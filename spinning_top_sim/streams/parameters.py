@@ -249,13 +249,6 @@ def checked(values: Mapping[str, Value]) -> dict[str, Value]:
 
     Raises ValueError naming the parameter, its value and what is allowed.
     """
-    result = checked_each(values)
-    start_state(result)
-    return result
-
-
-def checked_each(values: Mapping[str, Value]) -> dict[str, Value]:
-    """Return the same without asking whether there is a motion with all of them."""
     result = defaults()
     for name, value in values.items():
         if name not in BY_NAME:
@@ -267,6 +260,7 @@ def checked_each(values: Mapping[str, Value]) -> dict[str, Value]:
         names = ', '.join(row[0] for row in STREAM_DEFAULTS)
         raise ValueError(f'record.streams = {list(result["record.streams"])!r}: {unknown[0]!r} '
                          f'is no stream; must be all or some of {names}')
+    start_state(result)
     return result
 
 

@@ -1,7 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-The command line: arguments, progress, a report, an exit code.
-
-Here belongs what a terminal needs.  What never does: what a test or another program would call,
-and rclpy.
-"""
+"""The command line without ROS: simulate, and what is done with a log."""
