@@ -46,6 +46,8 @@ STEP_BUDGET_S = 2.0
 LATEST_NS = 500_000_000
 # A simulation further behind than this lets its clock slip: its real-time factor falls below 1.
 LONGEST_LAG_NS = 1_000_000_000
+# At the end of `duration` all subscribers together are waited for at most this long.
+ACKNOWLEDGED_S = 1.0
 NO_CLOCK = 'waiting for the first /clock (use_sim_time is set)'
 
 
@@ -198,9 +200,11 @@ class Simulator(Node):
 
     def _finish(self) -> None:
         """The duration has passed: let the last messages arrive, then end the spin."""
+        give_up = time.monotonic() + ACKNOWLEDGED_S
         for publisher in self._outputs.values():
             if publisher.get_subscription_count():
-                publisher.wait_for_all_acked(Duration(seconds=1))
+                left = max(0.0, give_up - time.monotonic())
+                publisher.wait_for_all_acked(Duration(nanoseconds=int(left * NANOSECONDS)))
         if not self.finished.done():
             self.finished.set_result(None)
 
