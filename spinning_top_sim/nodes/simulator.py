@@ -225,13 +225,18 @@ class Simulator(Node):
             if self._paused or self._failure or self.finished.done():
                 return
             self._count_tick()
-            target = self._simulated_clock.now()
-            duration = round(self._values['duration'] * NANOSECONDS)
-            if duration:
-                target = min(target, duration)
-            self._advance(target)
+            self._advance(self._due())
+            duration = self._duration_ns()
             if duration and self._simulation.now_ns >= duration:
                 self._finish()
+
+    def _duration_ns(self) -> int:
+        return round(self._values['duration'] * NANOSECONDS)
+
+    def _due(self) -> int:
+        """Return the simulated time to go to: that of the clock, not beyond the duration."""
+        now, duration = self._simulated_clock.now(), self._duration_ns()
+        return min(now, duration) if duration else now
 
     def _count_tick(self) -> None:
         now = time.monotonic_ns()
@@ -303,7 +308,7 @@ class Simulator(Node):
     def _command(self, l3: float, lz: float) -> None:
         with self._lock:
             if not self._paused and not self._failure:
-                self._advance(self._simulated_clock.now())
+                self._advance(self._due())
             if self._failure:
                 raise ValueError(f'l3 = {l3!r}, lz = {lz!r}: the motion stands still: '
                                  f'{self._failure}')
@@ -362,7 +367,7 @@ class Simulator(Node):
         with self._lock:
             if request.data and not self._paused:
                 self._simulated_clock.stop()
-                self._advance(self._simulated_clock.now())
+                self._advance(self._due())
                 self._simulated_clock.stop()
                 self._paused = True
             elif not request.data and self._paused:
