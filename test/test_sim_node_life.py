@@ -27,6 +27,7 @@ from node_logs import (
 )
 from sensor_msgs.msg import JointState
 
+from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 
@@ -283,3 +284,32 @@ def test_the_euler_form_at_a_pole_stands_still_and_says_why(peer, diagnostics, t
         assert_clean_end(node, node.end())
         peer.stop_listening(joints)
     assert 'leapt over a pole' in node.err
+
+
+SMALL_FILES = """
+import resource, runpy, signal
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, resource.RLIM_INFINITY))
+runpy.run_module('spinning_top_sim.nodes.sim_node', run_name='__main__')
+"""
+
+
+def test_a_full_disk_stops_the_recording_and_nothing_else(peer, diagnostics, tmp_path):
+    """A file may not grow beyond 300 kB: the write that would fails, as on a full disk."""
+    with SimNode(tmp_path, {'record.enabled': True, 'record.compression': 'none',
+                            'record.max_loss': 0.2, 'status_period': 0.2},
+                 program=('-c', SMALL_FILES)) as node:
+        status = diagnostics.wait_for(node, 'an error', lambda s: s.level == b'\x02')
+        assert 'File too large' in status.message
+        poses = peer.listen(node.topic('pose'), PoseStamped).wait(50)
+        again = peer.switch(node, 'record', True)
+        assert again.success, again.message
+        assert_clean_end(node, node.end())
+        peer.stop_listening(poses)
+    assert node.err.count('recording stopped') >= 1
+    logs = sorted(node.folder.glob('*.mcap'))
+    assert len(logs) == 2
+    with LogReader(logs[0]) as reader:      # there may have been no room for an index
+        stamps = [message.log_time for message in reader.messages([node.topic('pose')])]
+        assert not reader.damage.losses
+    assert len(stamps) > 20 and set(np.diff(stamps)) == {PERIODS_NS['pose']}
