@@ -20,6 +20,7 @@ from node_logs import (
     SECOND,
     TRACEBACK,
     assert_clean_end,
+    assert_received_from,
     by_parameters,
     decoded,
     log_of,
@@ -143,8 +144,7 @@ def test_however_it_is_ended_the_log_is_whole(peer, tmp_path, case):
     path = the_log(node.folder)
     log, _ = log_of(path)
     logged = [data for _, data in log[node.topic('pose')]]
-    first = logged.index(pose.raw[0])
-    assert logged[first:first + len(pose.raw)] == pose.raw
+    assert_received_from(pose.raw, logged)
     assert decoded(path)[node.topic('pose')] == len(logged)
     assert path.name in node.out, 'it says what it has recorded'
 
