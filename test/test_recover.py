@@ -395,6 +395,54 @@ def test_a_lost_chunk_is_told_in_numbers(tmp_path, log, has_summary):
     assert 'lost before: 12 messages' in out
 
 
+@pytest.mark.parametrize('has_summary', [True, False])
+def test_a_wrong_number_in_a_message_is_seen_by_the_checksum_alone(tmp_path, has_summary):
+    """Uncompressed: nothing else about the chunk is wrong."""
+    path = tmp_path / 'run.mcap'
+    messages = write_log(path, compression='none')
+    content = path.read_bytes()
+    chunks = [record for record in records_of(content) if record[0] == Opcode.CHUNK]
+    data = content.index(messages[MESSAGES_PER_CHUNK + 2][2])
+    assert chunks[1][1] < data < chunks[1][2]
+    path.write_bytes(flipped(content if has_summary else content[:chunks[2][2]], data + 9, 2))
+    with LogReader(path) as reader:
+        (loss,) = reader.damage.losses
+    assert (loss.offset, loss.reason) == (chunks[1][1], 'its checksum is wrong')
+    assert seen_by_us(path) == messages[:MESSAGES_PER_CHUNK] + messages[2 * MESSAGES_PER_CHUNK:]
+
+
+@pytest.mark.parametrize('has_summary', [True, False])
+def test_a_channel_does_not_become_a_message(tmp_path, log, has_summary):
+    """One bit makes it one, of a channel that exists."""
+    channel = [start for opcode, start, _ in log.records if opcode == Opcode.CHANNEL][1]
+    content = flipped(log.content, channel, 0)
+    assert content[channel] == Opcode.MESSAGE
+    path = tmp_path / 'run.mcap'
+    path.write_bytes(content if has_summary else content[:log.chunks[-1][2]])
+    known = [message for message in log.messages if has_summary or message[0] == '/top/point']
+    assert seen_by_us(path) == known
+    assert run(path, '-o', tmp_path / 'whole.mcap')[0] == SOME_LOST
+    assert seen_by_mcap(tmp_path / 'whole.mcap') == known
+
+
+def test_a_wild_length_that_seems_to_lead_to_a_record_takes_no_other_chunk(tmp_path):
+    """It leads to data in the next chunk that look like the head of metadata."""
+    path = tmp_path / 'run.mcap'
+    decoy = struct.pack('<BQ', Opcode.METADATA, 5) + bytes(40)
+    file = McapFile(path, TOPICS[1:2], {NUMBER: find_definition(NUMBER)}, {},
+                    library='spinning_top_sim 0', compression='none')
+    for number, data in enumerate((b'first', decoy, b'third')):
+        file.append(0, number, data)
+        file.write_chunk()
+    content = path.read_bytes()
+    file.finish()
+    lost = next(start for opcode, start, _ in records_of(path.read_bytes())
+                if opcode == Opcode.CHUNK)
+    length = content.index(decoy) - lost - 9
+    path.write_bytes(content[:lost + 1] + struct.pack('<Q', length) + content[lost + 9:])
+    assert [data for _, _, data in seen_by_us(path)] == [decoy, b'third']
+
+
 def test_gaps_in_our_numbers_tell_what_a_wild_length_took(tmp_path, log):
     """A chunk whose length is wrong takes its indexes with it, which would tell its messages."""
     _, start, _ = log.chunks[1]

@@ -230,7 +230,8 @@ def test_events_tell_the_run(tmp_path):
                                   '--command', '0.5:2.0:1.5'))
     events = [json.loads(data[8:].rstrip(b'\0')) for data in log['/spinning_top/events'].values()]
     assert [event['event'] for event in events] == ['start', 'command']
-    assert events[1] == {'event': 'command', 't_ns': 500_000_000, 'l3': 2.0, 'lz': 1.5}
+    assert events[1] == {'event': 'command', 't_ns': 500_000_000, 'sent_ns': 500_000_000,
+                         'l3': 2.0, 'lz': 1.5}
     assert json.loads(metadata['parameters'])['spin.l3'] == 1.6
 
 

@@ -29,7 +29,8 @@ Topics keep their recorded names, whatever the namespace of this node (`replay`)
 `--ros-args -r FROM:=TO` works on them. They are published with the recorded QoS, and
 `qos_overrides.<topic>.publisher.{history,depth,reliability}` override it. A topic whose type is
 not installed is named and left out. Messages go out in the order of their log times and with their
-recorded bytes: stamps inside them stay as they are, in every round of --loop.
+recorded bytes: stamps inside them stay as they are, in every round of --loop. What is late is sent
+at once; at high rates a greater depth keeps more of it for subscribers that cannot follow.
 
 while playing:
   ros2 service call /replay/set_pause std_srvs/srv/SetBool '{data: true}'

@@ -53,9 +53,6 @@ UNKNOWN = {
 # How long the last messages may take to reach those who listen: Fast DDS asks every 3 s whether
 # they have.
 LAST_WORD_S = 5.0
-# Messages that a reliable, volatile topic keeps to send again: rates above 1 and late messages
-# make bursts that the recorded publisher never had.  It changes nothing in who matches.
-LONGEST_BURST = 1000
 # How often subscribers are counted while waiting for them, and stops are looked for.
 LOOK_S = 0.02
 # A thread that wants to send gets Python's lock this soon from the one that reads ahead.
@@ -201,11 +198,7 @@ class Replayer(Node):
         for key in ('history', 'reliability', 'durability', 'liveliness'):
             if policies[key] in UNKNOWN[key]:
                 policies[key] = DEFAULT_QOS[key]
-        qos = QoSProfile(**{**policies, 'depth': policies['depth'] or DEFAULT_QOS['depth']})
-        if (qos.reliability, qos.durability) == (QoSReliabilityPolicy.RELIABLE,
-                                                 QoSDurabilityPolicy.VOLATILE):
-            qos.depth = max(qos.depth, LONGEST_BURST)
-        return qos
+        return QoSProfile(**{**policies, 'depth': policies['depth'] or DEFAULT_QOS['depth']})
 
     # ---------------------------------------------------------------------- start and stop
 

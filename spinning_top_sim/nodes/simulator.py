@@ -316,7 +316,7 @@ class Simulator(Node):
             simulation.command(l3, lz)
             self._counters.commands += 1
             at_ns = simulation.history[-1][0]
-            self._journal('command', at_ns, l3=l3, lz=lz)
+            self._journal('command', at_ns, simulation.now_ns, l3=l3, lz=lz)
             self._record(journal.COMMANDS, at_ns, journal.command(l3, lz))
 
     def _apply(self, values: dict[str, Any], changed: set[str]) -> None:
@@ -326,7 +326,8 @@ class Simulator(Node):
                 self._refuse_counted(values['spin.l3'], values['spin.lz'])
             rest = changed - {'spin.l3', 'spin.lz'}
             if rest:
-                self._journal('parameters', max(self._simulation.now_ns, 0),
+                now_ns = self._simulation.now_ns
+                self._journal('parameters', max(now_ns, 0), now_ns,
                               **{name: values[name] for name in sorted(rest)})
             # `self._changes` takes the values over only after this.
             before, self._changes.values = self._changes.values, values
@@ -426,7 +427,8 @@ class Simulator(Node):
             simulation = self._simulation
             # Back to the spin it was started with, whatever was commanded since.
             values = {**self._values, **self._changes.start_spin}
-            last_stamp = simulation.epoch_ns + simulation.now_ns
+            sent_ns = simulation.now_ns
+            last_stamp = simulation.epoch_ns + sent_ns
             try:
                 simulation.restart(values)
             except (ValueError, RuntimeError) as error:
@@ -440,7 +442,8 @@ class Simulator(Node):
             if self._paused:
                 self._simulated_clock.stop()
             self._speed.read(0)
-            self._journal('reset', 0, epoch_ns=simulation.epoch_ns, parameters=values)
+            self._journal('reset', 0, sent_ns, epoch_ns=simulation.epoch_ns,
+                          parameters=values)
             response.success = True
             response.message = f'at t = 0, stamps go on from {simulation.epoch_ns} ns'
             l3, lz = simulation.l3, simulation.lz
@@ -489,7 +492,7 @@ class Simulator(Node):
             self._journal_topics = {name: len(streams) + i
                                     for i, (name, _) in enumerate(journal.TOPICS)}
             self._recorder, self._record_error = recorder, None
-            self._journal('start', max(simulation.now_ns, 0))
+            self._journal('start', max(simulation.now_ns, 0), simulation.now_ns)
             return f'recording to {recorder.path}'
 
     def _log_metadata(self) -> dict[str, str]:
@@ -520,9 +523,9 @@ class Simulator(Node):
             self._recorder.write(self._journal_topics[topic],
                                  self._simulation.epoch_ns + at_ns, data)
 
-    def _journal(self, event: str, at_ns: int, **details: Any) -> None:
+    def _journal(self, event: str, at_ns: int, sent_ns: int, **details: Any) -> None:
         """Log what happened to the motion, so that it can be computed again."""
-        self._record(journal.EVENTS, at_ns, journal.event(event, at_ns, **details))
+        self._record(journal.EVENTS, at_ns, journal.event(event, at_ns, sent_ns, **details))
 
     def _check_recorder(self) -> None:
         recorder = self._recorder
