@@ -286,11 +286,12 @@ class Replay(SimNode):
     def __init__(self, folder, file, *options, arguments=()):
         super().__init__(folder, namespace='/', arguments=arguments, program=(
             '-m', 'spinning_top_sim.nodes.replay_node', str(file), *options))
-        self.name = '/replay'
+        self.name = f'{self.namespace}/replay'
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture
 def peer():
+    """Return a new one for each test: subscriptions of before would count as subscribers."""
     with Peer() as peer:
         yield peer
 
@@ -299,24 +300,17 @@ class Listening:
     """Subscriptions that know whether they have found a publisher."""
 
     def __init__(self, peer, topics):
-        self.topics, self._peer, self._matched = [], peer, {}
+        self.topics, self._matched = [], {}
         for name, kind in topics:
             topic = Topic(message_type(kind))
             matched = self._matched[name] = threading.Event()
-            topic.subscription = peer.node.create_subscription(
+            peer.node.create_subscription(
                 topic.kind, name, topic.receive,
                 QoSProfile(depth=20_000, reliability=ReliabilityPolicy.BEST_EFFORT
                            if name == BEST_EFFORT else ReliabilityPolicy.RELIABLE),
                 raw=True, event_callbacks=SubscriptionEventCallbacks(
                     matched=lambda info, matched=matched: matched.set()))
             self.topics.append(topic)
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        for topic in self.topics:
-            self._peer.stop_listening(topic)
 
     def wait_until_matched(self):
         for name, matched in self._matched.items():
@@ -337,9 +331,9 @@ def replaying(peer, folder, file, topics, *options, depth=5000, arguments=()):
     """
     kept = [argument for name, _ in topics if name not in (BEST_EFFORT, '/clock')
             for argument in ('-p', f'qos_overrides.{name}.publisher.depth:={depth}')]
-    with Listening(peer, topics) as heard, Replay(
-            folder, file, '--start-paused', '--wait-for-subscribers', str(len(topics)), *options,
-            arguments=(*kept, *arguments)) as node:
+    heard = Listening(peer, topics)
+    with Replay(folder, file, '--start-paused', '--wait-for-subscribers', str(len(topics)),
+                *options, arguments=(*kept, *arguments)) as node:
         heard.wait_until_matched()
         yield node, heard
 
@@ -399,8 +393,8 @@ def test_names_and_qos_can_be_changed_as_usual(peer, tmp_path, strangers_log):
     path, wanted = strangers_log
     raw, _ = play_all(
         peer, tmp_path, path, (('/elsewhere/vel', TWIST), ('/chatter', STRING)), '--rate', '10',
-        depth=30, arguments=('-r', '/robot/cmd_vel:=/elsewhere/vel', '-r', '__ns:=/any',
-                   '-p', 'qos_overrides./elsewhere/vel.publisher.reliability:=reliable'))
+        depth=30, arguments=('-r', '/robot/cmd_vel:=/elsewhere/vel',
+                             '-p', 'qos_overrides./elsewhere/vel.publisher.reliability:=reliable'))
     assert_same(raw, wanted[::-1])
 
 
@@ -561,8 +555,8 @@ def test_the_rate_is_a_parameter(peer, tmp_path):
     (signal.SIGINT, 1), (signal.SIGTERM, 1), (signal.SIGINT, 2)])
 def test_a_signal_ends_it_properly(peer, tmp_path, number, times):
     write_log(tmp_path / 'run.mcap', 100, step_ns=SECOND)
-    with Listening(peer, OURS) as heard, Replay(tmp_path, tmp_path / 'run.mcap', '--rate', '20',
-                                                '--clock') as node:
+    heard = Listening(peer, OURS)
+    with Replay(tmp_path, tmp_path / 'run.mcap', '--rate', '20', '--clock') as node:
         heard.topics[0].wait(2)
         assert node.end(number, times) == 0, node.err
         assert 'Traceback' not in node.err
