@@ -13,7 +13,7 @@ MAKEFLAGS += --no-builtin-rules
 .SUFFIXES:
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help run test dependencies lint build clean check-scene FORCE
+.PHONY: help run test stress benchmark docs dependencies lint build clean check-scene FORCE
 
 # DDS stays on this machine: by default it would ask the whole network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
@@ -42,6 +42,11 @@ help:
 	@echo '             SCENE=$(SCENE)  (of: $(SCENES))'
 	@echo '             ARGS=...  more arguments, such as ARGS="-p time_scale:=0.5 -r __ns:=/top"'
 	@echo 'make test    run the tests;  TESTS=... picks some, ARGS=... is for pytest'
+	@echo 'make stress  200 recording nodes killed (KILLS=...), then 100 000 random tops (STRESS=...)'
+	@echo '             through both solvers: an hour'
+	@echo 'make benchmark  accuracy, stability and cost beside other programs, into docs/ (an hour,'
+	@echo '             in an environment of its own, .venv-benchmark)'
+	@echo 'make docs    write the interface page and the pictures anew'
 	@echo 'make lint    ruff and mypy'
 	@echo 'make build   build with colcon in a temporary workspace and run what was installed'
 	@echo 'make clean   remove $(VENV) and caches; logs stay'
@@ -66,6 +71,34 @@ dependencies: $(VENV)/.deps-test $(VENV)/.package
 # `pytest`, not `python -m pytest`: what is tested is the installed package.
 test: dependencies
 	'$(VENV)/bin/pytest' $(TESTS) $(ARGS)
+
+STRESS ?= 100000
+KILLS ?= 200
+stress: dependencies
+	KILLS=$(KILLS) '$(VENV)/bin/pytest' -q test/test_kill.py
+	'$(VENV)/bin/python' test/stress.py $(STRESS)
+
+# Peers need hundreds of megabytes that the package does not: they have their own environment.
+benchmark: export OMP_NUM_THREADS ?= 1
+benchmark: export OPENBLAS_NUM_THREADS ?= 1
+benchmark:
+	@$(MAKE) --no-print-directory VENV=.venv-benchmark .venv-benchmark/.package \
+	    .venv-benchmark/.peers
+	.venv-benchmark/bin/python benchmark/heavy_top.py
+	.venv-benchmark/bin/python benchmark/exact_cost.py
+	.venv-benchmark/bin/python benchmark/offline.py --hour
+	.venv-benchmark/bin/python benchmark/gauge.py
+	.venv-benchmark/bin/python benchmark/stability.py
+	.venv-benchmark/bin/python benchmark/work_precision.py
+
+$(VENV)/.peers: benchmark/requirements.txt $(VENV)/.deps-test
+	@echo 'Installing into $(VENV) what the benchmarks compare with'
+	@$(PIP) -r benchmark/requirements.txt
+	@touch '$@'
+
+docs: $(VENV)/.deps-plot $(VENV)/.package
+	'$(VENV)/bin/python' docs/interface.py
+	'$(VENV)/bin/python' docs/figures.py
 
 lint: $(VENV)/.deps-test $(VENV)/.deps-lint $(VENV)/.package
 	'$(VENV)/bin/ruff' check . scripts/*

@@ -12,7 +12,10 @@ NAME = 'spinning_top_sim'
 # scripts/ too, installed there as data by pip and by colcon alike.
 EXECUTABLES = {
     'sim_node': 'spinning_top_sim.nodes.sim_node',
+    'replay_node': 'spinning_top_sim.nodes.replay_node',
     'simulate': 'spinning_top_sim.tools.simulate',
+    'recover': 'spinning_top_sim.tools.recover',
+    'inspect': 'spinning_top_sim.tools.inspect',
 }
 
 DATA_FILES = {
@@ -59,10 +62,10 @@ setup(
             'rosbags>=0.10.11,<0.12',
             'scipy>=1.11,<2',
         ],
-        # simulate: parameter files, a progress bar, Parquet
-        'tools': ['PyYAML>=6.0,<7', 'tqdm>=4.64,<5'],
+        # simulate: parameter files, a progress bar;  inspect: tables
+        'tools': ['PyYAML>=6.0,<7', 'rich>=12', 'tqdm>=4.64,<5'],
         'parquet': ['pyarrow>=14,<30'],
-        'plot': ['matplotlib>=3.6,<4'],     # docs/figures.py
+        'plot': ['matplotlib>=3.6,<4'],     # inspect --plot, docs/figures.py
         # Narrow: a new release of these finds new faults.
         'lint': [
             'mypy>=2.4.1,<2.5',

@@ -12,6 +12,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import fcntl
+import itertools
 import json
 import os
 import shutil
@@ -24,7 +25,7 @@ import time
 from pathlib import Path
 
 PATIENCE_S = 60.0           # for what takes a second on an idle machine
-LIFETIME_S = 170.0          # a node that is still there is killed
+LIFETIME_S = 300.0          # a node that is still there is killed
 DOMAINS = range(1, 101)
 
 
@@ -79,6 +80,10 @@ def wait_for(what, condition, timeout=PATIENCE_S):
     return result
 
 
+# Where the test process is itself killed, its nodes shall not live on.
+_DIE_WITH_PARENT = ['setpriv', '--pdeathsig', 'KILL'] if shutil.which('setpriv') else []
+
+
 class SimNode:
     """
     A sim_node in its own process group; ends with the `with` at the latest.
@@ -87,7 +92,11 @@ class SimNode:
     the module;  out, err: what it has printed.
     """
 
-    def __init__(self, folder, parameters=None, *, namespace='/', arguments=(), program=None):
+    _number = itertools.count(1)
+
+    def __init__(self, folder, parameters=None, *, namespace=None, arguments=(), program=None):
+        if namespace is None:
+            namespace = f'/top{next(self._number)}'     # tests share a domain, not names
         self.folder = Path(folder) / (namespace.strip('/') or 'root')
         self.folder.mkdir(parents=True, exist_ok=True)
         self.name = f'{namespace.rstrip("/")}/spinning_top'
@@ -95,8 +104,9 @@ class SimNode:
         options = [item for name, value in (parameters or {}).items()
                    for item in ('-p', f'{name}:={as_yaml(value)}')]
         self.command = [
-            sys.executable, *(program or ('-m', 'spinning_top_sim.nodes.sim_node')), '--ros-args',
-            '-r', f'__ns:={namespace}', *options, *arguments]
+            *_DIE_WITH_PARENT, sys.executable,
+            *(program or ('-m', 'spinning_top_sim.nodes.sim_node')),
+            '--ros-args', '-r', f'__ns:={namespace}', *options, *arguments]
         self.seconds_to_end = None
 
     def __enter__(self):
@@ -182,9 +192,11 @@ class Topic:
     def __init__(self, kind):
         self.kind = kind
         self.raw = []
+        self.muted = False
 
     def receive(self, data):
-        self.raw.append(data)
+        if not self.muted:
+            self.raw.append(data)
 
     def wait(self, count, timeout=PATIENCE_S):
         """Wait until so many have arrived in all."""
@@ -237,13 +249,14 @@ class Peer:
     def listen(self, name, kind, reliability=ReliabilityPolicy.RELIABLE):
         """Subscribe; the queue holds whatever may come."""
         topic = Topic(kind)
-        topic.subscription = self.node.create_subscription(
+        self.node.create_subscription(
             kind, name, topic.receive, QoSProfile(depth=20_000, reliability=reliability),
             raw=True)
         return topic
 
     def stop_listening(self, topic):
-        self.node.destroy_subscription(topic.subscription)
+        """Let what comes from now on go by; rclpy cannot destroy what its executor waits for."""
+        topic.muted = True
 
     def call(self, kind, name, request, timeout=PATIENCE_S):
         """Call a service and return its answer."""

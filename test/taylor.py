@@ -24,7 +24,8 @@ class Path:
     What many tops do: `samples` (tops, times, 7) of p (w, x, y, z) and L/lambda1, at `times`.
 
     share: of the radius of convergence, a step; e^-2 leaves e^-(2 * 24), below a long double
-    nudge: the start's relative error, in roundings of a long double
+    nudge: moves the start by so many roundings of a long double, of 1 in p, of its scale in L:
+    more than all roundings on the way do together, so that the distance shows their effect
     """
 
     def __init__(self, cases, times, share, nudge):
@@ -53,7 +54,10 @@ class Path:
             (outward * sine + across * cosine) / self.lambda1, self.lz / self.lambda1))
 
     def _run(self, share):
-        y = self._start() * (1 + self.nudge[:, None])
+        y = self._start()
+        scale = np.ones_like(y)
+        scale[4:] = np.maximum(np.abs(y[4:]).max(axis=0), np.sqrt(np.abs(self.fall)))
+        y += self.nudge[:, None] * scale
         count, n = self.times.shape
         out = np.empty((count, n, 7), LONG)
         t, following = np.zeros(count, LONG), np.zeros(count, int)

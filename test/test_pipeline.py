@@ -344,7 +344,7 @@ def test_a_refused_command_names_the_value_and_changes_nothing(l3, lz, named):
     taken = listen(simulation)
     simulation.advance(SECOND // 3)
     momenta = simulation.l3, simulation.lz
-    with pytest.raises(ValueError, match='must be finite|no motion from') as refusal:
+    with pytest.raises(ValueError, match=r'must be finite|no motion from') as refusal:
         simulation.command(l3, lz)
     assert named in str(refusal.value)
     simulation.advance(SECOND)

@@ -1,19 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The node as it runs: in a process of its own, over real DDS, seen from another process.
+What the running node publishes: over real DDS, seen from another process.
 
 Truths come from outside the code under test: differences of what was published, the field's
 formulas, readers of other people; or from the pipeline run in this process without ROS.
 """
 
-import importlib.metadata
-import json
 import math
-import os
 import signal
 import time
-from fractions import Fraction
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,190 +16,33 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from node_harness import (  # noqa: E402
-    LIFETIME_S,
-    PATIENCE_S,
-    Diagnostics,
-    Peer,
-    SimNode,
-    numbers,
-    wait_for,
+from node_harness import LIFETIME_S, SimNode
+from node_logs import (
+    GRAVITY,
+    KINDS,
+    PERIODS_NS,
+    SECOND,
+    about_x,
+    about_y,
+    about_z,
+    assert_clean_end,
+    assert_received_from,
+    assert_steps,
+    conjugate,
+    difference,
+    in_common,
+    log_of,
+    product,
+    simulated,
+    stamp_of,
+    stamps_of,
+    the_log,
+    turned,
+    xyz,
+    xyzw,
 )
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402, I001
-from geometry_msgs.msg import PoseStamped  # noqa: E402
-from mcap.reader import make_reader  # noqa: E402
-from mcap_ros2.decoder import DecoderFactory  # noqa: E402
-from nav_msgs.msg import Odometry  # noqa: E402
-from rclpy.qos import ReliabilityPolicy  # noqa: E402
-from rosbags.highlevel import AnyReader  # noqa: E402
-from rosgraph_msgs.msg import Clock  # noqa: E402
-from sensor_msgs.msg import Imu, JointState  # noqa: E402
-from std_msgs.msg import Float64MultiArray  # noqa: E402
 
-from spinning_top_sim.streams import parameters  # noqa: E402
-from spinning_top_sim.streams.pipeline import Simulation  # noqa: E402
-
-SECOND = 1_000_000_000
-KINDS = {'pose': PoseStamped, 'joint_states': JointState, 'imu/data_raw': Imu,
-         'ground_truth/imu': Imu, 'ground_truth/odom': Odometry, 'ground_truth/imu_bias': Imu}
-PERIODS_NS = {'pose': 10_000_000, 'joint_states': 10_000_000, 'imu/data_raw': 5_000_000,
-              'ground_truth/imu': 5_000_000, 'ground_truth/odom': 10_000_000,
-              'ground_truth/imu_bias': 5_000_000}
 WATCHED_S = 10
-GRAVITY = 9.80665
-STAMP = slice(4, 12)            # of a message that begins with a header, behind the encapsulation
-QUIET = {'status_period': 0.0}
-TRACEBACK = 'Traceback (most recent call last)'
-
-
-@pytest.fixture(scope='module')
-def peer():
-    with Peer() as peer:
-        yield peer
-
-
-@pytest.fixture(scope='module')
-def diagnostics(peer):
-    return Diagnostics(peer)
-
-
-# ------------------------------------------------------------------------------ small helpers
-
-def stamp_of(data):
-    """Return the stamp [ns] of a serialized message that begins with a header."""
-    sec = int.from_bytes(data[4:8], 'little', signed=True)
-    return sec * SECOND + int.from_bytes(data[8:12], 'little')
-
-
-def stamps_of(topic):
-    return np.array([stamp_of(data) for data in topic.raw])
-
-
-def xyzw(q):
-    return q.x, q.y, q.z, q.w
-
-
-def xyz(v):
-    return v.x, v.y, v.z
-
-
-def product(p, q):
-    """Return the Hamilton product of arrays of x, y, z, w."""
-    (a, b, c, d), (x, y, z, w) = np.moveaxis(p, -1, 0), np.moveaxis(q, -1, 0)
-    return np.stack([d * x + a * w + b * z - c * y, d * y - a * z + b * w + c * x,
-                     d * z + a * y - b * x + c * w, d * w - a * x - b * y - c * z], axis=-1)
-
-
-def conjugate(q):
-    return q * np.array([-1.0, -1.0, -1.0, 1.0])
-
-
-def turned(q, v):
-    """Return R(q) v for arrays of x, y, z, w and of vectors."""
-    pure = np.concatenate([v, np.zeros((*v.shape[:-1], 1))], axis=-1)
-    return product(product(q, pure), conjugate(q))[..., :3]
-
-
-def about_z(angle):
-    zero = np.zeros_like(angle)
-    return np.stack([zero, zero, np.sin(angle / 2), np.cos(angle / 2)], axis=-1)
-
-
-def about_y(angle):
-    zero = np.zeros_like(angle)
-    return np.stack([zero, np.sin(angle / 2), zero, np.cos(angle / 2)], axis=-1)
-
-
-def about_x(angle):
-    zero = np.zeros_like(angle)
-    return np.stack([np.sin(angle / 2), zero, zero, np.cos(angle / 2)], axis=-1)
-
-
-def central_weights(order, reach=5):
-    """Weights of the 10th-order central difference, from the conditions on polynomials."""
-    points = range(-reach, reach + 1)
-    rows = [[Fraction(p) ** power for p in points] for power in range(2 * reach + 1)]
-    for row, power in zip(rows, range(2 * reach + 1), strict=True):
-        row.append(Fraction(math.factorial(order) if power == order else 0))
-    for column in range(len(rows)):
-        pivot = next(r for r in range(column, len(rows)) if rows[r][column])
-        rows[column], rows[pivot] = rows[pivot], rows[column]
-        rows[column] = [value / rows[column][column] for value in rows[column]]
-        for other in range(len(rows)):
-            if other != column:
-                factor = rows[other][column]
-                rows[other] = [a - factor * b
-                               for a, b in zip(rows[other], rows[column], strict=True)]
-    return np.array([float(row[-1]) for row in rows])
-
-
-def difference(values, step, order=1):
-    """Return the derivative of rows `step` seconds apart; five are lost at both ends."""
-    weights = central_weights(order)
-    n = len(values) - 10
-    return sum(w * values[k:k + n] for k, w in enumerate(weights)) / step ** order
-
-
-def in_common(*topics):
-    """Return the messages of topics at the stamps that all of them have."""
-    by_stamp = [{stamp_of(data): i for i, data in enumerate(topic.raw)} for topic in topics]
-    common = sorted(set.intersection(*map(set, by_stamp)))
-    return common, [[messages[index[stamp]] for stamp in common]
-                    for messages, index in zip((t.messages() for t in topics), by_stamp,
-                                               strict=True)]
-
-
-def log_of(path):
-    """Return {topic: [(log time, bytes)]} and the metadata of a log, by the mcap package."""
-    with Path(path).open('rb') as file:
-        reader = make_reader(file)
-        log = {channel.topic: [] for channel in reader.get_summary().channels.values()}
-        for _, channel, message in reader.iter_messages(log_time_order=False):
-            log[channel.topic].append((message.log_time, message.data))
-        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
-    return log, metadata
-
-
-def the_log(folder):
-    (path,) = Path(folder).glob('*.mcap')
-    return path
-
-
-def simulated(log, metadata, until_ns):
-    """Compute the run of a log in this process; return {topic: [(stamp, bytes)]}."""
-    record = metadata['spinning_top_sim']
-    assert 0 <= until_ns < LIFETIME_S * SECOND, 'the stamp of t = 0 in the log is wrong'
-    simulation = Simulation(parameters.checked(json.loads(record['parameters'])),
-                            int(record['epoch_ns']))
-    taken = {}
-    for stream in simulation.streams:
-        rows = taken[stream.topic] = []
-        stream.record = lambda stamp, data, rows=rows: rows.append((stamp, data))
-    for at_ns, l3, lz in commands_in(log):
-        simulation.advance(at_ns)
-        simulation.command(l3, lz)
-    simulation.advance(until_ns)
-    return taken
-
-
-def events_in(log):
-    """Return the journal of a log: one JSON object a std_msgs/String."""
-    (rows,) = [rows for topic, rows in log.items() if topic.endswith('/events')]
-    return [json.loads(data[8:].rstrip(b'\0')) for _, data in rows]
-
-
-def commands_in(log):
-    return [(event['t_ns'], event['l3'], event['lz']) for event in events_in(log)
-            if event['event'] == 'command']
-
-
-def assert_clean_end(node, code):
-    assert code == 0, node.err
-    assert TRACEBACK not in node.err
-    assert TRACEBACK not in node.out
-
-
-# ------------------------------------------------------ what is published, from its own content
 
 RUNS = {
     'timer': {},
@@ -228,12 +66,12 @@ def both_runs(peer, diagnostics, tmp_path_factory):
         for run in runs.values():
             for name, topic in run.topics.items():
                 topic.wait(WATCHED_S * SECOND // PERIODS_NS[name])
+            for topic in run.topics.values():
+                peer.stop_listening(topic)
             run.said = diagnostics.next(run.node)
         runs['timer'].code = one.end(signal.SIGINT)
         runs['thread'].code = two.end(signal.SIGTERM)
     for run in runs.values():
-        for topic in run.topics.values():
-            peer.stop_listening(topic)
         run.log, run.metadata = log_of(the_log(run.node.folder))
     return runs
 
@@ -243,23 +81,15 @@ def run(request, both_runs):
     return both_runs[request.param]
 
 
-def quaternions(topic, of=lambda m: m.pose.orientation):
-    return np.array([xyzw(of(message)) for message in topic.messages()])
-
-
 @pytest.mark.parametrize('name', KINDS)
 def test_consecutive_stamps_differ_by_exactly_the_period(run, name):
     stamps = stamps_of(run.topics[name])
-    steps = np.diff(stamps)
-    assert (steps > 0).all()
     assert set(stamps % PERIODS_NS[name]) == {0}
-    # A machine that holds the node up for half a second makes it skip, and say so.
-    if int(run.said['skipped samples']) == 0:
-        assert set(steps) == {PERIODS_NS[name]}
+    assert_steps(stamps, PERIODS_NS[name], run.said['skipped samples'])
 
 
 def test_pose_is_the_zyz_quaternion_of_the_joints(run):
-    """q = Rz(precession) Ry(nutation) Rz(spin), the sign included."""
+    """Q = Rz(precession) Ry(nutation) Rz(spin), the sign included."""
     common, (poses, joints) = in_common(run.topics['pose'], run.topics['joint_states'])
     assert len(common) > 0.9 * WATCHED_S * 100
     assert list(joints[0].name) == ['precession_joint', 'nutation_joint', 'spin_joint']
@@ -275,8 +105,9 @@ def test_pose_is_the_zyz_quaternion_of_the_joints(run):
     ('pose', lambda m: m.pose.orientation), ('ground_truth/imu', lambda m: m.orientation),
     ('ground_truth/odom', lambda m: m.pose.pose.orientation)])
 def test_quaternions_are_of_norm_one_and_continuous(run, name, of):
-    found = quaternions(run.topics[name], of)
+    found = np.array([xyzw(of(message)) for message in run.topics[name].messages()])
     assert max(abs(math.hypot(*q) - 1.0) for q in found) <= 8e-16
+    found = np.array([xyzw(of(message)) for message in gapless(run, name)])
     assert (np.sum(found[1:] * found[:-1], axis=1) > 0.9).all()
 
 
@@ -301,7 +132,8 @@ def test_odometry_rates_are_the_derivative_of_its_attitude(run):
     rates = np.array([xyz(m.twist.twist.angular) for m in messages])
     assert np.abs(rates_by_differences(q, 0.01) - rates[5:-5]).max() < 1e-6
     assert np.ptp(rates, axis=0).max() > 0.1
-    assert {xyz(m.twist.twist.linear) + xyz(m.pose.pose.position) for m in messages} == {6 * (0.0,)}
+    resting = {xyz(m.twist.twist.linear) + xyz(m.pose.pose.position) for m in messages}
+    assert resting == {6 * (0.0,)}
 
 
 def test_imu_rates_are_the_derivative_of_its_attitude(run):
@@ -337,7 +169,7 @@ def test_the_accelerometer_on_the_body_reads_the_acceleration_of_its_place(both_
     mounting = product(product(about_z(yaw), about_y(pitch)), about_x(roll))
     q_body = product(q_sensor, conjugate(np.tile(mounting, (len(q_sensor), 1))))
     arm = np.tile(RUNS['thread']['imu.lever_arm'], (len(q_body), 1))
-    force = difference(turned(q_body, arm), 0.005, order=2) + [0.0, 0.0, GRAVITY]
+    force = difference(turned(q_body, arm), 0.005, order=2) + np.array([0.0, 0.0, GRAVITY])
     expected = turned(conjugate(q_sensor[5:-5]), force)
     found = np.array([xyz(m.linear_acceleration) for m in messages])[5:-5]
     assert np.abs(found - expected).max() < 1e-6
@@ -385,7 +217,7 @@ def test_the_log_is_what_the_subscribers_got(run):
         if int(run.said['skipped samples']) == 0:
             assert logged[first:first + len(topic.raw)] == topic.raw, name
         else:
-            assert set(topic.raw) <= set(logged)
+            assert_received_from(topic.raw, logged)
 
 
 def test_the_log_is_the_run_computed_offline(run):
@@ -428,244 +260,3 @@ def test_two_nodes_in_two_namespaces_do_not_disturb_each_other(both_runs):
 def test_sigint_and_sigterm_end_a_node_properly(run):
     assert_clean_end(run.node, run.code)
     print(f'ended within {run.node.seconds_to_end:.2f} s')
-
-
-# ------------------------------------------------------------------------- commands, parameters
-
-LAMBDA3 = parameters.defaults()['top.lambda3']
-
-
-def listen_to_motion(peer, node):
-    kinds = {'joint_states': JointState, 'ground_truth/odom': Odometry, 'pose': PoseStamped,
-             '~/invariants': Float64MultiArray}
-    topics = {name: peer.listen(node.topic(name), kind) for name, kind in kinds.items()}
-    for topic in topics.values():
-        topic.wait(3)
-    return topics
-
-
-@pytest.fixture(scope='module')
-def commanded(peer, diagnostics, tmp_path_factory):
-    """A node that takes commands; sampled at 1 kHz, so that a jump would show."""
-    folder = tmp_path_factory.mktemp('commanded')
-    rates = {f'{name}.rate': 500.0 for name in ('joint_states', 'ground_truth_odom', 'pose',
-                                                'invariants')}
-    with SimNode(folder, {**QUIET, **rates, 'tick_rate': 100.0, 'record.enabled': True}) as node:
-        topics = listen_to_motion(peer, node)
-        peer.introduce(node, diagnostics)
-        yield SimpleNamespace(node=node, topics=topics)
-        assert_clean_end(node, node.end())
-        # All that was commanded, computed again in this process, is what was recorded.
-        log, metadata = log_of(the_log(node.folder))
-        until = max(time for time, _ in log['/pose'])
-        expected = simulated(log, metadata, until - int(metadata['spinning_top_sim']['epoch_ns']))
-        for stream in ('pose', 'joint_states', 'ground_truth/odom', '~/invariants'):
-            rows = log[node.topic(stream)]
-            assert rows == expected[stream][:len(rows)]
-        assert len(commands_in(log)) > 3
-
-
-@pytest.fixture
-def motion(commanded):
-    """The listened-to node, with only what comes from now on."""
-    for topic in commanded.topics.values():
-        del topic.raw[:]
-        topic.wait(50)
-    return commanded
-
-
-def by_topic_command(peer, node, l3, lz):
-    peer.send_command(node, l3, lz)
-
-
-def by_parameters(peer, node, l3, lz):
-    result = peer.set_together(node, spin__l3=l3, spin__lz=lz)
-    assert result.successful, result.reason
-
-
-def l3_of(topic):
-    return np.array([m.twist.twist.angular.z * LAMBDA3 for m in topic.messages()])
-
-
-@pytest.mark.parametrize(('command', 'l3', 'lz'), [
-    (by_topic_command, 1.25, 0.75), (by_parameters, 2.0, -0.5), (by_parameters, 1, 1),
-    (by_topic_command, 1.6, 1.3856)])
-def test_a_command_sets_the_momenta_and_nothing_jumps(peer, motion, command, l3, lz):
-    """An impulsive torque: attitude and nutation rate go on, L3 and Lz are the commanded ones."""
-    topics = motion.topics
-    command(peer, motion.node, l3, lz)
-    wait_for('the new momentum', lambda: abs(l3_of(topics['ground_truth/odom'])[-1] - l3) < 1e-9)
-    for topic in topics.values():
-        topic.wait_more(50)
-    # Omega3 = L3/lambda3 has one jump, from the one exactly to the other.
-    momentum = l3_of(topics['ground_truth/odom'])
-    jump = int(np.argmax(np.abs(momentum - momentum[0]) > 1e-9))
-    assert jump >= 40
-    assert np.abs(momentum[:jump] - momentum[0]).max() < 1e-12
-    assert np.abs(momentum[jump:] - l3).max() < 1e-12
-    at = stamps_of(topics['ground_truth/odom'])[jump]
-    # L3 and Lz as the node itself reports them.
-    invariants = np.array([m.data for m in topics['~/invariants'].messages()])
-    assert np.abs(invariants[-1, 1:3] - (l3, lz)).max() < 1e-11
-    # Joints: no further in a period than the larger rate at its two ends, and a little.
-    joints = topics['joint_states'].messages()
-    position = np.array([m.position for m in joints])
-    velocity = np.array([m.velocity for m in joints])
-    moved = np.abs(np.diff(position, axis=0))
-    fastest = np.maximum(np.abs(velocity[1:]), np.abs(velocity[:-1]))
-    assert (moved <= 0.002 * (fastest + 0.5)).all()
-    # theta' goes on: its change around the command is that of a bounded acceleration.
-    assert np.abs(np.diff(velocity[:, 1])).max() < 0.002 * 200.0
-    # phi' right after follows eq. (31) with the commanded momenta.
-    after = int(np.argmax(stamps_of(topics['joint_states']) >= at))
-    theta = position[after:, 1]
-    lambda1 = parameters.defaults()['top.lambda1']
-    expected = (lz - l3 * np.cos(theta)) / (lambda1 * np.sin(theta) ** 2)
-    assert np.abs(velocity[after:, 0] - expected).max() < 1e-8
-    assert np.abs(velocity[after:, 2] - (l3 / LAMBDA3 - expected * np.cos(theta))).max() < 1e-8
-    q = np.array([xyzw(m.pose.orientation) for m in topics['pose'].messages()])
-    assert (np.sum(q[1:] * q[:-1], axis=1) > 0.99).all()
-    assert peer.get(motion.node, 'spin.l3', 'spin.lz') == [l3, lz]
-
-
-def test_an_integer_is_taken_for_a_double(peer, motion):
-    assert all(result.successful for result in
-               peer.set_each(motion.node, spin__l3=2, pose__rate=250))
-    assert peer.get(motion.node, 'spin.l3', 'pose.rate') == [2.0, 250.0]
-    topic = motion.topics['pose']
-    del topic.raw[:]
-    topic.wait(20)
-    assert set(np.diff(stamps_of(topic))) == {4_000_000}
-    assert peer.set_each(motion.node, pose__rate=500.0)[0].successful
-
-
-REFUSED_COMMANDS = [(), (1.0,), (1.0, 1.0, 1.0), (math.nan, 1.0), (1.0, math.nan),
-                    (math.inf, 1.0), (1.0, -math.inf), (1e300, 1e300), (1e20, 1.0),
-                    (1e100, 1e100), (-1e150, 1e15)]
-REFUSED_PARAMETERS = [
-    ({'spin__l3': math.nan}, 'nan'), ({'spin__lz': math.inf}, 'inf'),
-    ({'spin__l3': 1e300}, '1e+300'), ({'spin__l3': 1e20, 'spin__lz': 1.0}, '1e+20'),
-    ({'spin__l3': 'fast'}, 'fast'), ({'pose__rate': 'fast'}, 'fast'),
-    ({'spin__l3': True}, 'True'), ({'pose__enabled': 1}, '1'),
-    ({'top__lambda1': 0.0}, '0.0'), ({'top__lambda1': -1.5}, '-1.5'),
-    ({'top__lambda3': -2}, '-2.0'), ({'top__mass': 1e300, 'top__gravity': 1e300}, 'inf'),
-    ({'pose__rate': -100.0}, '-100.0'), ({'pose__rate': 0.0}, '0.0'), ({'imu__rate': 1e5}, '1000'),
-    ({'tick_rate': 0}, '0.0'), ({'time_scale': -1.0}, '-1.0'), ({'time_scale': math.inf}, 'inf'),
-    ({'solver__method': 'magic'}, 'magic'), ({'solver__equations': ''}, "''"),
-    ({'solver__rtol': 1.0}, '1.0'), ({'initial__theta': 4.0}, '4.0'),
-    ({'imu__lever_arm': [1.0, 2.0]}, '2.0'), ({'duration': -1.0}, '-1.0'),
-    ({'record__streams': ['pose', 'poise']}, 'poise'), ({'step__count': 0}, '0'),
-    ({'step__count': 1.5}, '1.5'), ({'record__compression': 'zip'}, 'zip')]
-
-
-def test_refused_commands_and_parameters_change_nothing(peer, diagnostics, tmp_path):
-    """Each is refused with the value named; the motion is to the bit the undisturbed one."""
-    with SimNode(tmp_path, {**QUIET, 'record.enabled': True}) as node:
-        joints = peer.listen(node.topic('joint_states'), JointState)
-        peer.introduce(node, diagnostics)
-        before = diagnostics.next(node)
-        for data in REFUSED_COMMANDS:
-            peer.send_command(node, *data)
-        wait_for('all refusals counted', lambda: diagnostics.number(node, 'rejected commands')
-                 >= int(before['rejected commands']) + len(REFUSED_COMMANDS))
-        values = peer.get(node, 'spin.l3', 'top.lambda1', 'pose.rate')
-        for given, named in REFUSED_PARAMETERS:
-            result = peer.set_together(node, **given)
-            assert not result.successful, given
-            name = next(iter(given)).replace('__', '.')
-            assert named in result.reason, (given, result.reason)
-            assert name.split('.')[-1] in result.reason, (given, result.reason)
-        assert not peer.set_together(node, pacing='thread').successful
-        assert peer.get(node, 'spin.l3', 'top.lambda1', 'pose.rate') == values
-        after = diagnostics.next(node)
-        assert int(after['rejected commands']) == (
-            int(before['rejected commands']) + len(REFUSED_COMMANDS)
-            + sum('spin' in name for given, _ in REFUSED_PARAMETERS for name in list(given)[:1]
-                  if not isinstance(given[name], str | bool)
-                  and math.isfinite(given[name])))
-        assert int(after['commands']) == 0
-        joints.wait_more(10)
-        warnings = node.err
-        assert_clean_end(node, node.end())
-    for shown in ('nan', 'inf', '1e+300', '1e+20', '3 values', '0 values'):
-        assert shown in warnings, shown
-    log, metadata = log_of(the_log(node.folder))
-    rows = log['/joint_states']
-    epoch = int(metadata['spinning_top_sim']['epoch_ns'])
-    assert commands_in(log) == []
-    assert rows == simulated(log, metadata, rows[-1][0] - epoch)['joint_states']
-
-
-def test_at_a_pole_only_the_possible_commands_are_taken(peer, diagnostics, tmp_path):
-    with SimNode(tmp_path, {**QUIET, 'initial.theta': 0.0, 'spin.l3': 3.0}) as node:
-        joints = peer.listen(node.topic('joint_states'), JointState).wait(10)
-        peer.introduce(node, diagnostics)
-        before = diagnostics.number(node, 'rejected commands')
-        rates = {tuple(m.velocity) for m in joints.messages()}
-        for data in ((3.0, 2.0), (-3.0, 3.0), (2.0, 3.0)):
-            peer.send_command(node, *data)
-            reason = peer.set_together(node, spin__l3=data[0], spin__lz=data[1])
-            assert not reason.successful
-            assert 'pole' in reason.reason
-            assert repr(data[1]) in reason.reason
-        wait_for('refusals', lambda: diagnostics.number(node, 'rejected commands') == before + 6)
-        joints.wait_more(20)
-        assert {tuple(m.velocity) for m in joints.messages()} == rates
-        peer.send_command(node, 2.0, 2.0)
-        wait_for('the new spin', lambda: tuple(joints.last().velocity) not in rates)
-        phi_dot, theta_dot, psi_dot = joints.last().velocity
-        assert phi_dot + psi_dot == pytest.approx(2.0 / LAMBDA3, abs=1e-12)
-        assert theta_dot == 0.0
-        assert joints.last().position[1] == 0.0
-        assert_clean_end(node, node.end())
-
-
-STARTS_REFUSED = {
-    'negative inertia': (['-p', 'top.lambda1:=-1.0'], ('top.lambda1', '-1.0', '> 0')),
-    'zero inertia': (['-p', 'top.lambda3:=0'], ('top.lambda3', '0', '> 0')),
-    'string for a double': (['-p', 'spin.l3:=fast'], ('spin.l3', 'fast', 'a number')),
-    'nan': (['-p', 'spin.l3:=.nan'], ('spin.l3', 'nan', 'a number')),
-    'unknown solver': (['-p', 'solver.method:=magic'], ('solver.method', 'magic', 'rk45')),
-    'pole': (['-p', 'initial.theta:=0.0', '-p', 'spin.lz:=1.0'], ('lz', '1.0', '1.6')),
-    'too fast': (['-p', 'spin.l3:=1.0e20'], ('l3', '1e+20')),
-    'beyond doubles': (['-p', 'spin.l3:=1.0e300'], ('l3', '1e+300')),
-    'theta': (['-p', 'initial.theta:=7.0'], ('initial.theta', '7.0', '3.14159')),
-    'missing file': (['--params-file', 'nowhere.yaml'], ('nowhere.yaml',)),
-    'no YAML': (['--params-file', 'bad.yaml'], ('bad.yaml',)),
-    'no parameters': (['--params-file', 'list.yaml'], ('list.yaml',)),
-    'use_sim_time': (['-p', 'use_sim_time:=perhaps'], ('use_sim_time', 'perhaps')),
-    'no stream': (['-p', 'record.streams:=[poise]'], ('record.streams', 'poise')),
-    'bad remapping': (['-r', 'pose:='], ('pose:=',)),
-    'bad qos': (['-p', 'qos_overrides./pose.publisher.reliability:=often'], ('often',)),
-}
-
-
-@pytest.mark.parametrize('case', STARTS_REFUSED)
-def test_what_cannot_be_started_is_said_in_one_line_with_exit_code_2(tmp_path, case):
-    arguments, named = STARTS_REFUSED[case]
-    node = SimNode(tmp_path, arguments=arguments)
-    (node.folder / 'bad.yaml').write_text('a: [1, 2\n  : {{{\n')
-    (node.folder / 'list.yaml').write_text('- 1\n- 2\n')
-    with node:
-        code = node.wait()
-    assert code == 2, (code, node.err)
-    assert TRACEBACK not in node.err + node.out
-    lines = [line for line in node.err.splitlines() if line.strip()]
-    ours = [line for line in lines if line.startswith('sim_node: cannot start:')]
-    assert len(ours) == 1, node.err
-    for text in named:
-        assert text in ours[0], (text, ours[0])
-    assert lines == ours or case == 'theta', node.err
-
-
-def test_an_unknown_parameter_is_said_with_its_likely_name(tmp_path):
-    with SimNode(tmp_path, {'spin.l33': 1.0, 'duration': 0.01}) as node:
-        assert_clean_end(node, node.wait())
-    assert 'spin.l33' in node.err
-    assert 'did you mean spin.l3?' in node.err
-
-
-def test_a_body_that_cannot_be_is_warned_about_and_simulated(tmp_path):
-    with SimNode(tmp_path, {'top.lambda3': 0.5, 'duration': 0.01}) as node:
-        assert_clean_end(node, node.wait())
-    assert 'top.lambda3 = 0.5' in node.err

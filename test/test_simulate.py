@@ -51,8 +51,7 @@ def in_memory(values, commands, duration_ns):
                       parameters.BY_NAME[f'{stream.parameter}.enabled'].default):
             name = stream.topic.replace('~', 'spinning_top')
             topic = name if name.startswith('/') else f'/{name}'
-            stream.record = lambda stamp, data, to=found.setdefault(topic, {}): to.update(
-                {stamp: data})
+            stream.record = found.setdefault(topic, {}).__setitem__
     rng = np.random.default_rng(1)
     now = 0
     for at_ns, l3, lz in (*commands, (duration_ns, None, None)):
@@ -231,7 +230,8 @@ def test_events_tell_the_run(tmp_path):
                                   '--command', '0.5:2.0:1.5'))
     events = [json.loads(data[8:].rstrip(b'\0')) for data in log['/spinning_top/events'].values()]
     assert [event['event'] for event in events] == ['start', 'command']
-    assert events[1] == {'event': 'command', 't_ns': 500_000_000, 'l3': 2.0, 'lz': 1.5}
+    assert events[1] == {'event': 'command', 't_ns': 500_000_000, 'sent_ns': 500_000_000,
+                         'l3': 2.0, 'lz': 1.5}
     assert json.loads(metadata['parameters'])['spin.l3'] == 1.6
 
 

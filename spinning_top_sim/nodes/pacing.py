@@ -21,13 +21,19 @@ class SimulatedClock:
         self._from_source: int | None = None
         self._from_simulated = 0
 
+    @property
+    def running(self) -> bool:
+        """Whether time passes."""
+        return self._from_source is not None
+
     def start(self, simulated_ns: int) -> None:
         """Run from this simulated time on."""
         self._from_source, self._from_simulated = self._source(), simulated_ns
 
-    def stop(self) -> None:
-        """Stand still: a pause."""
-        self._from_simulated, self._from_source = self.now(), None
+    def stop(self, at_ns: int | None = None) -> None:
+        """Stand still: a pause, here or at this simulated time."""
+        self._from_simulated = self.now() if at_ns is None else at_ns
+        self._from_source = None
 
     def now(self) -> int:
         """Return the simulated time that is due [ns]."""
@@ -36,13 +42,18 @@ class SimulatedClock:
         elapsed = self._source() - self._from_source
         return self._from_simulated + int(elapsed * self._scale)
 
+    def when(self, simulated_ns: int) -> int | None:
+        """Return at what time of the source it will be this simulated time; None: it stands."""
+        if self._from_source is None:
+            return None
+        return self._from_source + round((simulated_ns - self._from_simulated) / self._scale)
+
     def set_scale(self, scale: float) -> None:
         """Go on from now at another speed."""
-        running = self._from_source is not None
         now = self.now()
         self._scale = scale
         self._from_simulated = now
-        if running:
+        if self.running:
             self.start(now)
 
 
@@ -57,8 +68,8 @@ class DeadlineThread(threading.Thread):
     # Looked at this often while waiting for a far deadline, so that `stop` is quick.
     LONGEST_SLEEP = 0.05
 
-    def __init__(self, tick: Callable[[], None], rate: float) -> None:
-        super().__init__(name='simulation', daemon=True)
+    def __init__(self, tick: Callable[[], None], rate: float, name: str = 'simulation') -> None:
+        super().__init__(name=name, daemon=True)
         self._tick = tick
         self._stopped = False
         self.set_rate(rate)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
 import time
 from dataclasses import dataclass
@@ -80,18 +81,28 @@ class Terminal:
     def show(self, line: str) -> None:
         """Show the newest line."""
         if self._overwrites:
-            print(f'\r\x1b[K{line}', end='', flush=True)
+            self._write(f'\r\x1b[K{line}')
             self._open = True
         else:
-            print(line, flush=True)
+            self._write(f'{line}\n')
 
     def tell(self, line: str) -> None:
         """Show a line that stays."""
         self.end()
-        print(line, flush=True)
+        self._write(f'{line}\n')
 
     def end(self) -> None:
         """Leave the cursor on a fresh line."""
         if self._open:
-            print(flush=True)
             self._open = False
+            self._write('\n')
+
+    @staticmethod
+    def _write(text: str) -> None:
+        try:
+            print(text, end='', flush=True)
+        except OSError:
+            # Whoever read this has gone, as in `sim_node | head`: the motion goes on unread.
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, sys.stdout.fileno())
+            os.close(nowhere)

@@ -21,6 +21,7 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.parameters import Effect, Parameter
 
 LARGEST = sys.float_info.max
+SPIN = ('spin.l3', 'spin.lz')
 # Parameters that a node has of itself.
 FOREIGN = ('use_sim_time', 'qos_overrides.', 'start_type_description_service')
 
@@ -79,14 +80,16 @@ class ParameterChanges:
     """
     Validates changes while the node runs, and hands them over all together or not at all.
 
+    values: as they are;  start_spin: spin.* as the node was started with
     apply(values, changed): called with every parameter's value and the names that changed;
     raises ValueError to refuse.
     """
 
-    def __init__(self, node: Node, values: Mapping[str, Any],
+    def __init__(self, node: Node, values: Mapping[str, Any], start_spin: Mapping[str, Any],
                  apply: Callable[[dict[str, Any], set[str]], None]) -> None:
         self._node, self._apply = node, apply
         self.values = dict(values)
+        self.start_spin = dict(start_spin)
         self._following = False
         node.add_pre_set_parameters_callback(self._convert)
         node.add_on_set_parameters_callback(self._change)
@@ -105,7 +108,11 @@ class ParameterChanges:
             for name, value in ours.items():
                 if value is None:
                     raise ValueError(f'{name}: cannot be unset while the node runs')
-            values = parameters.checked({**self.values, **ours})
+            # Whether there is a motion is asked of the start, with its own spin, to which a reset
+            # goes back; the spin of now is a command's, and asked where the top is now.
+            values = parameters.checked({**self.values, **ours, **self.start_spin})
+            values.update({name: parameters.BY_NAME[name].check(ours.get(name, self.values[name]))
+                           for name in SPIN})
             self._apply(values, set(ours))
         except (ValueError, RuntimeError) as error:
             return SetParametersResult(successful=False, reason=str(error))

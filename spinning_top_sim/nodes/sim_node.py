@@ -1,10 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The executable `sim_node`: start, spin, and end properly whichever way it is asked to."""
+"""The executable `sim_node`."""
 
 from __future__ import annotations
 
-import signal
 import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from spinning_top_sim.nodes import executable
+
+if TYPE_CHECKING:
+    from spinning_top_sim.nodes.simulator import Simulator
 
 USAGE = """usage: sim_node [--help] [--ros-args -p NAME:=VALUE --params-file FILE ...]
 
@@ -20,14 +26,20 @@ Parameters (a change by `ros2 param set` takes effect as said there):
 
 def main(argv: list[str] | None = None) -> int:
     """Run the node; return 0 after an ordinary end, 2 for what could not be started."""
-    argv = sys.argv if argv is None else argv
-    try:
-        if '--help' in argv[1:] or '-h' in argv[1:]:
-            _show_help()
-            return 0
-        return _run(argv)
-    except KeyboardInterrupt:           # before the node was there
-        return 130
+    return executable.run('sim_node', sys.argv if argv is None else argv, _prepare)
+
+
+def _prepare(argv: list[str]) -> Callable[[], Simulator] | None:
+    if '--help' in argv[1:] or '-h' in argv[1:]:
+        _show_help()
+        return None
+    return _make_node
+
+
+def _make_node() -> Simulator:
+    from spinning_top_sim.nodes.simulator import Simulator  # noqa: PLC0415
+
+    return Simulator()
 
 
 def _show_help() -> None:
@@ -39,46 +51,6 @@ def _show_help() -> None:
         shown = list(default) if isinstance(default, tuple) else default
         print(f'  {parameter.name}  (default {"unset" if shown is None else shown})\n'
               f'      {parameter.description}')
-
-
-def _run(argv: list[str]) -> int:
-    import rclpy  # noqa: PLC0415 - so that Ctrl-C while rclpy is imported ends quietly too
-    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor  # noqa: PLC0415
-
-    try:
-        rclpy.init(args=argv)
-    except Exception as error:          # a params file that is missing or no YAML, a bad remapping
-        print(f'sim_node: cannot start: {error}', file=sys.stderr)
-        return 2
-    node = None
-    try:
-        from spinning_top_sim.nodes.simulator import Simulator  # noqa: PLC0415
-
-        try:
-            node = Simulator()
-        except (ValueError, RuntimeError) as error:
-            if not rclpy.ok():
-                return 0
-            print(f'sim_node: cannot start: {error}', file=sys.stderr)
-            return 2
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        node.start()
-        executor.spin_until_future_complete(node.finished)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except Exception:
-        # What was in the middle of a call when the context went down raises whatever it likes.
-        if rclpy.ok():
-            raise
-    finally:
-        # A launched node is told twice, by the terminal and by launch.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        if node is not None:
-            node.stop()
-            node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
 
 
 if __name__ == '__main__':

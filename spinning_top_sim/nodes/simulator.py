@@ -23,8 +23,9 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes import reports
+from spinning_top_sim.nodes.message_types import message_type
 from spinning_top_sim.nodes.pacing import DeadlineThread, SimulatedClock
-from spinning_top_sim.nodes.ros_parameters import ParameterChanges, declare, start_values
+from spinning_top_sim.nodes.ros_parameters import SPIN, ParameterChanges, declare, start_values
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -39,10 +40,14 @@ OPENING_NS = 60_000_000
 LISTENERS_PERIOD_NS = 50_000_000
 # One tick works at most this long before services and signals get their turn.
 TICK_BUDGET_S = 0.05
+# One ~/step works at most this long.
+STEP_BUDGET_S = 2.0
 # Samples later than this are not published any more.
 LATEST_NS = 500_000_000
 # A simulation further behind than this lets its clock slip: its real-time factor falls below 1.
 LONGEST_LAG_NS = 1_000_000_000
+# At the end of `duration` all subscribers together are waited for at most this long.
+ACKNOWLEDGED_S = 1.0
 NO_CLOCK = 'waiting for the first /clock (use_sim_time is set)'
 
 
@@ -70,11 +75,11 @@ class Simulator(Node):
         self._factor = 0.0
         self._described: object = None          # the motion that `_regime` names
         self._regime = ''
-        if values['spin.lz'] is None:
-            values = {**values, 'spin.lz': self._simulation.lz}
+        # What a reset goes back to: an unset spin.lz is the cusp, wherever initial.theta is then.
+        start_spin = {name: values[name] for name in SPIN}
+        values = {**values, 'spin.lz': self._simulation.lz}
         declare(self, values)
-        self._start_values = values
-        self._changes = ParameterChanges(self, values, self._apply)
+        self._changes = ParameterChanges(self, values, start_spin, self._apply)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._qos: dict[str, QoSProfile] = {}
         self._outputs: dict[str, Publisher] = {}
@@ -113,7 +118,7 @@ class Simulator(Node):
             there = stream.topic in self._outputs
             if wanted and not there:
                 self._outputs[stream.topic] = self._publisher(
-                    _message_type(stream.type_name), stream.topic)
+                    message_type(stream.type_name), stream.topic)
             elif there and not wanted:
                 stream.publish = None
                 self.destroy_publisher(self._outputs.pop(stream.topic))
@@ -191,13 +196,15 @@ class Simulator(Node):
         self._terminal.end()
         summary = self._stop_recording()
         if summary:
-            print(summary, flush=True)
+            self._terminal.tell(summary)
 
     def _finish(self) -> None:
         """The duration has passed: let the last messages arrive, then end the spin."""
+        give_up = time.monotonic() + ACKNOWLEDGED_S
         for publisher in self._outputs.values():
             if publisher.get_subscription_count():
-                publisher.wait_for_all_acked(Duration(seconds=1))
+                left = max(0.0, give_up - time.monotonic())
+                publisher.wait_for_all_acked(Duration(nanoseconds=int(left * NANOSECONDS)))
         if not self.finished.done():
             self.finished.set_result(None)
 
@@ -218,13 +225,18 @@ class Simulator(Node):
             if self._paused or self._failure or self.finished.done():
                 return
             self._count_tick()
-            target = self._simulated_clock.now()
-            duration = round(self._values['duration'] * NANOSECONDS)
-            if duration:
-                target = min(target, duration)
-            self._advance(target)
+            self._advance(self._due())
+            duration = self._duration_ns()
             if duration and self._simulation.now_ns >= duration:
                 self._finish()
+
+    def _duration_ns(self) -> int:
+        return round(self._values['duration'] * NANOSECONDS)
+
+    def _due(self) -> int:
+        """Return the simulated time to go to: that of the clock, not beyond the duration."""
+        now, duration = self._simulated_clock.now(), self._duration_ns()
+        return min(now, duration) if duration else now
 
     def _count_tick(self) -> None:
         now = time.monotonic_ns()
@@ -296,7 +308,7 @@ class Simulator(Node):
     def _command(self, l3: float, lz: float) -> None:
         with self._lock:
             if not self._paused and not self._failure:
-                self._advance(self._simulated_clock.now())
+                self._advance(self._due())
             if self._failure:
                 raise ValueError(f'l3 = {l3!r}, lz = {lz!r}: the motion stands still: '
                                  f'{self._failure}')
@@ -304,7 +316,7 @@ class Simulator(Node):
             simulation.command(l3, lz)
             self._counters.commands += 1
             at_ns = simulation.history[-1][0]
-            self._journal('command', at_ns, l3=l3, lz=lz)
+            self._journal('command', at_ns, simulation.now_ns, l3=l3, lz=lz)
             self._record(journal.COMMANDS, at_ns, journal.command(l3, lz))
 
     def _apply(self, values: dict[str, Any], changed: set[str]) -> None:
@@ -314,7 +326,8 @@ class Simulator(Node):
                 self._refuse_counted(values['spin.l3'], values['spin.lz'])
             rest = changed - {'spin.l3', 'spin.lz'}
             if rest:
-                self._journal('parameters', max(self._simulation.now_ns, 0),
+                now_ns = self._simulation.now_ns
+                self._journal('parameters', max(now_ns, 0), now_ns,
                               **{name: values[name] for name in sorted(rest)})
             # `self._changes` takes the values over only after this.
             before, self._changes.values = self._changes.values, values
@@ -355,7 +368,7 @@ class Simulator(Node):
         with self._lock:
             if request.data and not self._paused:
                 self._simulated_clock.stop()
-                self._advance(self._simulated_clock.now())
+                self._advance(self._due())
                 self._simulated_clock.stop()
                 self._paused = True
             elif not request.data and self._paused:
@@ -383,14 +396,27 @@ class Simulator(Node):
             self._look_for_listeners()
             count, dt = self._values['step.count'], self._values['step.dt']
             target = max(self._simulation.now_ns, 0) + count * round(dt * NANOSECONDS)
+            arrived = False
+            stop_at = time.monotonic() + STEP_BUDGET_S
+            recorder = self._recorder
+
+            def give_way() -> bool:
+                if recorder is not None and not recorder.room:
+                    recorder.wait_for_room(0.1)
+                return time.monotonic() > stop_at or not self.context.ok()
+
             try:
-                self._simulation.advance(target)
+                arrived = self._simulation.advance(target, give_way=give_way)
             except IntegrationError as error:
                 self._fail(str(error))
             self._simulated_clock.start(max(self._simulation.now_ns, 0))
             self._simulated_clock.stop()
-            response.success = self._failure is None
+            response.success = arrived
             response.message = self._failure or f'at t = {self._seconds():.9g} s'
+            if not arrived and self._failure is None:
+                response.message += (f': after {STEP_BUDGET_S:g} s of computing there are '
+                                     f'{(target - self._simulation.now_ns) / NANOSECONDS:.9g} s '
+                                     'left; others want to be served too')
         return response
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Any:
@@ -400,9 +426,9 @@ class Simulator(Node):
                 return response
             simulation = self._simulation
             # Back to the spin it was started with, whatever was commanded since.
-            values = {**self._values, 'spin.l3': self._start_values['spin.l3'],
-                      'spin.lz': self._start_values['spin.lz']}
-            last_stamp = simulation.epoch_ns + simulation.now_ns
+            values = {**self._values, **self._changes.start_spin}
+            sent_ns = simulation.now_ns
+            last_stamp = simulation.epoch_ns + sent_ns
             try:
                 simulation.restart(values)
             except (ValueError, RuntimeError) as error:
@@ -416,10 +442,12 @@ class Simulator(Node):
             if self._paused:
                 self._simulated_clock.stop()
             self._speed.read(0)
-            self._journal('reset', 0, epoch_ns=simulation.epoch_ns, parameters=values)
+            self._journal('reset', 0, sent_ns, epoch_ns=simulation.epoch_ns,
+                          parameters=values)
             response.success = True
             response.message = f'at t = 0, stamps go on from {simulation.epoch_ns} ns'
-        self._changes.follow(spin__l3=values['spin.l3'], spin__lz=values['spin.lz'])
+            l3, lz = simulation.l3, simulation.lz
+        self._changes.follow(spin__l3=l3, spin__lz=lz)
         return response
 
     def _on_record(self, request: SetBool.Request, response: SetBool.Response) -> Any:
@@ -464,7 +492,7 @@ class Simulator(Node):
             self._journal_topics = {name: len(streams) + i
                                     for i, (name, _) in enumerate(journal.TOPICS)}
             self._recorder, self._record_error = recorder, None
-            self._journal('start', max(simulation.now_ns, 0))
+            self._journal('start', max(simulation.now_ns, 0), simulation.now_ns)
             return f'recording to {recorder.path}'
 
     def _log_metadata(self) -> dict[str, str]:
@@ -495,9 +523,9 @@ class Simulator(Node):
             self._recorder.write(self._journal_topics[topic],
                                  self._simulation.epoch_ns + at_ns, data)
 
-    def _journal(self, event: str, at_ns: int, **details: Any) -> None:
+    def _journal(self, event: str, at_ns: int, sent_ns: int, **details: Any) -> None:
         """Log what happened to the motion, so that it can be computed again."""
-        self._record(journal.EVENTS, at_ns, journal.event(event, at_ns, **details))
+        self._record(journal.EVENTS, at_ns, journal.event(event, at_ns, sent_ns, **details))
 
     def _check_recorder(self) -> None:
         recorder = self._recorder
@@ -589,14 +617,6 @@ class Simulator(Node):
             if description is not None:
                 self._terminal.tell(str(description))
         return self._regime
-
-
-def _message_type(type_name: str) -> type:
-    """Import the Python class of a message type when a stream of it is enabled."""
-    import importlib  # noqa: PLC0415
-
-    package, _, name = type_name.split('/')
-    return getattr(importlib.import_module(f'{package}.msg'), name)
 
 
 def _rosbag2_qos(qos: QoSProfile) -> dict[str, Any]:

@@ -102,9 +102,9 @@ class Columns:
 
     @lazy
     def body_rates(self) -> tuple[Any, Any, Any]:
-        """omega_1, omega_2, omega_3 in the body frame [rad/s]."""
+        """omega_1, omega_2 and the constant omega_3 in the body frame [rad/s]."""
         rate = self.transverse_rate
-        return rate.real, rate.imag, self.l3 / self.top.lambda3
+        return rate.real, rate.imag, self.l3_start / self.top.lambda3
 
     @lazy
     def body_acceleration(self) -> tuple[Any, Any, float]:
@@ -122,9 +122,9 @@ class Columns:
     @lazy
     def energy(self) -> Any:
         """E = kinetic energy + P cos(theta) [J]."""
-        top = self.top
+        top, l3 = self.top, self.l3_start
         return (0.5 * top.lambda1 * attitude.squared_modulus(self.transverse_rate)
-                + 0.5 * self.l3 * self.l3 / top.lambda3 + top.gravity_torque * self.axis[1])
+                + 0.5 * l3 * l3 / top.lambda3 + top.gravity_torque * self.axis[1])
 
 
 class OneState(Columns):

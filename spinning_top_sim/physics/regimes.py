@@ -190,15 +190,15 @@ def _bisect(f0: float, f1: float, f2: float, f3: float, end: float) -> float:
             outside = middle
 
 
-def regime(top: Top, state: State) -> str:
-    """Return the motion's name."""
+def regime(top: Top, state: State, coincide: float = COINCIDE) -> str:
+    """Return the motion's name; coincide: relative distance below which roots are one."""
     l3, lz = state.l3, state.lz
     scale = abs(l3) + abs(lz)
     at = swing(top, state)
-    resting = at.high - at.low <= COINCIDE
+    resting = at.high - at.low <= coincide
     if top.gravity_torque == 0.0:
         return 'free top' if scale or state.theta_dot else 'at rest'
-    if resting and 1.0 - abs(at.low) <= COINCIDE:
+    if resting and 1.0 - abs(at.low) <= coincide:
         if scale == 0.0:
             return 'at rest'
         upright = (at.low > 0.0) == (top.gravity_torque > 0.0)
@@ -207,17 +207,17 @@ def regime(top: Top, state: State) -> str:
         stable = l3 * l3 > 4.0 * top.lambda1 * abs(top.gravity_torque)
         return 'sleeping' if stable else 'sleeping, unstable'
     if scale == 0.0:
-        return 'planar pendulum, ' + ('rotating' if at.high >= 1.0 - COINCIDE and at.low
-                                      <= -1.0 + COINCIDE else 'swinging')
+        return 'planar pendulum, ' + ('rotating' if at.high >= 1.0 - coincide and at.low
+                                      <= -1.0 + coincide else 'swinging')
     if resting:
         return 'steady precession'
     if l3 == 0.0:
         return 'spherical pendulum'
     turning = lz / l3
-    if lz == l3 and at.high >= 1.0 - COINCIDE:
+    if lz == l3 and at.high >= 1.0 - coincide:
         return 'through the top'
-    if lz == -l3 and at.low <= -1.0 + COINCIDE:
+    if lz == -l3 and at.low <= -1.0 + coincide:
         return 'through the bottom'
-    if min(abs(turning - at.low), abs(turning - at.high)) <= COINCIDE * max(1.0, abs(turning)):
+    if min(abs(turning - at.low), abs(turning - at.high)) <= coincide * max(1.0, abs(turning)):
         return 'cusps'
     return 'loops' if at.low < turning < at.high else 'waves'

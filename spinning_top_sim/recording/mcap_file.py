@@ -59,8 +59,8 @@ CHUNK_BYTES = 1 << 20  # uncompressed; a single larger message still makes a chu
 # What a chunk holds, by channel: log time, offset in the uncompressed chunk, log time, offset, ...
 Entries = Mapping[int, Sequence[int]]
 
-_MESSAGE = struct.Struct('<BQHIQQ')  # opcode, length, channel, sequence, log and publish time
-_MESSAGE_FIELDS = 2 + 4 + 8 + 8      # what `length` counts besides the data
+MESSAGE = struct.Struct('<BQHIQQ')  # opcode, length, channel, sequence, log and publish time
+MESSAGE_FIELDS = 2 + 4 + 8 + 8      # what `length` counts besides the data
 _INDEX = struct.Struct('<BQHI')      # opcode, length, channel, length of the entries
 
 
@@ -153,8 +153,8 @@ class IndexedFile:
         self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int, data: bytes,
     ) -> bool:
         """Add a message to the chunk in memory; return whether the chunk is full."""
-        self._chunk_parts.append(_MESSAGE.pack(
-            Opcode.MESSAGE, _MESSAGE_FIELDS + len(data), channel_id, sequence, log_time_ns,
+        self._chunk_parts.append(MESSAGE.pack(
+            Opcode.MESSAGE, MESSAGE_FIELDS + len(data), channel_id, sequence, log_time_ns,
             publish_time_ns))
         self._chunk_parts.append(data)
         entries = self._chunk_entries.get(channel_id)
@@ -162,7 +162,7 @@ class IndexedFile:
             entries = self._chunk_entries[channel_id] = []
         entries.append(log_time_ns)
         entries.append(self._chunk_size)
-        self._chunk_size += _MESSAGE.size + len(data)
+        self._chunk_size += MESSAGE.size + len(data)
         return self._chunk_size >= CHUNK_BYTES
 
     def write_chunk(self) -> None:
@@ -384,7 +384,7 @@ class McapFile(IndexedFile):
             records = plain[at:at + count * length].reshape(count, length)
             heads = records[:, :head.itemsize].view(head)[:, 0]
             heads['opcode'] = Opcode.MESSAGE
-            heads['length'] = _MESSAGE_FIELDS + size
+            heads['length'] = MESSAGE_FIELDS + size
             heads['channel'] = topic_index + 1
             sequence = self._sequences[topic_index]
             heads['sequence'] = numpy.arange(sequence, sequence + count) & 0xFFFFFFFF

@@ -28,7 +28,6 @@ def provenance(values: Mapping[str, Any], epoch_ns: int, begun_ns: int,
     """
     return {
         'format': FORMAT,
-        'version': _version('spinning_top_sim'),
         'parameters': json.dumps(dict(values), default=list, sort_keys=True),
         'parameters_now': json.dumps(dict(now), default=list, sort_keys=True),
         'seed': str(values['seed']),
@@ -36,6 +35,14 @@ def provenance(values: Mapping[str, Any], epoch_ns: int, begun_ns: int,
         'begun_ns': str(begun_ns),
         'history': json.dumps(list(history)),
         'evaluation': evaluation,
+        **surroundings(),
+    }
+
+
+def surroundings() -> dict[str, str]:
+    """Return what else decides the last bits: this package's version, machine, libraries."""
+    return {
+        'version': _version('spinning_top_sim'),
         'platform': f'{platform.machine()} {platform.system()} '
                     f'{platform.python_implementation()} {platform.python_version()} '
                     f'{sys.byteorder}',

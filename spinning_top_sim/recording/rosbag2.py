@@ -40,6 +40,7 @@ _POLICY_NAMES = {
 }
 
 
+_INTEGER = re.compile(r'-?[0-9]+')
 _QOS_LINE = re.compile(r'(- | {2,})(\w+): *(\S*) *', re.ASCII)
 
 
@@ -94,6 +95,49 @@ def offered_qos_yaml(topic: RecordedTopic) -> str:
     Names would do for jazzy; integers are what older releases read, and jazzy too.
     """
     return '\n'.join(_qos_lines(topic.qos, as_names=False))
+
+
+def parse_offered_qos(text: str) -> list[dict[str, Any]]:
+    """
+    Return the profiles of an `offered_qos_profiles`: the keys of DEFAULT_QOS, policies as in rmw.
+
+    Understands what rosbag2 and this package write, in block style, policies by number or name.
+    A policy that is missing or not understood is as in DEFAULT_QOS; a text that is no list of
+    profiles has none.
+    """
+    profiles: list[dict[str, Any]] = []
+    key = ''
+    for line in text.splitlines():
+        match = _QOS_LINE.fullmatch(line)
+        if match is None or not (profiles or match[1] == '- '):
+            return []
+        indent, name, word = match.groups()
+        if indent == '- ':
+            profiles.append({})
+        value: Any = {'': {}, 'true': True, 'false': False}.get(word, word)
+        if isinstance(value, str) and _INTEGER.fullmatch(value):
+            value = int(value)
+        nested = profiles[-1].get(key) if len(indent) > 2 else None
+        if isinstance(nested, dict):
+            nested[name] = value
+        else:
+            key = name
+            profiles[-1][key] = value
+    return [{key: _parsed_policy(key, profile.get(key)) for key in DEFAULT_QOS}
+            for profile in profiles]
+
+
+def _parsed_policy(key: str, value: Any) -> Any:
+    default, names = DEFAULT_QOS[key], _POLICY_NAMES.get(key)
+    if isinstance(default, Mapping):
+        parts = value if isinstance(value, Mapping) else {}
+        return value if all(isinstance(parts.get(part), int) for part in default) else default
+    if names is not None:
+        if value in names:
+            value = names.index(value)
+        known = type(value) is int and 0 <= value < len(names) and names[value] != 'unknown'
+        return value if known else default
+    return value if type(value) is type(default) else default
 
 
 def bag_metadata_yaml(
@@ -154,42 +198,6 @@ def bag_metadata_yaml(
         or f'ros_distro: {_quoted(os.environ.get("ROS_DISTRO") or "jazzy")}',
     ]
     return '\n'.join(lines)
-
-
-def parse_offered_qos(text: str) -> tuple[dict[str, Any], ...]:
-    """
-    Return the profiles in the `offered_qos_profiles` of a channel, each as for RecordedTopic.
-
-    Understands what rosbag2 and this package write, in block style, policies as integers or names.
-    Raises ValueError for anything else.
-    """
-    profiles: list[dict[str, Any]] = []
-    key = ''
-    for line in text.splitlines():
-        match = _QOS_LINE.fullmatch(line)
-        if match is None:
-            raise ValueError(f'no line of a QoS profile: {line!r}')
-        indent, name, word = match.groups()
-        if indent == '- ':
-            profiles.append({})
-        if not profiles:
-            raise ValueError(f'no list of QoS profiles: {text[:80]!r}')
-        if len(indent) > 2 and isinstance(profiles[-1].get(key), dict):
-            profiles[-1][key][name] = int(word)
-            continue
-        key = name
-        default = DEFAULT_QOS.get(key)
-        if isinstance(default, Mapping):
-            profiles[-1][key] = dict(default)
-        elif isinstance(default, bool):
-            profiles[-1][key] = word == 'true'
-        elif key in _POLICY_NAMES and word in _POLICY_NAMES[key]:
-            profiles[-1][key] = _POLICY_NAMES[key].index(word)
-        else:
-            profiles[-1][key] = int(word)
-    for profile in profiles:
-        RecordedTopic('', '', profile)  # raises what is wrong with it
-    return tuple(profiles)
 
 
 def _block(text: str, key: str) -> str:

@@ -16,7 +16,7 @@ import math
 from collections.abc import Iterator
 from decimal import Decimal
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -29,7 +29,14 @@ from spinning_top_sim.solvers.exact import (
     nutation_at,
     transverse_rates,
 )
-from spinning_top_sim.solvers.long_decimals import ONE, double_double, pi, precision, sinh_cosh
+from spinning_top_sim.solvers.long_decimals import (
+    ONE,
+    ZERO,
+    double_double,
+    pi,
+    precision,
+    sinh_cosh,
+)
 from spinning_top_sim.solvers.theta_series import Series
 from spinning_top_sim.solvers.theta_setup import Factor, ThetaMotion
 
@@ -37,7 +44,7 @@ if TYPE_CHECKING:
     from spinning_top_sim.solvers.exact import ExactSolution
 
 ARRAY = Functions(np.sin, np.sinh, np.sqrt, np.hypot, np.arctan2)
-CHUNK = 8192                # times in a block: its temporaries stay in the cache
+CHUNK = 5120                # times in a block: its temporaries stay in the cache
 TWO_PI = 2.0 * math.pi
 NEGLIGIBLE = 1e-18          # beside the largest coefficient
 
@@ -299,173 +306,160 @@ NANOSECOND = Rate(Decimal('1e-9'))
 # -------------------------------------------------------------------------- one form all round
 
 
-def _sine_table() -> tuple[np.ndarray, np.ndarray]:
-    """Sines and cosines of whole steps, from angles of at most an eighth of a turn."""
+def _turn_table() -> np.ndarray:
+    """Return exp(i angle) of whole steps, from angles of at most an eighth of a turn."""
     step = np.arange(TABLE_STEPS)
     quarter = np.rint(step / (TABLE_STEPS // 4)).astype(int)
     angle = STEP_ANGLE * (step - quarter * (TABLE_STEPS // 4))
     s, c = np.sin(angle), np.cos(angle)
-    return np.choose(quarter % 4, (s, c, -s, -c)), np.choose(quarter % 4, (c, -s, -c, s))
+    return (np.choose(quarter % 4, (c, -s, -c, s))
+            + 1j * np.choose(quarter % 4, (s, c, -s, -c)))
 
 
-SINES, COSINES = _sine_table()
-
-
-class _FactorBuffers:
-    """Alpha or beta in a block: R, s J, and sine and cosine of the rotation."""
-
-    def __init__(self, n: int):
-        self.real, self.imag, self.sine, self.cosine = np.empty((4, n))
+TURN = _turn_table()
+# Constants as arrays, which numpy takes up faster than numbers.
+SINE_1, SINE_3 = np.array(STEP_ANGLE), np.array(-STEP_ANGLE ** 3 / 6.0)
+COSINE_2, COSINE_4 = np.array(-STEP_ANGLE ** 2 / 2.0), np.array(STEP_ANGLE ** 4 / 24.0)
+COUNTER = np.array(1.5 * 2.0 ** 52)     # doubles of its size are the whole numbers
+UNITY, FOUR_ONES = np.array(1.0), np.ones(4)
 
 
 class _Block:
-    """Named buffers for a block of n times: all is computed in place, in the cache."""
+    """
+    Buffers for a block of n times: all is computed in place, in the cache.
 
-    def __init__(self, n: int, latest: float):
-        self.latest = latest            # the largest |t| of the call
-        (self.t1, self.t2, self.rest, self.step, self.work, self.square,
-         self.table_sine, self.table_cosine,
-         self.y, self.flip, self.sin, self.cos, self.scale) = np.empty((13, n))
-        self.index = np.empty(n, np.int64)
-        self.alpha, self.beta = _FactorBuffers(n), _FactorBuffers(n)
+    Rows belong to rotors, later to series or to the halves x + iy and z + iw of the quaternions.
+    What is alike goes through numpy together: a call costs as much as some thousand sums.
+    """
+
+    def __init__(self, n: int, powers: int, latest: float):
+        self.latest = latest                    # the largest |t| of the call
+        self.times = np.empty((4, n))           # what angles are linear in: t1, t2, 1 and y
+        self.t1, self.t2, ones, self.y = self.times
+        self.powers = np.empty((powers, n))     # of xi, from 1 on
+        self.powers[0] = ones[...] = 1.0
+        self.sin, self.cos, self.flip, self.scale = np.empty((4, n))
+        rows = np.empty((12, n))                # of the angles
+        self.exact, self.minor, self.rest, self.step = rows.reshape(4, 3, n)
+        self.rest_rotation = np.empty((3, n), complex)
+        # What comes later takes the memory of what is done with, so that all fits the cache.
+        self.rotation = rows[:6].reshape(3, 2 * n).view(complex)
+        self.series, self.squares = rows[6:10], self.rest_rotation.view(float).reshape(6, n)[:4]
+        self.halves = self.rest_rotation[:2]
 
     def load(self, t: np.ndarray, t_rest: np.ndarray | None) -> None:
         """Take the times, and split them as `_halves` does."""
         self.t, self.t_rest = t, t_rest
-        np.multiply(t, 134217729.0, out=self.work)
-        np.subtract(self.work, t, out=self.rest)
-        np.subtract(self.work, self.rest, out=self.t1)
+        np.multiply(t, 134217729.0, out=self.t2)
+        np.subtract(self.t2, t, out=self.t1)
+        np.subtract(self.t2, self.t1, out=self.t1)
         np.subtract(t, self.t1, out=self.t2)
 
 
-class _Rotor:
-    """The angle 2 pi (rate t + start) + drift y, rate and start in turns."""
+class _Angle(NamedTuple):
+    """2 pi (rate t + start) + drift y, rate and start in turns."""
 
-    def __init__(self, rate: Decimal, start: Decimal, drift: float = 0.0):
-        self.fixed = FixedRate.of(rate, start)
-        self.turns = Rate(rate)
-        in_steps = rate * TABLE_STEPS
-        self.rate = float(in_steps)
-        self.rate1, _ = _halves(self.rate)
-        self.rate2 = float(in_steps - Decimal(self.rate1))
-        start = (start - start.to_integral_value()) * TABLE_STEPS
-        self.start_step = float(start.to_integral_value())
-        self.start_rest = float(start - start.to_integral_value())
-        self.drift = drift / STEP_ANGLE
+    rate: Decimal
+    start: Decimal
+    drift: float = 0.0
 
-    def count_steps(self, b: _Block) -> None:
-        """Set b.step to the nearest whole number of steps, b.rest to what remains."""
-        if b.t_rest is not None or b.latest * abs(self.turns.high) > SHORT_TURNS:
-            part, rest = self.turns.fraction(b.t, b.t_rest)
-            np.multiply(part, TABLE_STEPS, out=b.rest)
-            np.multiply(rest, TABLE_STEPS, out=b.work)
+    def negative(self) -> _Angle:
+        """Return the angle of the conjugate."""
+        return _Angle(-self.rate, -self.start, -self.drift)
+
+
+class _Rotors:
+    """exp(i angle) for up to three angles side by side."""
+
+    def __init__(self, *angles: _Angle):
+        self.turns = [Rate(angle.rate) for angle in angles]
+        self.fastest = max(abs(rate.high) for rate in self.turns)
+        self.exact_rates, self.start_steps, minor_rates = [], [], []
+        for rate, start, drift in angles:
+            in_steps = rate * TABLE_STEPS
+            exact_rate, _ = _halves(float(in_steps))
+            start_steps = (start - start.to_integral_value()) * TABLE_STEPS
+            whole = start_steps.to_integral_value()
+            self.exact_rates.append(np.array(exact_rate))
+            self.start_steps.append(int(whole))
+            minor_rates.append((float(in_steps - Decimal(exact_rate)), float(in_steps),
+                                float(start_steps - whole), drift / STEP_ANGLE))
+        # For t1, t2, 1 and y; without drifts y is left out, as it may be undefined.
+        self.minor_rates = np.array(minor_rates)
+        if not self.minor_rates[:, 3].any():
+            self.minor_rates = self.minor_rates[:, :3].copy()
+        # A table for each, that begins at the start.
+        self.tables = [np.roll(TURN, -start) for start in self.start_steps]
+
+    def count_steps(self, b: _Block) -> tuple[np.ndarray, np.ndarray]:
+        """Return COUNTER + the nearest whole numbers of steps from the start, and the rests."""
+        n, columns = self.minor_rates.shape
+        exact, minor, rest, step = b.exact[:n], b.minor[:n], b.rest[:n], b.step[:n]
+        if b.t_rest is not None or b.latest * self.fastest > SHORT_TURNS:
+            np.matmul(self.minor_rates[:, 2:], b.times[2:columns], out=minor)
+            for turns, exact_row, minor_row in zip(self.turns, exact, minor, strict=True):
+                part, part_rest = turns.fraction(b.t, b.t_rest)
+                np.multiply(part, TABLE_STEPS, out=exact_row)
+                np.add(minor_row, TABLE_STEPS * part_rest, out=minor_row)
         else:
-            # t1 rate1 is exact, and so is its difference from a near whole number.
-            np.multiply(b.t1, self.rate2, out=b.work)
-            np.multiply(b.t2, self.rate, out=b.rest)
-            np.add(b.work, b.rest, out=b.work)
-            np.multiply(b.t1, self.rate1, out=b.rest)
-        np.add(b.work, self.start_rest, out=b.work)
-        if self.drift:
-            np.multiply(b.y, self.drift, out=b.step)
-            np.add(b.work, b.step, out=b.work)
-        np.add(b.rest, b.work, out=b.step)
-        np.rint(b.step, out=b.step)
-        np.subtract(b.rest, b.step, out=b.rest)
-        np.add(b.rest, b.work, out=b.rest)
-        np.add(b.step, self.start_step, out=b.step)
+            # The products of halves are exact, and so are their differences from near whole
+            # numbers.  What else there is, little of a turn, is one product of matrices.
+            for exact_rate, row in zip(self.exact_rates, exact, strict=True):
+                np.multiply(b.t1, exact_rate, out=row)
+            np.matmul(self.minor_rates, b.times[:columns], out=minor)
+        np.add(exact, minor, out=rest)
+        np.add(rest, COUNTER, out=step)         # rounds, as doubles of this size are whole
+        np.subtract(step, COUNTER, out=rest)
+        np.subtract(exact, rest, out=rest)
+        np.add(rest, minor, out=rest)
+        return step, rest
 
-    def sin_cos(self, b: _Block, sine: np.ndarray, cosine: np.ndarray) -> None:
-        """Look up the nearest step of the table, and turn on by the rest of the angle."""
-        self.count_steps(b)
-        np.copyto(b.index, b.step, casting='unsafe')
-        np.bitwise_and(b.index, TABLE_STEPS - 1, out=b.index)
-        np.take(SINES, b.index, out=b.table_sine, mode='clip')
-        np.take(COSINES, b.index, out=b.table_cosine, mode='clip')
-        # Sine of the rest, and cosine less 1, by their power series.
-        np.multiply(b.rest, b.rest, out=b.square)
-        np.multiply(b.square, -STEP_ANGLE ** 3 / 6.0, out=b.work)
-        np.add(b.work, STEP_ANGLE, out=b.work)
-        np.multiply(b.rest, b.work, out=b.rest)
-        np.multiply(b.square, STEP_ANGLE ** 4 / 24.0, out=b.work)
-        np.subtract(b.work, STEP_ANGLE ** 2 / 2.0, out=b.work)
-        np.multiply(b.work, b.square, out=b.square)
-        # The sum of both angles; the large term is added last.
-        np.multiply(b.table_sine, b.square, out=sine)
-        np.multiply(b.table_cosine, b.rest, out=b.work)
-        np.add(sine, b.work, out=sine)
-        np.add(sine, b.table_sine, out=sine)
-        np.multiply(b.table_cosine, b.square, out=cosine)
-        np.multiply(b.table_sine, b.rest, out=b.work)
-        np.subtract(cosine, b.work, out=cosine)
-        np.add(cosine, b.table_cosine, out=cosine)
+    def rotations(self, b: _Block) -> np.ndarray:
+        """Return exp(i angle): the nearest step from the table, turned on by the rest."""
+        step, rest = self.count_steps(b)
+        n = len(step)
+        rotation, rest_rotation = b.rotation[:n], b.rest_rotation[:n]
+        # Cosine and sine of the rest by their power series.
+        square, series = b.exact[:n], b.minor[:n]
+        np.multiply(rest, rest, out=square)
+        np.multiply(square, COSINE_4, out=series)
+        np.add(series, COSINE_2, out=series)
+        np.multiply(series, square, out=series)
+        np.add(series, UNITY, out=rest_rotation.real)
+        np.multiply(square, SINE_3, out=series)
+        np.add(series, SINE_1, out=series)
+        np.multiply(series, rest, out=rest_rotation.imag)
+        index = step.view(np.int64)             # the last bits of COUNTER + k are those of k
+        np.bitwise_and(index, TABLE_STEPS - 1, out=index)
+        for table, row, out in zip(self.tables, index, rotation, strict=True):
+            table.take(row, out=out, mode='clip')           # 'raise' would buffer
+        np.multiply(rotation, rest_rotation, out=rotation)
+        return rotation
 
 
-class _Polynomial:
-    """A theta series as prefactor * polynomial in xi."""
-
-    def __init__(self, series: Series, largest_xi: Decimal):
-        self.prefactor = series.prefactor
-        exact = series.polynomial()
-        sizes = [abs(c) * largest_xi ** i for i, c in enumerate(exact)]
-        while len(exact) > 1 and sizes[len(exact) - 1] < Decimal(NEGLIGIBLE) * max(sizes):
-            exact.pop()
-        self.coefficients = [float(x) for x in exact]
-
-    def evaluate(self, b: _Block, out: np.ndarray) -> None:
-        """From b.square = xi, b.sin and b.cos."""
-        *lower, highest = self.coefficients
-        if not lower:
-            out[...] = highest
-        else:
-            np.multiply(b.square, highest, out=out)
-            np.add(out, lower[-1], out=out)
-        for coefficient in reversed(lower[:-1]):
-            np.multiply(out, b.square, out=out)
-            np.add(out, coefficient, out=out)
-        for factor in ((), (b.cos,), (b.sin,), (b.sin, b.cos))[self.prefactor]:
-            np.multiply(out, factor, out=out)
+def _polynomial(series: Series, largest_xi: Decimal) -> list[float]:
+    """Return the coefficients in xi of a theta series less its prefactor, lowest first."""
+    exact = series.polynomial()
+    sizes = [abs(c) * largest_xi ** i for i, c in enumerate(exact)]
+    while len(exact) > 1 and sizes[len(exact) - 1] < Decimal(NEGLIGIBLE) * max(sizes):
+        exact.pop()
+    return [float(x) for x in exact]
 
 
 class _AttitudeFactor:
     """Alpha or beta over the even quarter periods: series for R and s J, and the rotation."""
 
-    def __init__(self, factor: Factor, v_rate: Decimal, v_start: Decimal,
-                 largest_xi: Decimal):
+    def __init__(self, factor: Factor, v_rate: Decimal, v_start: Decimal):
         branch = factor.full_circle or factor.even
         self.flips = factor.crosses and not factor.full_circle
         if factor.full_circle:          # the drift -s y, with y = v, is part of the rotation
-            self.rotor = _Rotor(factor.rate / (2 * pi()) - factor.sense * v_rate,
+            self.angle = _Angle(factor.rate / (2 * pi()) - factor.sense * v_rate,
                                 factor.phase_turns - factor.sense * v_start)
         else:
-            self.rotor = _Rotor(factor.rate / (2 * pi()), factor.phase_turns, float(factor.drift))
+            self.angle = _Angle(factor.rate / (2 * pi()), factor.phase_turns, float(factor.drift))
+        self.fixed = FixedRate.of(self.angle.rate, self.angle.start)
         self.real = branch.real.scaled(Decimal(factor.sign))
         self.imag = branch.imag.scaled(Decimal(factor.sense)) if branch.imag else None
-        self.real_polynomial = _Polynomial(self.real, largest_xi)
-        self.imag_polynomial = _Polynomial(self.imag, largest_xi) if self.imag else None
-
-    def evaluate(self, b: _Block, f: _FactorBuffers) -> None:
-        """Leave R and s J in f, and add their squares to b.scale."""
-        self.real_polynomial.evaluate(b, f.real)
-        if self.flips:
-            np.multiply(f.real, b.flip, out=f.real)
-        np.multiply(f.real, f.real, out=b.work)
-        np.add(b.scale, b.work, out=b.scale)
-        if self.imag_polynomial:
-            self.imag_polynomial.evaluate(b, f.imag)
-            np.multiply(f.imag, f.imag, out=b.work)
-            np.add(b.scale, b.work, out=b.scale)
-
-    def rotate(self, b: _Block, f: _FactorBuffers) -> tuple[np.ndarray, np.ndarray]:
-        """Return real and imaginary part of (R + i s J) exp(i rotation), in buffers of b."""
-        np.multiply(f.real, f.cosine, out=b.step)
-        np.multiply(f.real, f.sine, out=b.rest)
-        if self.imag_polynomial:
-            np.multiply(f.imag, f.sine, out=b.work)
-            np.subtract(b.step, b.work, out=b.step)
-            np.multiply(f.imag, f.cosine, out=b.work)
-            np.add(b.rest, b.work, out=b.rest)
-        return b.step, b.rest
 
     def modes(self) -> dict[int, complex]:
         """Return c_n with R + i s J = sum of c_n exp(i n v), in the real form."""
@@ -490,73 +484,102 @@ class _Attitudes:
     alpha = (R + i s J)(y)/D(y) exp i(rotation), with D from |alpha|^2 + |beta|^2 = 1.  In the real
     form y = v = (pi/2) Z, at any Z; the imaginary form, near the separatrix, reaches
     from Z = -1 to 1 about the nearest even Z, where D = cosh x and more than e^14.
+
+    A row of the result is two complex numbers, i beta = x + iy and i conj(alpha) = z + iw: each is
+    a product of complex numbers, (-s J + iR) exp(i rotation) and (s J + iR) exp(-i rotation).
     """
 
     def __init__(self, motion: ThetaMotion):
         self.imaginary = motion.alpha.full_circle is None
         self.stretch = float(motion.stretch)
-        v_rate, v_start = motion.quarter_rate / 4, (motion.quarter0 + motion.offset0) / 4
-        self.phase = _Rotor(v_rate, v_start)
-        largest_xi = sinh_cosh(motion.stretch * pi() / 2)[0] ** 2 if self.imaginary else ONE
-        self.alpha, self.beta = (_AttitudeFactor(factor, v_rate, v_start, largest_xi)
-                                 for factor in (motion.alpha, motion.beta))
+        v = _Angle(motion.quarter_rate / 4, (motion.quarter0 + motion.offset0) / 4)
+        self.phase_fixed = FixedRate.of(v.rate, v.start)
+        self.alpha, self.beta = (
+            _AttitudeFactor(factor, v.rate, v.start) for factor in (motion.alpha, motion.beta))
+        both = self.beta.angle, self.alpha.angle.negative()
+        if self.imaginary:
+            self.phase, self.rotors = _Rotors(v), _Rotors(*both)
+        else:
+            self.rotors = _Rotors(*both, v)         # the phase is a rotor like the others
+        self._set_up_series(
+            sinh_cosh(motion.stretch * pi() / 2)[0] ** 2 if self.imaginary else ONE)
         self._grids: dict[int, _Grid] = {}
+
+    def _set_up_series(self, largest_xi: Decimal) -> None:
+        """-s J and R of beta, s J and R of alpha: prefactors and a matrix of coefficients."""
+        none = Series('cos even', (ZERO,))
+        rows = (self.beta.imag.scaled(-ONE) if self.beta.imag else none, self.beta.real,
+                self.alpha.imag or none, self.alpha.real)
+        polynomials = [_polynomial(series, largest_xi) for series in rows]
+        self.coefficients = np.zeros((4, max(2, *map(len, polynomials))))
+        for row, polynomial in zip(self.coefficients, polynomials, strict=True):
+            row[:len(polynomial)] = polynomial
+        self.prefactors = [series.prefactor for series in rows]
 
     def quaternion(self, t: np.ndarray, t_rest: np.ndarray | None) -> np.ndarray:
         """Return (n, 4) x, y, z, w."""
-        out = np.empty((len(t), 4))
-        latest = max(float(t.max()), -float(t.min())) if t.size else 0.0
-        buffers = _Block(min(len(t), CHUNK), latest)
-        for block in _blocks(len(t)):
-            if block.stop - block.start < len(buffers.t1):
-                buffers = _Block(block.stop - block.start, latest)
+        n = len(t)
+        out = np.empty((n, 4))
+        if not n:
+            return out
+        # Blocks of one size, so that the same buffers serve all; the last may overlap another.
+        size = math.ceil(n / math.ceil(n / CHUNK))
+        buffers = _Block(size, self.coefficients.shape[1], max(float(t.max()), -float(t.min())))
+        for first in range(0, n, size):
+            begin = min(first, n - size)
+            block = slice(begin, begin + size)
             buffers.load(t[block], _part_of(t_rest, block))
-            self._quaternion(buffers, out[block])
+            self._fill(out[block].view(complex), buffers)
         return out
 
-    def _quaternion(self, b: _Block, out: np.ndarray) -> None:
+    def _fill(self, out: np.ndarray, b: _Block) -> None:
+        """Set the columns x + iy and z + iw."""
         if self.imaginary:
             self._hyperbolic_phase(b)
-        else:
-            self.phase.sin_cos(b, b.sin, b.cos)
-        self.alpha.rotor.sin_cos(b, b.alpha.sine, b.alpha.cosine)
-        self.beta.rotor.sin_cos(b, b.beta.sine, b.beta.cosine)
-        np.multiply(b.sin, b.sin, out=b.square)
+        rotation = self.rotors.rotations(b)
         if self.imaginary:
-            np.negative(b.square, out=b.square)
-        b.scale[...] = 0.0
-        self.alpha.evaluate(b, b.alpha)
-        self.beta.evaluate(b, b.beta)
+            self._evaluate_series(b, b.sin, b.cos)
+        else:
+            self._evaluate_series(b, rotation[2].imag, rotation[2].real)
+        for k in (0, 1):
+            half = b.halves[k]
+            np.multiply(b.series[2 * k], b.scale, out=half.real)
+            np.multiply(b.series[2 * k + 1], b.scale, out=half.imag)
+            np.multiply(half, rotation[k], out=out[:, k])
+
+    def _evaluate_series(self, b: _Block, sin: np.ndarray, cos: np.ndarray) -> None:
+        """Set b.series, and b.scale = 1/D."""
+        xi = np.multiply(sin, sin, out=b.powers[1])
+        if self.imaginary:
+            np.negative(xi, out=xi)
+        for k in range(2, len(b.powers)):
+            np.multiply(b.powers[k - 1], xi, out=b.powers[k])
+        np.matmul(self.coefficients, b.powers, out=b.series)
+        for row, prefactor in zip(b.series, self.prefactors, strict=True):
+            for factor in ((), (cos,), (sin,), (sin, cos))[prefactor]:
+                np.multiply(row, factor, out=row)
+        if self.beta.flips:
+            b.series[:2] *= b.flip
+        if self.alpha.flips:
+            b.series[2:] *= b.flip
+        np.multiply(b.series, b.series, out=b.squares)
+        np.matmul(FOUR_ONES, b.squares, out=b.scale)        # the quickest sum
         np.sqrt(b.scale, out=b.scale)
-        np.divide(1.0, b.scale, out=b.scale)
-        w, z = self.alpha.rotate(b, b.alpha)
-        np.multiply(w, b.scale, out=out[:, 3])
-        np.multiply(z, b.scale, out=out[:, 2])
-        y, minus_x = self.beta.rotate(b, b.beta)
-        np.multiply(y, b.scale, out=out[:, 1])
-        np.negative(b.scale, out=b.scale)
-        np.multiply(minus_x, b.scale, out=out[:, 0])
+        np.divide(UNITY, b.scale, out=b.scale)
 
     def _hyperbolic_phase(self, b: _Block) -> None:
         """Set b.y in [-pi/2, pi/2], b.flip = (-1)^(N/2), b.sin = sinh x and b.cos = cosh x."""
-        self.phase.count_steps(b)
-        half_turn = TABLE_STEPS // 2
-        np.multiply(b.step, 1.0 / half_turn, out=b.work)
-        np.rint(b.work, out=b.work)
-        np.copyto(b.index, b.work, casting='unsafe')
-        np.bitwise_and(b.index, 1, out=b.index)
-        np.multiply(b.index, -2.0, out=b.flip)
-        np.add(b.flip, 1.0, out=b.flip)
-        np.multiply(b.work, half_turn, out=b.work)
-        np.subtract(b.step, b.work, out=b.step)
-        np.add(b.step, b.rest, out=b.y)
-        np.multiply(b.y, STEP_ANGLE, out=b.y)
-        np.multiply(b.y, self.stretch, out=b.work)
-        np.exp(b.work, out=b.work)
-        np.divide(0.5, b.work, out=b.rest)
-        np.multiply(b.work, 0.5, out=b.work)
-        np.subtract(b.work, b.rest, out=b.sin)
-        np.add(b.work, b.rest, out=b.cos)
+        (step,), (rest,) = self.phase.count_steps(b)
+        (start,) = self.phase.start_steps
+        step += start - COUNTER
+        half_turns = np.rint(step * (2.0 / TABLE_STEPS))
+        np.subtract(1.0, 2.0 * (half_turns.astype(np.int64) & 1), out=b.flip)
+        step -= half_turns * (TABLE_STEPS // 2)
+        np.multiply(step + rest, STEP_ANGLE, out=b.y)
+        growing = 0.5 * np.exp(b.y * self.stretch)
+        falling = 0.25 / growing
+        np.subtract(growing, falling, out=b.sin)
+        np.add(growing, falling, out=b.cos)
 
     def quaternion_grid(self, start_ns: int, step_ns: int, count: int) -> np.ndarray:
         """Return (count, 4) x, y, z, w; in the real form only."""
@@ -619,9 +642,9 @@ class _Grid:
     def _within_row(self, factor: _AttitudeFactor) -> np.ndarray:
         """Return real over imaginary parts of c_n exp(i nu_n k step), k within a row."""
         modes = factor.modes()
-        phase = self.attitudes.phase.fixed
+        phase = self.attitudes.phase_fixed
         waves = np.array(list(modes.values()))[:, None] * _waves(
-            modes, _fractions(0, factor.rotor.fixed.rate * self.step_ns, GRID_BLOCK),
+            modes, _fractions(0, factor.fixed.rate * self.step_ns, GRID_BLOCK),
             _fractions(0, phase.rate * self.step_ns, GRID_BLOCK))
         return np.concatenate((waves.real, waves.imag))
 
@@ -630,7 +653,7 @@ class _Grid:
         """Return exp(i nu_n T) so that products with `_within_row` are real, imaginary parts."""
         row_ns = self.step_ns * GRID_BLOCK
         rotation, phase = (_fractions(fixed.at(start_ns), fixed.rate * row_ns, rows)
-                           for fixed in (factor.rotor.fixed, self.attitudes.phase.fixed))
+                           for fixed in (factor.fixed, self.attitudes.phase_fixed))
         waves = _waves(factor.modes(), rotation, phase).T
         return (np.concatenate((waves.real, -waves.imag), axis=1),
                 np.concatenate((waves.imag, waves.real), axis=1))

@@ -75,7 +75,7 @@ class Motion(Columns):
     @lazy
     def angular_velocity(self) -> Column:
         """Body rates (n, 3) [rad/s]."""
-        return np.stack(self.body_rates, axis=-1)
+        return np.stack(np.broadcast_arrays(*self.body_rates), axis=-1)
 
     @lazy
     def angular_acceleration(self) -> Column:

@@ -41,6 +41,10 @@ class Winding:
         self.momentum, self.phase = momentum, phase
         self.sign = math.copysign(1.0, modulus)
 
+    def moved_to(self, phase: float) -> Winding:
+        """Return the same winding at another phase."""
+        return Winding(self.momentum, self.sign, phase)
+
     @property
     def crosses(self) -> bool:
         """Whether this parameter can vanish: it then moves on a straight line through zero."""
@@ -77,6 +81,44 @@ def windings(start: State) -> tuple[Winding, Winding]:
                     0.5 * (start.phi + start.psi)),
             Winding(start.lz - start.l3, math.sin(0.5 * start.theta),
                     0.5 * (start.phi - start.psi)))
+
+
+class StepPhases:
+    """
+    See `Phases`; t lies in a step that began with the phases and theta/2 that are given here.
+
+    A state read in that step keeps this: its angles stay right when the steps go on.
+    """
+
+    def __init__(self, line_rate: float, alpha: Winding, beta: Winding,
+                 half_theta: float) -> None:
+        """Take Omega/2 [rad/s], and the windings' phases less that line."""
+        self._line_rate, self._alpha, self._beta = line_rate, alpha, beta
+        self._half_theta = half_theta
+
+    def polar(self, alpha: complex, beta: complex, t: float) -> Polar:
+        """See `Phases`."""
+        return self._continue(alpha, beta, self._line_rate * t)
+
+    def theta(self, half_theta: float, t: float) -> float:
+        """See `Phases`; theta/2 turns by less than pi within a step."""
+        return 2.0 * (half_theta
+                      + math.tau * round((self._half_theta - half_theta) / math.tau))
+
+    def _continue(self, alpha: complex, beta: complex, line: float) -> Polar:
+        a, b = self._alpha, self._beta
+        return (a.on_line(alpha, a.phase + line) if a.crosses
+                else a.onward(alpha, a.phase + line),
+                b.on_line(beta, b.phase - line) if b.crosses
+                else b.onward(beta, b.phase - line))
+
+    def moved_to(self, alpha: complex, beta: complex, line: float) -> StepPhases:
+        """Return those of the step that begins with alpha and beta, whose phases have `line`."""
+        (cosine, phase_a), (sine, phase_b) = self._continue(alpha, beta, line)
+        return StepPhases(
+            self._line_rate, self._alpha.moved_to(phase_a - line),
+            self._beta.moved_to(phase_b + line),
+            0.5 * self.theta(math.atan2(sine, cosine), 0.0))
 
 
 def spin_excess(top: Top, l3: float) -> float:

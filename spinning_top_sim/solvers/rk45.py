@@ -11,11 +11,12 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.kinematics import AxisState, OneState
 from spinning_top_sim.physics.regimes import cubic
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.dormand_prince import Form, Integrator, Vector
+from spinning_top_sim.solvers.dormand_prince import Form, IntegrationError, Integrator, Vector
 from spinning_top_sim.solvers.euler_form import EulerForm
 from spinning_top_sim.solvers.phases import (
     MomentumState,
     Polar,
+    StepPhases,
     Winding,
     spin_excess,
     windings,
@@ -24,6 +25,12 @@ from spinning_top_sim.solvers.transport import TransportForm
 
 NANOSECONDS = 1_000_000_000
 EQUATIONS = ('transport', 'euler')
+# Larger energies and rates leave no room for their products in doubles.
+MOST = 1e290
+# A time that so many steps of the present size do not reach is refused at once: 3 hours of work.
+MOST_STEPS = 1e9
+# The careful first steps say nothing about that.
+TRIAL_STEPS = 100
 # How many units in the last place count as rounding.
 REST_ULPS = 2.0
 # And how far the axis may swing all the same, in cos(theta) over sin^2(theta).
@@ -37,9 +44,23 @@ def rk45(top: Top, start: State, *, equations: str = 'transport', rtol: float = 
 
     rtol, atol: tolerated error a step.  The transport form scales its unknowns to 1, so there
     the two add up; the Euler form tolerates atol + rtol |angle|.
-    Raises ValueError for a bad setting, IntegrationError where the Euler form cannot start.
+    Raises ValueError for a bad setting or constants that doubles cannot hold, IntegrationError
+    where the Euler form cannot start.
     """
     check_settings(equations, rtol, atol)
+    try:
+        motion = _motion(top, start, equations, rtol, atol)
+        first = motion.at(0.0)
+        held = all(abs(x) <= MOST for x in (first.energy, first.phi_dot, first.psi_dot))
+    except ArithmeticError:
+        held = False
+    if not held:
+        raise ValueError(f'{top} from {start}: the constants are too far apart in size for '
+                         'doubles to hold the motion')
+    return motion
+
+
+def _motion(top: Top, start: State, equations: str, rtol: float, atol: float) -> SteppedOrClosed:
     if equations == 'euler':
         return EulerMotion(top, start, rtol, atol)
     if top.gravity_torque == 0.0:
@@ -139,6 +160,12 @@ class _Stepped(SteppedOrClosed):
                 return False
             self._step()
             taken += 1
+            step = integrator.t1 - integrator.t0
+            if max_steps is None and taken == TRIAL_STEPS and t - integrator.t1 > (
+                    MOST_STEPS * step):
+                raise IntegrationError(
+                    f't = {t:.9g} s is more than {MOST_STEPS:.0e} steps of {step:.3g} s away: '
+                    "use method = 'exact'")
         return True
 
     def _step(self) -> None:
@@ -172,10 +199,10 @@ class TransportMotion(_Stepped):
         self._top, self._start = top, start
         self._form = TransportForm(top, start, rtol, atol)
         super().__init__(self._form, self._form.start, self._form.first_step)
-        self._alpha, self._beta = windings(start)
-        self._line_rate = 0.5 * spin_excess(top, start.l3)
+        alpha, beta = windings(start)
+        self._phases = StepPhases(0.5 * spin_excess(top, start.l3), alpha, beta,
+                                  0.5 * start.theta)
         self._carried_rate = 0.5 * self._form.spin_carried / top.lambda1
-        self._half_theta = 0.5 * start.theta
 
     def at(self, t: float) -> OneState:
         """Return the state at t [s], on the invariants."""
@@ -184,34 +211,14 @@ class TransportMotion(_Stepped):
             alpha, beta, m = self._form.project((alpha, beta, m))
         spin = cmath.rect(1.0, 0.5 * self._form.spin_rate * t)
         return MomentumState(self._top, self._start, alpha * spin, beta * spin.conjugate(),
-                             -2j * self._top.lambda1 * m, t, self)
-
-    def polar(self, alpha: complex, beta: complex, t: float) -> Polar:
-        """See `phases.Phases`; t lies in the newest step."""
-        line = self._line_rate * t
-        return self._continue(alpha, beta, line)
-
-    def theta(self, half_theta: float, t: float) -> float:
-        """See `phases.Phases`; theta/2 turns by less than pi within a step."""
-        return 2.0 * (half_theta
-                      + math.tau * round((self._half_theta - half_theta) / math.tau))
-
-    def _continue(self, alpha: complex, beta: complex, line: float) -> Polar:
-        a, b = self._alpha, self._beta
-        return (a.on_line(alpha, a.phase + line) if a.crosses
-                else a.onward(alpha, a.phase + line),
-                b.on_line(beta, b.phase - line) if b.crosses
-                else b.onward(beta, b.phase - line))
+                             -2j * self._top.lambda1 * m, t, self._phases)
 
     def _step(self) -> None:
         """Take a step, after moving the phases to where it starts."""
-        integrator, a, b = self._integrator, self._alpha, self._beta
+        integrator = self._integrator
         alpha, beta, _ = integrator.y1
         # The stepped frame lacks the spin of `TransportForm.spin_rate`: so does its line.
-        line = -self._carried_rate * integrator.t1
-        (cosine, phase_a), (sine, phase_b) = self._continue(alpha, beta, line)
-        a.phase, b.phase = phase_a - line, phase_b + line
-        self._half_theta = 0.5 * self.theta(math.atan2(sine, cosine), integrator.t1)
+        self._phases = self._phases.moved_to(alpha, beta, -self._carried_rate * integrator.t1)
         integrator.step()
 
 

@@ -53,8 +53,10 @@ class TransportForm:
         self.start = self._vector(start)
         # What 2 lambda1 |m|^2 + P cos(theta) must stay; the rest of the energy is constant.
         self._energy = self._axis_energy(*self.start)
-        # |m| never exceeds this: the scale of its error, as 1 is that of alpha and beta.
-        self._scale = math.sqrt(max(0.5 * (self._energy + abs(torque)) / lambda1, 0.0)) or 1.0
+        # |m| never exceeds this: the scale of its error, as 1 is that of alpha and beta.  Close to
+        # hanging the sum is what its rounding leaves.
+        above_lowest = max(self._energy + abs(torque), 4.0 * math.ulp(1.0) * abs(torque))
+        self._scale = math.sqrt(0.5 * above_lowest / lambda1) or 1.0
         self._tolerance = rtol + atol
         self._large_enough = NUTATION_SHARE * self._scale ** 2
 

@@ -112,16 +112,7 @@ class Template:
 
         count = len(stamps_ns)
         if self._rows is None or len(self._rows) < count:
-            names = [f'run{i}' for i in range(len(self._fields))]
-            formats: list[Any] = [('<f8', (number,)) for _, number in self._fields]
-            offsets = [at for at, _ in self._fields]
-            if self._stamp_at is not None:
-                names += ['sec', 'nanosec']
-                formats += ['<i4', '<u4']
-                offsets += [self._stamp_at, self._stamp_at + 4]
-            self._rows = numpy.empty(count, numpy.dtype({
-                'names': names, 'formats': formats, 'offsets': offsets,
-                'itemsize': len(self._buffer)}))
+            self._rows = numpy.empty(count, self._row_type())
             self._rows.view('u1').reshape(count, -1)[:] = numpy.frombuffer(self._buffer, 'u1')
         rows = self._rows[:count]
         if self._stamp_at is not None:
@@ -134,3 +125,34 @@ class Template:
                 for column, values in enumerate(run):
                     field[:, column] = values
         return rows.view('u1').reshape(count, -1)
+
+    def decode_many(self, data: bytes) -> tuple[Any, ...]:
+        """Return the runs, (n, count) arrays each, of n messages one after the other."""
+        import numpy  # noqa: PLC0415
+
+        rows = numpy.frombuffer(data, self._row_type())
+        return tuple(rows[f'run{i}'] for i in range(len(self._fields)))
+
+    def _row_type(self) -> Any:
+        """Return a message as a numpy type: the runs, and the stamp if there is one."""
+        import numpy  # noqa: PLC0415
+
+        names = [f'run{i}' for i in range(len(self._fields))]
+        formats: list[Any] = [('<f8', (number,)) for _, number in self._fields]
+        offsets = [at for at, _ in self._fields]
+        if self._stamp_at is not None:
+            names += ['sec', 'nanosec']
+            formats += ['<i4', '<u4']
+            offsets += [self._stamp_at, self._stamp_at + 4]
+        return numpy.dtype({'names': names, 'formats': formats, 'offsets': offsets,
+                            'itemsize': len(self._buffer)})
+
+    def field_at(self, at: int) -> tuple[int, int, int] | None:
+        """Return run, element and offset of what holds a byte: run -1 is the stamp."""
+        if self._stamp_at is not None and 0 <= at - self._stamp_at < 8:
+            return -1, 0, self._stamp_at
+        for run, (begin, count) in enumerate(self._fields):
+            if 0 <= at - begin < 8 * count:
+                element = (at - begin) // 8
+                return run, element, begin + 8 * element
+        return None

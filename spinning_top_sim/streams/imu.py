@@ -44,6 +44,14 @@ class Imu:
             return state.quaternion
         return _product(attitude.quaternion(state.alpha, state.beta), self._mounting)
 
+    def in_body(self, orientation: Quaternion, rates: Vector) -> tuple[Quaternion, Vector]:
+        """Return attitude and rates of the body from those of the IMU."""
+        if not self._turned:
+            return orientation, rates
+        x, y, z, w = self._mounting
+        return (_product(orientation, (-x, -y, -z, w)),
+                _apply(_transposed(self._to_sensor), rates))
+
     def true(self, state: Columns) -> tuple[Vector, Vector]:
         """Return angular velocity [rad/s] and specific force [m/s^2] in the IMU's frame."""
         rates = state.body_rates

@@ -38,6 +38,12 @@ def command(l3: float, lz: float) -> bytes:
     return messages.float64_multi_array(('l3', 'lz')).encode(0, (l3, lz))
 
 
-def event(name: str, t_ns: int, **details: Any) -> bytes:
-    """Return an event as it is logged: std_msgs/String of JSON; t_ns is simulated time."""
-    return messages.string(json.dumps({'event': name, 't_ns': t_ns, **details}, default=list))
+def event(name: str, t_ns: int, sent_ns: int, **details: Any) -> bytes:
+    """
+    Return an event as it is logged: std_msgs/String of JSON.
+
+    t_ns: simulated time;  sent_ns: up to there all samples had been sent (-1: not even that of
+    t = 0), of the motion that a reset ended
+    """
+    return messages.string(json.dumps(
+        {'event': name, 't_ns': t_ns, 'sent_ns': sent_ns, **details}, default=list))

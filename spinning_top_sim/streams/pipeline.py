@@ -94,6 +94,11 @@ class Simulation:
         """Something that is the same as long as the same motion goes on."""
         return self._first
 
+    @property
+    def start_energy(self) -> float:
+        """Of the present motion [J], as it began."""
+        return self._first.energy
+
     def energy_drift(self, state: OneState) -> float:
         """Return the energy's relative drift since then (absolute where it was 0)."""
         return (state.energy - self._first.energy) / (abs(self._first.energy) or 1.0)
@@ -122,7 +127,7 @@ class Simulation:
 
         0 for the exact solution itself; NaN for a motion that it cannot hold.
         """
-        exact = self._exact()
+        exact = self.exact()
         if exact is None or exact is self.solver:
             return math.nan if exact is None else 0.0
         return attitude.angle_between(state.quaternion,
@@ -130,13 +135,17 @@ class Simulation:
 
     def describe(self) -> Description | None:
         """Return the present motion in numbers; None where the closed form cannot hold it."""
-        exact = self._exact()
+        exact = self.exact()
         if exact is None:
             return None
         return describe(self.top, exact.solution.start, exact.solution)
 
-    def _exact(self) -> ExactPropagator | None:
-        """Return the closed form of the present motion, set up when first asked for."""
+    def exact(self) -> ExactPropagator | None:
+        """
+        Return the closed form of the present motion, set up when first asked for.
+
+        Its t = 0 is `anchor_ns`.  None for a motion that it cannot hold.
+        """
         if isinstance(self.solver, ExactPropagator):
             return self.solver
         if self._reference is None:

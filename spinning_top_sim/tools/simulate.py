@@ -108,7 +108,7 @@ def _run(arguments: argparse.Namespace, values: dict[str, Any]) -> None:
     output = Path(arguments.output)
     kind = arguments.format or {'.csv': 'csv', '.parquet': 'parquet'}.get(output.suffix, 'mcap')
     duration_ns = round(values['duration'] * NANOSECONDS)
-    with _progress(values['duration'], arguments.quiet) as show:
+    with progress(values['duration'], arguments.quiet) as show:
         if kind == 'mcap':
             summary = write_log(output, values, duration_ns, commands,
                                 epoch_ns=round(arguments.epoch * NANOSECONDS),
@@ -121,7 +121,7 @@ def _run(arguments: argparse.Namespace, values: dict[str, Any]) -> None:
         print(f'{output}: {summary}')
 
 
-class _progress:  # noqa: N801 - a context manager, used like a function
+class progress:  # noqa: N801 - a context manager, used like a function
     """Shows simulated seconds on a terminal: `show(t)`."""
 
     def __init__(self, total: float, quiet: bool) -> None:
@@ -187,17 +187,17 @@ def write_log(path: Path, values: Mapping[str, Any], duration_ns: int,
 
     for index, stream in enumerate(streams):
         stream.record = partial(write, index)
-    write(events_topic, epoch_ns, journal.event('start', 0))
+    write(events_topic, epoch_ns, journal.event('start', 0, -1))
     try:
-        for target_ns, command in _stretches(duration_ns, commands,
-                                             _stride(streams) if columns else STRIDE_NS):
+        for target_ns, command in stretches(duration_ns, commands,
+                                            stride(streams) if columns else STRIDE_NS):
             advance(target_ns)
             if command is not None:
                 _, l3, lz = command
                 simulation.command(l3, lz)
                 at_ns = simulation.history[-1][0]
                 write(events_topic, epoch_ns + at_ns,
-                      journal.event('command', at_ns, l3=l3, lz=lz))
+                      journal.event('command', at_ns, simulation.now_ns, l3=l3, lz=lz))
                 write(commands_topic, epoch_ns + at_ns, journal.command(l3, lz))
             show(target_ns)
     finally:
@@ -206,9 +206,13 @@ def write_log(path: Path, values: Mapping[str, Any], duration_ns: int,
     return f'{sum(file.counts)} messages, {file.size / 1e6:.1f} MB'
 
 
-def _stretches(duration_ns: int, commands: Sequence[Command], stride_ns: int,
-               ) -> Iterator[tuple[int, Command | None]]:
-    """Yield how far to go next, and the command to apply there."""
+def stretches(duration_ns: int, commands: Sequence[Command], stride_ns: int,
+              ) -> Iterator[tuple[int, Command | None]]:
+    """
+    Yield how far to go next, and the command to apply there.
+
+    The last bits of columns depend on it.
+    """
     now = 0
     due = [command for command in commands if command[0] <= duration_ns]
     for until_ns, command in (*((command[0], command) for command in due), (duration_ns, None)):
@@ -219,7 +223,7 @@ def _stretches(duration_ns: int, commands: Sequence[Command], stride_ns: int,
         yield now, command
 
 
-def _stride(streams: Sequence[Any]) -> int:
+def stride(streams: Sequence[Any]) -> int:
     """Return the simulated time that fills a chunk of columns [ns]."""
     bytes_per_ns = sum(len(stream.template) / stream.period_ns for stream in streams)
     return max(int(CHUNK_BYTES / bytes_per_ns), 1) if bytes_per_ns else STRIDE_NS

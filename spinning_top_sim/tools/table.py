@@ -73,7 +73,7 @@ def _columns(simulation: Simulation, times: Any, period: int) -> list[Any]:
     solver = simulation.solver
     if isinstance(solver, ExactPropagator):
         grid = solver.grid(int(times[0]) - simulation.anchor_ns, period, len(times))
-        return [read(grid) for _, _, read in COLUMNS]
+        return [np.broadcast_to(read(grid), len(times)) for _, _, read in COLUMNS]
     rows = []
     for t_ns in times.tolist():
         state = solver.at_ns(t_ns - simulation.anchor_ns)

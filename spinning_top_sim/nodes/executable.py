@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How every node of ours runs: start, spin, and end properly whichever way it is asked to."""
+
+from __future__ import annotations
+
+import re
+import signal
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from rclpy.context import Context
+    from rclpy.task import Future
+
+
+class RunnableNode(Protocol):
+    """
+    A node as `run` needs it, besides what rclpy wants.
+
+    finished: completes when the node ends by itself, with its exit code (None is 0)
+    """
+
+    finished: Future
+    context: Context
+
+    def start(self) -> None:
+        """Begin to work: the node is about to be spun."""
+
+    def stop(self) -> None:
+        """End the work, whatever state the context is in."""
+
+    def destroy_node(self) -> None: ...
+
+
+def run(name: str, argv: list[str],
+        prepare: Callable[[list[str]], Callable[[], RunnableNode] | None]) -> int:
+    """
+    Run a node; return 0 after an ordinary end, 2 for what could not be started.
+
+    prepare: gets the arguments before ROS does; returns what makes the node, or None when there is
+    nothing to run.  It and what it returns may raise ValueError, RuntimeError or OSError, whose
+    text is shown.
+    """
+    try:
+        try:
+            make_node = prepare(argv)
+        except (ValueError, RuntimeError, OSError) as error:
+            return _cannot_start(name, error)
+        return 0 if make_node is None else _run(name, argv, make_node)
+    except KeyboardInterrupt:           # before the node was there
+        return 130
+
+
+def _cannot_start(name: str, error: Exception) -> int:
+    """Say why in one line, without the places in the sources of rcl; return the exit code."""
+    text = re.sub(r',\s*at \S+:\d+', '', str(error))
+    print(f'{name}: cannot start: {" ".join(text.split())}', file=sys.stderr)
+    return 2
+
+
+def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode]) -> int:
+    import rclpy  # noqa: PLC0415 - so that Ctrl-C while rclpy is imported ends quietly too
+    from rclpy.exceptions import ParameterException  # noqa: PLC0415
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor  # noqa: PLC0415
+
+    try:
+        rclpy.init(args=argv)
+    except Exception as error:          # a params file that is missing or no YAML, a bad remapping
+        return _cannot_start(name, error)
+    node = None
+    try:
+        try:
+            node = make_node()
+        except (ValueError, RuntimeError, OSError, ParameterException) as error:
+            return _cannot_start(name, error) if rclpy.ok() else 0
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        node.start()
+        executor.spin_until_future_complete(node.finished)
+        if node.finished.done():
+            return node.finished.result() or 0
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except Exception:
+        # What was in the middle of a call when the context went down raises whatever it likes.
+        if rclpy.ok():
+            raise
+    finally:
+        # A launched node is told twice, by the terminal and by launch.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        if node is not None:
+            node.stop()
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0

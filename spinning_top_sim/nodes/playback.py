@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recorded messages at their recorded distances: reading ahead, rounds, and the moment to send."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+
+from spinning_top_sim.nodes.pacing import SimulatedClock
+
+Message = tuple[int, int, bytes]    # time [ns], which publisher, CDR
+
+# Between the last message of a round and the first of the next; also what a log of a single
+# moment is repeated at.
+ROUND_GAP_NS = 10_000_000
+# A message sent later than this is counted.
+LATE_NS = 10_000_000
+
+BATCH_BYTES = 256_000
+BATCH_MESSAGES = 512
+BATCHES = 16
+
+
+def rounds(read: Callable[[], Iterable[Message]], length_ns: int, loop: bool) -> Iterator[Message]:
+    """
+    Yield the messages once, or again and again with times that go on.
+
+    read: returns the messages of one round;  length_ns: from the first round's begin to the next's
+    """
+    shift = 0
+    while True:
+        empty = True
+        for at_ns, index, data in read():
+            empty = False
+            yield at_ns + shift, index, data
+        if empty or not loop:
+            return
+        shift += length_ns
+
+
+class ReadAhead:
+    """
+    Iterates over messages that a thread reads ahead, a bounded number of them.
+
+    Reading takes a while whenever a chunk begins; whoever waits for deadlines should not do it.
+    What the reading raises is raised here, in its place.
+    """
+
+    _END = object()
+
+    def __init__(self, messages: Iterable[Message]) -> None:
+        self._messages = messages
+        self._batches: queue.Queue = queue.Queue(BATCHES)
+        self._stopped = False
+        self._thread = threading.Thread(target=self._read, name='read ahead', daemon=True)
+        self._thread.start()
+
+    def __iter__(self) -> Iterator[Message]:
+        while not self._stopped:
+            batch = self._batches.get()
+            if batch is self._END:
+                return
+            if isinstance(batch, Exception):
+                raise batch
+            yield from batch
+
+    def stop(self) -> None:
+        """End both the reading and the iterating."""
+        self._stopped = True
+        # Whichever of the two waits for the other finds something: room, and the end.
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._batches.get_nowait()
+        with contextlib.suppress(queue.Full):
+            self._batches.put_nowait(self._END)
+        if self._thread is not threading.current_thread():
+            self._thread.join(1.0)
+
+    def _read(self) -> None:
+        try:
+            batch: list[Message] = []
+            size = 0
+            for message in self._messages:
+                batch.append(message)
+                size += len(message[2])
+                if size >= BATCH_BYTES or len(batch) >= BATCH_MESSAGES:
+                    self._batches.put(batch)
+                    batch, size = [], 0
+                if self._stopped:
+                    return
+            self._batches.put(batch)
+            self._batches.put(self._END)
+        except Exception as error:
+            self._batches.put(error)
+
+
+class Playback:
+    """
+    Sends messages when their time has come by a clock that can stand still and change its rate.
+
+    A deadline is computed from the clock alone, never from the one before, so nothing drifts.
+    What is due together is sent together; what is late is sent at once and counted, not dropped.
+
+    messages: in the order of their times;  begin_ns: time at which the clock starts
+    send: called with (which publisher, CDR)
+    source, sleep: steady time [ns], and what waits that many seconds (None: until told), or less
+
+    sent, late: counts;  paused: whether the clock stands
+    """
+
+    def __init__(self, messages: Iterable[Message], begin_ns: int, rate: float,
+                 send: Callable[[int, bytes], None], *, paused: bool = False,
+                 source: Callable[[], int] = time.monotonic_ns,
+                 sleep: Callable[[float | None], None] | None = None) -> None:
+        self._messages, self._send, self._source = messages, send, source
+        self._clock = SimulatedClock(source, rate)
+        self._clock.stop(begin_ns)
+        self._begun = False
+        self._stopped = False
+        self._known_until = begin_ns        # no message of before this is still to be sent
+        self._wake = threading.Event()
+        self._sleep = sleep or self._sleep_until_told
+        self._lock = threading.Lock()       # the clock, and sending
+        # Held while waiting for the lock, so that who plays without a rest leaves it to others.
+        self._turnstile = threading.Lock()
+        self.paused = paused
+        self.sent = self.late = 0
+
+    def run(self) -> None:
+        """Play to the end, or until stopped."""
+        messages = iter(self._messages)
+        first = list(itertools.islice(messages, 1))     # read before the clock starts
+        with self._control():
+            self._begun = True
+            self._run_clock()
+        for at_ns, index, data in itertools.chain(first, messages):
+            self._known_until = at_ns
+            if not self._send_when_due(at_ns, index, data):
+                return
+
+    def now(self) -> int:
+        """Return the time of the messages [ns]: all of before are sent."""
+        with self._control():
+            return min(self._clock.now(), self._known_until)
+
+    def pause(self, paused: bool) -> None:
+        """Stand still, or go on as if no time had passed; no message is sent after the return."""
+        with self._control():
+            self.paused = paused
+            self._run_clock()
+
+    def set_rate(self, rate: float) -> None:
+        """Go on at another rate."""
+        with self._control():
+            self._clock.set_scale(rate)
+
+    def stop(self) -> None:
+        """Make `run` return, soon."""
+        with self._control():
+            self._stopped = True
+
+    def rest(self, seconds: float) -> bool:
+        """Wait before or after playing; return whether nobody said stop."""
+        self._sleep(seconds)
+        return not self._stopped
+
+    def _run_clock(self) -> None:
+        runs = self._begun and not self.paused
+        if runs and not self._clock.running:
+            self._clock.start(self._clock.now())
+        elif not runs:
+            self._clock.stop()
+
+    def _send_when_due(self, at_ns: int, index: int, data: bytes) -> bool:
+        """Send a message when its time has come; return False when stopped before."""
+        while True:
+            with self._turnstile:
+                pass
+            with self._lock:
+                if self._stopped:
+                    return False
+                due = self._clock.when(at_ns)
+                left = None if due is None else due - self._source()
+                if left is not None and left <= 0:
+                    self._send(index, data)
+                    self.sent += 1
+                    self.late += left < -LATE_NS
+                    return True
+            self._sleep(None if left is None else left / 1e9)
+
+    @contextlib.contextmanager
+    def _control(self) -> Iterator[None]:
+        with self._turnstile, self._lock:
+            yield
+        self._wake.set()
+
+    def _sleep_until_told(self, seconds: float | None) -> None:
+        self._wake.wait(None if seconds is None else min(seconds, threading.TIMEOUT_MAX))
+        self._wake.clear()

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The executable `replay_node`."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from spinning_top_sim.nodes import executable
+
+if TYPE_CHECKING:
+    from spinning_top_sim.nodes.replayer import Replayer
+    from spinning_top_sim.recording.reader import LogReader
+
+DESCRIPTION = """\
+Publish the messages of a ROS 2 log (.mcap) with their recorded spacing, then end.
+
+  ros2 run spinning_top_sim replay_node run.mcap
+  ros2 run spinning_top_sim replay_node run.mcap --rate 0.5 --loop --clock
+  ros2 run spinning_top_sim replay_node run.mcap --ros-args -r /imu/data_raw:=/replayed/imu
+"""
+
+EPILOG = """\
+Topics keep their recorded names, whatever the namespace of this node (`replay`); remapping with
+`--ros-args -r FROM:=TO` works on them. They are published with the recorded QoS, and
+`qos_overrides.<topic>.publisher.{history,depth,reliability}` override it. A topic whose type is
+not installed is named and left out. Messages go out in the order of their log times and with their
+recorded bytes: stamps inside them stay as they are, in every round of --loop. What is late is sent
+at once; at high rates a greater depth keeps more of it for subscribers that cannot follow.
+
+while playing:
+  ros2 service call /replay/set_pause std_srvs/srv/SetBool '{data: true}'
+  ros2 param set /replay rate 2.0
+
+exit code: 0 played (also in part: topics left out, ended by a signal), 2 cannot be played
+"""
+
+CLOCK_RATE = 40.0           # Hz, as `ros2 bag play` has it
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the node; return 0 after an ordinary end, 2 for what could not be played."""
+    return executable.run('replay_node', sys.argv if argv is None else argv, _prepare)
+
+
+def _prepare(argv: list[str]) -> Callable[[], Replayer]:
+    from rclpy.utilities import remove_ros_args  # noqa: PLC0415
+
+    arguments = _parser().parse_args(remove_ros_args(argv)[1:])
+
+    log = _open(arguments.file, partial=arguments.partial)
+
+    def make_node() -> Replayer:
+        from spinning_top_sim.nodes.replayer import Options, Replayer  # noqa: PLC0415
+
+        return Replayer(log, Options(
+            rate=arguments.rate, loop=arguments.loop, start=arguments.start,
+            topics=tuple(arguments.topics), clock=arguments.clock,
+            partial=arguments.partial, paused=arguments.start_paused, delay=arguments.delay,
+            subscribers=arguments.wait_for_subscribers))
+
+    return make_node
+
+
+def _open(path: Path, *, partial: bool) -> LogReader:
+    """Open a log.  Raises ValueError for what is none, and for a torn one unless `partial`."""
+    from spinning_top_sim.recording.errors import LogError  # noqa: PLC0415
+    from spinning_top_sim.recording.reader import LogReader  # noqa: PLC0415
+
+    try:
+        log = LogReader(path)
+        damage = None if log.whole else log.damage
+    except LogError as error:
+        raise ValueError(error) from error
+    if damage is not None and (damage.torn or damage.losses):
+        if not partial:
+            raise ValueError(f'{path} is torn: `recover` makes a whole log of it, --partial plays '
+                             'what is whole')
+        said = '; '.join(damage.lines()[:1])
+        print(f'replay_node: {path} is torn, playing what is whole{said and "; "}{said}',
+              file=sys.stderr)
+    return log
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='replay_node', description=DESCRIPTION, epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('file', type=Path, metavar='FILE', help='the log')
+    parser.add_argument('-r', '--rate', type=_positive, metavar='R',
+                        help='recorded over real time (default: the parameter `rate`, 1)')
+    parser.add_argument('-l', '--loop', action='store_true',
+                        help='begin again at the end; --clock goes on')
+    parser.add_argument('--start', type=_not_negative, default=0.0, metavar='S',
+                        help='begin S seconds after the begin of the log')
+    parser.add_argument('--topics', nargs='+', default=[], metavar='T',
+                        help='play these only, by their recorded names')
+    parser.add_argument('--clock', type=_positive, nargs='?', const=CLOCK_RATE, default=0.0,
+                        metavar='HZ', help="publish the log's time on /clock, HZ times a second "
+                        f'(default {CLOCK_RATE:g}), instead of a recorded /clock')
+    parser.add_argument('--partial', action='store_true',
+                        help='play what is whole of a torn log')
+    parser.add_argument('-p', '--start-paused', action='store_true',
+                        help='wait for ~/set_pause false')
+    parser.add_argument('-d', '--delay', type=_not_negative, default=0.0, metavar='S',
+                        help='wait S seconds before the first message')
+    parser.add_argument('--wait-for-subscribers', type=int, default=0, metavar='COUNT',
+                        help='wait until there are so many, over all topics')
+    return parser
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not (math.isfinite(value) and value > 0.0):
+        raise argparse.ArgumentTypeError(f'{text}: must be a finite number > 0')
+    return value
+
+
+def _not_negative(text: str) -> float:
+    value = float(text)
+    if not (math.isfinite(value) and value >= 0.0):
+        raise argparse.ArgumentTypeError(f'{text}: must be a finite number >= 0')
+    return value
+
+
+if __name__ == '__main__':
+    sys.exit(main())

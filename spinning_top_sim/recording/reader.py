@@ -1,0 +1,370 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Reading MCAP logs: ours or a stranger's, whole, torn or with wrong bytes.
+
+Everything that can be proven whole is read (`walk.py` says how damage is met), and `damage` says
+what is not.  Memory holds the chunks that overlap in time, one in a log written in order.
+"""
+
+from __future__ import annotations
+
+import functools
+import heapq
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple
+
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Header, Metadata
+from mcap.writer import MCAP0_MAGIC
+
+from spinning_top_sim.recording.damage import Damage
+from spinning_top_sim.recording.errors import NotMcapError
+from spinning_top_sim.recording.parsing import (
+    HEAD,
+    Damaged,
+    StoredMessage,
+    open_chunk,
+    parse_message,
+)
+from spinning_top_sim.recording.rosbag2 import parse_offered_qos
+from spinning_top_sim.recording.walk import (
+    MAGIC_SIZE,
+    Reading,
+    Walk,
+    read_summary,
+)
+
+_RUN_BYTES = 1 << 20  # of messages outside of chunks that are read at a time
+
+
+@dataclass(frozen=True)
+class LogTopic:
+    """
+    A channel of a log.
+
+    name: such as '/imu/data_raw';  type_name: such as 'sensor_msgs/msg/Imu', '' without schema
+    schema: its text, with those of the types it is made of;  schema_encoding: such as 'ros2msg'
+    encoding: of its messages, such as 'cdr'
+    qos: profiles offered, each as the `qos` of RecordedTopic; empty where none can be read
+    metadata: of the channel, as it stands;  channel_id: its number in the file
+    """
+
+    name: str
+    type_name: str
+    schema: str
+    schema_encoding: str
+    encoding: str
+    qos: tuple[Mapping[str, Any], ...]
+    metadata: Mapping[str, str]
+    channel_id: int
+
+
+class LogMessage(NamedTuple):
+    """
+    A message of a log.
+
+    topic: its name;  log_time, publish_time: [ns];  sequence: its number in the channel, as the
+    writer counts;  data: as `LogTopic.encoding` says;  channel_id: of its LogTopic
+    """
+
+    topic: str
+    log_time: int
+    publish_time: int
+    sequence: int
+    data: bytes
+    channel_id: int
+
+
+class _Span(NamedTuple):
+    """A stretch of the file with messages between two log times: a chunk or loose messages."""
+
+    start_ns: int
+    offset: int
+    length: int
+    end_ns: int
+
+
+class LogReader:
+    """
+    An MCAP file, open for reading; also a context manager.
+
+    A file whose summary is right opens at once.  Any other is read through before its topics,
+    metadata or messages are told, and so is every file for its `damage`.
+
+    Raises LogAccessError when the file cannot be opened or read, at any call, and NotMcapError
+    when it is none.  Damage raises nothing.
+
+    left_out: pieces of the file that `messages` came upon and left out, damaged
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        self.left_out = 0
+        self._reading = Reading(self.path)
+        try:
+            self._header = self._check_beginning()
+            self._summary = read_summary(self._reading)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Close the file."""
+        self._reading.close()
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file when it was opened."""
+        return self._reading.size
+
+    def __enter__(self) -> LogReader:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    @property
+    def profile(self) -> str:
+        """What the header says of the content; 'ros2' where it cannot be read."""
+        return self._header.profile
+
+    @property
+    def library(self) -> str:
+        """What the header says of the program that wrote the file; '' where it cannot be read."""
+        return self._header.library
+
+    @property
+    def whole(self) -> bool:
+        """
+        Whether the file was closed: its summary is there, is right and fits the file.
+
+        Chunks may be damaged all the same: `damage` tells.
+        """
+        return not self._summary.missing
+
+    @property
+    def topics(self) -> tuple[LogTopic, ...]:
+        """The channels of the log, in the order of their numbers."""
+        schemas, channels = self._declared
+        found = []
+        for number, channel in sorted(channels.items()):
+            schema = schemas.get(channel.schema_id)
+            found.append(LogTopic(
+                name=channel.topic, type_name=schema.name if schema else '',
+                schema=schema.data.decode(errors='replace') if schema else '',
+                schema_encoding=schema.encoding if schema else '',
+                encoding=channel.message_encoding, qos=qos_profiles(channel),
+                metadata=channel.metadata, channel_id=number))
+        return tuple(found)
+
+    @property
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """The metadata records by name; the last where a name stands for several."""
+        if self._survey_is_needed or '_survey' in self.__dict__:
+            return dict(self._survey.metadata)
+        found = {}
+        for index in self._summary.metadata:
+            try:
+                record = self._reading.record(index.offset, self._summary.data_end)
+            except Damaged:
+                continue
+            if isinstance(record, Metadata):
+                found[record.name] = record.metadata
+        return found
+
+    @property
+    def damage(self) -> Damage:
+        """What is wrong with the file; reads all of it at the first use."""
+        return self._survey.damage
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """Log times of the first and of the last message [ns]; both 0 without any."""
+        spans = [span for span in self._spans if span.end_ns]
+        return (min((span.start_ns for span in spans), default=0),
+                max((span.end_ns for span in spans), default=0))
+
+    def messages(
+        self, topics: Iterable[str] | None = None, start: int | None = None,
+        end: int | None = None,
+    ) -> Iterator[LogMessage]:
+        """
+        Yield the whole messages in the order of their log times, equal ones in file order.
+
+        topics: names, None for all;  start, end: log times [ns], from and up to but without
+
+        What is damaged is left out, counted in `left_out`, and told by `damage`.
+        """
+        schemas, known = self._declared
+        names = None if topics is None else frozenset(topics)
+        channels = {
+            number: channel.topic for number, channel in known.items()
+            if (names is None or channel.topic in names)
+            and (channel.schema_id == 0 or channel.schema_id in schemas)}
+
+        # One chunk after the other, those that overlap in time together.
+        pending: list[_Cursor] = []
+        for span in self._spans:
+            if (start is not None and span.end_ns < start) or (
+                    end is not None and span.start_ns >= end):
+                continue
+            yield from _merge(pending, channels, span.start_ns)
+            plain, stored = self._read(span)
+            chosen = [message for message in stored
+                      if message.channel_id in channels
+                      and (start is None or message.log_time >= start)
+                      and (end is None or message.log_time < end)]
+            if chosen:
+                chosen.sort(key=lambda message: message.log_time)
+                heapq.heappush(pending, (chosen[0].log_time, span.offset, 0, plain, chosen))
+        yield from _merge(pending, channels, None)
+
+    def walk(self) -> Walk:
+        """Begin a walk through all usable records in file order, for who rewrites the file."""
+        return Walk(self._reading, self._summary)
+
+    def blocks(self, offset: int, length: int) -> Iterator[bytes]:
+        """Yield bytes of the file, in blocks."""
+        return self._reading.blocks(offset, length)
+
+    @functools.cached_property
+    def _survey(self) -> _Survey:
+        """What a walk through the whole file found, done at the first use."""
+        walk = self.walk()
+        spans: list[_Span] = []
+        metadata = {}
+        run: _Span | None = None  # loose messages, one after the other
+        for piece in walk:
+            if isinstance(piece.record, Metadata):
+                metadata[piece.record.name] = piece.record.metadata
+            if piece.contents is None or not piece.contents.messages:
+                continue
+            times = [message.log_time for message in piece.contents.messages]
+            span = _Span(min(times), piece.offset, piece.length, max(times))
+            if piece.record is not None:
+                spans.append(span)
+            elif (run is not None and run.offset + run.length == span.offset
+                    and run.length < _RUN_BYTES):
+                run = _Span(min(run.start_ns, span.start_ns), run.offset,
+                            run.length + span.length, max(run.end_ns, span.end_ns))
+                spans[-1] = run
+            else:
+                run = span
+                spans.append(run)
+        return _Survey(walk, metadata, sorted(spans), walk.damage())
+
+    def _check_beginning(self) -> Header:
+        """Return the header; raises NotMcapError where neither magic nor header is there."""
+        if not self.size:
+            raise NotMcapError(f'cannot read {self.path}: it is empty')
+        magic = self._reading.at(0, MAGIC_SIZE)
+        if magic != MCAP0_MAGIC and len(magic) < MAGIC_SIZE and MCAP0_MAGIC.startswith(magic):
+            raise NotMcapError(
+                f'cannot read {self.path}: it ends after {self.size} bytes of an MCAP file')
+        try:
+            header = self._reading.record(MAGIC_SIZE, self.size)
+        except Damaged:
+            header = None
+        if isinstance(header, Header):
+            return header
+        if magic != MCAP0_MAGIC:
+            raise NotMcapError(f'cannot read {self.path}: it is no MCAP file')
+        return Header(profile='ros2', library='')
+
+    @property
+    def _declared(self) -> tuple[dict[int, Any], dict[int, Channel]]:
+        """Return schemas and channels by number."""
+        source = self._survey.walk if self._survey_is_needed else self._summary
+        return source.schemas, source.channels
+
+    @property
+    def _spans(self) -> list[_Span]:
+        if self._survey_is_needed or '_survey' in self.__dict__:
+            return self._survey.spans
+        return sorted(_Span(index.message_start_time, index.chunk_start_offset,
+                            index.chunk_length, index.message_end_time)
+                      for index in self._summary.chunks)
+
+    @functools.cached_property
+    def _survey_is_needed(self) -> bool:
+        """Whether the summary does not lead to all messages, metadata and channels."""
+        summary = self._summary
+        statistics = summary.statistics
+        if statistics is None:
+            return True
+        return (
+            not summary.all_in_chunks
+            or len(summary.metadata) != statistics.metadata_count
+            or len(summary.channels) != statistics.channel_count
+            or any(channel.schema_id not in {0, *summary.schemas}
+                   for channel in summary.channels.values()))
+
+    def _read(self, span: _Span) -> tuple[bytes, list[StoredMessage]]:
+        """Return the messages of a span and the bytes they are in; none where it is damaged."""
+        content = self._reading.at(span.offset, span.length)
+        try:
+            if content[:1] == bytes([Opcode.MESSAGE]):
+                return content, list(_loose_messages(content))
+            chunk = self._reading.record(span.offset, span.offset + span.length)
+            if isinstance(chunk, Chunk):
+                contents = open_chunk(chunk)
+                return contents.plain, contents.messages
+        except Damaged:
+            pass
+        self.left_out += 1
+        return b'', []
+
+
+@dataclass(frozen=True)
+class _Survey:
+    """What a walk through a file found."""
+
+    walk: Walk
+    metadata: dict[str, dict[str, str]]
+    spans: list[_Span]
+    damage: Damage
+
+
+# A chunk being read: next log time, where it is in the file, how many of its messages are
+# through, its bytes, its messages.
+_Cursor = tuple[int, int, int, bytes, list[StoredMessage]]
+
+
+def _merge(
+    cursors: list[_Cursor], names: Mapping[int, str], until_ns: int | None,
+) -> Iterator[LogMessage]:
+    """Yield messages of a heap of chunks, those before a log time or all."""
+    while cursors and (until_ns is None or cursors[0][0] < until_ns):
+        _, offset, number, plain, messages = cursors[0]
+        log_time, channel_id, sequence, publish_time, start, end = messages[number]
+        number += 1
+        if number < len(messages):
+            heapq.heapreplace(
+                cursors, (messages[number].log_time, offset, number, plain, messages))
+        else:
+            heapq.heappop(cursors)
+        yield LogMessage(names[channel_id], log_time, publish_time, sequence, plain[start:end],
+                         channel_id)
+
+
+def _loose_messages(records: bytes) -> Iterator[StoredMessage]:
+    """Yield the messages of message records that stand one after the other."""
+    offset = 0
+    while offset < len(records):
+        _, length = HEAD.unpack_from(records, offset)
+        offset += HEAD.size
+        message = parse_message(records[offset:offset + length])
+        yield message._replace(start=offset + message.start, end=offset + message.end)
+        offset += length
+
+
+def qos_profiles(channel: Channel) -> tuple[Mapping[str, Any], ...]:
+    """Return what a channel says its publishers offer; nothing where that cannot be read."""
+    return tuple(parse_offered_qos(channel.metadata.get('offered_qos_profiles', '')))

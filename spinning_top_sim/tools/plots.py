@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of a top: the tip's path on the sphere, a page about a log, an animation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from spinning_top_sim.tools.analysis import Tilts, interpolate
+
+if TYPE_CHECKING:
+    from spinning_top_sim.tools.survey import Motion, Survey
+
+ELEVATION, AZIMUTH = np.radians(45.0), np.radians(-60.0)
+INK, FAINT, PATH = '#1b1b1b', '#c9c9c9', '#0b6fa4'
+# Okabe and Ito's colours: told apart by the colour-blind, and by their greys.
+COLOURS = ('#0072b2', '#d55e00', '#009e73', '#cc79a7', '#e69f00', '#56b4e9')
+FINER = 10                  # points drawn for each sample
+PAGE_NUTATIONS, PAGE_S = 8, 5.0      # on the page; seconds where theta rests
+FRAMES_PER_S, LONGEST_S = 20, 10.0
+FRAME_SIZE, FRAME_DPI = 3.6, 90
+DISC, DISC_HEIGHT = 0.42, 0.45      # radius of the body's disc and its place on the axis
+
+
+def seen(x: Any, y: Any, z: Any, elevation: float = ELEVATION,
+         azimuth: float = AZIMUTH) -> tuple[Any, Any, Any]:
+    """Return the picture coordinates of points on the unit sphere, and their nearness."""
+    across = -np.sin(azimuth) * x + np.cos(azimuth) * y
+    towards = np.cos(azimuth) * x + np.sin(azimuth) * y
+    return (across, np.cos(elevation) * z - np.sin(elevation) * towards,
+            np.cos(elevation) * towards + np.sin(elevation) * z)
+
+
+def draw(axes: Any, points: tuple[Any, Any, Any], **style: Any) -> None:
+    """Draw a curve on the sphere: what lies behind it faintly."""
+    across, up, near = seen(*points)
+    for visible, alpha in ((near >= 0.0, 1.0), (near < 0.0, 0.25)):
+        axes.plot(np.where(visible, across, np.nan), np.where(visible, up, np.nan),
+                  alpha=alpha, **style)
+
+
+def circle(theta: float) -> tuple[Any, Any, Any]:
+    """Return the circle of one tilt."""
+    phi = np.linspace(0.0, 2.0 * np.pi, 400)
+    return np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.full(400, np.cos(theta))
+
+
+def draw_sphere(axes: Any, tilts: tuple[float, ...], lowest: float = -0.9) -> None:
+    """Draw the unit sphere with circles of these tilts; below `lowest` it is open."""
+    outline = np.linspace(0.0, 2.0 * np.pi, 400)
+    axes.plot(np.where(np.sin(outline) > lowest + 0.2, np.cos(outline), np.nan),
+              np.sin(outline), color=FAINT, linewidth=1.0)
+    for theta in tilts:
+        draw(axes, circle(theta), color=FAINT, linewidth=0.8)
+    axes.set_aspect('equal')
+    axes.set_xlim(-1.1, 1.1)
+    axes.set_ylim(lowest, 1.25)
+    axes.axis('off')
+
+
+def draw_tip(axes: Any, tip: Any, height: Any) -> None:
+    """Draw the tip's path, x + iy and z, and the axis at its end."""
+    draw(axes, (tip.real, tip.imag, height), color=PATH, linewidth=1.8)
+    across, up, _ = seen(tip.real[-1], tip.imag[-1], height[-1])
+    axes.plot([0.0, across], [0.0, up], color=INK, linewidth=2.2, solid_capstyle='round')
+    axes.plot([across], [up], 'o', color=INK, markersize=5)
+
+
+def smooth_tip(tilts: Tilts, finer: int = FINER) -> tuple[Any, Any, Any]:
+    """Return time [s], tip (x + iy) and height of the axis, with points between the samples."""
+    at = np.linspace(0.0, len(tilts.time) - 1.0, (len(tilts.time) - 1) * finer + 1)
+    return at * tilts.period, interpolate(tilts.tip, at), interpolate(tilts.height, at)
+
+
+def page(found: Survey, path: Path, name: str) -> None:
+    """Draw a page about a log of ours with attitudes in it.  Raises OSError, ValueError."""
+    assert found.tilts is not None
+    motion = _of(found, found.tilts)
+    period = motion.measured.nutation_period if motion.measured is not None else None
+    shown_s = PAGE_S if period is None else PAGE_NUTATIONS * period
+    tilts = found.tilts.first(shown_s)
+    figure = Figure(figsize=(11.0, 10.2 if found.readings else 7.8), layout='constrained')
+    rows = 4 if found.readings else 3
+    grid = figure.add_gridspec(rows, 2, height_ratios=[1.1, 1.1, 1.0, 1.0][:rows])
+    _title(figure, found, motion, name)
+    _tip_panel(figure.add_subplot(grid[0:2, 0]), tilts, motion)
+    tilt = figure.add_subplot(grid[0, 1])
+    _tilt_panel(tilt, tilts, motion)
+    _precession_panel(figure.add_subplot(grid[1, 1], sharex=tilt), tilts, motion)
+    _drift_panel(figure.add_subplot(grid[2, 0]), found)
+    _error_panel(figure.add_subplot(grid[2, 1]), found)
+    if found.readings:
+        for place, run, what, unit in ((grid[3, 0], 1, 'angular velocity', 'rad/s'),
+                                       (grid[3, 1], 2, 'specific force', 'm/s²')):
+            _imu_panel(figure.add_subplot(place), found, run, what, unit, shown_s)
+    figure.savefig(path, dpi=120)
+
+
+def _of(found: Survey, tilts: Tilts) -> Motion:
+    """Return the motion that the pictured samples are of."""
+    first = int(tilts.stamps_ns[0])
+    return next(motion for motion in found.motions if motion.begin_ns < first <= motion.end_ns)
+
+
+def _title(figure: Any, found: Survey, motion: Motion, name: str) -> None:
+    regime = motion.regime or (motion.described.name if motion.described else '')
+    figure.suptitle(f'{name}: {regime}', fontsize=14, color=INK)
+
+
+def _tip_panel(axes: Any, tilts: Tilts, motion: Motion) -> None:
+    turned = np.flatnonzero(np.abs(tilts.phi - tilts.phi[0]) > 2.0 * np.pi)
+    measured = motion.measured
+    if len(turned):         # one turn is enough, if two nutations are in it
+        period = None if measured is None else measured.nutation_period
+        tilts = tilts.first(max(float(tilts.time[turned[0]]), 2.0 * (period or 0.0)))
+    time, tip, height = smooth_tip(tilts)
+    low, high = ((float(np.min(tilts.theta)), float(np.max(tilts.theta))) if measured is None
+                 else (measured.theta_min, measured.theta_max))
+    draw_sphere(axes, (low, high, np.pi / 2),
+                lowest=-0.9 if high < np.radians(100.0) else -1.25)
+    draw_tip(axes, tip, height)
+    axes.set_title(f'path of the tip, t = 0 to {time[-1]:.3g} s', fontsize=11, color=INK)
+
+
+def _tilt_panel(axes: Any, tilts: Tilts, motion: Motion) -> None:
+    time, _, height = smooth_tip(tilts)
+    axes.plot(time, np.degrees(np.arccos(np.clip(height, -1.0, 1.0))), color=COLOURS[0])
+    if motion.measured is not None and motion.measured.nutation_period is not None:
+        axes.set_title(f'nutation, period {motion.measured.nutation_period:.9g} s', fontsize=11)
+    _dress(axes, 'tilt θ [deg]', 'time [s]')
+
+
+def _precession_panel(axes: Any, tilts: Tilts, motion: Motion) -> None:
+    if tilts.phi_dot is None:
+        axes.text(0.5, 0.5, "φ': no topic with rates", ha='center', transform=axes.transAxes)
+    else:
+        axes.plot(tilts.time, tilts.phi_dot, color=COLOURS[1])
+        low, high = np.nanpercentile(tilts.phi_dot, (1.0, 99.0))
+        if np.nanmax(np.abs(tilts.phi_dot)) > 20.0 * max(abs(low), abs(high), 1e-3):
+            axes.set_yscale('symlog', linthresh=max(abs(low), abs(high)))
+        axes.axhline(0.0, color=FAINT, linewidth=0.8, zorder=0)
+    if motion.measured is not None and motion.measured.mean_precession_rate is not None:
+        mean = motion.measured.mean_precession_rate
+        axes.axhline(mean, color=INK, linewidth=0.9, linestyle='--')
+        axes.set_title(f'precession, mean {mean:.9g} rad/s (dashed)', fontsize=11)
+    _dress(axes, "φ' [rad/s]", 'time [s]')
+
+
+def _drift_panel(axes: Any, found: Survey) -> None:
+    topic = min(found.drifts, default='', key=lambda name: found.drifts[name]['energy'].largest)
+    if topic:
+        for (name, curve), colour, style in zip(found.drifts[topic].items(), COLOURS,
+                                                ('-', '--', ':'), strict=False):
+            stamps, values = curve.points()
+            label = {'energy': 'E', 'l3': '$L_3$', 'lz': '$L_z$'}[name]
+            axes.plot((stamps - found.begin_ns) * 1e-9, values, style, color=colour,
+                      linewidth=1.0, label=label)
+        axes.legend(loc='upper left', ncols=3, fontsize=8, frameon=False)
+        axes.margins(y=0.25)
+        axes.set_title(f'drift of the constants, from {topic}', fontsize=11)
+    _mark_motions(axes, found)
+    _dress(axes, 'relative drift', 'time in the log [s]')
+
+
+def _error_panel(axes: Any, found: Survey) -> None:
+    if found.errors:
+        topic = min(found.errors, key=lambda name: found.errors[name].largest)
+        stamps, values = found.errors[topic].points()
+        axes.plot((stamps - found.begin_ns) * 1e-9, values, color=COLOURS[2], linewidth=1.0)
+        axes.set_title(f'error against the exact solution, from {topic}', fontsize=11)
+        axes.set_ylim(bottom=0.0)
+    _mark_motions(axes, found)
+    _dress(axes, 'orientation error [rad]', 'time in the log [s]')
+
+
+def _mark_motions(axes: Any, found: Survey) -> None:
+    """Mark commands and resets, where there are not too many."""
+    for motion in found.motions[1:] if len(found.motions) <= 30 else ():
+        axes.axvline((motion.begin_ns - found.begin_ns) * 1e-9, color=FAINT, linewidth=0.8,
+                     zorder=0)
+
+
+def _imu_panel(axes: Any, found: Survey, run: int, what: str, unit: str,
+               shown_s: float) -> None:
+    raw = [topic for topic in found.readings if topic.endswith('data_raw')]
+    true = [topic for topic in found.readings if topic.endswith('ground_truth/imu')]
+    topic = (raw or true or list(found.readings))[0]
+    stamps, columns = found.readings[topic][0], found.readings[topic][run]
+    time = (stamps - stamps[0]) * 1e-9
+    shown = time <= shown_s
+    for axis, column, colour in zip('xyz', columns.T, COLOURS, strict=False):
+        axes.plot(time[shown], column[shown], color=colour, linewidth=0.9, label=axis)
+    axes.legend(loc='upper right', ncols=3, fontsize=8, frameon=False)
+    axes.margins(y=0.2)
+    axes.set_title(f'{what}, {topic}', fontsize=11)
+    _dress(axes, f'{what} [{unit}]', 'time [s]')
+
+
+def _dress(axes: Any, what: str, when: str) -> None:
+    axes.set_ylabel(what, fontsize=9)
+    axes.set_xlabel(when, fontsize=9)
+    axes.tick_params(labelsize=8)
+    axes.margins(x=0.0)
+    for side in ('top', 'right'):
+        axes.spines[side].set_visible(False)
+
+
+def animate(found: Survey, path: Path) -> None:
+    """
+    Draw the turning top as a GIF, at most LONGEST_S of it: axis, disc with a mark, trace.
+
+    Raises OSError, ValueError.
+    """
+    from matplotlib.animation import FuncAnimation, PillowWriter  # noqa: PLC0415
+
+    tilts = found.tilts
+    assert tilts is not None
+    duration = min(LONGEST_S, float(tilts.time[-1]))
+    frames = max(2, int(duration * FRAMES_PER_S))
+    at = np.arange(frames) / (FRAMES_PER_S * tilts.period)
+    spin = np.interp(at, np.arange(len(tilts.psi)), tilts.psi)
+    trace = np.linspace(0.0, at[-1], frames * FINER)
+    tip, height = interpolate(tilts.tip, trace), interpolate(tilts.height, trace)
+    lowest = -0.9 if float(np.min(height)) > -0.2 else -1.25
+
+    figure = Figure(figsize=(FRAME_SIZE, FRAME_SIZE), dpi=FRAME_DPI)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+
+    def frame(number: int) -> list[Any]:
+        axes.clear()
+        draw_sphere(axes, (np.pi / 2,), lowest)
+        shown = number * FINER + 1
+        _draw_body(axes, tip[number * FINER], float(height[number * FINER]), float(spin[number]))
+        draw_tip(axes, tip[:shown], height[:shown])
+        axes.text(-1.05, 1.15, f't = {number / FRAMES_PER_S:.2f} s', color=INK, fontsize=9)
+        return []
+
+    FuncAnimation(figure, frame, frames=frames, blit=False).save(
+        path, writer=PillowWriter(fps=FRAMES_PER_S))
+
+
+def _draw_body(axes: Any, tip: complex, height: float, psi: float) -> None:
+    """Draw the disc across the axis, with a mark that turns with the body."""
+    axis = np.array([tip.real, tip.imag, height])
+    phi = float(np.angle(tip))
+    along = np.array([np.cos(phi) * height, np.sin(phi) * height, -abs(tip)])
+    across = np.array([-np.sin(phi), np.cos(phi), 0.0])
+
+    def rim(angle: Any, radius: float = DISC) -> Any:
+        angle = np.atleast_1d(angle)[:, None]
+        return DISC_HEIGHT * axis + radius * (np.cos(angle) * along + np.sin(angle) * across)
+
+    outline = seen(*rim(np.linspace(0.0, 2.0 * np.pi, 60)).T)
+    axes.fill(outline[0], outline[1], facecolor='#f2e3c9', edgecolor=INK, linewidth=1.0,
+              alpha=0.9)
+    sector = np.vstack((DISC_HEIGHT * axis, rim(psi + np.linspace(-0.25, 0.25, 9))))
+    mark = seen(*sector.T)
+    axes.fill(mark[0], mark[1], color=COLOURS[1])

@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading what a node has published and recorded, and what tests of it share."""
+
+import json
+import math
+import time
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from nav_msgs.msg import Odometry
+from node_harness import LIFETIME_S
+from rosbags.highlevel import AnyReader
+from sensor_msgs.msg import Imu, JointState
+
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.pipeline import Simulation
+
+SECOND = 1_000_000_000
+KINDS = {'pose': PoseStamped, 'joint_states': JointState, 'imu/data_raw': Imu,
+         'ground_truth/imu': Imu, 'ground_truth/odom': Odometry, 'ground_truth/imu_bias': Imu}
+PERIODS_NS = {'pose': 10_000_000, 'joint_states': 10_000_000, 'imu/data_raw': 5_000_000,
+              'ground_truth/imu': 5_000_000, 'ground_truth/odom': 10_000_000,
+              'ground_truth/imu_bias': 5_000_000}
+GRAVITY = 9.80665
+QUIET = {'status_period': 0.0}
+TRACEBACK = 'Traceback (most recent call last)'
+
+
+def stamp_of(data):
+    """Return the stamp [ns] of a serialized message that begins with a header."""
+    sec = int.from_bytes(data[4:8], 'little', signed=True)
+    return sec * SECOND + int.from_bytes(data[8:12], 'little')
+
+
+def stamps_of(topic):
+    return np.array([stamp_of(data) for data in topic.raw])
+
+
+def xyzw(q):
+    return q.x, q.y, q.z, q.w
+
+
+def xyz(v):
+    return v.x, v.y, v.z
+
+
+def product(p, q):
+    """Return the Hamilton product of arrays of x, y, z, w."""
+    (a, b, c, d), (x, y, z, w) = np.moveaxis(p, -1, 0), np.moveaxis(q, -1, 0)
+    return np.stack([d * x + a * w + b * z - c * y, d * y - a * z + b * w + c * x,
+                     d * z + a * y - b * x + c * w, d * w - a * x - b * y - c * z], axis=-1)
+
+
+def conjugate(q):
+    return q * np.array([-1.0, -1.0, -1.0, 1.0])
+
+
+def turned(q, v):
+    """Return R(q) v for arrays of x, y, z, w and of vectors."""
+    pure = np.concatenate([v, np.zeros((*v.shape[:-1], 1))], axis=-1)
+    return product(product(q, pure), conjugate(q))[..., :3]
+
+
+def about_z(angle):
+    zero = np.zeros_like(angle)
+    return np.stack([zero, zero, np.sin(angle / 2), np.cos(angle / 2)], axis=-1)
+
+
+def about_y(angle):
+    zero = np.zeros_like(angle)
+    return np.stack([zero, np.sin(angle / 2), zero, np.cos(angle / 2)], axis=-1)
+
+
+def about_x(angle):
+    zero = np.zeros_like(angle)
+    return np.stack([np.sin(angle / 2), zero, zero, np.cos(angle / 2)], axis=-1)
+
+
+def central_weights(order, reach=5):
+    """Weights of the 10th-order central difference, from the conditions on polynomials."""
+    points = range(-reach, reach + 1)
+    rows = [[Fraction(p) ** power for p in points] for power in range(2 * reach + 1)]
+    for row, power in zip(rows, range(2 * reach + 1), strict=True):
+        row.append(Fraction(math.factorial(order) if power == order else 0))
+    for column in range(len(rows)):
+        pivot = next(r for r in range(column, len(rows)) if rows[r][column])
+        rows[column], rows[pivot] = rows[pivot], rows[column]
+        rows[column] = [value / rows[column][column] for value in rows[column]]
+        for other in range(len(rows)):
+            if other != column:
+                factor = rows[other][column]
+                rows[other] = [a - factor * b
+                               for a, b in zip(rows[other], rows[column], strict=True)]
+    return np.array([float(row[-1]) for row in rows])
+
+
+def difference(values, step, order=1):
+    """Return the derivative of rows `step` seconds apart; five are lost at both ends."""
+    weights = central_weights(order)
+    n = len(values) - 10
+    return sum(w * values[k:k + n] for k, w in enumerate(weights)) / step ** order
+
+
+def in_common(*topics):
+    """Return the messages of topics at the stamps that all of them have."""
+    by_stamp = [{stamp_of(data): i for i, data in enumerate(topic.raw)} for topic in topics]
+    common = sorted(set.intersection(*map(set, by_stamp)))
+    return common, [[messages[index[stamp]] for stamp in common]
+                    for messages, index in zip((t.messages() for t in topics), by_stamp,
+                                               strict=True)]
+
+
+def log_of(path):
+    """Return {topic: [(log time, bytes)]} and the metadata of a log, by the mcap package."""
+    with Path(path).open('rb') as file:
+        reader = make_reader(file)
+        log = {channel.topic: [] for channel in reader.get_summary().channels.values()}
+        for _, channel, message in reader.iter_messages(log_time_order=False):
+            log[channel.topic].append((message.log_time, message.data))
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+    return log, metadata
+
+
+def the_log(folder):
+    (path,) = Path(folder).glob('*.mcap')
+    return path
+
+
+def simulated(log, metadata, until_ns):
+    """Compute the run of a log in this process; return {topic: [(stamp, bytes)]}."""
+    record = metadata['spinning_top_sim']
+    assert 0 <= until_ns < LIFETIME_S * SECOND, 'the stamp of t = 0 in the log is wrong'
+    simulation = Simulation(parameters.checked(json.loads(record['parameters'])),
+                            int(record['epoch_ns']))
+    taken = {}
+    for stream in simulation.streams:
+        rows = taken[stream.topic] = []
+        stream.record = lambda stamp, data, rows=rows: rows.append((stamp, data))
+    for event in events_in(log):
+        if event['event'] in ('command', 'parameters'):
+            simulation.advance(event['t_ns'])
+        if event['event'] == 'command':
+            simulation.command(event['l3'], event['lz'])
+        for stream in simulation.streams:
+            rate = event.get(f'{stream.parameter}.rate')
+            if event['event'] == 'parameters' and rate is not None:
+                stream.set_rate(rate)
+                stream.resume(event['t_ns'])
+    simulation.advance(until_ns)
+    return taken
+
+
+def events_in(log):
+    """Return the journal of a log: one JSON object a std_msgs/String."""
+    (rows,) = [rows for topic, rows in log.items() if topic.endswith('/events')]
+    return [json.loads(data[8:].rstrip(b'\0')) for _, data in rows]
+
+
+def commands_in(log):
+    return [(event['t_ns'], event['l3'], event['lz']) for event in events_in(log)
+            if event['event'] == 'command']
+
+
+def assert_clean_end(node, code):
+    assert code == 0, node.err
+    assert TRACEBACK not in node.err
+    assert TRACEBACK not in node.out
+
+
+def settled(topic):
+    """Return how many have arrived when no more do: what was under way is there."""
+    count = -1
+    while count != len(topic.raw):
+        count = len(topic.raw)
+        time.sleep(0.3)
+    return count
+
+
+def decoded(path):
+    """Return how many messages of each topic two readers of other people decode."""
+    counts = [{}, {}]
+    with AnyReader([Path(path)]) as reader:
+        for connection, _, data in reader.messages():
+            reader.deserialize(data, connection.msgtype)
+            counts[0][connection.topic] = counts[0].get(connection.topic, 0) + 1
+    with Path(path).open('rb') as file:
+        for _, channel, _, message in make_reader(
+                file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+            assert message is not None
+            counts[1][channel.topic] = counts[1].get(channel.topic, 0) + 1
+    assert counts[0] == counts[1]
+    return counts[0]
+
+
+def by_topic_command(peer, node, l3, lz):
+    peer.send_command(node, l3, lz)
+
+
+def by_parameters(peer, node, l3, lz):
+    result = peer.set_together(node, spin__l3=l3, spin__lz=lz)
+    assert result.successful, result.reason
+
+
+def assert_steps(stamps, period, skipped):
+    """Whether stamps are a period apart; or periods, where the node says that it skipped some."""
+    steps = np.diff(stamps)
+    assert (steps > 0).all()
+    assert (steps % period == 0).all()
+    # Only a machine that holds the node up for half a second makes it skip.
+    if int(skipped) == 0:
+        assert set(steps) == {period}
+
+
+def assert_received_from(received, logged):
+    """Whether all that was received is in the log, in the same order."""
+    place = {data: index for index, data in enumerate(logged)}
+    assert len(received) > 0
+    places = [place[data] for data in received]
+    assert places == sorted(set(places))

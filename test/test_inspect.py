@@ -1,0 +1,507 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+`inspect`: the truth about a log, from logs that other tests trust and from damaged copies.
+
+What is measured is compared with the closed form, which test_exact.py holds against 30 digits.
+"""
+
+import json
+import re
+import struct
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from reference import ROOT, SCENES, scene_parameters
+
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.tools import analysis, inspect, simulate
+from spinning_top_sim.tools.survey import survey
+
+RUN_S = 20
+NAMES = {'cusp': 'cusps', 'fast_gyroscope': 'cusps', 'free_top': 'free top', 'heavy_top': 'loops',
+         'looping': 'loops', 'near_separatrix': 'waves',
+         'planar_pendulum': 'planar pendulum, rotating', 'sleeping': 'sleeping',
+         'spherical_pendulum': 'spherical pendulum', 'steady_fast': 'steady precession',
+         'steady_slow': 'steady precession', 'waking_sleeper': 'cusps', 'wavy': 'waves'}
+# The tilt rests, or nearly: there is no nutation in the data.
+RESTING = {'sleeping', 'steady_fast', 'steady_slow'}
+
+
+def log_of(path, *arguments):
+    assert simulate.main(['-o', str(path), '--quiet', *map(str, arguments)]) == 0
+    return path
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp('inspect')
+
+
+@pytest.fixture(scope='module')
+def stepped(folder):
+    """Four motions by steps, with noise, in a namespace."""
+    return log_of(folder / 'stepped.mcap', '--duration', 3, '--command', '1.0:2.0:1.5',
+                  '--command', '0:1.7:1.4', '--command', '2.0031:1.6:1.0', '--namespace', '/a/b',
+                  '-p', 'imu.gyroscope_noise_density:=0.01')
+
+
+@pytest.fixture(scope='module')
+def columns(folder):
+    """The exact solution in columns, with commands between the stretches."""
+    return log_of(folder / 'columns.mcap', '--duration', 12, '--command', '1.7:2.0:1.5',
+                  '--command', '3.1:1.7:1.4',
+                  '-p', 'solver.method:=exact', '-p', 'imu.accelerometer_random_walk:=0.01')
+
+
+def told(capsys, *arguments):
+    """Run inspect; return exit code, output and complaints."""
+    code = inspect.main([str(argument) for argument in arguments])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def as_json(capsys, *arguments):
+    code, out, _ = told(capsys, *arguments, '--json')
+    return code, json.loads(out)
+
+
+def surveyed(path):
+    with LogReader(path) as reader:
+        return survey(reader)
+
+
+def rewritten(source, target, change=lambda topic, number, data: data):
+    """Copy a log with checksums that are right; `change` has each message, None drops it."""
+    numbers = {}
+    with open(source, 'rb') as old, open(target, 'wb') as new:
+        reader, writer = make_reader(old), Writer(new)
+        writer.start('ros2')
+        for record in reader.iter_metadata():
+            writer.add_metadata(record.name, record.metadata)
+        summary = reader.get_summary()
+        schemas = {number: writer.register_schema(schema.name, schema.encoding, schema.data)
+                   for number, schema in summary.schemas.items()}
+        channels = {number: writer.register_channel(
+            channel.topic, channel.message_encoding, schemas[channel.schema_id],
+            channel.metadata) for number, channel in summary.channels.items()}
+        for _, channel, message in reader.iter_messages():
+            number = numbers[channel.topic] = numbers.get(channel.topic, -1) + 1
+            data = change(channel.topic, number, message.data)
+            if data is not None:
+                writer.add_message(channels[channel.id], message.log_time, data,
+                                   message.publish_time)
+        writer.finish()
+    return target
+
+
+def with_flipped_bit(data, byte, bit=0):
+    changed = bytearray(data)
+    changed[byte] ^= 1 << bit
+    return bytes(changed)
+
+
+# --------------------------------------------------------------------------------- measuring
+
+
+@pytest.mark.parametrize('method', ['exact', 'rk45'])
+@pytest.mark.parametrize('scene', SCENES)
+def test_every_scene_is_measured_from_its_data(tmp_path, scene, method):
+    slow = (scene, method) == ('fast_gyroscope', 'rk45')        # 80 nutations a second
+    arguments = ['--params', ROOT / f'config/{scene}.yaml', '--duration', 4 if slow else RUN_S,
+                 '-p', f'solver.method:={method}', '-p', "record.streams:=['joint_states', "
+                 "'ground_truth_imu']"]
+    if scene == 'waking_sleeper':       # grows what the tolerance leaves by a million
+        arguments += ['-p', 'solver.rtol:=1.0e-13']
+    found = surveyed(log_of(tmp_path / 'run.mcap', *arguments))
+    truth = Simulation(parameters.checked(scene_parameters(scene))).describe()
+    motion, = found.motions
+    assert motion.described == truth
+    assert motion.described.name == motion.regime == NAMES[scene]
+    measured = motion.measured
+    if scene in RESTING:
+        assert measured.nutation_period is None and measured.nutations == 0
+    else:
+        assert measured.nutations >= 2
+        assert measured.nutation_period == pytest.approx(truth.nutation_period, rel=1e-9)
+    assert measured.mean_precession_rate == pytest.approx(
+        truth.mean_precession_rate, rel=1e-9, abs=1e-9 if scene == 'free_top' else 0.0)
+    assert measured.mean_spin_rate == pytest.approx(truth.mean_spin_rate, rel=1e-9)
+    # Near a pole a tilt is the root of a square that doubles hold to 1e-16.
+    assert measured.theta_min == pytest.approx(truth.theta_min, abs=1e-6)
+    assert measured.theta_max == pytest.approx(truth.theta_max, abs=1e-6)
+    assert not measured.missing
+
+
+def test_a_slow_topic_says_that_it_does_not_resolve_the_nutation(tmp_path):
+    found = surveyed(log_of(
+        tmp_path / 'run.mcap', '--params', ROOT / 'config/fast_gyroscope.yaml', '--duration', 5,
+        '-p', 'record.streams:=["joint_states"]', '-p', 'solver.method:=exact'))
+    motion, = found.motions
+    assert motion.measured.nutation_period is None
+    assert motion.measured.mean_precession_rate is None
+    assert 'a few samples' in motion.measured.missing[0]
+
+
+@pytest.mark.parametrize('topic', ['pose', 'ground_truth_odom', 'ground_truth_imu', 'imu_data'])
+def test_any_topic_with_an_attitude_measures_a_motion(tmp_path, topic):
+    found = surveyed(log_of(
+        tmp_path / 'run.mcap', '--duration', 10, '-p', f'record.streams:=["{topic}"]',
+        '-p', 'imu_data.enabled:=true', '-p', 'imu.rpy:=[0.3, -0.2, 1.1]',
+        '-p', 'solver.method:=exact', '--namespace', '/one'))
+    motion, = found.motions
+    for name in ('nutation_period', 'mean_precession_rate', 'mean_spin_rate'):
+        assert getattr(motion.measured, name) == pytest.approx(
+            getattr(motion.described, name), rel=1e-9), name
+    assert max(curve.largest for curve in found.errors.values()) < 1e-14
+    drifts = [curve.largest for curves in found.drifts.values() for curve in curves.values()]
+    assert len(drifts) == (3 if topic.startswith('ground_truth') else 0)
+    assert all(drift < 1e-14 for drift in drifts)
+
+
+def test_errors_and_drifts_are_those_in_the_data(stepped, tmp_path, capsys):
+    """A pose turned by 1e-6 rad, a rate off by 1e-3: told as such, and where."""
+    def change(topic, number, data):
+        if topic == '/a/b/pose' and number == 250:
+            x, y, z, w = struct.unpack_from('<4d', data, len(data) - 32)
+            half = 5e-7                 # about z, in the body
+            turned = (x + y * half, y - x * half, z + w * half, w - z * half)
+            return data[:-32] + struct.pack('<4d', *turned)
+        return data
+    code, content = as_json(capsys, rewritten(stepped, tmp_path / 'run.mcap', change))
+    assert code == 0
+    errors = content['orientation_error']
+    assert errors['/a/b/pose']['max'] == pytest.approx(1e-6, rel=1e-3)
+    assert errors['/a/b/joint_states']['max'] < 1e-9
+    assert errors['/a/b/pose']['rms'] == pytest.approx(1e-6 / np.sqrt(301), rel=1e-2)
+    for drifts in content['drifts'].values():
+        assert 0.0 < drifts['energy'] < 1e-11 and drifts['l3'] < 1e-13
+
+
+def test_interpolation_is_as_good_as_its_bound():
+    """Ten samples in a period: off by sin(pi/10)^24 of the amplitude at most."""
+    samples = np.cos(2.0 * np.pi * np.arange(200) / 10.0 + 0.3)
+    at = np.linspace(20.0, 180.0, 1001)
+    off = analysis.interpolate(samples, at) - np.cos(2.0 * np.pi * at / 10.0 + 0.3)
+    assert np.max(np.abs(off)) < 1.5 * np.sin(np.pi / 10.0) ** 24 + 2e-15
+    assert np.array_equal(analysis.interpolate(samples, np.arange(200.0)), samples)
+
+
+def test_missing_samples_are_told_where_they_are(stepped, tmp_path, capsys):
+    path = rewritten(stepped, tmp_path / 'gap.mcap', lambda topic, number, data: (
+        None if topic == '/a/b/pose' and 50 <= number < 60 else data))
+    _, content = as_json(capsys, path)
+    pose = content['topics']['/a/b/pose']
+    assert (pose['missing'], pose['count']) == (10, 291)
+    assert pose['gaps_ns'] == [[1_500_000_000, 1_590_000_000]]
+    assert all(topic['missing'] == 0 for name, topic in content['topics'].items()
+               if topic['stream'] and name != '/a/b/pose')
+
+
+# ---------------------------------------------------------------------------------- verifying
+
+
+def verified(capsys, path):
+    code, content = as_json(capsys, path, '--verify')
+    assert code == (0 if content['verify']['identical'] else 1)
+    return content['verify']
+
+
+@pytest.mark.parametrize('name', ['stepped', 'columns'])
+def test_offline_logs_verify(name, capsys, request):
+    path = request.getfixturevalue(name)
+    verdict = verified(capsys, path)
+    assert verdict['identical'] and verdict['warnings'] == []
+    with LogReader(path) as reader:
+        counts = {}
+        for message in reader.messages():
+            counts[message.topic] = counts.get(message.topic, 0) + 1
+    counts.pop(next(name for name in counts if name.endswith('/events')))
+    assert verdict['compared'] == counts
+
+
+@pytest.mark.parametrize('name', ['stepped', 'columns'])
+def test_a_changed_bit_is_found_wherever_it_is(name, tmp_path, capsys, request):
+    source = request.getfixturevalue(name)
+    with LogReader(source) as reader:
+        sizes = {message.topic: len(message.data) for message in reader.messages()}
+    rng = np.random.default_rng(5)
+    for topic, size in sizes.items():
+        if topic.endswith('/events'):
+            continue
+        byte, bit = int(rng.integers(4, size)), int(rng.integers(8))
+        def change(name, number, data, *, place=(topic, 1), byte=byte, bit=bit):
+            return with_flipped_bit(data, byte, bit) if (name, number) == place else data
+        path = rewritten(source, tmp_path / 'changed.mcap', change)
+        verdict = verified(capsys, path)
+        first = verdict['first']
+        assert not verdict['identical'], topic
+        assert (verdict['different'], first['topic'], first['byte']) == (1, topic, byte)
+        assert first['logged'] != first['computed']
+        path.unlink()
+
+
+def test_a_difference_names_field_stamp_and_both_values(stepped, tmp_path, capsys):
+    path = rewritten(stepped, tmp_path / 'run.mcap', lambda topic, number, data: (
+        with_flipped_bit(data, len(data) - 8) if (topic, number) == ('/a/b/pose', 7) else data))
+    code, out, _ = told(capsys, path, '--verify')
+    assert code == 1
+    said = re.search(r'first: /a/b/pose at 1\.070000000 s, byte \d+, pose\.orientation\[3\]: '
+                     r'in the log (\S+), computed (\S+)', out)
+    logged, computed = float(said[1]), float(said[2])
+    assert 0.0 < abs(logged - computed) < 3e-16
+
+
+def test_messages_too_few_and_too_many_are_told(stepped, tmp_path, capsys):
+    verdict = verified(capsys, rewritten(
+        stepped, tmp_path / 'fewer.mcap', lambda topic, number, data: (
+            None if (topic, number) == ('/a/b/pose', 100) else data)))
+    assert (verdict['missing'], verdict['unexpected'], verdict['different']) == (1, 0, 0)
+    assert verdict['first']['stamp_ns'] == 2_000_000_000
+
+
+def test_a_changed_journal_is_found(stepped, tmp_path, capsys):
+    """A digit of a commanded momentum: the motion after it is another."""
+    verdict = verified(capsys, rewritten(
+        stepped, tmp_path / 'run.mcap', lambda topic, number, data: (
+            data.replace(b'"l3": 2.0', b'"l3": 2.1') if topic.endswith('/events') else data)))
+    assert not verdict['identical'] and verdict['different'] > 1000
+    verdict = verified(capsys, rewritten(
+        stepped, tmp_path / 'cut.mcap', lambda topic, number, data: (
+            data.replace(b'"l3": 2.0', b'"l3"; 2.0') if topic.endswith('/events') else data)))
+    assert not verdict['identical'] and verdict['first']['topic'].endswith('/events')
+
+
+def test_another_machine_is_warned_of(stepped, capsys, monkeypatch):
+    from spinning_top_sim.tools import verify
+    here = verify.surroundings()
+    monkeypatch.setattr(verify, 'surroundings', lambda: {**here, 'platform': 'abacus'})
+    verdict = verified(capsys, stepped)
+    assert verdict['identical']
+    assert len(verdict['warnings']) == 1 and 'abacus' in verdict['warnings'][0]
+
+
+def test_live_logs_verify(tmp_path, capsys):
+    """From the start, and from the middle with commands before; rates change, resets happen."""
+    pytest.importorskip('rclpy')
+    from geometry_msgs.msg import PoseStamped
+    from node_harness import Peer, SimNode
+
+    whole, part = tmp_path / 'whole.mcap', tmp_path / 'part.mcap'
+    options = {'status_period': 0.0, 'record.uri': str(whole), 'start_paused': True,
+               'imu.gyroscope_noise_density': 0.01}
+    with SimNode(tmp_path, options, namespace='/live') as node, Peer() as peer:
+        pose = peer.listen(node.topic('pose'), PoseStamped)
+
+        def set_now(**values):
+            assert all(result.successful for result in peer.set_each(node, **values))
+            pose.wait_more(15)
+        assert peer.set_together(node, spin__l3=1.7, spin__lz=1.4).successful
+        assert peer.switch(node, 'record', True).success
+        assert peer.set_together(node, spin__l3=1.65, spin__lz=1.4).successful   # before t = 0
+        peer.switch(node, 'set_pause', False)
+        pose.wait(20)
+        set_now(imu__rate=125.0, pose__rate=50.0)
+        set_now(spin__lz=1.3)
+        assert peer.switch(node, 'record', False).success
+        set_now(record__uri=str(part), joint_states__rate=33.0)
+        assert peer.switch(node, 'record', True).success
+        set_now(spin__l3=1.8)
+        set_now(imu__rate=250.0, imu__gyroscope_noise_density=0.02, solver__method='exact')
+        assert peer.trigger(node, 'reset').success
+        pose.wait_more(15)
+        peer.switch(node, 'set_pause', True)
+        assert peer.trigger(node, 'reset').success
+        assert peer.set_together(node, spin__l3=1.9, spin__lz=1.3).successful    # before t = 0
+        assert peer.trigger(node, 'step').success
+        peer.switch(node, 'set_pause', False)
+        set_now(ground_truth_imu__rate=100.0)
+        assert node.end() == 0, node.err
+    for path, causes in ((whole, ['start', 'command', 'command']),
+                         (part, ['start', 'command', 'reset', 'reset', 'command'])):
+        code, content = as_json(capsys, path, '--verify')
+        verdict = content['verify']
+        assert verdict['identical'] and code == 0, verdict
+        assert sum(verdict['compared'].values()) > 300
+        assert [motion['cause'] for motion in content['motions']] == causes
+        assert all(topic['missing'] == 0 and topic['off_grid'] == 0
+                   for topic in content['topics'].values() if topic['stream'])
+        assert all(error['max'] < 1e-9 for error in content['orientation_error'].values())
+
+
+def test_an_euler_form_that_stops_verifies(tmp_path, capsys):
+    """Where the equations cannot go on the log ends; so does what is computed again."""
+    path = tmp_path / 'run.mcap'
+    assert simulate.main(['-o', str(path), '--quiet', '--duration', '5',
+                          '-p', 'solver.equations:=euler', '-p', 'spin.lz:=1.6']) == 1
+    capsys.readouterr()
+    verdict = verified(capsys, path)
+    assert verdict['identical'] and sum(verdict['compared'].values()) > 100
+
+
+# ------------------------------------------------------------------------------ what is told
+
+
+def test_a_torn_file_is_told_and_what_is_left_verifies(columns, tmp_path, capsys):
+    torn = tmp_path / 'torn.mcap'
+    with open(columns, 'rb') as file:
+        last = make_reader(file).get_summary().chunk_indexes[-1]
+    torn.write_bytes(columns.read_bytes()[:last.chunk_start_offset + last.chunk_length // 2])
+    code, out, _ = told(capsys, torn, '--verify')
+    assert code == 1
+    assert 'torn.mcap: torn' in out and 'lost: ' in out
+    assert re.search(r'verify: identical, all \d+ messages', out)
+    code, content = as_json(capsys, torn)
+    assert code == 1 and not content['whole'] and content['damage']['torn']
+    assert content['damage']['lost_bytes'] > 0
+    assert content['motions'][2]['measured']['nutations'] > 5
+
+
+def test_text_tells_the_numbers_with_and_without_rich(stepped, capsys, monkeypatch):
+    texts = [told(capsys, stepped)[1]]
+    monkeypatch.setitem(sys.modules, 'rich', None)
+    texts.append(told(capsys, stepped)[1])
+    for text in texts:
+        assert 'whole, 3 s' in text and '/a/b/ground_truth/imu' in text
+        assert 'motion 3 (command), 1 to 2.0031 s: loops' in text
+        assert re.search(r'nutation period \[s\] +0\.433970\d+ +0\.433970\d+ +-?\d\.\de-1\d', text)
+        assert 'orientation error against the exact solution' in text
+        assert 'journal: 3 commands, 0 resets' in text
+
+
+def test_json_is_strict_and_documented(columns, capsys):
+    _, out, _ = told(capsys, columns, '--json', '--verify')
+    content = json.loads(out, parse_constant=pytest.fail)
+    page = (ROOT / 'docs/inspect.md').read_text()
+    keys = set(content) | {key for name in ('damage', 'run', 'verify') for key in content[name]}
+    keys |= set(content['motions'][0]) | set(content['motions'][0]['measured'])
+    keys |= set(content['motions'][0]['exact']) | set(content['topics']['/pose'])
+    assert {key for key in keys if f'`{key}`' not in page} == set()
+
+
+def test_a_strangers_log_is_listed(tmp_path, capsys):
+    path = tmp_path / 'stranger.mcap'
+    with open(path, 'wb') as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema('some/Thing', 'jsonschema', b'{}')
+        channel = writer.register_channel('/thing', 'json', schema)
+        for number in range(11):
+            writer.add_message(channel, number * 100_000_000, b'{}', number * 100_000_000)
+        writer.finish()
+    code, content = as_json(capsys, path)
+    assert code == 0 and content['ours'] is False
+    assert content['topics']['/thing']['count'] == 11
+    assert content['topics']['/thing']['rate'] == pytest.approx(10.0)
+    code, out, _ = told(capsys, path)
+    assert code == 0 and 'not one of ours' in out and '/thing' in out
+    assert told(capsys, path, '--verify')[0] == 1
+    code, _, err = told(capsys, path, '--plot', tmp_path / 'no.png')
+    assert code == 1 and 'nothing to draw' in err and not (tmp_path / 'no.png').exists()
+
+
+@pytest.mark.parametrize('content', [None, b'', b'no log at all'])
+def test_what_cannot_be_read_says_so(tmp_path, capsys, content):
+    path = tmp_path / 'bad.mcap'
+    if content is not None:
+        path.write_bytes(content)
+    code, out, err = told(capsys, path)
+    assert code == 1 and not out and str(path) in err
+
+
+def test_wrong_arguments_are_2(capsys):
+    with pytest.raises(SystemExit) as ended:
+        inspect.main(['--no-such-thing'])
+    assert ended.value.code == 2
+
+
+@pytest.mark.parametrize('streams', [['imu'], ['invariants'], ['pose']])
+def test_says_what_it_cannot_tell(tmp_path, capsys, streams):
+    path = log_of(tmp_path / 'run.mcap', '--duration', 2, '-p', f'record.streams:={streams}')
+    code, out, _ = told(capsys, path, '--verify')
+    assert code == 0
+    assert 'drifts of E, L3, Lz: no topic with rates' in out
+    assert ('no topic with an attitude' in out) == (streams != ['pose'])
+
+
+# ---------------------------------------------------------------------------------- pictures
+
+
+@pytest.mark.parametrize('method', ['exact', 'rk45'])
+def test_the_path_that_is_drawn_has_cusps(tmp_path, method):
+    """At the least tilt the tip stands still, and the motion along the meridian turns round."""
+    pytest.importorskip('matplotlib')
+    from spinning_top_sim.tools.plots import smooth_tip
+
+    found = surveyed(log_of(tmp_path / 'run.mcap', '--duration', 6,
+                            '-p', f'solver.method:={method}'))
+    time, tip, height = smooth_tip(found.tilts)
+    points = np.stack((tip.real, tip.imag, height))
+    velocity = np.diff(points, axis=1) / np.diff(time)
+    speed = np.linalg.norm(velocity, axis=0)
+    period = found.motions[0].measured.nutation_period
+    step = time[1]
+    # Near a cusp the speed grows in proportion to time: half a step away it is what the
+    # acceleration makes of it, the greatest there is.
+    acceleration = np.max(np.linalg.norm(np.diff(velocity, axis=1), axis=0)) / step
+    for number in range(1, 9):
+        at = round(number * period / step)
+        near = slice(at - 2, at + 2)
+        assert np.min(speed[near]) < 1.01 * acceleration * step
+        assert np.min(speed[near]) < 2e-2 * np.max(speed)
+        before, after = velocity[:, at - 12], velocity[:, at + 12]
+        cosine = before @ after / np.linalg.norm(before) / np.linalg.norm(after)
+        assert cosine < -0.9                            # a loop or a wave would go on
+        assert height[at] > 0.99999 * np.max(height)
+
+
+def test_pictures_are_drawn(stepped, tmp_path, capsys):
+    pytest.importorskip('matplotlib')
+    image = pytest.importorskip('PIL.Image')
+    page, film = tmp_path / 'page.png', tmp_path / 'top.gif'
+    assert told(capsys, stepped, '--plot', page, '--animate', film)[0] == 0
+    pixels = np.asarray(image.open(page).convert('L'))
+    assert min(pixels.shape) > 700 and 0.02 < np.mean(pixels < 250) < 0.5
+    frames = image.open(film)
+    assert frames.n_frames == 19 and frames.info['duration'] == 50
+    assert film.stat().st_size < 400_000
+    shown = []
+    for number in (0, 10):
+        frames.seek(number)
+        shown.append(np.asarray(frames.convert('RGB'), int))
+    assert np.mean(np.abs(shown[1] - shown[0]).max(axis=2) > 30) > 0.01
+
+
+@pytest.mark.parametrize('scene', ['fast_gyroscope', 'heavy_top', 'near_separatrix',
+                                   'planar_pendulum', 'sleeping'])
+def test_a_page_is_drawn_of_odd_scenes(tmp_path, scene, capsys):
+    pytest.importorskip('matplotlib')
+    path = log_of(tmp_path / 'run.mcap', '--params', ROOT / f'config/{scene}.yaml', '--duration',
+                  2, '-p', 'solver.method:=exact')
+    assert told(capsys, path, '--plot', tmp_path / 'page.svg')[0] == 0
+    assert (tmp_path / 'page.svg').stat().st_size > 10_000
+
+
+def test_without_matplotlib_there_is_a_hint(stepped, tmp_path):
+    code = ('import sys\nsys.modules["matplotlib"] = None\n'
+            'from spinning_top_sim.tools.inspect import main\n'
+            f'sys.exit(main([{str(stepped)!r}, "--plot", {str(tmp_path / "page.png")!r}]))')
+    run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                         timeout=60, check=False)
+    assert run.returncode == 1 and "pip install 'spinning_top_sim[plot]'" in run.stderr
+    assert 'Traceback' not in run.stderr and len(run.stderr.splitlines()) == 1
+    assert 'motion 3' in run.stdout                     # the rest is told all the same
+
+
+def test_neither_ros_nor_pictures_are_imported_unasked(stepped):
+    code = ('import sys\nfrom spinning_top_sim.tools.inspect import main\n'
+            f'main([{str(stepped)!r}, "--verify"])\n'
+            'print("loaded:", sorted({"rclpy", "scipy", "matplotlib"} & set(sys.modules)))')
+    run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                         timeout=60, check=True)
+    assert run.stdout.strip().endswith('loaded: []')

@@ -1,0 +1,955 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Reading and recovering logs that are torn, flipped, foreign or no logs at all.
+
+What was recovered is read by rosbags, mcap-ros2-support and mcap, none of them written here; so
+are the places of records in a file.  Children are killed for good after a timeout.
+"""
+
+import contextlib
+import io
+import os
+import random
+import resource
+import signal
+import struct
+import subprocess
+import sys
+import tracemalloc
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import zstandard
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import Chunk, Header
+from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader, StoragePlugin
+from rosbags.rosbag2 import Writer as BagWriter
+from rosbags.typesys import Stores, get_typestore
+from test_recording import METADATA, eventually, kill, start_child
+
+from spinning_top_sim.recording import mcap_file, walk
+from spinning_top_sim.recording.errors import LogAccessError, NotMcapError
+from spinning_top_sim.recording.mcap_file import McapFile, record_bytes
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic
+from spinning_top_sim.recording.schemas import find_definition
+from spinning_top_sim.tools.recover import main
+
+ROOT = Path(__file__).parents[1]
+JAZZY = get_typestore(Stores.ROS2_JAZZY)
+POINT = 'geometry_msgs/msg/Point'
+NUMBER = 'std_msgs/msg/Float64'
+TOPICS = (
+    RecordedTopic('/top/point', POINT),
+    RecordedTopic('/top/number', NUMBER, {'depth': 3, 'reliability': 2}),
+)
+EPOCH_NS = 1_700_000_000_000_000_000
+CHUNKS = 3
+MESSAGES_PER_CHUNK = 12
+ALL_KEPT, FAILED, SOME_LOST = 0, 1, 3
+
+
+def cdr(number: int) -> tuple[int, bytes]:
+    """Return a topic and a message for it."""
+    if number % 3:
+        return 0, bytes(JAZZY.serialize_cdr(
+            JAZZY.types[POINT](float(number), -2.0, 1 / 3), POINT))
+    return 1, bytes(JAZZY.serialize_cdr(JAZZY.types[NUMBER](float(number)), NUMBER))
+
+
+def write_log(path, chunks=CHUNKS, compression='zstd', messages_per_chunk=MESSAGES_PER_CHUNK):
+    """Write a log by our writer, chunk borders where they are wanted; return its messages."""
+    definitions = {name: find_definition(name) for name in (POINT, NUMBER)}
+    file = McapFile(path, TOPICS, definitions, {'spinning_top_sim': METADATA},
+                    library='spinning_top_sim 0', compression=compression)
+    messages = []
+    for number in range(chunks * messages_per_chunk):
+        index, data = cdr(number)
+        stamp = EPOCH_NS + number * 1_234_567
+        file.append(index, stamp, data)
+        messages.append((TOPICS[index].name, stamp, data))
+        if (number + 1) % messages_per_chunk == 0:
+            file.write_chunk()
+    file.finish()
+    return messages
+
+
+@pytest.fixture(scope='module')
+def log(tmp_path_factory):
+    """A small log of ours: bytes, messages, and (opcode, start, end) of each record."""
+    path = tmp_path_factory.mktemp('log') / 'run.mcap'
+    messages = write_log(path)
+    content = path.read_bytes()
+    records = records_of(content)
+    chunks = [record for record in records if record[0] == Opcode.CHUNK]
+    assert len(chunks) == CHUNKS
+    return SimpleNamespace(content=content, messages=messages, records=records, chunks=chunks)
+
+
+@pytest.fixture
+def no_sync(monkeypatch):
+    """For thousands of recoveries that nobody pulls the plug on."""
+    monkeypatch.setattr(mcap_file.os, 'fsync', lambda descriptor: None)
+
+
+def records_of(content: bytes) -> list[tuple[int, int, int]]:
+    """Return opcode, start and end of every record, of a whole file."""
+    found = []
+    offset = len(MCAP0_MAGIC)
+    while offset < len(content) - len(MCAP0_MAGIC):
+        opcode, length = struct.unpack_from('<BQ', content, offset)
+        found.append((opcode, offset, offset + 9 + length))
+        offset += 9 + length
+    return found
+
+
+def run(*argv) -> tuple[int, str, str]:
+    """Run the command in this process; return exit code, output and errors."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main([str(argument) for argument in argv])
+    return code, out.getvalue(), err.getvalue()
+
+
+def run_process(*argv, **options) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, '-m', 'spinning_top_sim.tools.recover', *map(str, argv)],
+        env=os.environ | {'PYTHONPATH': str(ROOT)}, capture_output=True, text=True, timeout=60,
+        check=False, **options)
+
+
+def seen_by_us(path) -> list[tuple[str, int, bytes]]:
+    with LogReader(path) as reader:
+        return [(message.topic, message.log_time, message.data) for message in reader.messages()]
+
+
+def seen_by_mcap(path) -> list[tuple[str, int, bytes]]:
+    """Return what mcap reads by the index; the file must hold in itself by its checksums, too."""
+    with open(path, 'rb') as file:
+        list(StreamReader(file, validate_crcs=True).records)
+        file.seek(0)
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        read = [(channel.topic, message.log_time, message.data)
+                for _, channel, message in reader.iter_messages()]
+    assert summary.statistics.message_count == len(read)
+    return read
+
+
+def seen_by_rosbags(path) -> list[tuple[str, int, bytes]]:
+    with AnyReader([Path(path)]) as reader:
+        read = [(connection.topic, stamp, bytes(data))
+                for connection, stamp, data in reader.messages()]
+        for connection, _, data in reader.messages():
+            reader.deserialize(data, connection.msgtype)
+    return read
+
+
+def metadata_of(path) -> dict[str, dict[str, str]]:
+    with open(path, 'rb') as file:
+        return {record.name: record.metadata for record in make_reader(file).iter_metadata()}
+
+
+def check_with_all_readers(path, messages) -> None:
+    """A recovered log of ours: the messages, for everyone, and what it says of the run."""
+    assert seen_by_us(path) == seen_by_mcap(path) == seen_by_rosbags(path) == messages
+    with open(path, 'rb') as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        values = [message.x if schema.name == POINT else message.data
+                  for schema, _, _, message in reader.iter_decoded_messages()]
+    assert values == [float(number) for number in range(len(messages))]
+    metadata = metadata_of(path)
+    assert metadata['spinning_top_sim'] == METADATA
+    assert f'message_count: {len(messages)}\n' in metadata['rosbag2']['serialized_metadata']
+    with LogReader(path) as reader:
+        assert reader.whole
+        assert reader.metadata == metadata
+        assert [topic.name for topic in reader.topics] == [topic.name for topic in TOPICS]
+
+
+# Torn
+
+def test_every_cut_keeps_every_whole_chunk(tmp_path, log, no_sync):
+    """Cut after each byte; the exit code says whether a message was in what is gone."""
+    ends = [end for _, _, end in log.chunks]
+    index_ends = [start for _, start, _ in log.chunks[1:]]
+    torn, output = tmp_path / 'torn.mcap', tmp_path / 'whole.mcap'
+    seen = {}
+    torn.write_bytes(log.content)
+    for size in range(len(log.content), -1, -1):
+        os.truncate(torn, size)
+        whole_chunks = sum(end <= size for end in ends)
+        if whole_chunks == 0:
+            expected = FAILED
+        elif whole_chunks == CHUNKS or size <= index_ends[whole_chunks - 1]:
+            expected = ALL_KEPT
+        else:
+            expected = SOME_LOST
+        code, out, err = run(torn, '-o', output)
+        assert code == expected, (size, out, err)
+        assert err.count('\n') == (code == FAILED), (size, err)
+        assert output.exists() == (code != FAILED), size
+        assert ('lost: ' in out) == (code == SOME_LOST), (size, out)
+        if output.exists():
+            seen.setdefault(whole_chunks, set()).add(output.read_bytes())
+            output.unlink()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['torn.mcap']
+    assert sorted(seen) == [1, 2, 3]
+    for whole_chunks, contents in seen.items():
+        (content,) = contents
+        output.write_bytes(content)
+        check_with_all_readers(output, log.messages[:whole_chunks * MESSAGES_PER_CHUNK])
+
+
+def test_a_cut_file_can_be_read(tmp_path, log):
+    torn = tmp_path / 'torn.mcap'
+    for size in range(len(MCAP0_MAGIC), len(log.content), 5):
+        torn.write_bytes(log.content[:size])
+        whole_chunks = sum(end <= size for _, _, end in log.chunks)
+        with LogReader(torn) as reader:
+            assert not reader.whole
+            assert reader.damage.torn
+            read = [(message.topic, message.log_time, message.data)
+                    for message in reader.messages()]
+            assert read == log.messages[:whole_chunks * MESSAGES_PER_CHUNK], size
+            assert sum(reader.damage.messages.values()) == len(read)
+            if size >= log.chunks[0][1]:
+                assert reader.metadata['spinning_top_sim'] == METADATA
+                assert [(topic.name, topic.type_name) for topic in reader.topics] == [
+                    (topic.name, topic.type_name) for topic in TOPICS]
+
+
+def test_a_torn_chunk_tells_its_time(tmp_path, log):
+    torn = tmp_path / 'torn.mcap'
+    _, start, end = log.chunks[2]
+    torn.write_bytes(log.content[:end - 5])
+    with LogReader(torn) as reader:
+        (loss,) = reader.damage.losses
+    first = 2 * MESSAGES_PER_CHUNK
+    assert (loss.what, loss.offset, loss.bytes) == ('chunk', start, end - 5 - start)
+    assert (loss.start_ns, loss.end_ns) == (
+        log.messages[first][1], log.messages[first + MESSAGES_PER_CHUNK - 1][1])
+    code, out, _ = run(torn)
+    assert code == SOME_LOST
+    assert f'{end - 5 - start} bytes, 1 chunk, an unknown number of messages' in out
+    assert (tmp_path / 'torn_recovered.mcap').exists()
+
+
+def test_zeros_behind_the_tear_are_no_records(tmp_path, log):
+    """As some file systems leave them after a power loss."""
+    torn = tmp_path / 'torn.mcap'
+    torn.write_bytes(log.content[:log.chunks[2][1]] + bytes(3_000_000))
+    code, out, _ = run(torn, '-o', tmp_path / 'whole.mcap')
+    assert code == SOME_LOST
+    assert 'lost: 3000000 bytes' in out
+    check_with_all_readers(tmp_path / 'whole.mcap', log.messages[:2 * MESSAGES_PER_CHUNK])
+
+
+def test_a_killed_recording_is_recovered(tmp_path):
+    path, whole = tmp_path / 'run.mcap', tmp_path / 'whole.mcap'
+    child = start_child("""
+        recorder = McapRecorder.open(
+            sys.argv[1], TOPICS, {'seed': '5'}, min_free_bytes=0, max_loss=0.1)
+        for number in range(1_000_000):
+            recorder.write(0, number, struct.pack('<4sIIId', bytes(4), 0, 0, 1, 0.0))
+            time.sleep(0.0005)
+        """, path)
+    try:
+        eventually(lambda: child.poll() is not None or (
+            path.exists() and path.read_bytes().count(b'zstd') > 3))
+    finally:
+        kill(child)
+    assert child.returncode == -signal.SIGKILL
+    assert run_process(path, '-o', whole).returncode in (ALL_KEPT, SOME_LOST)
+    stamps = [stamp for _, stamp, _ in seen_by_mcap(whole)]
+    assert len(stamps) > 10
+    assert stamps == list(range(len(stamps)))
+    assert metadata_of(whole)['spinning_top_sim'] == {'seed': '5'}
+
+
+# Wrong bytes
+
+def places(log, each=24):
+    """Some bytes of every record: all of its head, and seeded ones of the rest; and the magic."""
+    choice = random.Random(5)
+    yield from range(len(MCAP0_MAGIC))
+    for _, start, end in log.records:
+        head = range(start, min(start + each, end))
+        yield from head
+        yield from choice.sample(range(head.stop, end), min(each, end - head.stop))
+    yield from range(len(log.content) - len(MCAP0_MAGIC), len(log.content))
+
+
+def flipped(content: bytes, position: int, bit: int) -> bytes:
+    changed = bytearray(content)
+    changed[position] ^= 1 << bit
+    return bytes(changed)
+
+
+def test_a_flipped_bit_is_never_passed_over(tmp_path, log, no_sync):
+    """
+    Anywhere in a whole file: it is said, and what is kept is what was there.
+
+    Every byte is under some checksum or has one value only, so nothing may go unnoticed.
+    """
+    random_bits = random.Random(1)
+    broken, output = tmp_path / 'broken.mcap', tmp_path / 'out' / 'broken.mcap'
+    output.parent.mkdir()
+    broken.write_bytes(log.content)
+    assert run(broken, '-o', output)[0] == ALL_KEPT
+    original = output.read_bytes()
+    output.unlink()
+    codes = {}
+    for position in places(log):
+        broken.write_bytes(flipped(log.content, position, random_bits.randrange(8)))
+        code, out, err = run(broken, '-o', output)
+        assert code in (ALL_KEPT, SOME_LOST), (position, err)
+        assert 'found: ' in out or 'lost: ' in out, (position, out)
+        kind = next((Opcode(opcode) for opcode, start, end in log.records
+                     if start <= position < end), None)
+        codes.setdefault(kind, set()).add(code)
+        content = output.read_bytes()
+        output.unlink()
+        if code == ALL_KEPT:
+            assert content == original, position
+            continue
+        output.write_bytes(content)
+        touched = [start <= position < end for _, start, end in log.chunks]
+        kept = [message for number, message in enumerate(log.messages)
+                if not touched[number // MESSAGES_PER_CHUNK]]
+        # A compressed chunk may be another one and yet give the same bytes, by its checksum.
+        assert seen_by_us(output) in (kept, log.messages), position
+        output.unlink()
+    # What stands twice in a file, or follows from the rest, is made right again.
+    for kind in (None, Opcode.MESSAGE_INDEX, Opcode.STATISTICS, Opcode.CHUNK_INDEX,
+                 Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET, Opcode.FOOTER):
+        assert codes[kind] == {ALL_KEPT}, kind
+    assert codes[Opcode.CHUNK] == {ALL_KEPT, SOME_LOST}  # kept with wrong times in the head
+    assert SOME_LOST in codes[Opcode.METADATA]
+
+
+def test_flipped_bits_in_a_torn_file_spare_the_other_chunks(tmp_path, log, no_sync):
+    """Without a summary the next chunk is found by search, where a length is wrong."""
+    broken, output = tmp_path / 'broken.mcap', tmp_path / 'whole.mcap'
+    torn = log.content[:log.chunks[-1][2]]
+    random_bits = random.Random(2)
+    for position in places(log):
+        if not log.chunks[0][1] <= position < len(torn):
+            continue
+        broken.write_bytes(flipped(torn, position, random_bits.randrange(8)))
+        code, out, _ = run(broken, '-o', output)
+        touched = [start <= position < end for _, start, end in log.chunks]
+        must = [message for number, message in enumerate(log.messages)
+                if not touched[number // MESSAGES_PER_CHUNK]]
+        read = seen_by_us(output)
+        assert read == (log.messages if len(read) > len(must) else must), position
+        assert (code == ALL_KEPT) == (len(read) == len(log.messages)) or 'lost: ' in out, position
+        output.unlink()
+
+
+def test_flipped_bits_in_the_head_of_a_torn_file_crash_nothing(tmp_path, log, no_sync):
+    broken, output = tmp_path / 'broken.mcap', tmp_path / 'whole.mcap'
+    torn = log.content[:log.chunks[1][2]]
+    random_bits = random.Random(3)
+    texts = {data for _, _, data in log.messages}
+    for position in range(log.chunks[0][1]):
+        broken.write_bytes(flipped(torn, position, random_bits.randrange(8)))
+        code, _, err = run(broken, '-o', output)
+        assert code in (ALL_KEPT, SOME_LOST), (position, err)
+        assert {data for _, _, data in seen_by_mcap(output)} <= texts
+        output.unlink()
+
+
+@pytest.mark.parametrize('has_summary', [True, False])
+def test_a_lost_chunk_is_told_in_numbers(tmp_path, log, has_summary):
+    _, start, end = log.chunks[1]
+    broken = tmp_path / 'broken.mcap'
+    content = flipped(log.content, end - 8, 3)
+    broken.write_bytes(content if has_summary else content[:log.chunks[-1][2]])
+    first, last = MESSAGES_PER_CHUNK, 2 * MESSAGES_PER_CHUNK - 1
+    with LogReader(broken) as reader:
+        damage = reader.damage
+    assert (damage.lost_chunks, damage.lost_bytes) == (1, end - start)
+    assert damage.missing == {'/top/point': 8, '/top/number': 4}
+    assert damage.missing_exactly == has_summary
+    assert damage.missing_spans == ((log.messages[first][1], log.messages[last][1]),)
+    assert damage.losses[0].messages == MESSAGES_PER_CHUNK
+    code, out, _ = run(broken)
+    assert code == SOME_LOST
+    least = '' if has_summary else 'at least '
+    assert f'lost: {end - start} bytes, 1 chunk, {least}{MESSAGES_PER_CHUNK} messages\n' in out
+
+    # The new file is whole, and its sequence numbers still tell what is missing.
+    with LogReader(tmp_path / 'broken_recovered.mcap') as reader:
+        assert reader.whole
+        assert reader.damage.lossless
+        assert reader.damage.missing == damage.missing
+    code, out, _ = run(tmp_path / 'broken_recovered.mcap')
+    assert code == ALL_KEPT
+    assert 'lost before: 12 messages' in out
+
+
+@pytest.mark.parametrize('has_summary', [True, False])
+def test_a_wrong_number_in_a_message_is_seen_by_the_checksum_alone(tmp_path, has_summary):
+    """Uncompressed: nothing else about the chunk is wrong."""
+    path = tmp_path / 'run.mcap'
+    messages = write_log(path, compression='none')
+    content = path.read_bytes()
+    chunks = [record for record in records_of(content) if record[0] == Opcode.CHUNK]
+    data = content.index(messages[MESSAGES_PER_CHUNK + 2][2])
+    assert chunks[1][1] < data < chunks[1][2]
+    path.write_bytes(flipped(content if has_summary else content[:chunks[2][2]], data + 9, 2))
+    with LogReader(path) as reader:
+        (loss,) = reader.damage.losses
+    assert (loss.offset, loss.reason) == (chunks[1][1], 'its checksum is wrong')
+    assert seen_by_us(path) == messages[:MESSAGES_PER_CHUNK] + messages[2 * MESSAGES_PER_CHUNK:]
+
+
+@pytest.mark.parametrize('has_summary', [True, False])
+def test_a_channel_does_not_become_a_message(tmp_path, log, has_summary):
+    """One bit makes it one, of a channel that exists."""
+    channel = [start for opcode, start, _ in log.records if opcode == Opcode.CHANNEL][1]
+    content = flipped(log.content, channel, 0)
+    assert content[channel] == Opcode.MESSAGE
+    path = tmp_path / 'run.mcap'
+    path.write_bytes(content if has_summary else content[:log.chunks[-1][2]])
+    known = [message for message in log.messages if has_summary or message[0] == '/top/point']
+    assert seen_by_us(path) == known
+    assert run(path, '-o', tmp_path / 'whole.mcap')[0] == SOME_LOST
+    assert seen_by_mcap(tmp_path / 'whole.mcap') == known
+
+
+def test_a_wild_length_that_seems_to_lead_to_a_record_takes_no_other_chunk(tmp_path):
+    """It leads to data in the next chunk that look like the head of metadata."""
+    path = tmp_path / 'run.mcap'
+    decoy = struct.pack('<BQ', Opcode.METADATA, 5) + bytes(40)
+    file = McapFile(path, TOPICS[1:2], {NUMBER: find_definition(NUMBER)}, {},
+                    library='spinning_top_sim 0', compression='none')
+    for number, data in enumerate((b'first', decoy, b'third')):
+        file.append(0, number, data)
+        file.write_chunk()
+    content = path.read_bytes()
+    file.finish()
+    lost = next(start for opcode, start, _ in records_of(path.read_bytes())
+                if opcode == Opcode.CHUNK)
+    length = content.index(decoy) - lost - 9
+    path.write_bytes(content[:lost + 1] + struct.pack('<Q', length) + content[lost + 9:])
+    assert [data for _, _, data in seen_by_us(path)] == [decoy, b'third']
+
+
+def test_gaps_in_our_numbers_tell_what_a_wild_length_took(tmp_path, log):
+    """A chunk whose length is wrong takes its indexes with it, which would tell its messages."""
+    _, start, _ = log.chunks[1]
+    broken = tmp_path / 'broken.mcap'
+    broken.write_bytes(flipped(log.content[:log.chunks[-1][2]], start + 1 + 3, 7))
+    with LogReader(broken) as reader:
+        assert reader.damage.missing == {'/top/point': 8, '/top/number': 4}
+        (loss,) = reader.damage.losses
+    assert (loss.offset, loss.offset + loss.bytes) == (start, log.chunks[2][1])
+
+
+def test_schemas_and_channels_are_found_behind_a_wild_length(tmp_path, log):
+    """In a torn file, where no summary repeats them."""
+    (header,) = [start for opcode, start, _ in log.records if opcode == Opcode.HEADER]
+    broken = tmp_path / 'broken.mcap'
+    broken.write_bytes(flipped(log.content[:log.chunks[-1][2]], header + 1 + 5, 0))
+    code, _, _ = run(broken, '-o', tmp_path / 'whole.mcap')
+    assert code == SOME_LOST
+    check_with_all_readers(tmp_path / 'whole.mcap', log.messages)
+
+
+def test_messages_of_a_lost_schema_are_counted(tmp_path, log):
+    """They could not be understood, and no reader takes a file with them."""
+    schema = next(start for opcode, start, _ in log.records if opcode == Opcode.SCHEMA)
+    broken, output = tmp_path / 'broken.mcap', tmp_path / 'whole.mcap'
+    broken.write_bytes(flipped(log.content[:log.chunks[-1][2]], schema + 9 + 3, 6))
+    code, out, _ = run(broken, '-o', output)
+    assert code == SOME_LOST
+    points = sum(topic == '/top/point' for topic, _, _ in log.messages)
+    assert f'{points} messages' in out
+    numbers = [message for message in log.messages if message[0] == '/top/number']
+    assert seen_by_us(output) == seen_by_mcap(output) == seen_by_rosbags(output) == numbers
+
+
+# Whole
+
+@pytest.mark.parametrize('compression', ['zstd', 'lz4', 'none'])
+def test_recovering_a_whole_file_changes_nothing(tmp_path, compression):
+    path = tmp_path / 'run.mcap'
+    messages = write_log(path, compression=compression)
+    (tmp_path / 'out').mkdir()
+    code, out, _ = run(path, '-o', tmp_path / 'out' / 'run.mcap')
+    assert code == ALL_KEPT
+    assert out.startswith(f'kept all: {len(messages)} messages in {CHUNKS} chunks')
+    assert (tmp_path / 'out' / 'run.mcap').read_bytes() == path.read_bytes()
+    with LogReader(path) as reader:
+        assert reader.whole
+        assert reader.damage.lossless
+        assert not reader.damage.lines()
+
+
+def test_a_whole_file_without_messages_is_recovered(tmp_path):
+    write_log(tmp_path / 'run.mcap', chunks=0)
+    assert run(tmp_path / 'run.mcap', '-o', tmp_path / 'whole.mcap')[0] == ALL_KEPT
+    assert seen_by_mcap(tmp_path / 'whole.mcap') == []
+    assert metadata_of(tmp_path / 'whole.mcap')['spinning_top_sim'] == METADATA
+
+
+def test_a_topic_tells_all_that_its_channel_says(log, tmp_path):
+    (tmp_path / 'run.mcap').write_bytes(log.content)
+    with LogReader(tmp_path / 'run.mcap') as reader:
+        topic = reader.topics[1]
+        assert (reader.profile, reader.library) == ('ros2', 'spinning_top_sim 0')
+        assert reader.size == len(log.content)
+    assert (topic.name, topic.type_name, topic.encoding) == ('/top/number', NUMBER, 'cdr')
+    assert (topic.schema_encoding, topic.schema) == ('ros2msg', find_definition(NUMBER).text)
+    assert topic.qos == (dict(DEFAULT_QOS) | TOPICS[1].qos,)
+    assert topic.metadata['topic_type_hash'] == JAZZY.hash_rihs01(NUMBER)
+
+
+def test_messages_can_be_chosen(log, tmp_path):
+    (tmp_path / 'run.mcap').write_bytes(log.content)
+    (tmp_path / 'torn.mcap').write_bytes(log.content[:log.chunks[-1][2]])
+    start, end = log.messages[10][1], log.messages[31][1]
+    for name in ('run.mcap', 'torn.mcap'):
+        with LogReader(tmp_path / name) as reader:
+            chosen = list(reader.messages(topics=['/top/number'], start=start, end=end))
+            assert [(message.topic, message.log_time, message.data) for message in chosen] == [
+                message for message in log.messages[10:31] if message[0] == '/top/number']
+            assert [message.sequence for message in chosen] == list(range(4, 11))
+            assert not list(reader.messages(topics=[]))
+            assert not list(reader.messages(start=end, end=start))
+
+
+@pytest.mark.parametrize('torn', [False, True])
+def test_messages_come_in_the_order_of_their_log_times(tmp_path, torn):
+    """Within chunks and across them; equal times in file order."""
+    path = tmp_path / 'run.mcap'
+    order = random.Random(4)
+    stamps = [order.randrange(200) for _ in range(600)]
+    file = McapFile(path, TOPICS[1:2], {NUMBER: find_definition(NUMBER)}, {},
+                    library='spinning_top_sim 0', compression='none')
+    for number, stamp in enumerate(stamps):
+        file.append(0, stamp, struct.pack('<I', number))
+        if number % 50 == 49:
+            file.write_chunk()
+    file.finish()
+    if torn:
+        path.write_bytes(path.read_bytes()[:-100])
+    with LogReader(path) as reader:
+        assert reader.whole == (not torn)
+        read = [(message.log_time, struct.unpack('<I', message.data)[0])
+                for message in reader.messages()]
+    assert read == sorted((stamp, number) for number, stamp in enumerate(stamps))
+
+
+@pytest.mark.parametrize('text', ['depth: 1', '- [1]', '- reliability: 77', '- lifespan: x',
+                                  '- depth: ²', '- lifespan:\n    sec: ²\n    nsec: x'])
+def test_a_qos_that_means_nothing_is_no_obstacle(tmp_path, text):
+    path, output = tmp_path / 'a.mcap', tmp_path / 'whole.mcap'
+    with open(path, 'wb') as file:
+        writer = Writer(file)
+        writer.start(profile='ros2', library='libmcap')
+        channel = writer.register_channel('/raw', 'cdr', 0, {'offered_qos_profiles': text})
+        writer.add_message(channel, 1, b'1234', 1)
+        writer.finish()
+    assert run(path, '-o', output)[0] == ALL_KEPT
+    assert seen_by_mcap(output) == [('/raw', 1, b'1234')]
+    with LogReader(output) as reader:
+        assert reader.topics[0].metadata == {'offered_qos_profiles': text}
+
+
+# Of strangers
+
+STRANGERS = {
+    'plain': {},
+    'unchunked': {'use_chunking': False},
+    'lz4': {'compression': CompressionType.LZ4},
+    'uncompressed': {'compression': CompressionType.NONE},
+    'no index': {'index_types': IndexType.NONE},
+    'no statistics': {'use_statistics': False},
+    'nothing repeated': {'repeat_channels': False, 'repeat_schemas': False},
+    'no checksums': {'enable_crcs': False},
+    'nothing but messages': {
+        'use_chunking': False, 'use_statistics': False, 'use_summary_offsets': False,
+        'repeat_channels': False, 'repeat_schemas': False, 'index_types': IndexType.NONE,
+        'enable_crcs': False},
+}
+
+
+def write_stranger(path, options, profile='', count=300):
+    """Write JSON and schemaless messages by mcap's own writer, with an attachment."""
+    messages = []
+    with open(path, 'wb') as file:
+        writer = Writer(file, chunk_size=1000, **options)
+        writer.start(profile=profile, library='a stranger')
+        writer.add_metadata('note', {'a': 'ä', 'b': ''})
+        schema = writer.register_schema('thing', 'jsonschema', b'{"type": "object"}')
+        channels = {
+            '/json': writer.register_channel('/json', 'json', schema, {'unit': 'm'}),
+            '/raw': writer.register_channel('/raw', 'octets', 0)}
+        for number in range(count):
+            topic = ('/json', '/raw')[number % 2]
+            data = b'{"n": %d}' % number if topic == '/json' else os.urandom(number % 70)
+            writer.add_message(channels[topic], 1000 + number, data, 2000 + number)
+            messages.append((topic, 1000 + number, data))
+            if number == count // 2:
+                writer.add_attachment(3, 4, 'calibration.bin', 'x/y', b'\x06' * 3000)
+        writer.finish()
+    return messages
+
+
+@pytest.mark.parametrize('kind', STRANGERS)
+def test_a_strangers_file_is_read_and_recovered(tmp_path, kind):
+    path, output = tmp_path / 'stranger.mcap', tmp_path / 'whole.mcap'
+    messages = write_stranger(path, STRANGERS[kind])
+    assert seen_by_us(path) == messages
+    with LogReader(path) as reader:
+        assert reader.damage.lossless
+        assert not reader.damage.torn
+        assert not reader.damage.missing
+        assert reader.metadata == {'note': {'a': 'ä', 'b': ''}}
+        assert [(topic.name, topic.type_name, topic.encoding) for topic in reader.topics] == [
+            ('/json', 'thing', 'json'), ('/raw', '', 'octets')]
+        assert reader.topics[0].metadata == {'unit': 'm'}
+    code, out, err = run(path, '-o', output)
+    assert code == ALL_KEPT, (out, err)
+    assert seen_by_us(output) == seen_by_mcap(output) == messages
+    with open(output, 'rb') as file:
+        reader = make_reader(file)
+        assert reader.get_header() == Header(profile='', library='a stranger')
+        assert [(record.name, record.metadata) for record in reader.iter_metadata()] == [
+            ('note', {'a': 'ä', 'b': ''})]
+        (attachment,) = reader.iter_attachments()
+        assert [message.publish_time for _, _, message in reader.iter_messages()] == [
+            stamp + 1000 for _, stamp, _ in messages]
+    assert (attachment.name, attachment.media_type, attachment.data) == (
+        'calibration.bin', 'x/y', b'\x06' * 3000)
+    with LogReader(output) as reader:
+        assert reader.whole
+
+
+@pytest.mark.parametrize('kind', ['plain', 'unchunked', 'no checksums'])
+def test_a_torn_file_of_a_stranger_keeps_what_stands_before_the_tear(tmp_path, kind, no_sync):
+    path, torn, output = (tmp_path / name for name in ('a.mcap', 'torn.mcap', 'whole.mcap'))
+    messages = write_stranger(path, STRANGERS[kind], count=60)
+    content = path.read_bytes()
+    records = records_of(content)
+    ends = [end for opcode, _, end in records if opcode in (Opcode.CHUNK, Opcode.MESSAGE)]
+    firsts = [first_message(content[start:end], messages)
+              for opcode, start, end in records if opcode == Opcode.CHUNK]
+    firsts = [*firsts[1:], len(messages)] if firsts else range(1, len(messages) + 1)
+    for size in range(8, len(content), 17):
+        torn.write_bytes(content[:size])
+        whole = sum(end <= size for end in ends)
+        kept = firsts[whole - 1] if whole else 0
+        code, _, err = run(torn, '-o', output)
+        assert (code == FAILED) == (kept == 0), (size, err)
+        if kept:
+            assert seen_by_us(output) == seen_by_mcap(output) == messages[:kept], size
+            output.unlink()
+
+
+def first_message(chunk: bytes, messages) -> int:
+    """Return the number of the message that a chunk of `write_stranger` begins with."""
+    start_time, = struct.unpack_from('<Q', chunk, 9)
+    return start_time - messages[0][1]
+
+
+def test_a_bag_of_rosbags_is_recovered(tmp_path):
+    with BagWriter(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection('/number', NUMBER, typestore=JAZZY)
+        for number in range(200):
+            writer.write(connection, number, bytes(JAZZY.serialize_cdr(
+                JAZZY.types[NUMBER](float(number)), NUMBER)))
+    (path,) = (tmp_path / 'bag').glob('*.mcap')
+    expected = seen_by_rosbags(path)
+    assert len(expected) == 200
+    code, out, err = run(path, '-o', tmp_path / 'whole.mcap')
+    assert code == ALL_KEPT, (out, err)
+    output = tmp_path / 'whole.mcap'
+    assert seen_by_rosbags(output) == seen_by_mcap(output) == seen_by_us(output) == expected
+    assert 'name: "/number"' in metadata_of(output)['rosbag2']['serialized_metadata']
+
+
+def test_what_rosbag2_wrote_of_the_distribution_stays(tmp_path):
+    path = tmp_path / 'humble.mcap'
+    bag = 'version: 8\ncustom_data:\n  robot: top\nros_distro: humble\nmessage_count: 7'
+    with open(path, 'wb') as file:
+        writer = Writer(file)
+        writer.start(profile='ros2', library='libmcap')
+        channel = writer.register_channel('/raw', 'cdr', 0)
+        writer.add_message(channel, 1, b'1234', 1)
+        writer.add_metadata('rosbag2', {'serialized_metadata': bag})
+        writer.finish()
+    assert run(path, '-o', tmp_path / 'whole.mcap')[0] == ALL_KEPT
+    text = metadata_of(tmp_path / 'whole.mcap')['rosbag2']['serialized_metadata']
+    assert 'custom_data:\n  robot: top\nros_distro: humble' in text
+    assert 'message_count: 1\n' in text
+    assert 'message_count: 7' not in text
+    with Reader(tmp_path / 'whole.mcap') as reader:
+        assert reader.message_count == 1
+
+
+def test_a_damaged_attachment_is_left_out(tmp_path):
+    path, output = tmp_path / 'a.mcap', tmp_path / 'whole.mcap'
+    messages = write_stranger(path, {})
+    content = path.read_bytes()
+    (start,) = [start for opcode, start, _ in records_of(content) if opcode == Opcode.ATTACHMENT]
+    path.write_bytes(flipped(content, start + 500, 0))
+    code, out, _ = run(path, '-o', output)
+    assert code == SOME_LOST
+    assert f'attachment at byte {start} ' in out
+    assert seen_by_mcap(output) == messages
+    with open(output, 'rb') as file:
+        assert not list(make_reader(file).iter_attachments())
+
+
+# Hostile
+
+def test_a_chunk_that_would_fill_the_memory_does_not(tmp_path):
+    bomb = zstandard.ZstdCompressor().compress(bytes(300_000_000))
+    chunks = [Chunk(compression='zstd', data=bomb, uncompressed_size=size, uncompressed_crc=1,
+                    message_start_time=1, message_end_time=2) for size in (100, 1 << 62)]
+    path = tmp_path / 'bomb.mcap'
+    path.write_bytes(b''.join([MCAP0_MAGIC, record_bytes(Header(profile='', library='')),
+                               *map(record_bytes, chunks[:1])]))
+    tracemalloc.start()
+    try:
+        with LogReader(path) as reader:
+            assert not list(reader.messages())
+            assert reader.damage.lost_chunks == 1
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 10_000_000
+
+
+def test_memory_does_not_grow_with_the_file(tmp_path):
+    """Twenty times as many chunks: no more than their index, less than a fifth of the file."""
+    peaks = []
+    for chunks in (10, 200):
+        path = tmp_path / f'{chunks}.mcap'
+        file = McapFile(path, TOPICS[1:2], {NUMBER: find_definition(NUMBER)}, {},
+                        library='spinning_top_sim 0', compression='none')
+        for number in range(chunks):
+            file.append(0, number, random.Random(number).randbytes(50_000))
+            file.write_chunk()
+        file.finish()
+        path.write_bytes(path.read_bytes()[:-100])
+        tracemalloc.start()
+        try:
+            assert run(path)[0] == ALL_KEPT
+            with LogReader(path) as reader:
+                assert sum(1 for _ in reader.messages()) == chunks
+            peaks.append(tracemalloc.get_traced_memory()[1])
+        finally:
+            tracemalloc.stop()
+    assert peaks[1] - peaks[0] < 1_000_000
+
+
+def test_noise_crashes_nothing(tmp_path, no_sync):
+    """Records of random kinds, lengths and contents behind a right beginning."""
+    path, output = tmp_path / 'noise.mcap', tmp_path / 'whole.mcap'
+    begin = MCAP0_MAGIC + record_bytes(Header(profile='ros2', library='spinning_top_sim 0'))
+    for seed in range(300):
+        noise = random.Random(seed)
+        content = begin
+        for _ in range(noise.randrange(20)):
+            body = noise.choice([noise.randbytes, bytes])(noise.randrange(200))
+            length = len(body) if noise.random() < 0.8 else noise.getrandbits(noise.choice(
+                (8, 16, 32, 64)))
+            content += struct.pack('<BQ', noise.randrange(20), length) + body
+        if noise.random() < 0.3:
+            content += struct.pack('<BQQQI', 2, 20, noise.randrange(2 * len(content)), 0, 0)
+            content += MCAP0_MAGIC
+        path.write_bytes(content)
+        with LogReader(path) as reader:
+            list(reader.messages())
+            assert isinstance(reader.damage.lines(), list)
+            assert isinstance(reader.topics, tuple)
+        code, _, err = run(path, '-o', output)
+        assert code in (ALL_KEPT, FAILED, SOME_LOST)
+        assert (code == FAILED) == err.startswith('recover: ')
+        output.unlink(missing_ok=True)
+
+
+def test_a_search_does_not_believe_a_chunk_with_a_wrong_checksum(tmp_path, log):
+    _, start, _ = log.chunks[0]
+    _, second, end = log.chunks[1]
+    chunk = bytearray(log.content[second:end])
+    chunk[-6] ^= 1
+    broken = tmp_path / 'broken.mcap'
+    broken.write_bytes(log.content[:start] + b'\x00' * 50 + chunk + log.content[
+        log.chunks[2][1]:log.chunks[2][2]])
+    assert seen_by_us(broken) == log.messages[2 * MESSAGES_PER_CHUNK:]
+
+
+# The command and its errors
+
+def test_exit_codes_of_the_process(tmp_path, log):
+    whole, torn, head = (tmp_path / f'{name}.mcap' for name in ('whole', 'torn', 'head'))
+    whole.write_bytes(log.content)
+    torn.write_bytes(log.content[:log.chunks[2][2] - 1])
+    head.write_bytes(log.content[:log.chunks[0][1]])
+    done = run_process(whole)
+    assert (done.returncode, done.stderr) == (ALL_KEPT, '')
+    assert 'kept all: 36 messages in 3 chunks' in done.stdout
+    done = run_process(torn, '--output', tmp_path / 'out.mcap')
+    assert (done.returncode, done.stderr) == (SOME_LOST, '')
+    assert 'kept: 24 messages in 2 chunks' in done.stdout
+    done = run_process(head)
+    assert (done.returncode, done.stdout) == (FAILED, '')
+    assert done.stderr == f'recover: nothing to save in {head}: there is no whole message in it\n'
+    assert run_process().returncode == 2
+    done = run_process('--help')
+    assert done.returncode == 0
+    assert 'exit codes:' in done.stdout
+
+
+def test_nothing_is_overwritten(tmp_path, log):
+    path, other = tmp_path / 'run.mcap', tmp_path / 'other.mcap'
+    path.write_bytes(log.content)
+    other.write_text('precious')
+    (tmp_path / 'link.mcap').symlink_to(tmp_path / 'nowhere')
+    for output in (path, other, tmp_path / 'link.mcap'):
+        code, out, err = run(path, '-o', output)
+        assert (code, out) == (FAILED, '')
+        assert err == f'recover: {output} exists, and nothing is overwritten\n'
+    assert path.read_bytes() == log.content
+    assert other.read_text() == 'precious'
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_an_output_that_appears_meanwhile_is_not_overwritten(tmp_path, log, monkeypatch):
+    path, output = tmp_path / 'run.mcap', tmp_path / 'whole.mcap'
+    path.write_bytes(log.content)
+    monkeypatch.setattr(McapFile.__base__, 'sync', lambda self: output.write_text('precious'))
+    code, _, err = run(path, '-o', output)
+    assert (code, err) == (FAILED, f'recover: {output} exists, and nothing is overwritten\n')
+    assert output.read_text() == 'precious'
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_file_system_without_links_does_too(tmp_path, log, monkeypatch):
+    def refuse(*_):
+        raise PermissionError(1, os.strerror(1))
+
+    (tmp_path / 'run.mcap').write_bytes(log.content)
+    monkeypatch.setattr(os, 'link', refuse)
+    assert run(tmp_path / 'run.mcap', '-o', tmp_path / 'whole.mcap')[0] == ALL_KEPT
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['run.mcap', 'whole.mcap']
+    assert seen_by_mcap(tmp_path / 'whole.mcap') == log.messages
+
+
+def test_a_full_disk_leaves_nothing_behind(tmp_path, log):
+    path = tmp_path / 'run.mcap'
+    path.write_bytes(log.content)
+    limit = len(log.content) - 1000
+    done = run_process(path, preexec_fn=lambda: resource.setrlimit(
+        resource.RLIMIT_FSIZE, (limit, limit)))
+    assert done.returncode == FAILED
+    assert done.stderr == (
+        f'recover: cannot write {tmp_path / "run_recovered.mcap"}: File too large\n')
+    assert [item.name for item in tmp_path.iterdir()] == ['run.mcap']
+
+
+def test_an_output_that_cannot_be_made_is_named(tmp_path, log):
+    path = tmp_path / 'run.mcap'
+    path.write_bytes(log.content)
+    code, _, err = run(path, '-o', tmp_path / 'none' / 'whole.mcap')
+    assert code == FAILED
+    assert err == (f'recover: cannot write {tmp_path}/none/whole.mcap: there is no directory '
+                   f'{tmp_path}/none\n')
+    code, _, err = run(path, '-o', path / 'whole.mcap')
+    assert code == FAILED
+    assert 'Not a directory' in err
+
+
+@pytest.mark.parametrize(('content', 'reason'), [
+    (b'', 'it is empty'),
+    (MCAP0_MAGIC[:5], 'it ends after 5 bytes of an MCAP file'),
+    (b'SQLite format 3\x00' + bytes(100), 'it is no MCAP file'),
+    (b'\n', 'it is no MCAP file'),
+])
+def test_what_is_no_log_is_refused(tmp_path, content, reason):
+    path = tmp_path / 'file.mcap'
+    path.write_bytes(content)
+    with pytest.raises(NotMcapError) as caught:
+        LogReader(path)
+    assert str(caught.value) == f'cannot read {path}: {reason}'
+    assert run(path) == (FAILED, '', f'recover: cannot read {path}: {reason}\n')
+
+
+def test_what_cannot_be_opened_is_named(tmp_path, monkeypatch, log):
+    os.mkfifo(tmp_path / 'pipe')
+    for name, reason in (('missing', 'No such file or directory'),
+                         ('', 'it is no regular file'), ('pipe', 'it is no regular file')):
+        path = tmp_path / name
+        with pytest.raises(LogAccessError) as caught:
+            LogReader(path)
+        assert str(caught.value) == f'cannot read {path}: {reason}'
+        assert run(path, '-o', tmp_path / 'x') == (FAILED, '', f'recover: {caught.value}\n')
+
+    def refuse(path, *_, **__):
+        raise PermissionError(13, os.strerror(13), str(path))
+
+    (tmp_path / 'run.mcap').write_bytes(log.content)
+    monkeypatch.setattr(walk, 'open', refuse, raising=False)
+    assert run(tmp_path / 'run.mcap') == (
+        FAILED, '', f'recover: cannot read {tmp_path / "run.mcap"}: Permission denied\n')
+
+
+def test_a_disk_that_fails_while_it_is_read_is_an_error(tmp_path, log, monkeypatch):
+    (tmp_path / 'run.mcap').write_bytes(log.content)
+    real = open
+
+    def open_bad(path, *arguments, **options):
+        file = real(path, *arguments, **options)
+
+        class Bad:
+            def __getattr__(self, name):
+                return getattr(file, name)
+
+            def read(self, size):
+                if file.tell() >= log.chunks[1][1]:
+                    raise OSError(5, os.strerror(5))
+                return file.read(size)
+
+        return Bad()
+
+    torn = log.content[:log.chunks[-1][2]]
+    (tmp_path / 'run.mcap').write_bytes(torn + bytes(40))
+    monkeypatch.setattr(walk, 'open', open_bad, raising=False)
+    code, _, err = run(tmp_path / 'run.mcap')
+    assert code == FAILED
+    assert err == f'recover: cannot read {tmp_path / "run.mcap"}: Input/output error\n'
+    assert [path.name for path in tmp_path.iterdir()] == ['run.mcap']
+
+
+def test_ctrl_c_leaves_nothing_behind(tmp_path, log, monkeypatch):
+    def interrupt(self, last_metadata):
+        raise KeyboardInterrupt
+
+    (tmp_path / 'run.mcap').write_bytes(log.content)
+    monkeypatch.setattr(McapFile.__base__, 'close', interrupt)
+    assert run(tmp_path / 'run.mcap')[0] == 130
+    assert [path.name for path in tmp_path.iterdir()] == ['run.mcap']
+
+
+def test_reading_and_recovering_import_no_ros(tmp_path, log):
+    (tmp_path / 'run.mcap').write_bytes(log.content)
+    done = subprocess.run(
+        [sys.executable, '-c',
+         'import sys; from spinning_top_sim.tools.recover import main\n'
+         f'assert main([{str(tmp_path / "run.mcap")!r}]) == 0\n'
+         'print([name for name in ("rclpy", "numpy", "yaml", "scipy") if name in sys.modules])'],
+        env=os.environ | {'PYTHONPATH': str(ROOT)}, capture_output=True, text=True, timeout=60,
+        check=True)
+    assert done.stdout.endswith('\n[]\n')

@@ -1,0 +1,572 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Replay: what is due when, without ROS and with a clock of our own; and nodes over real DDS.
+
+Logs are written by the recorder of this package and by rosbags, which nobody here wrote.  No test
+is decided by how long something took, except that nothing may come before its time.
+"""
+
+import contextlib
+import dataclasses
+import itertools
+import signal
+import threading
+import time
+from fractions import Fraction
+
+import pytest
+from node_harness import PATIENCE_S, Peer, SimNode, Topic
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from spinning_top_sim.nodes import playback
+from spinning_top_sim.nodes.message_types import message_type
+from spinning_top_sim.nodes.playback import ROUND_GAP_NS, Playback, ReadAhead, rounds
+from spinning_top_sim.recording import writer
+from spinning_top_sim.recording.rosbag2 import RecordedTopic
+from spinning_top_sim.recording.schemas import find_definition
+from spinning_top_sim.recording.writer import McapRecorder
+
+JAZZY = get_typestore(Stores.ROS2_JAZZY)
+EPOCH_NS = 1_700_000_000_123_456_789
+SECOND = 1_000_000_000
+
+# ------------------------------------------------------------------- when a message is due
+
+
+class FakeTime:
+    """A steady clock that stands, except while somebody sleeps."""
+
+    def __init__(self):
+        self.now_ns = 77
+        self.at_rest = {}       # time: what to do when it has come
+        self.sleeps = 0
+
+    def now(self):
+        return self.now_ns
+
+    def sleep(self, seconds):
+        self.sleeps += 1
+        wanted = None if seconds is None else self.now_ns + max(1, round(seconds * 1e9))
+        planned = min(self.at_rest, default=None)
+        if planned is not None and (wanted is None or planned <= wanted):
+            self.now_ns = planned
+            self.at_rest.pop(planned)()
+        else:
+            assert wanted is not None, 'sleeps for ever'
+            self.now_ns = wanted
+
+
+def play(messages, rate=1.0, plan=None, cost_ns=0, **options):
+    """Play with a fake clock; return [(index, time from the start)] and the playback."""
+    fake = FakeTime()
+    sent = []
+
+    def send(index, _):
+        sent.append((index, fake.now_ns - 77))
+        fake.now_ns += cost_ns
+
+    player = Playback(messages, EPOCH_NS, rate, send, source=fake.now, sleep=fake.sleep, **options)
+    fake.at_rest = {77 + at: (lambda act=act: act(player)) for at, act in (plan or {}).items()}
+    player.run()
+    return sent, player, fake
+
+
+def messages_at(*offsets):
+    return [(EPOCH_NS + offset, index, b'') for index, offset in enumerate(offsets)]
+
+
+@pytest.mark.parametrize('rate', [0.1, 1.0, 3.0, 10.0])
+def test_every_message_has_its_own_deadline_from_the_start(rate):
+    # Periods that no binary fraction is: rounding that added up would show at the end.
+    offsets = [n * 3_333_333 for n in range(20_000)]
+    sent, player, _ = play(messages_at(*offsets), rate)
+    assert [index for index, _ in sent] == list(range(20_000))
+    for (_, at), offset in zip(sent, offsets, strict=True):
+        assert abs(at - Fraction(offset) / Fraction(rate)) <= 1
+    assert player.late == 0
+
+
+def test_what_is_due_together_is_sent_together():
+    sent, _, fake = play(messages_at(5, 5, 5, 900, 900))
+    assert [at for _, at in sent] == [5, 5, 5, 900, 900]
+    assert fake.sleeps == 2
+
+
+def test_what_is_late_is_sent_at_once_and_counted_and_later_deadlines_stay():
+    cost = 30_000_000
+    offsets = [0, 1_000_000, 2_000_000, 500_000_000]
+    sent, player, _ = play(messages_at(*offsets), cost_ns=cost)
+    assert sent == [(0, 0), (1, cost), (2, 2 * cost), (3, 500_000_000)]
+    assert player.late == 2
+    assert player.sent == 4
+
+
+def test_a_pause_shifts_what_follows_and_catches_nothing_up():
+    offsets = [0, 100, 200, 300]
+    sent, player, _ = play(messages_at(*offsets), plan={
+        150: lambda p: p.pause(True), 5_000: lambda p: p.pause(True),
+        1_000_150: lambda p: p.pause(False), 1_000_160: lambda p: p.pause(False)})
+    assert [at for _, at in sent] == [0, 100, 1_000_200, 1_000_300]
+    assert player.late == 0
+
+
+def test_started_paused_nothing_goes_out_before_the_resume():
+    sent, player, _ = play(messages_at(10), paused=True, plan={
+        10_000_000: lambda p: p.pause(False)})
+    assert [at for _, at in sent] == [10_000_010]
+    assert not player.paused
+
+
+def test_a_new_rate_holds_from_its_moment_on():
+    sent, _, _ = play(messages_at(0, 1_000, 3_000), plan={
+        1_500: lambda p: p.set_rate(0.5)})
+    assert [at for _, at in sent] == [0, 1_000, 1_500 + 3_000]
+
+
+def test_told_to_stop_it_sends_nothing_more():
+    sent, player, _ = play(messages_at(0, 1_000), plan={500: lambda p: p.stop()})
+    assert sent == [(0, 0)]
+    assert player.sent == 1
+
+
+def test_the_time_told_never_passes_a_message_that_is_still_to_be_sent():
+    told = []
+
+    def look(player):
+        told.append(player.now() - EPOCH_NS)
+
+    _, player, fake = play(messages_at(0, 1_000_000, 2_000_000),
+                           plan={400_000: look, 1_500_000: look})
+    fake.now_ns += SECOND
+    look(player)
+    assert told == [400_000, 1_500_000, 2_000_000]
+
+
+def test_rounds_go_on_where_the_last_one_ended():
+    log = [(EPOCH_NS, 0, b'a'), (EPOCH_NS + 500, 1, b'b')]
+    length = 500 + ROUND_GAP_NS
+    endless = rounds(lambda: log, length, loop=True)
+    found = list(itertools.islice(endless, 5))
+    assert found == [(at + turn * length, index, data) for turn in range(3)
+                     for at, index, data in log][:5]
+    assert list(rounds(lambda: log, length, loop=False)) == log
+    assert list(rounds(list, length, loop=True)) == []
+
+
+def test_reading_ahead_is_bounded_in_order_and_ends():
+    taken = itertools.count()
+    last = [0]
+
+    def endless():
+        for number in taken:
+            last[0] = number
+            yield number, 0, b'x' * 100
+
+    ahead = ReadAhead(endless())
+    first = list(itertools.islice(ahead, 1_000))
+    assert [number for number, _, _ in first] == list(range(1_000))
+    ahead.stop()
+    assert not ahead._thread.is_alive()
+    most = (playback.BATCHES + 3) * playback.BATCH_MESSAGES
+    assert last[0] < 1_000 + most
+
+
+def test_what_reading_raises_comes_after_what_was_read():
+    def broken():
+        yield 1, 0, b'a'
+        raise OSError('gone')
+
+    found = []
+    with pytest.raises(OSError, match='gone'):
+        found.extend(ReadAhead(broken()))
+    assert len(found) == 0 or found == [(1, 0, b'a')]
+
+
+def test_stopping_wakes_who_waits_for_a_reader():
+    block = threading.Event()
+
+    def slow():
+        block.wait(60.0)
+        yield 1, 0, b''
+
+    ahead = ReadAhead(slow())
+    consumer = threading.Thread(target=lambda: list(ahead), daemon=True)
+    consumer.start()
+    ahead.stop()
+    consumer.join(20.0)
+    assert not consumer.is_alive()
+    block.set()
+
+
+# --------------------------------------------------------------------------- logs to play
+
+STRING, TWIST, THING = 'std_msgs/msg/String', 'geometry_msgs/msg/Twist', 'nowhere_msgs/msg/Thing'
+
+
+def string_cdr(number, padding=0):
+    text = f'message {number}' + padding * '.'
+    data = JAZZY.serialize_cdr(JAZZY.types[STRING](text), STRING).tobytes()
+    return data + bytes(-len(data) % 4)     # as it comes off the wire, and so into logs
+
+
+def twist_cdr(number):
+    vector = JAZZY.types['geometry_msgs/msg/Vector3']
+    twist = JAZZY.types[TWIST](vector(1.0, 2.0, float(number)), vector(0.0, 0.5, -0.5))
+    return JAZZY.serialize_cdr(twist, TWIST).tobytes()
+
+
+def write_bag(folder, connections, messages):
+    """Let rosbags write a log; messages: (index of the connection, time, CDR) as they come."""
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        opened = [bag.add_connection(name, kind, typestore=JAZZY, offered_qos_profiles=qos)
+                  for name, kind, qos in connections]
+        for index, at_ns, data in messages:
+            bag.write(opened[index], at_ns, data)
+    return next(folder.glob('*.mcap'))
+
+
+@pytest.fixture(scope='module')
+def strangers_log(tmp_path_factory):
+    """Two topics of a stranger in one file, out of order; what should come is (log, in order)."""
+    order = [*range(20, 40), *range(20), *range(40, 60)]
+    messages = [(n % 2, EPOCH_NS + n * 20_000_000, (string_cdr, twist_cdr)[n % 2](n))
+                for n in order]
+    qos = [Qos(QosHistory.KEEP_LAST, 7, QosReliability.BEST_EFFORT, QosDurability.VOLATILE,
+               QosTime(9223372036, 854775807), QosTime(9223372036, 854775807),
+               QosLiveliness.AUTOMATIC, QosTime(9223372036, 854775807),
+               avoid_ros_namespace_conventions=False)]
+    path = write_bag(tmp_path_factory.mktemp('stranger') / 'bag',
+                     [('/chatter', STRING, ()), ('/robot/cmd_vel', TWIST, qos)], messages)
+    in_order = sorted(messages, key=lambda message: message[1])
+    return path, [[data for index, _, data in in_order if index == topic] for topic in (0, 1)]
+
+
+def write_log(path, count, step_ns=2_000_000, padding=0, **options):
+    """Record strings and twists in turn with our recorder; return what is in, by topic."""
+    messages = [(n % 2, EPOCH_NS + n * step_ns,
+                 twist_cdr(n) if n % 2 else string_cdr(n, padding)) for n in range(count)]
+    topics = [RecordedTopic('/ours/text', STRING),
+              RecordedTopic('/ours/twist', TWIST, {'depth': 3, 'durability': 1})]
+    with McapRecorder.open(path, topics, {}, **{'min_free_bytes': 0} | options) as recorder:
+        for message in messages:
+            recorder.write(*message)
+    return [[data for index, _, data in messages if index == topic] for topic in (0, 1)]
+
+
+OURS = (('/ours/text', STRING), ('/ours/twist', TWIST))
+BEST_EFFORT = '/robot/cmd_vel'
+STRANGERS = (('/chatter', STRING), ('/robot/cmd_vel', TWIST))
+
+
+def assert_same(found, wanted):
+    """Compare lists of messages by topic; pytest takes minutes to show how long ones differ."""
+    assert [len(messages) for messages in found] == [len(messages) for messages in wanted]
+    for of_found, of_wanted in zip(found, wanted, strict=True):
+        for number, pair in enumerate(zip(of_found, of_wanted, strict=True)):
+            assert pair[0] == pair[1], f'message {number}'
+
+
+# ------------------------------------------------------------------------------- nodes
+
+
+class Replay(SimNode):
+    """A replay_node in its own process group."""
+
+    def __init__(self, folder, file, *options, arguments=()):
+        super().__init__(folder, namespace='/', arguments=arguments, program=(
+            '-m', 'spinning_top_sim.nodes.replay_node', str(file), *options))
+        self.name = f'{self.namespace}/replay'
+
+
+@pytest.fixture
+def peer():
+    """Return a new one for each test: subscriptions of before would count as subscribers."""
+    with Peer() as peer:
+        yield peer
+
+
+class Listening:
+    """Subscriptions that know whether they have found a publisher."""
+
+    def __init__(self, peer, topics):
+        self.topics, self._matched = [], {}
+        for name, kind in topics:
+            topic = Topic(message_type(kind))
+            matched = self._matched[name] = threading.Event()
+            peer.node.create_subscription(
+                topic.kind, name, topic.receive,
+                QoSProfile(depth=20_000, reliability=ReliabilityPolicy.BEST_EFFORT
+                           if name == BEST_EFFORT else ReliabilityPolicy.RELIABLE),
+                raw=True, event_callbacks=SubscriptionEventCallbacks(
+                    matched=lambda info, matched=matched: matched.set()))
+            self.topics.append(topic)
+
+    def wait_until_matched(self):
+        for name, matched in self._matched.items():
+            assert matched.wait(PATIENCE_S), f'no publisher of {name}'
+
+    @property
+    def raw(self):
+        return [topic.raw for topic in self.topics]
+
+
+@contextlib.contextmanager
+def replaying(peer, folder, file, topics, *options, depth=5000, arguments=()):
+    """
+    Have a replay that stands before its first message; both sides know each other.
+
+    depth: of reliable publishers; with no less than a topic has messages, a busy machine cannot
+    decide what arrives, and with no more the last ones are acknowledged at once
+    """
+    kept = [argument for name, _ in topics if name not in (BEST_EFFORT, '/clock')
+            for argument in ('-p', f'qos_overrides.{name}.publisher.depth:={depth}')]
+    heard = Listening(peer, topics)
+    with Replay(folder, file, '--start-paused', '--wait-for-subscribers', str(len(topics)),
+                *options, arguments=(*kept, *arguments)) as node:
+        heard.wait_until_matched()
+        yield node, heard
+
+
+def play_all(peer, folder, file, topics, *options, **given):
+    """Play a log to its end; return what has arrived by topic, and the node."""
+    with replaying(peer, folder, file, topics, *options, **given) as (node, heard):
+        assert peer.switch(node, 'set_pause', False).success
+        assert node.wait() == 0, node.err
+        wait_until_still(heard)
+        return heard.raw, node
+
+
+def wait_until_still(heard):
+    """Wait for what is on its way after the sender has ended: acknowledged, not yet taken."""
+    counts = None
+    while counts != (now := [len(raw) for raw in heard.raw]):
+        counts = now
+        time.sleep(0.2)
+
+
+def test_all_bytes_arrive_to_the_last_message(peer, tmp_path):
+    wanted = write_log(tmp_path / 'run.mcap', 1_000)
+    begin = time.monotonic()
+    raw, node = play_all(peer, tmp_path, tmp_path / 'run.mcap', OURS, '--rate', '2',
+                         depth=500)
+    assert_same(raw, wanted)
+    assert time.monotonic() - begin >= 1.998 / 2.0      # nothing before its time
+    assert 'played 1000 messages on 2 topics' in node.out
+    assert node.err == ''
+
+
+def test_a_long_log_plays_faster_where_asked_to(peer, tmp_path):
+    wanted = write_log(tmp_path / 'long.mcap', 100, step_ns=100 * SECOND)
+    raw, _ = play_all(peer, tmp_path, tmp_path / 'long.mcap', OURS, '--rate', '10000',
+                      depth=50)
+    assert_same(raw, wanted)
+
+
+def test_a_strangers_log_is_played_in_order_with_its_qos(peer, tmp_path, strangers_log):
+    path, wanted = strangers_log
+    with replaying(peer, tmp_path, path, STRANGERS, depth=30) as (node, heard):
+        offered = {}
+        for name, _ in STRANGERS:
+            (info,) = peer.node.get_publishers_info_by_topic(name)
+            offered[name] = info.qos_profile.reliability
+        assert offered == {'/chatter': ReliabilityPolicy.RELIABLE,
+                           '/robot/cmd_vel': ReliabilityPolicy.BEST_EFFORT}
+        assert peer.get(node, 'qos_overrides./robot/cmd_vel.publisher.depth') == [7]
+        peer.switch(node, 'set_pause', False)
+        assert node.wait() == 0, node.err
+        wait_until_still(heard)
+        assert_same(heard.raw, wanted)
+
+
+def test_names_and_qos_can_be_changed_as_usual(peer, tmp_path, strangers_log):
+    path, wanted = strangers_log
+    raw, _ = play_all(
+        peer, tmp_path, path, (('/elsewhere/vel', TWIST), ('/chatter', STRING)), '--rate', '10',
+        depth=30, arguments=('-r', '/robot/cmd_vel:=/elsewhere/vel',
+                             '-p', 'qos_overrides./elsewhere/vel.publisher.reliability:=reliable'))
+    assert_same(raw, wanted[::-1])
+
+
+def test_start_and_topics_choose_what_is_played(peer, tmp_path, strangers_log):
+    path, wanted = strangers_log
+    raw, node = play_all(peer, tmp_path, path, STRANGERS[:1], '--topics', '/chatter', '/nobody',
+                         '--start', '0.4', depth=20)
+    assert_same(raw, [wanted[0][10:]])
+    assert 'the log has no topic /nobody' in node.err
+    assert 'on 1 topics' in node.out
+
+
+def test_an_unknown_type_is_named_once_and_the_rest_plays(peer, tmp_path):
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg('int32 x', THING))
+    path = tmp_path / 'bag'
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        thing = bag.add_connection('/thing', THING, typestore=store)
+        text = bag.add_connection('/text', STRING, typestore=store)
+        for n in range(10):
+            at = EPOCH_NS + n * 1_000_000
+            bag.write(thing, at, b'\0\1\0\0\0\0\0\0')
+            bag.write(text, at, string_cdr(n))
+    raw, node = play_all(peer, tmp_path, next(path.glob('*.mcap')), (('/text', STRING),),
+                         depth=10)
+    assert_same(raw, [[string_cdr(n) for n in range(10)]])
+    assert node.err.count(THING) == 1
+    assert '/thing is not played' in node.err
+
+
+def test_a_type_that_has_changed_since_is_warned_about(peer, tmp_path, monkeypatch):
+    def another(type_name):
+        found = find_definition(type_name)
+        changed = type_name == STRING
+        return dataclasses.replace(found, type_hash='RIHS01_' + 64 * '0') if changed else found
+
+    monkeypatch.setattr(writer, 'find_definition', another)
+    wanted = write_log(tmp_path / 'run.mcap', 20)
+    raw, node = play_all(peer, tmp_path, tmp_path / 'run.mcap', OURS, depth=10)
+    assert_same(raw, wanted)
+    assert node.err.count('was recorded with another') == 1
+    assert f'/ours/text was recorded with another {STRING}' in node.err
+
+
+def test_a_torn_log_is_refused_with_a_hint_and_played_in_part(peer, tmp_path):
+    path = tmp_path / 'torn.mcap'
+    wanted = write_log(path, 400, padding=20_000, compression='none')
+    whole = path.read_bytes()
+    path.write_bytes(whole[:len(whole) // 2])
+    with Replay(tmp_path / 'refused', path) as node:
+        assert node.wait() == 2
+    (line,) = node.err.splitlines()
+    assert 'torn' in line
+    assert 'recover' in line
+    assert '--partial' in line
+    raw, node = play_all(peer, tmp_path, path, OURS, '--partial')
+    assert 'torn' in node.err
+    for found, all_of_it in zip(raw, wanted, strict=True):
+        assert 40 < len(found) < 110
+        assert_same([found], [all_of_it[:len(found)]])
+
+
+def test_damage_inside_is_no_secret(peer, tmp_path):
+    path = tmp_path / 'damaged.mcap'
+    wanted = write_log(path, 400, padding=20_000, compression='none')
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    with replaying(peer, tmp_path, path, OURS) as (node, heard):
+        peer.switch(node, 'set_pause', False)
+        assert node.wait() == 2
+        wait_until_still(heard)
+        assert 0 < len(heard.raw[0]) < len(wanted[0])
+        assert heard.raw[0][-1] == wanted[0][-1]
+    assert node.err.count('damaged inside') == 1
+    assert 'recover' in node.err
+
+
+def test_what_cannot_be_played_is_one_line_and_exit_code_2(tmp_path, strangers_log):
+    text = tmp_path / 'text.mcap'
+    text.write_text('no log')
+    path, _ = strangers_log
+    for options, says in (
+            ((tmp_path / 'missing.mcap',), 'No such file'),
+            ((tmp_path,), 'no regular file'),
+            ((text,), 'no MCAP'),
+            ((path, '--topics', '/nobody'), '/chatter'),
+            ((path, '--start', '99'), '1.180 s'),
+            ((path, '--rate', '0'), 'must be a finite number > 0')):
+        with Replay(tmp_path / 'node', *options) as node:
+            assert node.wait() == 2
+        assert says in node.err.splitlines()[-1], node.err
+        assert 'Traceback' not in node.err
+
+
+def test_loops_go_on_with_a_clock_that_never_goes_back(peer, tmp_path):
+    path = tmp_path / 'run.mcap'
+    wanted = write_log(path, 20)
+    with replaying(peer, tmp_path, path, (*OURS, ('/clock', 'rosgraph_msgs/msg/Clock')), '--loop',
+                   '--clock', '200') as (node, heard):
+        text, twist, clock = heard.topics
+        clock.wait(2)               # there while nothing is played, too
+        peer.switch(node, 'set_pause', False)
+        twist.wait(3 * len(wanted[1]))
+        clock.wait_more(20)
+        code = node.end()
+        assert code == 0, node.err
+        for topic, once in ((text, wanted[0]), (twist, wanted[1])):
+            arrived = list(topic.raw)
+            turns = -(-len(arrived) // len(once))
+            assert_same([arrived], [(once * turns)[:len(arrived)]])
+        times = [message.clock.sec * SECOND + message.clock.nanosec for message
+                 in clock.messages()]
+        assert times[0] == EPOCH_NS
+        assert times == sorted(times)
+        assert times[-1] > EPOCH_NS + 2 * (19 * 2_000_000 + ROUND_GAP_NS)
+
+
+def test_pause_stands_still_however_often_it_is_asked_for(peer, tmp_path):
+    path = tmp_path / 'run.mcap'
+    wanted = write_log(path, 500)
+    with replaying(peer, tmp_path, path, OURS, depth=250) as (node, heard):
+        peer.switch(node, 'set_pause', False)
+        heard.topics[0].wait(5)
+        first, second = (peer.switch(node, 'set_pause', True) for _ in range(2))
+        assert first.success
+        assert second.success
+        assert first.message.startswith('paused at')
+        # Time stood between the two answers, whatever went on elsewhere.
+        assert first.message == second.message
+        assert node.alive
+        assert [len(raw) for raw in heard.raw] != [len(topic) for topic in wanted]
+        peer.switch(node, 'set_pause', False)
+        assert node.wait() == 0
+        wait_until_still(heard)
+        assert_same(heard.raw, wanted)
+
+
+def test_the_rate_is_a_parameter(peer, tmp_path):
+    path = tmp_path / 'slow.mcap'
+    wanted = write_log(path, 20, step_ns=1000 * SECOND)
+    with replaying(peer, tmp_path, path, OURS, depth=10,
+                   arguments=('-p', 'rate:=2')) as (node, heard):
+        assert peer.get(node, 'rate') == [2.0]
+        (refused,) = peer.set_each(node, rate=0.0)
+        assert not refused.successful
+        (refused,) = peer.set_each(node, rate='fast')
+        assert 'must be a number' in refused.reason
+        peer.switch(node, 'set_pause', False)
+        (accepted,) = peer.set_each(node, rate=50_000)
+        assert accepted.successful, accepted.reason
+        assert node.wait() == 0         # 19000 s of log
+        wait_until_still(heard)
+        assert_same(heard.raw, wanted)
+
+
+@pytest.mark.parametrize(('number', 'times'), [
+    (signal.SIGINT, 1), (signal.SIGTERM, 1), (signal.SIGINT, 2)])
+def test_a_signal_ends_it_properly(peer, tmp_path, number, times):
+    write_log(tmp_path / 'run.mcap', 100, step_ns=SECOND)
+    heard = Listening(peer, OURS)
+    with Replay(tmp_path, tmp_path / 'run.mcap', '--rate', '20', '--clock') as node:
+        heard.topics[0].wait(2)
+        assert node.end(number, times) == 0, node.err
+        assert 'Traceback' not in node.err
+
+
+def test_a_signal_ends_it_while_it_waits_or_stands(peer, tmp_path):
+    write_log(tmp_path / 'run.mcap', 100)
+    for options in (('--wait-for-subscribers', '99'), ('--delay', '1000'), ('--start-paused',)):
+        with Replay(tmp_path, tmp_path / 'run.mcap', *options) as node:
+            # It serves before it plays.
+            assert peer.switch(node, 'set_pause', True).success
+            assert node.end(signal.SIGTERM) == 0, node.err
+        assert 'Traceback' not in node.err
