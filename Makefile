@@ -42,7 +42,8 @@ help:
 	@echo '             SCENE=$(SCENE)  (of: $(SCENES))'
 	@echo '             ARGS=...  more arguments, such as ARGS="-p time_scale:=0.5 -r __ns:=/top"'
 	@echo 'make test    run the tests;  TESTS=... picks some, ARGS=... is for pytest'
-	@echo 'make stress  100 000 random tops, STRESS=... of them, through both solvers'
+	@echo 'make stress  200 recording nodes killed (KILLS=...), then 100 000 random tops (STRESS=...)'
+	@echo '             through both solvers: an hour'
 	@echo 'make benchmark  accuracy, stability and cost beside other programs, into docs/ (an hour,'
 	@echo '             in an environment of its own, .venv-benchmark)'
 	@echo 'make docs    write the interface page and the pictures anew'
@@ -72,7 +73,9 @@ test: dependencies
 	'$(VENV)/bin/pytest' $(TESTS) $(ARGS)
 
 STRESS ?= 100000
+KILLS ?= 200
 stress: dependencies
+	KILLS=$(KILLS) '$(VENV)/bin/pytest' -q test/test_kill.py
 	'$(VENV)/bin/python' test/stress.py $(STRESS)
 
 # Peers need hundreds of megabytes that the package does not: they have their own environment.

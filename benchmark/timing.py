@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Time limits, and times measured side by side; all in processor time of this process.
+Time limits, and times measured side by side in processor time of this process.
 
 Processor time leaves out what other processes of a busy machine take, and counts every thread:
 the benchmarks keep to one (`one_thread`).
@@ -32,16 +32,20 @@ class TimeUpError(Exception):
 
 @contextmanager
 def time_limit(seconds: float) -> Iterator[None]:
-    """Raise TimeUpError in the block after so long: at the next line of Python that runs in it."""
+    """
+    Raise TimeUpError in the block after so long: at the next line of Python that runs in it.
+
+    Of real time: a timer of processor time would coarsen that clock to the kernel's ticks.
+    """
     def stop(signum, frame):
         raise TimeUpError(f'not done after {seconds:g} s')
-    before = signal.signal(signal.SIGPROF, stop)
-    signal.setitimer(signal.ITIMER_PROF, seconds)
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_PROF, 0.0)
-        signal.signal(signal.SIGPROF, before)
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def seconds_of(run: Callable[[], Any]) -> tuple[float, Any]:

@@ -477,8 +477,9 @@ def test_pictures_are_drawn(stepped, tmp_path, capsys):
     assert np.mean(np.abs(shown[1] - shown[0]).max(axis=2) > 30) > 0.01
 
 
-@pytest.mark.parametrize('scene', SCENES)
-def test_a_page_is_drawn_of_every_scene(tmp_path, scene, capsys):
+@pytest.mark.parametrize('scene', ['fast_gyroscope', 'heavy_top', 'near_separatrix',
+                                   'planar_pendulum', 'sleeping'])
+def test_a_page_is_drawn_of_odd_scenes(tmp_path, scene, capsys):
     pytest.importorskip('matplotlib')
     path = log_of(tmp_path / 'run.mcap', '--params', ROOT / f'config/{scene}.yaml', '--duration',
                   2, '-p', 'solver.method:=exact')

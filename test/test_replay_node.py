@@ -284,7 +284,7 @@ class Replay(SimNode):
     """A replay_node in its own process group."""
 
     def __init__(self, folder, file, *options, arguments=()):
-        super().__init__(folder, arguments=arguments, program=(
+        super().__init__(folder, namespace='/', arguments=arguments, program=(
             '-m', 'spinning_top_sim.nodes.replay_node', str(file), *options))
         self.name = f'{self.namespace}/replay'
 

@@ -20,6 +20,7 @@ from node_logs import (
     SECOND,
     TRACEBACK,
     assert_clean_end,
+    assert_received_from,
     by_parameters,
     decoded,
     log_of,
@@ -27,6 +28,8 @@ from node_logs import (
 )
 from sensor_msgs.msg import JointState
 
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 
 EXIT_HOOK = """
@@ -82,6 +85,32 @@ def test_runs_of_the_same_parameters_are_the_same_bytes_but_for_stamps(finished)
     assert len(set(logs[0]['/imu/data_raw'])) == 301
 
 
+def test_the_published_orientation_error_is_the_one_computed_from_the_log(finished):
+    """Column 7 of ~/invariants against the pose of the same instant and the exact solution."""
+    node = finished.nodes[0]
+    log, metadata = log_of(the_log(node.folder))
+    epoch = int(metadata['spinning_top_sim']['epoch_ns'])
+    values = parameters.checked({})
+    exact = ExactSolution(parameters.top_of(values), parameters.start_state(values))
+    poses = {t: np.frombuffer(data[-32:], '<f8') for t, data in log[node.topic('pose')]}
+    rows = log[node.topic('~/invariants')]
+    assert len(rows) == 151
+    published, computed = [], []
+    for t, data in rows:
+        p, q = poses[t], np.array(exact.quaternion_at(t - epoch))
+        computed.append(4.0 * np.arctan2(np.linalg.norm(p - q), np.linalg.norm(p + q)))
+        published.append(np.frombuffer(data[-64:], '<f8')[7])
+    assert 1e-13 < max(published) < 1e-9
+    assert published == pytest.approx(computed, rel=1e-6, abs=2e-15)
+
+
+def test_an_error_beyond_max_error_is_warned_about(peer, diagnostics, tmp_path):
+    with SimNode(tmp_path, {'solver.rtol': 1e-3, 'solver.atol': 1e-3, 'max_error': 1e-9}) as node:
+        status = diagnostics.wait_for(node, 'a warning', lambda s: s.level == b'\x01')
+        assert 'max_error = 1e-09 rad' in status.message
+        assert_clean_end(node, node.end())
+
+
 def test_what_a_scene_does_not_need_is_not_imported(finished):
     for node in finished.nodes:
         modules = json.loads((node.folder / 'modules.json').read_text())
@@ -115,8 +144,7 @@ def test_however_it_is_ended_the_log_is_whole(peer, tmp_path, case):
     path = the_log(node.folder)
     log, _ = log_of(path)
     logged = [data for _, data in log[node.topic('pose')]]
-    first = logged.index(pose.raw[0])
-    assert logged[first:first + len(pose.raw)] == pose.raw
+    assert_received_from(pose.raw, logged)
     assert decoded(path)[node.topic('pose')] == len(logged)
     assert path.name in node.out, 'it says what it has recorded'
 
@@ -202,7 +230,7 @@ def test_overload_skips_what_is_live_records_everything_and_stays_reachable(
         pose = peer.listen(node.topic('pose'), PoseStamped).wait(1)
         samples = []
         wait_for('a clock that slips', lambda: diagnostics.number(node, 'clock slip [s]') > 0)
-        for _ in range(3):
+        for _ in range(2):
             samples.append((node.memory(), diagnostics.next(node)))
         assert peer.get(node, 'time_scale') == [50.0]
         begun = time.monotonic()
@@ -256,3 +284,32 @@ def test_the_euler_form_at_a_pole_stands_still_and_says_why(peer, diagnostics, t
         assert_clean_end(node, node.end())
         peer.stop_listening(joints)
     assert 'leapt over a pole' in node.err
+
+
+SMALL_FILES = """
+import resource, runpy, signal
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, resource.RLIM_INFINITY))
+runpy.run_module('spinning_top_sim.nodes.sim_node', run_name='__main__')
+"""
+
+
+def test_a_full_disk_stops_the_recording_and_nothing_else(peer, diagnostics, tmp_path):
+    """A file may not grow beyond 300 kB: the write that would fails, as on a full disk."""
+    with SimNode(tmp_path, {'record.enabled': True, 'record.compression': 'none',
+                            'record.max_loss': 0.2, 'status_period': 0.2},
+                 program=('-c', SMALL_FILES)) as node:
+        status = diagnostics.wait_for(node, 'an error', lambda s: s.level == b'\x02')
+        assert 'File too large' in status.message
+        poses = peer.listen(node.topic('pose'), PoseStamped).wait(50)
+        again = peer.switch(node, 'record', True)
+        assert again.success, again.message
+        assert_clean_end(node, node.end())
+        peer.stop_listening(poses)
+    assert node.err.count('recording stopped') >= 1
+    logs = sorted(node.folder.glob('*.mcap'))
+    assert len(logs) == 2
+    with LogReader(logs[0]) as reader:      # there may have been no room for an index
+        stamps = [message.log_time for message in reader.messages([node.topic('pose')])]
+        assert not reader.damage.losses
+    assert len(stamps) > 20 and set(np.diff(stamps)) == {PERIODS_NS['pose']}

@@ -359,7 +359,7 @@ def test_steps_of_a_scaled_or_mirrored_top_are_the_same_to_the_last_bit(change, 
 @pytest.mark.parametrize('method', ['exact', 'rk45'])
 def test_a_motion_turned_upside_down_or_restarted_is_the_same(method):
     """
-    Theta -> pi - theta, psi -> -psi, L3 -> -L3, P -> -P; and from any state on.
+    With theta -> pi - theta, psi -> -psi, L3 -> -L3, P -> -P; and from any state on.
 
     Both round the start, which grows as neighbours do: by a thousand at most where this is
     tried, away from the separatrix (m1 > 1e-2).

@@ -106,7 +106,7 @@ def test_imu_is_what_ros_serializes(frame, stamp_ns, orientation):
     assert_same(template.encode(stamp_ns, values[:4], values[4:7], values[7:]), message)
 
 
-@pytest.mark.parametrize(('frame', 'child'), itertools.product(FRAMES[:9], FRAMES[:9]))
+@pytest.mark.parametrize(('frame', 'child'), [*itertools.product(FRAMES[:9], FRAMES[:9])])
 def test_odometry_is_what_ros_serializes(frame, child):
     template = messages.odometry(frame, child)
     for stamp_ns in STAMPS:

@@ -46,6 +46,8 @@ STEP_BUDGET_S = 2.0
 LATEST_NS = 500_000_000
 # A simulation further behind than this lets its clock slip: its real-time factor falls below 1.
 LONGEST_LAG_NS = 1_000_000_000
+# At the end of `duration` all subscribers together are waited for at most this long.
+ACKNOWLEDGED_S = 1.0
 NO_CLOCK = 'waiting for the first /clock (use_sim_time is set)'
 
 
@@ -198,9 +200,11 @@ class Simulator(Node):
 
     def _finish(self) -> None:
         """The duration has passed: let the last messages arrive, then end the spin."""
+        give_up = time.monotonic() + ACKNOWLEDGED_S
         for publisher in self._outputs.values():
             if publisher.get_subscription_count():
-                publisher.wait_for_all_acked(Duration(seconds=1))
+                left = max(0.0, give_up - time.monotonic())
+                publisher.wait_for_all_acked(Duration(nanoseconds=int(left * NANOSECONDS)))
         if not self.finished.done():
             self.finished.set_result(None)
 
@@ -221,13 +225,18 @@ class Simulator(Node):
             if self._paused or self._failure or self.finished.done():
                 return
             self._count_tick()
-            target = self._simulated_clock.now()
-            duration = round(self._values['duration'] * NANOSECONDS)
-            if duration:
-                target = min(target, duration)
-            self._advance(target)
+            self._advance(self._due())
+            duration = self._duration_ns()
             if duration and self._simulation.now_ns >= duration:
                 self._finish()
+
+    def _duration_ns(self) -> int:
+        return round(self._values['duration'] * NANOSECONDS)
+
+    def _due(self) -> int:
+        """Return the simulated time to go to: that of the clock, not beyond the duration."""
+        now, duration = self._simulated_clock.now(), self._duration_ns()
+        return min(now, duration) if duration else now
 
     def _count_tick(self) -> None:
         now = time.monotonic_ns()
@@ -299,7 +308,7 @@ class Simulator(Node):
     def _command(self, l3: float, lz: float) -> None:
         with self._lock:
             if not self._paused and not self._failure:
-                self._advance(self._simulated_clock.now())
+                self._advance(self._due())
             if self._failure:
                 raise ValueError(f'l3 = {l3!r}, lz = {lz!r}: the motion stands still: '
                                  f'{self._failure}')
@@ -359,7 +368,7 @@ class Simulator(Node):
         with self._lock:
             if request.data and not self._paused:
                 self._simulated_clock.stop()
-                self._advance(self._simulated_clock.now())
+                self._advance(self._due())
                 self._simulated_clock.stop()
                 self._paused = True
             elif not request.data and self._paused:

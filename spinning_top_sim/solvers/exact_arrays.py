@@ -518,13 +518,16 @@ class _Attitudes:
 
     def quaternion(self, t: np.ndarray, t_rest: np.ndarray | None) -> np.ndarray:
         """Return (n, 4) x, y, z, w."""
-        out = np.empty((len(t), 4))
-        latest = max(float(t.max()), -float(t.min())) if t.size else 0.0
-        buffers = None
-        for block in _blocks(len(t)):
-            n = block.stop - block.start
-            if buffers is None or n < len(buffers.t1):
-                buffers = _Block(n, self.coefficients.shape[1], latest)
+        n = len(t)
+        out = np.empty((n, 4))
+        if not n:
+            return out
+        # Blocks of one size, so that the same buffers serve all; the last may overlap another.
+        size = math.ceil(n / math.ceil(n / CHUNK))
+        buffers = _Block(size, self.coefficients.shape[1], max(float(t.max()), -float(t.min())))
+        for first in range(0, n, size):
+            begin = min(first, n - size)
+            block = slice(begin, begin + size)
             buffers.load(t[block], _part_of(t_rest, block))
             self._fill(out[block].view(complex), buffers)
         return out
@@ -560,7 +563,7 @@ class _Attitudes:
         if self.alpha.flips:
             b.series[2:] *= b.flip
         np.multiply(b.series, b.series, out=b.squares)
-        np.matmul(FOUR_ONES, b.squares, out=b.scale)             # the quickest sum
+        np.matmul(FOUR_ONES, b.squares, out=b.scale)        # the quickest sum
         np.sqrt(b.scale, out=b.scale)
         np.divide(UNITY, b.scale, out=b.scale)
 

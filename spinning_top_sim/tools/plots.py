@@ -112,10 +112,11 @@ def _title(figure: Any, found: Survey, motion: Motion, name: str) -> None:
 
 def _tip_panel(axes: Any, tilts: Tilts, motion: Motion) -> None:
     turned = np.flatnonzero(np.abs(tilts.phi - tilts.phi[0]) > 2.0 * np.pi)
-    if len(turned) and turned[0] > 1:       # one turn is enough
-        tilts = tilts.first(float(tilts.time[turned[0]]))
-    time, tip, height = smooth_tip(tilts)
     measured = motion.measured
+    if len(turned):         # one turn is enough, if two nutations are in it
+        period = None if measured is None else measured.nutation_period
+        tilts = tilts.first(max(float(tilts.time[turned[0]]), 2.0 * (period or 0.0)))
+    time, tip, height = smooth_tip(tilts)
     low, high = ((float(np.min(tilts.theta)), float(np.max(tilts.theta))) if measured is None
                  else (measured.theta_min, measured.theta_max))
     draw_sphere(axes, (low, high, np.pi / 2),
