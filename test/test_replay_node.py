@@ -386,7 +386,12 @@ def test_a_strangers_log_is_played_in_order_with_its_qos(peer, tmp_path, strange
         peer.switch(node, 'set_pause', False)
         assert node.wait() == 0, node.err
         wait_until_still(heard)
-        assert_same(heard.raw, wanted)
+        text, velocity = heard.raw
+        assert_same([text], wanted[:1])
+        # What nobody acknowledges may get lost, but neither change nor change places.
+        numbers = [wanted[1].index(data) for data in velocity]
+        assert numbers
+        assert numbers == sorted(set(numbers))
 
 
 def test_names_and_qos_can_be_changed_as_usual(peer, tmp_path, strangers_log):

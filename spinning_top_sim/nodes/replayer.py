@@ -53,6 +53,8 @@ UNKNOWN = {
 # How long the last messages may take to reach those who listen: Fast DDS asks every 3 s whether
 # they have.
 LAST_WORD_S = 5.0
+# How long they have where nothing is acknowledged: shared memory goes with its sender.
+UNACKNOWLEDGED_S = 0.3
 # How often subscribers are counted while waiting for them, and stops are looked for.
 LOOK_S = 0.02
 # A thread that wants to send gets Python's lock this soon from the one that reads ahead.
@@ -279,12 +281,15 @@ class Replayer(Node):
 
     def _wait_for_delivery(self) -> None:
         """Wait until all who listen have the last messages, or too long."""
-        end = time.monotonic() + LAST_WORD_S
-        for publisher in set(self._outputs.values()):
+        heard = [publisher for publisher in set(self._outputs.values())
+                 if publisher.get_subscription_count()]
+        now = time.monotonic()
+        for publisher in heard:
             reliable = publisher.qos_profile.reliability == QoSReliabilityPolicy.RELIABLE
-            while reliable and not publisher.wait_for_all_acked(Duration(seconds=LOOK_S)):
-                if time.monotonic() > end or not self._playback.rest(0.0):
-                    return
+            end = now + (LAST_WORD_S if reliable else UNACKNOWLEDGED_S)
+            while time.monotonic() < end and self._playback.rest(0.0 if reliable else LOOK_S):
+                if reliable and publisher.wait_for_all_acked(Duration(seconds=LOOK_S)):
+                    break
 
     # ------------------------------------------------------------------- clock and service
 
