@@ -55,6 +55,7 @@ setup(
         'test': [
             'catkin_pkg>=1.0,<2',
             'docutils>=0.20,<1',
+            'matplotlib>=3.6,<4',
             'mcap-ros2-support>=0.5.5,<0.7',
             'pyarrow>=14,<30',
             'pytest>=7.4,<10',
