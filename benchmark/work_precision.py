@@ -102,11 +102,11 @@ with {bits}-bit numbers.  Time: processor time of a whole call that returns all 
 by their number; what is done once before, a model's compilation or loading, is a column of its
 own, where a later setting may find in a cache what an earlier one compiled (our exact
 solution prepares each motion anew, some milliseconds, and that is in its time).
-Ratio 1 is {reference} at {tolerance:g}, if that ran.  Times are medians over interleaved rounds in one
-process, {rounds} here (where 1, at least {retakes} for runs below {short:g} s); a method whose run
-would take more than {longest:g} s is left out and says so.  SciPy, heyoka Euler and `rk45 euler`
-solve the paper's equations (29)-(32); heyoka quadratic and diffrax solve the quaternion form
-without poles.
+Ratio 1 is {reference} at {tolerance:g}, if that ran.  Times are medians over interleaved rounds
+in one process, {rounds} here (where 1, at least {retakes} for runs below {short:g} s); a method
+whose run would take more than {longest:g} s is left out and says so.  SciPy, heyoka Euler and
+`rk45 euler` solve the paper's equations (29)-(32); heyoka quadratic and diffrax solve the
+quaternion form without poles.
 MuJoCo's setting is its fixed step.
 
 Weak points of the comparison: how many samples share a step decides how much dense output
