@@ -13,7 +13,7 @@ Here the body frame turns about e3 at its true rate less chi: the known uniform
 spin exp(+-i chi t/2), chi = L3/lambda3 - (L3 - c)/lambda1, is put on when a state is read, so the
 step size follows the nutation and not the spin.  c = 0 carries the whole transverse rotation,
 c = L3 transports the frame parallel; c = L3/2 centres the spectrum of alpha and beta about zero
-and takes the largest steps of the family (docs/accuracy.md).
+and takes the fewest evaluations on cusps, the commonest of motions (docs/gauge.md).
 
 The invariants |q| = 1, L.e3 = L3 and the energy are restored after each step and in each sample
 (projection, Hairer, Lubich & Wanner, *Geometric Numerical Integration*, sect. IV.4).
