@@ -10,6 +10,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
+    from types import FrameType
+
     from rclpy.context import Context
     from rclpy.task import Future
 
@@ -33,6 +35,30 @@ class RunnableNode(Protocol):
     def destroy_node(self) -> None: ...
 
 
+class _InterruptOnce:
+    """
+    Raises KeyboardInterrupt at the first SIGINT only.
+
+    A launched node is told twice, by the terminal and by launch, and the second one would come in
+    the midst of ending properly.  Where SIGINT is ignored (nohup), it stays so.
+    """
+
+    def __init__(self) -> None:
+        self.told = False
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, self)
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        if not self.told:
+            self.told = True
+            raise KeyboardInterrupt
+
+    def off(self) -> None:
+        """Ignore every SIGINT from now on, also while the interpreter ends."""
+        self.told = True
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def run(name: str, argv: list[str],
         prepare: Callable[[list[str]], Callable[[], RunnableNode] | None]) -> int:
     """
@@ -42,12 +68,13 @@ def run(name: str, argv: list[str],
     nothing to run.  It and what it returns may raise ValueError, RuntimeError or OSError, whose
     text is shown.
     """
+    interrupt = _InterruptOnce()
     try:
         try:
             make_node = prepare(argv)
         except (ValueError, RuntimeError, OSError) as error:
             return _cannot_start(name, error)
-        return 0 if make_node is None else _run(name, argv, make_node)
+        return 0 if make_node is None else _run(name, argv, make_node, interrupt)
     except KeyboardInterrupt:           # before the node was there
         return 130
 
@@ -59,7 +86,8 @@ def _cannot_start(name: str, error: Exception) -> int:
     return 2
 
 
-def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode]) -> int:
+def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode],
+         interrupt: _InterruptOnce) -> int:
     import rclpy  # noqa: PLC0415 - so that Ctrl-C while rclpy is imported ends quietly too
     from rclpy.exceptions import ParameterException  # noqa: PLC0415
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor  # noqa: PLC0415
@@ -87,10 +115,10 @@ def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode]) -> i
         if rclpy.ok():
             raise
     finally:
-        # A launched node is told twice, by the terminal and by launch.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        interrupt.off()
         if node is not None:
             node.stop()
             node.destroy_node()
         rclpy.try_shutdown()
+        interrupt.off()                 # rclpy has put back the handler that it had found
     return 0
