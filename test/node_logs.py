@@ -167,8 +167,8 @@ def commands_in(log):
 
 def assert_clean_end(node, code):
     assert code == 0, node.err
-    assert TRACEBACK not in node.err
-    assert TRACEBACK not in node.out
+    assert TRACEBACK not in node.err, node.err
+    assert TRACEBACK not in node.out, node.out
 
 
 def settled(topic):

@@ -37,7 +37,7 @@ class RunnableNode(Protocol):
 
 class _InterruptOnce:
     """
-    Raises KeyboardInterrupt at the first SIGINT only.
+    Raises KeyboardInterrupt at the first SIGINT only, and not once `told` is set.
 
     A launched node is told twice, by the terminal and by launch, and the second one would come in
     the midst of ending properly.  Where SIGINT is ignored (nohup), it stays so.
@@ -105,6 +105,8 @@ def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode],
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         node.start()
+        # rclpy ends the spin at any signal; an exception in the midst of its code only does harm.
+        interrupt.told = True
         executor.spin_until_future_complete(node.finished)
         if node.finished.done():
             return node.finished.result() or 0
