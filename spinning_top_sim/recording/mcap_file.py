@@ -17,10 +17,12 @@ import contextlib
 import dataclasses
 import os
 import struct
+import sys
 import zlib
+from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
@@ -56,12 +58,25 @@ if TYPE_CHECKING:
 
 CHUNK_BYTES = 1 << 20  # uncompressed; a single larger message still makes a chunk of its own
 
-# What a chunk holds, by channel: log time, offset in the uncompressed chunk, log time, offset, ...
-Entries = Mapping[int, Sequence[int]]
+# What a chunk holds, by channel: log time, offset in the uncompressed chunk, log time, offset, ..
+# (uint64).
+Entries = Mapping[int, 'array[int]']
 
 MESSAGE = struct.Struct('<BQHIQQ')  # opcode, length, channel, sequence, log and publish time
 MESSAGE_FIELDS = 2 + 4 + 8 + 8      # what `length` counts besides the data
 _INDEX = struct.Struct('<BQHI')      # opcode, length, channel, length of the entries
+
+
+class PlainChunk(NamedTuple):
+    """
+    Messages that are to become a chunk.
+
+    data: their records;  span: earliest and latest stamp [ns]
+    """
+
+    data: bytes | memoryview
+    entries: Entries
+    span: tuple[int, int]
 
 
 def _compressor(compression: str) -> Callable[[bytes | memoryview], bytes]:
@@ -159,7 +174,7 @@ class IndexedFile:
         self._chunk_parts.append(data)
         entries = self._chunk_entries.get(channel_id)
         if entries is None:
-            entries = self._chunk_entries[channel_id] = []
+            entries = self._chunk_entries[channel_id] = array('Q')
         entries.append(log_time_ns)
         entries.append(self._chunk_size)
         self._chunk_size += MESSAGE.size + len(data)
@@ -169,18 +184,25 @@ class IndexedFile:
         """Compress and write the chunk in memory, if it holds anything."""
         if not self._chunk_size:
             return
-        self._put_plain_chunk(b''.join(self._chunk_parts), self._chunk_entries)
+        entries = self._chunk_entries
+        self.put_plain_chunk(PlainChunk(b''.join(self._chunk_parts), entries, time_span(entries)))
         self._clear_chunk()
 
-    def _put_plain_chunk(self, plain: bytes | memoryview, entries: Entries) -> None:
-        start_ns, end_ns = time_span(entries)
+    def put_plain_chunk(self, plain: PlainChunk) -> None:
+        """Compress and write a chunk, which holds something."""
+        start_ns, end_ns = plain.span
         self.put_chunk(Chunk(
-            compression=self._compression, data=self._compress(plain),
-            uncompressed_size=len(plain), uncompressed_crc=zlib.crc32(plain),
-            message_start_time=start_ns, message_end_time=end_ns), entries)
+            compression=self._compression, data=self._compress(plain.data),
+            uncompressed_size=len(plain.data), uncompressed_crc=zlib.crc32(plain.data),
+            message_start_time=start_ns, message_end_time=end_ns), plain.entries, plain.span)
 
-    def put_chunk(self, chunk: Chunk, entries: Entries) -> None:
-        """Write a chunk as it is, and the message indexes that belong to its `entries`."""
+    def put_chunk(self, chunk: Chunk, entries: Entries, span: tuple[int, int] | None = None,
+                  ) -> None:
+        """
+        Write a chunk as it is, and the message indexes that belong to its `entries`.
+
+        span: the earliest and the latest stamp in `entries`, where they are known
+        """
         record = record_bytes(chunk)
         indexes = message_indexes(entries)
         index_start = self.size + len(record)
@@ -201,7 +223,7 @@ class IndexedFile:
         self.chunk_count += 1
         if not indexes:
             return
-        start_ns, end_ns = time_span(entries)
+        start_ns, end_ns = span or time_span(entries)
         first = not any(self.message_counts.values())
         self.start_ns = start_ns if first else min(self.start_ns, start_ns)
         self.end_ns = max(self.end_ns, end_ns)
@@ -277,7 +299,7 @@ class IndexedFile:
     def _clear_chunk(self) -> None:
         self._chunk_parts: list[bytes] = []
         self._chunk_size = 0  # uncompressed
-        self._chunk_entries: dict[int, list[int]] = {}
+        self._chunk_entries: dict[int, array[int]] = {}
 
     def _put(self, records: bytes) -> None:
         """Write whole records, or none of them."""
@@ -360,28 +382,27 @@ class McapFile(IndexedFile):
         return self.add_message(
             topic_index + 1, sequence & 0xFFFFFFFF, log_time_ns, log_time_ns, data)
 
-    def write_rows(self, parts: Sequence[tuple[int, NDArray[Any], NDArray[Any]]]) -> None:
+    def chunk_of_rows(self, parts: Sequence[tuple[int, NDArray[Any], NDArray[Any]]]) -> PlainChunk:
         """
-        Write a chunk of messages of equal length a topic, in a few numpy calls.
+        Return a chunk of messages of equal length a topic, made in a few numpy calls.
 
-        parts: (topic index, log times (n,) int64 [ns], rows of CDR bytes (n, size) uint8), each
-            topic at most once and not empty.  The messages of a chunk need no order of time: its
-            message indexes have it (MCAP specification, "Message Index").
+        parts: (topic index, log times (n,) int64 [ns] in order, rows of CDR bytes (n, size)
+            uint8), each topic at most once and not empty.  The messages of a chunk need no order
+            of time: its message indexes have it (MCAP specification, "Message Index").
         """
-        self.write_chunk()
         import numpy  # noqa: PLC0415 - a live recording needs none
 
         head = numpy.dtype([
             ('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
             ('log_time', '<u8'), ('publish_time', '<u8')])
-        plain = numpy.empty(sum(len(times) * (head.itemsize + rows.shape[1])
-                                for _, times, rows in parts), 'u1')
+        data = numpy.empty(sum(len(times) * (head.itemsize + rows.shape[1])
+                               for _, times, rows in parts), 'u1')
         at = 0
         entries = {}
         for topic_index, times, rows in parts:
             count, size = rows.shape
             length = head.itemsize + size
-            records = plain[at:at + count * length].reshape(count, length)
+            records = data[at:at + count * length].reshape(count, length)
             heads = records[:, :head.itemsize].view(head)[:, 0]
             heads['opcode'] = Opcode.MESSAGE
             heads['length'] = MESSAGE_FIELDS + size
@@ -391,10 +412,14 @@ class McapFile(IndexedFile):
             heads['log_time'] = heads['publish_time'] = times
             records[:, head.itemsize:] = rows
             self._sequences[topic_index] = sequence + count
-            offsets = at + length * numpy.arange(count)
-            entries[topic_index + 1] = numpy.stack((times, offsets), axis=-1).ravel().tolist()
+            index = numpy.empty((count, 2), 'u8')
+            index[:, 0] = times
+            index[:, 1] = at + length * numpy.arange(count)
+            entries[topic_index + 1] = array('Q', index.tobytes())
             at += count * length
-        self._put_plain_chunk(plain.data, entries)
+        span = (min(int(times[0]) for _, times, _ in parts),
+                max(int(times[-1]) for _, times, _ in parts))
+        return PlainChunk(data.data, entries, span)
 
     def finish(self) -> None:
         """Write the summary of the chunks that are in the file, bring it to disk and close it."""
@@ -420,8 +445,15 @@ def message_indexes(entries: Entries) -> dict[int, bytes]:
     return {
         channel_id: _INDEX.pack(
             Opcode.MESSAGE_INDEX, 2 + 4 + 8 * len(numbers), channel_id, 8 * len(numbers))
-        + struct.pack(f'<{len(numbers)}Q', *numbers)
+        + _little_endian(numbers)
         for channel_id, numbers in sorted(entries.items()) if numbers}
+
+
+def _little_endian(numbers: array[int]) -> bytes:
+    if sys.byteorder == 'big':
+        numbers = array('Q', numbers)
+        numbers.byteswap()
+    return numbers.tobytes()
 
 
 def time_span(entries: Entries) -> tuple[int, int]:

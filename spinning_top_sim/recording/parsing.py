@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 import struct
 import zlib
+from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -114,13 +115,13 @@ class ChunkContents:
 
     @functools.cached_property
     def entries(self) -> Entries:
-        found: dict[int, list[int]] = {}
+        found: dict[int, array[int]] = {}
         for log_time, channel_id, _, _, start, _ in self.messages:
             numbers = found.get(channel_id)
             if numbers is None:
-                numbers = found[channel_id] = []
+                numbers = found[channel_id] = array('Q')
             numbers.append(log_time)
-            numbers.append(start - MESSAGE.size)
+            numbers.append(max(start - MESSAGE.size, 0))    # of no use outside of chunks
         return found
 
 

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
@@ -22,6 +22,9 @@ from spinning_top_sim.solvers.rk45 import NANOSECONDS
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor, Future
 
 # Simulated time between two looks at the progress, when states go one by one.
 STRIDE_NS = NANOSECONDS
@@ -171,7 +174,10 @@ def write_log(path: Path, values: Mapping[str, Any], duration_ns: int,
                           'columns' if columns else 'one state at a time')
     file = create_file(path, topics, metadata, compression=values['record.compression'])
 
+    behind = _Behind(file.put_plain_chunk)
+
     def write(topic_index: int, stamp_ns: int, data: bytes) -> None:
+        behind.wait()
         if file.append(topic_index, stamp_ns, data):
             file.write_chunk()
 
@@ -183,7 +189,10 @@ def write_log(path: Path, values: Mapping[str, Any], duration_ns: int,
         simulation.advance_in_columns(target_ns, lambda stream, stamps, rows: parts.append(
             (streams.index(stream), stamps, rows)))
         if parts:
-            file.write_rows(parts)
+            chunk = file.chunk_of_rows(parts)
+            behind.wait()
+            file.write_chunk()
+            behind.start(chunk)
 
     for index, stream in enumerate(streams):
         stream.record = partial(write, index)
@@ -200,10 +209,44 @@ def write_log(path: Path, values: Mapping[str, Any], duration_ns: int,
                       journal.event('command', at_ns, simulation.now_ns, l3=l3, lz=lz))
                 write(commands_topic, epoch_ns + at_ns, journal.command(l3, lz))
             show(target_ns)
+        behind.wait()
     finally:
+        behind.close()
         file.write_chunk()
         file.finish()
     return f'{sum(file.counts)} messages, {file.size / 1e6:.1f} MB'
+
+
+class _Behind:
+    """
+    Does something with one item in a thread, while the next item is made.
+
+    Compressing and writing take as long as computing, and leave Python to others meanwhile.
+    """
+
+    def __init__(self, work: Callable[[Any], None]) -> None:
+        self._work = work
+        self._thread: Executor | None = None
+        self._pending: Future[None] | None = None
+
+    def start(self, item: Any) -> None:
+        """Begin the work with an item; call `wait` before."""
+        if self._thread is None:
+            from concurrent.futures import ThreadPoolExecutor  # noqa: PLC0415
+
+            self._thread = ThreadPoolExecutor(1)
+        self._pending = self._thread.submit(self._work, item)
+
+    def wait(self) -> None:
+        """Wait until the work is done.  Raises what it raised."""
+        pending, self._pending = self._pending, None
+        if pending is not None:
+            pending.result()
+
+    def close(self) -> None:
+        """Wait until the work is done, whatever became of it, and end the thread."""
+        if self._thread is not None:
+            self._thread.shutdown()
 
 
 def stretches(duration_ns: int, commands: Sequence[Command], stride_ns: int,
