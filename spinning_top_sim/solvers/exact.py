@@ -22,7 +22,19 @@ from math import cos, sin, sinh, sqrt
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.long_decimals import ZERO, pi, precision
+from spinning_top_sim.solvers.exact_attitude import HALF_TURN, Quaternion, attitude_by_waves
+from spinning_top_sim.solvers.long_decimals import (
+    FIXED_BITS,
+    FIXED_HALF,
+    FIXED_ONE,
+    FIXED_UNIT,
+    FRACTION_MASK,
+    RADIANS_PER_UNIT,
+    ZERO,
+    FixedRate,
+    pi,
+    precision,
+)
 from spinning_top_sim.solvers.theta_series import TERMS, Series
 from spinning_top_sim.solvers.theta_setup import Branch, ThetaMotion, set_up
 
@@ -31,13 +43,6 @@ if TYPE_CHECKING:
 
     from spinning_top_sim.solvers.exact_arrays import ArrayEvaluator, ExactStates
 
-# Fixed point: turns, quarter periods and radians per nanosecond in units of 2^-128.
-FIXED_BITS = 128
-FIXED_ONE = 1 << FIXED_BITS
-FIXED_HALF = FIXED_ONE // 2
-FRACTION_MASK = FIXED_ONE - 1
-FIXED_UNIT = 2.0 ** -FIXED_BITS
-RADIANS_PER_UNIT = 2.0 * math.pi * FIXED_UNIT
 QUARTER_PERIOD_ANGLE = 0.5 * math.pi
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
@@ -58,6 +63,9 @@ class ExactSolution:
     smoothly through a pole that is passed exactly (and out of [0, pi]), phi and psi are unwrapped.
     On every motion each of them, over max(1, |value|), is within 5e-15.
 
+    quaternion_at: takes a time after the start, a Python int of nanoseconds, and returns the
+    attitude (x, y, z, w) there.  Raises ValueError for a time too far away.
+
     Attributes: nutation_period [s], None if the nutation rests; mean_precession_rate and
     mean_spin_rate [rad/s]; theta_min and theta_max [rad], of theta folded into [0, pi];
     m and m1 = 1 - m, the parameter of the elliptic functions: m1 -> 0 on the separatrix;
@@ -72,6 +80,9 @@ class ExactSolution:
         self.theta_motion = motion = set_up(top, start)
         with precision(motion.digits):
             self._take_over(motion, top, start)
+            self.quaternion_at: Callable[[int], Quaternion] = (
+                attitude_by_waves(motion, self.ns_limit, self.too_late)
+                or self._quaternion_by_quarters)
         self._check_start()
         self._arrays: ArrayEvaluator | None = None
 
@@ -121,19 +132,18 @@ class ExactSolution:
         self.ns_limit = min(int(Decimal(MOST_TURNS) / fastest * 10 ** 9), 2 ** 63 - 1)
         self._quarter_rate, self._offset0 = FixedRate.of(motion.quarter_rate, motion.offset0)
         self._offset_rest = float(motion.offset0 - Decimal(self._offset0) / FIXED_ONE)
-        self._alpha_turns = FixedRate.of(alpha.rate / two_pi, alpha.phase_turns)
-        self._beta_turns = FixedRate.of(beta.rate / two_pi, beta.phase_turns)
+        self._alpha_turns = FixedRate.of(alpha.rate / two_pi, alpha.phase_turns + HALF_TURN)
+        self._beta_turns = FixedRate.of(beta.rate / two_pi, beta.phase_turns + HALF_TURN)
         self._phi = FixedRate.of(motion.mean_precession_rate, ZERO)
         self._psi = FixedRate.of(motion.mean_spin_rate, ZERO)
 
     # ------------------------------------------------------------------------------ one state
 
-    def quaternion_at(self, ns: int) -> tuple[float, float, float, float]:
+    def _quaternion_by_quarters(self, ns: int) -> Quaternion:
         """
-        Return the attitude (x, y, z, w) at `ns` nanoseconds, a Python int, after the start.
+        Return what `quaternion_at` does, near the separatrix too.
 
         The formulas of `nutation_at`, with alpha and beta as complex numbers: no angles.
-        Raises ValueError for a time too far away.
         """
         if not -self.ns_limit <= ns <= self.ns_limit:
             raise self.too_late(f'{ns} ns')
@@ -167,12 +177,14 @@ class ExactSolution:
         scale = 1.0 / sqrt(alpha_real * alpha_real + alpha_imag * alpha_imag
                            + beta_real * beta_real + beta_imag * beta_imag)
         rate, start = self._alpha_turns
-        angle = (ns * rate + start & FRACTION_MASK) * RADIANS_PER_UNIT + alpha_drift * y
+        angle = (((ns * rate + start & FRACTION_MASK) - FIXED_HALF) * RADIANS_PER_UNIT
+                 + alpha_drift * y)
         s, c = scale * sin(angle), scale * cos(angle)
         z = alpha_real * s + alpha_imag * c
         w = alpha_real * c - alpha_imag * s
         rate, start = self._beta_turns
-        angle = (ns * rate + start & FRACTION_MASK) * RADIANS_PER_UNIT + beta_drift * y
+        angle = (((ns * rate + start & FRACTION_MASK) - FIXED_HALF) * RADIANS_PER_UNIT
+                 + beta_drift * y)
         s, c = scale * sin(angle), scale * cos(angle)
         return -beta_real * s - beta_imag * c, beta_real * c - beta_imag * s, z, w
 
@@ -205,10 +217,12 @@ class ExactSolution:
             half_theta += 2.0 * math.pi * round(self.turning.turns(quarters, y, half_theta))
 
         rate, start = self._alpha_turns
-        angle = (ns * rate + start & FRACTION_MASK) * RADIANS_PER_UNIT + alpha_argument
+        angle = (((ns * rate + start & FRACTION_MASK) - FIXED_HALF) * RADIANS_PER_UNIT
+                 + alpha_argument)
         sin_alpha, cos_alpha = sin(angle), cos(angle)
         rate, start = self._beta_turns
-        angle = (ns * rate + start & FRACTION_MASK) * RADIANS_PER_UNIT + beta_argument
+        angle = (((ns * rate + start & FRACTION_MASK) - FIXED_HALF) * RADIANS_PER_UNIT
+                 + beta_argument)
         sin_beta, cos_beta = sin(angle), cos(angle)
         scale = 1.0 / sqrt(alpha * alpha + beta * beta)
         cos_half, sin_half = scale * alpha, scale * beta
@@ -391,22 +405,6 @@ def _factor_at(factor: FactorBranch, y: Any, flip: Any, xi: Any, prefactors: tup
     imag = prefactors[factor.imag_prefactor] * (((b3 * xi + b2) * xi + b1) * xi + b0)
     modulus = functions.hypot(real, imag)       # its square may be too small for a double
     return modulus, factor.drift * y + factor.sense * functions.atan2(imag, real), modulus
-
-
-class FixedRate(NamedTuple):
-    """A rate per nanosecond and a start, in fixed point."""
-
-    rate: int
-    start: int
-
-    @classmethod
-    def of(cls, per_second: Decimal, start: Decimal) -> FixedRate:
-        """Round a rate per second and a start."""
-        return cls(int(per_second * FIXED_ONE / 10 ** 9), int(start * FIXED_ONE))
-
-    def at(self, ns: int) -> int:
-        """Return start + rate ns, in fixed point."""
-        return self.start + self.rate * ns
 
 
 def transverse_rates(precession: Any, theta_dot: Any, cos_psi: Any, sin_psi: Any

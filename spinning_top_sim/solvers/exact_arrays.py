@@ -13,7 +13,7 @@ of two small matrices (`_Grid`).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from decimal import Decimal
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -21,17 +21,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from spinning_top_sim.solvers.exact import (
-    FIXED_BITS,
-    FIXED_ONE,
     QUARTER_PERIOD_ANGLE,
-    FixedRate,
     Functions,
     nutation_at,
     transverse_rates,
 )
+from spinning_top_sim.solvers.exact_attitude import modes
 from spinning_top_sim.solvers.long_decimals import (
+    FIXED_BITS,
+    FIXED_ONE,
     ONE,
     ZERO,
+    FixedRate,
     double_double,
     pi,
     precision,
@@ -461,21 +462,6 @@ class _AttitudeFactor:
         self.real = branch.real.scaled(Decimal(factor.sign))
         self.imag = branch.imag.scaled(Decimal(factor.sense)) if branch.imag else None
 
-    def modes(self) -> dict[int, complex]:
-        """Return c_n with R + i s J = sum of c_n exp(i n v), in the real form."""
-        modes: dict[int, complex] = {}
-        for series, unit in ((self.real, 1.0), (self.imag, 1.0j)):
-            if series is None:
-                continue
-            is_sine = series.kind.startswith('sin')
-            for k, weight in enumerate(series.weights):
-                n = 2 * k + series.kind.endswith('odd')
-                half = 0.5 * float(weight) * unit * (-1.0j if is_sine else 1.0)
-                modes[n] = modes.get(n, 0.0) + half
-                modes[-n] = modes.get(-n, 0.0) + (-half if is_sine else half)
-        largest = max(abs(c) for c in modes.values())
-        return {n: c for n, c in modes.items() if abs(c) > NEGLIGIBLE * largest} or {0: 0.0}
-
 
 class _Attitudes:
     """
@@ -641,10 +627,10 @@ class _Grid:
 
     def _within_row(self, factor: _AttitudeFactor) -> np.ndarray:
         """Return real over imaginary parts of c_n exp(i nu_n k step), k within a row."""
-        modes = factor.modes()
+        amplitudes = modes(factor.real, factor.imag)
         phase = self.attitudes.phase_fixed
-        waves = np.array(list(modes.values()))[:, None] * _waves(
-            modes, _fractions(0, factor.fixed.rate * self.step_ns, GRID_BLOCK),
+        waves = np.array(list(amplitudes.values()))[:, None] * _waves(
+            amplitudes, _fractions(0, factor.fixed.rate * self.step_ns, GRID_BLOCK),
             _fractions(0, phase.rate * self.step_ns, GRID_BLOCK))
         return np.concatenate((waves.real, waves.imag))
 
@@ -654,18 +640,18 @@ class _Grid:
         row_ns = self.step_ns * GRID_BLOCK
         rotation, phase = (_fractions(fixed.at(start_ns), fixed.rate * row_ns, rows)
                            for fixed in (factor.fixed, self.attitudes.phase_fixed))
-        waves = _waves(factor.modes(), rotation, phase).T
+        waves = _waves(modes(factor.real, factor.imag), rotation, phase).T
         return (np.concatenate((waves.real, -waves.imag), axis=1),
                 np.concatenate((waves.imag, waves.real), axis=1))
 
 
-def _waves(modes: dict[int, complex], rotation: tuple[np.ndarray, np.ndarray],
+def _waves(numbers: Iterable[int], rotation: tuple[np.ndarray, np.ndarray],
            phase: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Return exp 2 pi i (rotation + n phase), a row for every mode n."""
-    numbers = np.array(list(modes))[:, None]
-    turns = rotation[0] + numbers * phase[0]        # fractions of 48 bits: exact
+    n = np.array(list(numbers))[:, None]
+    turns = rotation[0] + n * phase[0]        # fractions of 48 bits: exact
     turns -= np.rint(turns)
-    turns += rotation[1] + numbers * phase[1]
+    turns += rotation[1] + n * phase[1]
     return np.exp(2.0j * np.pi * turns)
 
 

@@ -156,12 +156,11 @@ class ExactGrid(ExactMotion):
         ns = start_ns + step_ns * np.arange(count, dtype=np.int64)
         Motion.__init__(self, solution.top, solution.start, ns * 1e-9)
         self.solution, self._branch = solution, branch
-        self._grid = (start_ns, step_ns, count)
         self._states = solution.states_at_ns(ns)
 
     @lazy
     def quaternion(self) -> Column:
-        return self._branch.sign * self.solution.quaternion_grid(*self._grid)
+        return self._branch.sign * self._states.quaternion
 
     @lazy
     def theta(self) -> Column:

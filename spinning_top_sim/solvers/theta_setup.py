@@ -105,6 +105,7 @@ class ThetaMotion:
     alpha: Factor
     beta: Factor
     imaginary: bool             # the form of the branches
+    full_circle: Series | None  # D for the full_circle of the factors
     stretch: Decimal            # x = stretch y in the imaginary form
     quarter_rate: Decimal       # quarter periods per second, w/K
     quarter0: int               # phase at t = 0 in quarter periods: whole part,
@@ -338,7 +339,8 @@ class _Orbit:
             digits=getcontext().prec,
             alpha=factor(self.cos_half, self.excess_spin, self.a_plus, alpha_turns),
             beta=factor(self.sin_half, -self.excess_spin, self.a_minus, beta_turns),
-            imaginary=False, stretch=ONE, quarter_rate=ZERO, quarter0=0, offset0=ZERO,
+            imaginary=False, full_circle=Series('cos even', (ONE,)),
+            stretch=ONE, quarter_rate=ZERO, quarter0=0, offset0=ZERO,
             u_dot=(ZERO, ZERO), u_dot_series=Series('sin odd', (ONE,)), turning=None,
             a_plus=self.a_plus, a_minus=self.a_minus, m=ZERO, m1=ONE,
             theta_bounds=(theta, theta))
@@ -403,6 +405,7 @@ class _Orbit:
         return ThetaMotion(
             digits=getcontext().prec, alpha=alpha, beta=beta,
             imaginary=form.imaginary,
+            full_circle=full_form.denominator_even() if full_form else None,
             stretch=form.K / form.K_prime if form.imaginary else ONE,
             quarter_rate=w / form.K, quarter0=quarter0, offset0=offset0,
             u_dot=(w * gap21 * slope_even, w * gap21 * slope_odd), u_dot_series=form.theta1(),
