@@ -3,6 +3,7 @@
 
 import json
 import signal
+import subprocess
 import time
 from types import SimpleNamespace
 
@@ -313,3 +314,41 @@ def test_a_full_disk_stops_the_recording_and_nothing_else(peer, diagnostics, tmp
         stamps = [message.log_time for message in reader.messages([node.topic('pose')])]
         assert not reader.damage.losses
     assert len(stamps) > 20 and set(np.diff(stamps)) == {PERIODS_NS['pose']}
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 2 MB, half of it taken by a file `ballast`."""
+    disk = tmp_path / 'disk'
+    disk.mkdir()
+    mounted = subprocess.run(
+        ['mount', '-t', 'tmpfs', '-o', 'size=2m', 'tmpfs', disk], capture_output=True, text=True,
+        timeout=20)
+    if mounted.returncode:
+        pytest.skip(f'mounting a small disk is not allowed: {mounted.stderr.strip()}')
+    (disk / 'ballast').write_bytes(bytes(1_000_000))
+    yield disk
+    subprocess.run(['umount', '--lazy', disk], check=True, timeout=20)
+
+
+def test_a_full_disk_and_a_new_recording_when_there_is_room(
+        peer, diagnostics, tmp_path, small_disk):
+    with SimNode(tmp_path, {'record.enabled': True, 'record.compression': 'none',
+                            'record.uri': str(small_disk / 'first.mcap'), 'record.max_loss': 0.2,
+                            'record.min_free_bytes': 0, 'status_period': 0.2}) as node:
+        status = diagnostics.wait_for(node, 'an error', lambda s: s.level == b'\x02')
+        assert 'No space left on device' in status.message
+        poses = peer.listen(node.topic('pose'), PoseStamped).wait(50)
+        refused = peer.switch(node, 'record', True)     # the first file is still there
+        assert not refused.success and 'first.mcap' in refused.message
+        (small_disk / 'ballast').unlink()
+        assert peer.set_together(node, record__uri=str(small_disk / 'second.mcap')).successful
+        assert peer.switch(node, 'record', True).success
+        diagnostics.wait_for(node, 'no error', lambda s: s.level == b'\x00')
+        assert_clean_end(node, node.end())
+        peer.stop_listening(poses)
+    for name in ('first', 'second'):
+        with LogReader(small_disk / f'{name}.mcap') as reader:
+            stamps = [message.log_time for message in reader.messages([node.topic('pose')])]
+            assert not reader.damage.losses
+        assert len(stamps) > 20 and set(np.diff(stamps)) == {PERIODS_NS['pose']}
