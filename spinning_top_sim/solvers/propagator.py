@@ -112,7 +112,7 @@ class Branch:
 
 
 class ExactState(OneState):
-    """One state of the closed form; the attitude costs 1 to 2 us, the rest 4 more when asked for."""
+    """One state of the closed form; the attitude costs 1 to 2 us, the rest 4 more if asked for."""
 
     def __init__(self, propagator: ExactPropagator, ns: int) -> None:
         solution = propagator.solution
