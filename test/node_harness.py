@@ -9,6 +9,7 @@ waits for its arrival, PATIENCE_S long: how fast this machine is decides nothing
 
 from __future__ import annotations
 
+import array
 import atexit
 import contextlib
 import fcntl
@@ -53,9 +54,11 @@ os.environ['ROS_LOG_DIR'] = tempfile.mkdtemp(prefix='spinning_top_sim_log_')
 atexit.register(shutil.rmtree, os.environ['ROS_LOG_DIR'], ignore_errors=True)
 
 import rclpy  # noqa: E402
+import yaml  # noqa: E402
 from rcl_interfaces.msg import Parameter as ParameterMessage  # noqa: E402
 from rcl_interfaces.srv import (  # noqa: E402
     GetParameters,
+    ListParameters,
     SetParameters,
     SetParametersAtomically,
 )
@@ -291,6 +294,19 @@ class Peer:
         answer = self.call(GetParameters, node.topic('~/get_parameters'),
                            GetParameters.Request(names=list(names)))
         return [parameter_value_to_python(value) for value in answer.values]
+
+    def dump(self, node):
+        """Return all parameters as `ros2 param dump` writes them, nested at the dots."""
+        listed = self.call(ListParameters, node.topic('~/list_parameters'),
+                           ListParameters.Request()).result.names
+        tree = {}
+        for name, value in zip(listed, self.get(node, *listed), strict=True):
+            *path, leaf = name.split('.')
+            branch = tree
+            for part in path:
+                branch = branch.setdefault(part, {})
+            branch[leaf] = list(value) if isinstance(value, array.array) else value
+        return yaml.dump({node.name: {'ros__parameters': tree}}, default_flow_style=False)
 
     def send_command(self, node, *data):
         """Publish on ~/commands, where `introduce` was called before."""

@@ -194,6 +194,41 @@ def test_remapping_and_qos_overrides_work(peer, tmp_path):
     assert offered['/ns/imu/data_raw'].depth == 3
 
 
+def test_a_dump_of_the_parameters_makes_the_same_run(peer, tmp_path):
+    """With lz unset, lists, integers, noise, and what was changed meanwhile."""
+    given = {'duration': 2.0, 'record.enabled': True, 'seed': 7, 'pose.rate': 37.5,
+             'imu.gyroscope_noise_density': 1e-3, 'imu.lever_arm': [0.1, 0.0, 0.02],
+             'imu.frame_id': 'sensor', 'ground_truth_odom.enabled': False,
+             'record.streams': ['pose', 'imu', 'joint_states'], 'solver.rtol': 1e-9,
+             'initial.theta': 0.7, 'start_paused': True}
+    with SimNode(tmp_path / 'first', given, namespace='/dumped') as first:
+        assert peer.set_together(first, solver__rtol=1e-10, seed=8).successful
+        assert peer.trigger(first, 'reset').success
+        dumped = peer.dump(first)
+        assert peer.switch(first, 'set_pause', False).success
+        assert_clean_end(first, first.wait())
+    file = tmp_path / 'dump.yaml'
+    file.write_text(dumped)
+    with SimNode(tmp_path / 'second', namespace='/dumped',
+                 arguments=['--params-file', str(file)]) as second:
+        assert peer.dump(second) == dumped
+        assert peer.switch(second, 'set_pause', False).success
+        assert_clean_end(second, second.wait())
+    logs = []
+    for node in (first, second):
+        log, metadata = log_of(the_log(node.folder))
+        epoch = int(metadata['spinning_top_sim']['epoch_ns'])
+        logs.append({topic: [(time - epoch, data[:4] + data[12:]) for time, data in rows]
+                     for topic, rows in log.items() if not topic.endswith(('events', 'commands'))})
+    assert set(logs[0]) == {f'/dumped/{name}' for name in (
+        'pose', 'imu/data_raw', 'ground_truth/imu_bias', 'joint_states')}
+    for topic, rows in logs[0].items():
+        times = [time - rows[0][0] for time, _ in rows]
+        assert times == [time - logs[1][topic][0][0] for time, _ in logs[1][topic]]
+        assert [data for _, data in rows] == [data for _, data in logs[1][topic]], topic
+    assert len(logs[0]['/dumped/imu/data_raw']) == 401
+
+
 def test_a_follower_moves_with_the_clock_of_another_node(peer, diagnostics, tmp_path):
     """One node drives /clock at twice real time; the other's stamps are of that clock."""
     with (SimNode(tmp_path, {**QUIET, 'use_sim_time': True, 'record.enabled': True},
