@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from reference import SCENES, scene_parameters
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from spinning_top_sim import solve
 from spinning_top_sim.solvers.propagator import propagate
@@ -54,6 +55,54 @@ def test_readings_are_the_derivatives_of_the_exact_pose(scene, lever_arm):
         assert (sensor.inv() * middle).magnitude() < 1e-12
 
 
+# ------------------------------------------------------------------------------------ by hand
+
+def force_at(arm, theta, theta_dot=0.0, l3=0.0, lz=0.0):
+    """Return the specific force at a place of the body, and the parameters."""
+    values = parameters.checked({
+        'initial.theta': theta, 'initial.theta_dot': theta_dot, 'spin.l3': l3, 'spin.lz': lz,
+        'imu.lever_arm': arm})
+    motion = propagate(parameters.top_of(values), parameters.start_state(values), method='exact')
+    return Imu(values).true(motion.at_ns(0))[1], values
+
+
+@pytest.mark.parametrize('arm', [(0.0, 0.0, 0.0), (0.1, -0.05, 0.08)])
+@pytest.mark.parametrize(('theta', 'expected'), [(0.0, 9.80665), (math.pi, -9.80665)])
+def test_at_rest_it_reads_g_upwards(arm, theta, expected):
+    """REP-145: standing and hanging, wherever it sits."""
+    force, _ = force_at(arm, theta)
+    assert force == pytest.approx((0.0, 0.0, expected), abs=1e-14)
+
+
+def test_a_sleeping_top_adds_the_centripetal_acceleration():
+    """omega^2 r towards the axis, with omega = L3/lambda3."""
+    force, values = force_at((0.1, 0.0, 0.3), 0.0, l3=1.6, lz=1.6)
+    omega = 1.6 / values['top.lambda3']
+    assert force == pytest.approx((-0.1 * omega ** 2, 0.0, 9.80665), rel=1e-13, abs=1e-13)
+
+
+def test_a_pendulum_reads_what_the_textbook_says():
+    """
+    Along the axis g cos(theta) - z theta'^2, across it z theta'' - g sin(theta).
+
+    With theta'' = M g R sin(theta)/lambda1.  At the centre of percussion z = lambda1/(M R) nothing
+    is read across the axis: there the body moves as a point mass would (Goldstein, Poole, Safko,
+    "Classical Mechanics", 3rd ed., 2002, chapter 5).
+    """
+    theta, theta_dot, g = 0.7, 1.3, 9.80665
+    values = parameters.defaults()
+    torque = values['top.mass'] * g * values['top.com_distance'] * math.sin(theta)
+    percussion = values['top.lambda1'] / (values['top.mass'] * values['top.com_distance'])
+    for z in (0.1, percussion):
+        force, _ = force_at((0.0, 0.0, z), theta, theta_dot)
+        across = z * torque / values['top.lambda1'] - g * math.sin(theta)
+        along = g * math.cos(theta) - z * theta_dot ** 2
+        assert force == pytest.approx((across, 0.0, along), rel=1e-12, abs=1e-12)
+    assert across == pytest.approx(0.0, abs=1e-14)
+
+
+# -------------------------------------------------------------------------------------- noise
+
 def readings(values, count, period_ns=5_000_000):
     """Return what an IMU at rest reads, (count, 6), and its bias."""
     sensor = Sensor(parameters.checked(values), period_ns)
@@ -76,6 +125,39 @@ def test_noise_has_the_covariance_that_is_published():
     assert published == pytest.approx(density ** 2 / 0.005)
 
 
+def messages(values, duration_ns, *topics):
+    """Return the messages of these topics, as (covariances, rows of rates and force)."""
+    simulation = Simulation(parameters.checked(values))
+    found = {}
+    for stream in simulation.streams:
+        if stream.topic in topics:
+            stream.publish = found.setdefault(stream.topic, []).append
+    simulation.advance(duration_ns)
+    # The end of a sensor_msgs/Imu: rates, 9 covariances, force, 9 covariances.
+    columns = {topic: np.array([np.frombuffer(data[-192:], '<f8') for data in raw])
+               for topic, raw in found.items()}
+    return {topic: (rows[0, [3, 7, 11, 15, 19, 23]], rows[:, [0, 1, 2, 12, 13, 14]])
+            for topic, rows in columns.items()}
+
+
+@pytest.mark.parametrize('resolution', [0.0, 1.0])
+def test_what_is_added_is_distributed_as_the_message_says(resolution):
+    """The errors over their published deviations: chi-square of as many degrees of freedom."""
+    steps = {'imu.gyroscope_resolution': 1e-3 * resolution / math.sqrt(0.005),
+             'imu.accelerometer_resolution': 2e-2 * resolution / math.sqrt(0.005)}
+    found = messages({**NOISY, **steps, 'solver.method': 'exact', 'imu.lever_arm': (0.1, 0, 0)},
+                     30_000_000_000, 'imu/data_raw', 'ground_truth/imu', 'ground_truth/imu_bias')
+    covariances, raw = found['imu/data_raw']
+    added = raw - found['ground_truth/imu'][1] - found['ground_truth/imu_bias'][1]
+    squares = np.sum((added / np.sqrt(covariances)) ** 2, axis=0)
+    assert len(added) == 6001
+    low, high = chi2.ppf((1e-5, 1.0 - 1e-5), len(added))
+    assert (low < squares).all() and (squares < high).all()
+    whitened = added / np.sqrt(covariances)
+    lagged = np.mean(whitened[1:] * whitened[:-1], axis=0)
+    assert np.abs(lagged).max() < 5.0 / math.sqrt(len(added))
+
+
 def test_bias_walks_with_its_own_variance():
     _, biases, sensor = readings(NOISY, 40_000)
     steps = np.diff(biases, axis=0)
@@ -92,9 +174,18 @@ def test_sample_k_depends_on_seed_and_k_alone():
     still = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     for k in (2999, 0, 511, 512, 1024, 5):
         assert np.array_equal(np.hstack(sensor.read(still, k)), forward[k])
-    other, _, _ = readings({**NOISY, 'seed': 1}, 3000)
-    assert abs(np.corrcoef(other[:, 0], forward[:, 0])[0, 1]) < 0.1
-    assert not np.array_equal(other, forward)
+
+
+def test_different_seeds_are_uncorrelated():
+    """White noise and steps of the bias, of all axes and any two seeds, near or far apart."""
+    count = 4000
+    columns = []
+    for seed in (0, 1, 2, 3, 1000, 2 ** 32, 2 ** 63 - 1):
+        rows, biases, _ = readings({**NOISY, 'seed': seed}, count)
+        columns += [*(rows - biases)[1:].T, *np.diff(biases, axis=0).T]
+    correlation = np.corrcoef(columns) - np.eye(len(columns))
+    # 3486 pairs: the largest of so many normal numbers is below 5.5 but once in 13 000 tries.
+    assert np.abs(correlation).max() < 5.5 / math.sqrt(count - 1)
 
 
 def test_white_noise_and_bias_are_separate_draws():
@@ -114,13 +205,15 @@ def test_readings_saturate_and_are_rounded():
     assert sensor.gyroscope.variance == pytest.approx(0.25 ** 2 / 12.0)
 
 
-def collect(values, ticks_ns):
+def collect(values, ticks_ns, others=()):
     """Return the bytes of imu/data_raw, whatever else is wanted, however ticks fall."""
     simulation = Simulation(parameters.checked({**NOISY, **values}))
     raw = []
     for stream in simulation.streams:
         if stream.topic == 'imu/data_raw':
             stream.publish = raw.append
+        elif stream.topic in others:
+            stream.record = lambda stamp_ns, data: None
     for tick in ticks_ns:
         simulation.advance(tick)
     return raw
@@ -131,6 +224,9 @@ def test_equal_seeds_give_equal_bytes_at_any_tick_rate():
     at_once = collect({}, [2_000_000_000])
     assert every_ms == at_once and len(at_once) == 401
     assert collect({'seed': 5}, [2_000_000_000]) != at_once
+    in_company = collect({'imu_data.enabled': True, 'imu_data.rate': 77.0}, [2_000_000_000],
+                         ('pose', 'imu/data', 'ground_truth/imu', 'ground_truth/imu_bias'))
+    assert in_company == at_once
 
 
 def test_a_perfect_imu_does_not_import_numpy():
