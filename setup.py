@@ -22,6 +22,7 @@ DATA_FILES = {
     'share/ament_index/resource_index/packages': [f'resource/{NAME}'],
     f'share/{NAME}': ['package.xml'],
     f'share/{NAME}/config': glob('config/*.yaml'),
+    f'share/{NAME}/config/imu': glob('config/imu/*.yaml'),
     f'share/{NAME}/launch': glob('launch/*.launch.*'),
     f'share/{NAME}/urdf': glob('urdf/*'),
     f'share/{NAME}/rviz': glob('rviz/*.rviz'),
@@ -53,6 +54,7 @@ setup(
             'ros-jazzy-common-interfaces>=5.3.6,<6',
         ],
         'test': [
+            'ahrs>=0.4,<0.5',
             'catkin_pkg>=1.0,<2',
             'docutils>=0.20,<1',
             'matplotlib>=3.6,<4',
@@ -62,11 +64,15 @@ setup(
             'PyYAML>=6.0,<7',
             'rosbags>=0.10.11,<0.12',
             'scipy>=1.11,<2',
+            'vqf>=2.1,<3',
         ],
         # simulate: parameter files, a progress bar;  inspect: tables
         'tools': ['PyYAML>=6.0,<7', 'rich>=12', 'tqdm>=4.64,<5'],
         'parquet': ['pyarrow>=14,<30'],
         'plot': ['matplotlib>=3.6,<4'],     # inspect --plot, docs/figures.py
+        # examples/attitude_filter.py
+        'examples': ['ahrs>=0.4,<0.5', 'matplotlib>=3.6,<4', 'rosbags>=0.10.11,<0.12',
+                     'vqf>=2.1,<3'],
         # Narrow: a new release of these finds new faults.
         'lint': [
             'mypy>=2.4.1,<2.5',

@@ -139,9 +139,9 @@ def test_an_installed_executable_runs_where_ros2_run_looks(script, prefix):
 def test_the_share_folder_is_complete(prefix):
     share = prefix / 'share' / NAME
     assert (share / 'package.xml').read_bytes() == (ROOT / 'package.xml').read_bytes()
-    for folder, pattern in (('config', '*.yaml'), ('launch', '*.launch.*'), ('urdf', '*'),
-                            ('rviz', '*.rviz')):
-        there = {path.name for path in (share / folder).glob('*')}
+    for folder, pattern in (('config', '*.yaml'), ('config/imu', '*.yaml'),
+                            ('launch', '*.launch.*'), ('urdf', '*'), ('rviz', '*.rviz')):
+        there = {path.name for path in (share / folder).glob('*') if path.is_file()}
         assert there == {path.name for path in (ROOT / folder).glob(pattern)}, folder
 
 

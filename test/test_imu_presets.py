@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The presets of config/imu: what they set, the data sheets' figures in SI units, their use."""
+
+import json
+import math
+
+import pytest
+from reference import ROOT, scene_parameters
+
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.tools.scene_file import read_scene
+from spinning_top_sim.tools.simulate import main as simulate
+
+PRESETS = sorted((ROOT / 'config/imu').glob('*.yaml'))
+ERRORS = {name for name in parameters.BY_NAME if name.endswith((
+    '_noise_density', '_random_walk', '_turn_on_bias', '_range', '_resolution'))}
+DEG, G = math.radians(1.0), 9.80665
+
+
+def sensor(values, kind):
+    """Return noise density, random walk, turn-on bias, range, resolution of a kind of axes."""
+    return tuple(values[f'imu.{kind}_{name}'] for name in (
+        'noise_density', 'random_walk', 'turn_on_bias', 'range', 'resolution'))
+
+
+def one_sided(density):
+    """Return the two-sided density of a one-sided one: half the power on either side."""
+    return density / math.sqrt(2.0)
+
+
+def walk_of(stability, density):
+    """Return the walk for which the Allan deviation of both has this minimum."""
+    return math.sqrt(3.0) * stability ** 2 / (2.0 * density)
+
+
+ADIS_RATE, ADIS_FORCE = 0.34 * DEG / 60.0, 0.037 / 60.0
+# Of gyroscope and accelerometer: noise density, walk, turn-on bias, range, resolution.
+DATA_SHEETS = {
+    'perfect': (5 * (0.0,), 5 * (0.0,)),
+    'bmi088': ((one_sided(0.014 * DEG), 0.0, 1.0 * DEG, 2000.0 * DEG, DEG / 16.384),
+               (one_sided(190e-6 * G), 0.0, 0.020 * G, 6.0 * G, G / 5460.0)),
+    'icm_42688_p': ((one_sided(0.0028 * DEG), 0.0, 0.5 * DEG, 2000.0 * DEG, DEG / 16.4),
+                    (one_sided(70e-6 * G), 0.0, 0.020 * G, 16.0 * G, G / 2048.0)),
+    'icm_20948': ((one_sided(0.015 * DEG), 0.0, 5.0 * DEG, 2000.0 * DEG, DEG / 16.4),
+                  (one_sided(230e-6 * G), 0.0, 0.025 * G, 16.0 * G, G / 2048.0)),
+    'adis16470': ((ADIS_RATE, walk_of(8.0 * DEG / 3600.0, ADIS_RATE), 0.2 * DEG, 2000.0 * DEG,
+                   0.1 * DEG),
+                  (ADIS_FORCE, walk_of(13e-6 * G, ADIS_FORCE), 0.004 * G, 40.0 * G, 1.25e-3 * G)),
+}
+
+
+def test_there_is_a_line_here_for_every_preset():
+    assert {path.stem for path in PRESETS} == set(DATA_SHEETS)
+
+
+@pytest.mark.parametrize('path', PRESETS, ids=lambda path: path.stem)
+def test_a_preset_sets_all_errors_of_the_imu_and_nothing_else(path):
+    """So any preset replaces any other, and a scene keeps its motion and its mounting."""
+    given = read_scene(path)
+    assert set(given) == ERRORS
+    values = parameters.checked({**scene_parameters('wavy'), **given})
+    for kind, figures in zip(('gyroscope', 'accelerometer'), DATA_SHEETS[path.stem], strict=True):
+        assert sensor(values, kind) == pytest.approx(figures, rel=2e-5), kind
+
+
+def test_the_two_noise_figures_of_the_adis16470_agree():
+    """Its angular random walk is its one-sided rate noise density over sqrt(2)."""
+    assert pytest.approx(one_sided(0.008 * DEG), rel=3e-3) == ADIS_RATE
+
+
+def test_the_derived_walk_puts_the_minimum_where_the_data_sheet_has_it():
+    walk = walk_of(8.0, 3.0)
+    lowest = min(math.sqrt(9.0 / tau + walk ** 2 * tau / 3.0)
+                 for tau in (0.001 * k for k in range(1, 10_000)))
+    assert lowest == pytest.approx(8.0, rel=1e-6)
+
+
+def test_simulate_takes_a_preset_on_top_of_a_scene(tmp_path):
+    log = tmp_path / 'run.mcap'
+    assert simulate(['--quiet', '-o', str(log), '--duration', '1',
+                     '--params', str(ROOT / 'config/wavy.yaml'),
+                     '--params', str(ROOT / 'config/imu/bmi088.yaml')]) == 0
+    with LogReader(log) as reader:
+        used = json.loads(reader.metadata['spinning_top_sim']['parameters'])
+    expected = parameters.checked({**scene_parameters('wavy'),
+                                   **read_scene(ROOT / 'config/imu/bmi088.yaml')})
+    assert all(used[name] == expected[name]
+               for name in (*ERRORS, 'spin.l3', 'spin.lz', 'initial.theta'))
