@@ -44,8 +44,8 @@ help:
 	@echo 'make test    run the tests;  TESTS=... picks some, ARGS=... is for pytest'
 	@echo 'make stress  200 recording nodes killed (KILLS=...), then 100 000 random tops (STRESS=...)'
 	@echo '             through both solvers: an hour'
-	@echo 'make benchmark  accuracy, stability and cost beside other programs, into docs/ (an hour,'
-	@echo '             in an environment of its own, .venv-benchmark)'
+	@echo 'make benchmark  accuracy, stability and cost beside other programs, and the noise of the'
+	@echo '             IMU, into docs/ (an hour, in an environment of its own, .venv-benchmark)'
 	@echo 'make docs    write the interface page and the pictures anew'
 	@echo 'make lint    ruff and mypy'
 	@echo 'make build   build with colcon in a temporary workspace and run what was installed'
@@ -90,6 +90,8 @@ benchmark:
 	.venv-benchmark/bin/python benchmark/gauge.py
 	.venv-benchmark/bin/python benchmark/stability.py
 	.venv-benchmark/bin/python benchmark/work_precision.py
+	.venv-benchmark/bin/python benchmark/allan.py
+	.venv-benchmark/bin/python benchmark/attitude_filter.py
 
 $(VENV)/.peers: benchmark/requirements.txt $(VENV)/.deps-test
 	@echo 'Installing into $(VENV) what the benchmarks compare with'
@@ -110,7 +112,8 @@ build: $(VENV)/.deps-colcon $(VENV)/.package
 clean:
 	test ! -e '$(VENV)/.made' || rm -rf '$(VENV)'
 	rm -rf .mypy_cache .pytest_cache .ruff_cache
-	find $(wildcard benchmark launch spinning_top_sim test) -name __pycache__ -prune -exec rm -rf {} +
+	find $(wildcard benchmark examples launch spinning_top_sim test) -name __pycache__ -prune \
+	    -exec rm -rf {} +
 
 # Made anew when it is of another Python than the one asked for, was moved, was left half made or
 # does not run.  An environment that someone else made is used as it is, or left alone.

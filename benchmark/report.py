@@ -17,19 +17,19 @@ from cases import ROOT
 PACKAGES = ('numpy', 'scipy', 'heyoka', 'mujoco', 'jax', 'diffrax', 'matplotlib')
 
 
-def preamble(title: str) -> str:
+def preamble(title: str, packages: Sequence[str] = PACKAGES) -> str:
     """Return the heading: which command wrote this, when, with what, on what."""
     command = ' '.join(['python', os.path.relpath(sys.argv[0], ROOT), *sys.argv[1:]])
     now = datetime.datetime.now(datetime.UTC).strftime('%Y-%m-%d %H:%M UTC')
     return (f'# {title}\n\nWritten by `{command}` on {now}, commit {_commit()}: do not edit.\n\n'
             f'{_processor()}, {os.cpu_count()} cores, {platform.system()}; '
-            f'Python {platform.python_version()}, {versions()}.\n')
+            f'Python {platform.python_version()}, {versions(packages)}.\n')
 
 
-def versions() -> str:
+def versions(packages: Sequence[str] = PACKAGES) -> str:
     """Return the versions of the libraries, the absent ones as such."""
     found = []
-    for name in PACKAGES:
+    for name in packages:
         try:
             found.append(f'{name} {importlib.metadata.version(name)}')
         except importlib.metadata.PackageNotFoundError:

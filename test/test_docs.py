@@ -12,14 +12,15 @@ def test_the_interface_page_is_written_from_the_present_code():
     assert (ROOT / 'docs/interface.md').read_text() == page
 
 
-def test_architecture_names_every_module_and_no_other():
+def test_architecture_names_every_module_and_example_and_no_other():
     text = (ROOT / 'docs/architecture.md').read_text()
     named = set(re.findall(r'`(?:\w+/)*(\w+\.py)`', text))
     modules = {path.name for path in (ROOT / 'spinning_top_sim').rglob('*.py')
                if path.name != '__init__.py'}
     tests = {path.name for path in (ROOT / 'test').glob('*.py')}
-    assert named - tests <= modules
-    missing = modules - named - {name for name in modules if name.startswith(('exact_', 'theta_',
+    examples = {path.name for path in (ROOT / 'examples').glob('*.py')}
+    assert named - tests <= modules | examples
+    missing = (modules | examples) - named - {name for name in modules if name.startswith(('exact_', 'theta_',
                                                                               'long_', 'errors'))}
     assert not missing
 

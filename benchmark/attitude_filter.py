@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Published attitude filters on the scene `wavy`, beside the truth:
+
+    PYTHONPATH=. python benchmark/attitude_filter.py
+
+The filters and the comparison are those of examples/attitude_filter.py.  What is varied: where the
+IMU sits, how often it is read, its errors, the filter's gain; and the integration of the rates
+alone, which no filter can do better than.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import math
+import sys
+import tempfile
+from pathlib import Path
+from types import ModuleType
+
+import matplotlib as mpl
+import numpy as np
+import report
+from ahrs.filters import AngularRate
+from cases import ROOT
+
+from spinning_top_sim.solvers.propagator import propagate
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.imu import Imu
+from spinning_top_sim.tools import simulate
+from spinning_top_sim.tools.scene_file import read_scene
+
+DURATION, SETTLE, RATE = 120, 60, 200
+SCENE = ROOT / 'config/wavy.yaml'
+ARMS_CM = (0, 5, 10)
+RATES = (100, 200, 1000)
+PRESETS = ('perfect', 'adis16470', 'icm_42688_p', 'bmi088', 'icm_20948')
+GAINS = (0.033, 0.1, 0.3, 1.0)
+
+
+def example() -> ModuleType:
+    """Return examples/attitude_filter.py."""
+    name = 'attitude_filter_example'
+    spec = importlib.util.spec_from_file_location(name, ROOT / 'examples/attitude_filter.py')
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+FILTERS = example()
+NAMES = tuple(FILTERS.FILTERS)
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        by_arm = {arm: compare(place, arm_cm=arm) for arm in ARMS_CM}
+        by_rate = {rate: compare(place, rate=rate) for rate in RATES if rate != RATE}
+        by_rate[RATE] = by_arm[0]
+        by_preset = {(preset, arm): compare(place, arm_cm=arm, preset=preset)
+                     for preset in PRESETS[1:] for arm in (0, ARMS_CM[-1])}
+        by_preset.update({(PRESETS[0], arm): by_arm[arm] for arm in (0, ARMS_CM[-1])})
+        gains = {arm: compare(place, arm_cm=arm, names=[gain_name(gain) for gain in GAINS])
+                 for arm in (0, ARMS_CM[-1])}
+    draw(by_arm)
+    turned = math.degrees(spin() / RATE)
+    text = [report.preamble('Attitude filters', ('numpy', 'vqf', 'ahrs', 'matplotlib')),
+            INTRODUCTION.format(scene=SCENE.stem, duration=DURATION, settle=SETTLE, rate=RATE,
+                                spin=spin(), turned=turned)]
+    text += ['## Where the IMU sits\n', ARM,
+             table('lever arm', {f'{arm} cm': by_arm[arm] for arm in ARMS_CM})]
+    text += ['## How often it is read\n', OFTEN.format(
+        lag=math.degrees(lag()), rate=RATE),
+        table('rate', {f'{rate} Hz': by_rate[rate] for rate in RATES})]
+    text += ['## Integration alone\n', INTEGRATION, integration()]
+    text += ['## Gain\n', GAIN, table('lever arm', {f'{arm} cm': gains[arm] for arm in gains})]
+    text += ['## Errors of the IMU\n', NOISE, table('preset, lever arm', {
+        f'`{preset}`, {arm} cm': by_preset[preset, arm]
+        for preset in PRESETS for arm in (0, ARMS_CM[-1])})]
+    report.write('attitude_filter.md', '\n'.join(text))
+
+
+INTRODUCTION = """\
+{duration} s of the scene `{scene}`: tilt near 30 degrees, {spin:.3g} rad/s of spin. The IMU is
+read at {rate} Hz, from one sample to the next the top turns by {turned:.2g} degrees. Every
+filter starts level and gets the mean of two consecutive rate samples for the step between them.
+Errors are counted from {settle} s on: tilt, the angle between the estimated and the true
+vertical, rms over all poses; in brackets the drift of the heading, which six axes cannot know.
+
+- `vqf`: VQF (Laidig and Seel 2023), package vqf. Rates integrated in closed form; the tilt is
+  corrected by the specific force averaged over 3 s in a frame that does not turn
+- `madgwick`, `ekf`: package ahrs. First-order steps; every sample of the specific force is
+  taken for gravity, as if the accelerometer were still
+
+![Tilt errors over time](attitude_filter.png)
+"""
+ARM = """\
+The pivot does not move: there the accelerometer reads gravity and nothing else. A lever arm
+across the axis adds centripetal and tangential acceleration, which turn with the body: what
+takes each sample for gravity tilts towards them. Seen from a frame that does not turn they
+average out over a few turns, and that is what VQF does.
+"""
+OFTEN = """\
+With a perfect IMU at the pivot what is left is the filter's own error. VQF's falls with the
+square of the step: the mean of two samples for the rates between them. Madgwick's step compares
+the new sample of the specific force with the attitude before the step; in the sensor, gravity
+moves by {lag:.3g} degrees in 1/{rate} s. What first-order steps lose is seen in the heading.
+"""
+INTEGRATION = """\
+The rates of a perfect IMU summed up from the true attitude on, by `AngularRate` of ahrs: angle
+to the true attitude after 60 s, over 60 s. `last`: a sample counts for the step that it ends,
+as it does in most drivers' loops; `mean`: the mean of both ends.
+"""
+GAIN = """\
+Madgwick's only setting, in rad/s: a low one takes minutes to converge from 30 degrees on a
+lever arm, a high one follows the acceleration.
+"""
+NOISE = """\
+The presets of config/imu, seed 0. Turn-on bias, white noise and resolution are those of the
+data sheets. A bias of the rates leans against the correction of the tilt and is a drift of the
+heading. VQF estimates it, but takes none of more than 2 deg/s for one: `icm_20948` has up to 5
+deg/s and more where nobody has calibrated it.
+"""
+
+
+def compare(folder: Path, arm_cm: int = 0, rate: int = RATE, preset: str = PRESETS[0],
+            names: tuple[str, ...] | list[str] = NAMES) -> list:
+    """Simulate, filter, and return a Comparison for each filter."""
+    log = folder / f'{arm_cm}_{rate}_{preset}.mcap'
+    if not log.exists():
+        code = simulate.main([
+            '--quiet', '-o', str(log), '--duration', str(DURATION), '--params', str(SCENE),
+            '--params', str(ROOT / f'config/imu/{preset}.yaml'), '-p', 'solver.method:=exact',
+            '-p', f'imu.rate:={rate}', '-p', f'imu.lever_arm:=[{arm_cm / 100}, 0.0, 0.0]',
+            '-p', 'record.streams:=[imu, pose]'])
+        assert code == 0
+    found = FILTERS.compare(log, names)
+    print(log.stem, *(str(one.summary(SETTLE)) for one in found), sep='\n  ', flush=True)
+    return found
+
+
+def gain_name(gain: float) -> str:
+    """Return the name of Madgwick's filter with a gain, known to the example from then on."""
+    name = f'gain {gain:g}'
+    FILTERS.FILTERS[name] = functools.partial(FILTERS.madgwick, gain=gain)
+    return name
+
+
+def table(head: str, rows: dict[str, list]) -> str:
+    """Return rms of tilt and drift of heading, a row a case, a column a filter."""
+    names = [one.name for one in next(iter(rows.values()))]
+    lines = []
+    for label, found in rows.items():
+        summaries = [one.summary(SETTLE) for one in found]
+        lines.append((label, *(f'{one.tilt_rms:.3g} ({one.heading_rate:+.2g}/s)'
+                               for one in summaries)))
+    return report.table((head, *(f'{name} [deg]' for name in names)), lines)
+
+
+def motion(rate: int, seconds: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return exact rates (n, 3) [rad/s] and attitudes w, x, y, z (n, 4) at the pivot."""
+    values = parameters.checked(read_scene(SCENE))
+    imu = Imu(values)
+    top = propagate(parameters.top_of(values), parameters.start_state(values), method='exact')
+    states = [top.at_ns(round(k * 1e9 / rate)) for k in range(seconds * rate + 1)]
+    attitudes = np.array([imu.orientation(state) for state in states])
+    return np.array([imu.true(state)[0] for state in states]), attitudes[:, [3, 0, 1, 2]]
+
+
+def spin() -> float:
+    """Return the rate about the axis [rad/s]."""
+    values = parameters.checked(read_scene(SCENE))
+    return values['spin.l3'] / values['top.lambda3']
+
+
+def lag() -> float:
+    """Return how far gravity moves in the sensor from one sample to the next, rms [rad]."""
+    _, attitudes = motion(RATE, 10)
+    w, x, y, z = attitudes.T
+    up = np.stack((2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)), axis=1)
+    return float(np.sqrt(np.mean(np.sum(np.diff(up, axis=0) ** 2, axis=1))))
+
+
+def integration() -> str:
+    """Return the table of what the integration alone loses."""
+    seconds, lines = 60, []
+    for rate in RATES:
+        rates, attitudes = motion(rate, seconds)
+        row = [f'{rate} Hz']
+        for method in ('series', 'closed'):
+            for mean in (False, True):
+                used = 0.5 * (rates[1:] + rates[:-1]) if mean else rates[1:]
+                integrator, attitude = AngularRate(Dt=1 / rate), attitudes[0]
+                for one in used:
+                    attitude = integrator.update(attitude, one, method=method, order=1)
+                w, x, y, z = FILTERS._product(attitude, attitudes[-1] * (1, -1, -1, -1))
+                angle = 2.0 * math.atan2(math.hypot(x, y, z), abs(w))
+                row.append(f'{math.degrees(angle) / seconds:.2g}')
+        lines.append(row)
+        print('integration', row, flush=True)
+    return report.table(('rate', *(f'{method}, {which} [deg/s]' for method in
+                                   ('first order', 'closed form') for which in ('last', 'mean'))),
+                        lines)
+
+
+def draw(by_arm: dict[int, list]) -> None:
+    """Draw the tilt errors at the pivot and on the longest lever arm."""
+    mpl.use('Agg')
+    import matplotlib.pyplot as plt
+
+    figure, panels = plt.subplots(1, 2, figsize=(11.0, 4.2), sharey=True)
+    for panel, arm in zip(panels, (0, ARMS_CM[-1]), strict=True):
+        for one in by_arm[arm]:
+            FILTERS.draw([panel], one, SETTLE, linewidth=0.9)
+        panel.set_title('IMU at the pivot' if arm == 0 else f'IMU {arm} cm off the axis',
+                        fontsize=11)
+        panel.grid(color='#DDDDDD', linewidth=0.6)
+        panel.set_axisbelow(True)
+    panels[1].set_ylabel('')
+    panels[0].set_ylim(3e-3, 100.0)
+    panels[0].legend(loc='upper right')
+    figure.tight_layout()
+    path = ROOT / 'docs/attitude_filter.png'
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    print(f'wrote {path.relative_to(ROOT)}')
+
+
+if __name__ == '__main__':
+    main()

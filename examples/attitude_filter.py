@@ -1,0 +1,456 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""
+Attitude filters beside the truth: from `imu/data_raw`, compared with `pose`, live or from a log.
+
+  python examples/attitude_filter.py run.mcap --filter vqf madgwick ekf --plot out.png
+  python examples/attitude_filter.py --duration 60 --ros-args -r __ns:=/top
+
+Needs `pip install 'spinning_top_sim[examples]'`.  Frames: x, y, z right-handed, z of the world up
+(REP-103); a resting accelerometer reads +g upwards (REP-145); attitudes are q(world <- IMU).  The
+pose is the body's, so the mounting of the IMU (`imu.rpy`) must be known: a log has it, live it is
+--rpy.  An IMU without a magnetometer knows no heading: tilt is compared as it is, heading from the
+end of --settle on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from spinning_top_sim.nodes import executable
+
+NANOSECONDS = 1_000_000_000
+IMU_TOPIC, POSE_TOPIC = 'imu/data_raw', 'pose'
+# The period is the smallest of so many first distances, so that a lost message does not decide it.
+LEARNED_FROM = 10
+# Over this much of lost samples nothing can be said of the motion: the filter starts anew.
+LONGEST_GAP_NS = NANOSECONDS // 10
+# What has not met its partner by then never will.
+KEPT_NS = 5 * NANOSECONDS
+CONVERGED_DEG = 1.0
+REPORT_NS = 2 * NANOSECONDS
+
+# One step of a filter: mean rates [rad/s] over the step and specific force [m/s^2] at its end, in
+# the frame of the IMU; returns q(world <- IMU) as w, x, y, z.
+Step = Callable[[np.ndarray, np.ndarray], Sequence[float]]
+
+
+# ----------------------------------------------------------------------------------- the filters
+
+def vqf(period: float) -> Step:
+    """
+    VQF without a magnetometer (D. Laidig, T. Seel, Information Fusion 91 (2023) 187-204).
+
+    Rates are integrated in closed form; what corrects the tilt is the specific force averaged over
+    seconds in a frame that does not turn.
+    """
+    from vqf import VQF
+
+    filter_ = VQF(period)
+
+    def step(rates: np.ndarray, force: np.ndarray) -> Sequence[float]:
+        filter_.update(rates, force)
+        return filter_.getQuat6D()
+    return step
+
+
+def madgwick(period: float, gain: float = 0.033) -> Step:
+    """
+    Madgwick's filter (S. Madgwick et al., ICORR 2011); gain [rad/s], as in the paper.
+
+    A first-order step; each sample of the specific force is taken for gravity.
+    """
+    from ahrs.filters import Madgwick
+
+    filter_ = Madgwick(Dt=period, gain=gain)
+    attitude = np.array((1.0, 0.0, 0.0, 0.0))
+
+    def step(rates: np.ndarray, force: np.ndarray) -> Sequence[float]:
+        nonlocal attitude
+        attitude = filter_.updateIMU(attitude, rates, force)
+        return attitude
+    return step
+
+
+def ekf(period: float) -> Step:
+    """
+    The extended Kalman filter of `ahrs` with its default noises (A. Sabatini, Sensors 11 (2011)).
+
+    A first-order step; each sample of the specific force is taken for gravity.
+    """
+    from ahrs.filters import EKF
+
+    filter_, attitude = EKF(Dt=period), np.array((1.0, 0.0, 0.0, 0.0))
+
+    def step(rates: np.ndarray, force: np.ndarray) -> Sequence[float]:
+        nonlocal attitude
+        attitude = filter_.update(attitude, rates, force)
+        return attitude
+    return step
+
+
+FILTERS: dict[str, Callable[[float], Step]] = {'vqf': vqf, 'madgwick': madgwick, 'ekf': ekf}
+
+
+# -------------------------------------------------------------------------------- the comparison
+
+class Error(NamedTuple):
+    """Of an attitude: stamp [ns]; angle between the verticals, turn about the vertical [rad]."""
+
+    stamp_ns: int
+    tilt: float
+    heading: float
+
+
+def error_of(estimate: Sequence[float], truth: Sequence[float]) -> tuple[float, float]:
+    """
+    Return tilt and heading of the rotation, in the world, from the truth to an estimate [rad].
+
+    estimate: w, x, y, z;  truth: x, y, z, w
+    """
+    w, x, y, z = _product(estimate, (truth[3], -truth[0], -truth[1], -truth[2]))
+    return 2.0 * math.atan2(math.hypot(x, y), math.hypot(z, w)), 2.0 * math.atan2(z, w)
+
+
+def mounting_of(roll: float, pitch: float, yaw: float) -> tuple[float, ...]:
+    """Return q(body <- IMU) of the URDF's roll, pitch and yaw [rad], as w, x, y, z."""
+    about_x, about_y, about_z = ((math.cos(0.5 * angle), math.sin(0.5 * angle))
+                                 for angle in (roll, pitch, yaw))
+    turn = _product((about_z[0], 0.0, 0.0, about_z[1]), (about_y[0], 0.0, about_y[1], 0.0))
+    return _product(turn, (about_x[0], about_x[1], 0.0, 0.0))
+
+
+def _product(p: Sequence[float], q: Sequence[float]) -> tuple[float, ...]:
+    (a, b, c, d), (w, x, y, z) = p, q
+    return (a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w)
+
+
+class Comparison:
+    """
+    One filter, fed with samples of the IMU and compared with poses of the same stamps.
+
+    errors: so far;  lost: samples that never came, bridged by a straight line;  restarts: of the
+    filter, after gaps too long for that or stamps that went back
+    """
+
+    def __init__(self, name: str, mounting: Sequence[float] = (1.0, 0.0, 0.0, 0.0)) -> None:
+        self.name = name
+        self.errors: list[Error] = []
+        self.lost = self.restarts = 0
+        self._mounting = mounting
+        self._first: list[tuple[int, np.ndarray, np.ndarray]] = []
+        self._period_ns = 0
+        self._step: Step
+        self._last: tuple[int, np.ndarray, np.ndarray]
+        self._estimates: dict[int, Sequence[float]] = {}
+        self._truths: dict[int, Sequence[float]] = {}
+
+    def imu(self, stamp_ns: int, rates: Sequence[float], force: Sequence[float]) -> None:
+        """Take a sample: rates [rad/s] and specific force [m/s^2]."""
+        sample = stamp_ns, np.array(rates, dtype=float), np.array(force, dtype=float)
+        if self._period_ns:
+            self._advance(sample)
+            return
+        self._first.append(sample)
+        if len(self._first) > LEARNED_FROM:
+            self._period_ns = min(abs(b[0] - a[0]) for a, b in
+                                  zip(self._first, self._first[1:], strict=False)) or 1
+            self._start(self._first[0])
+            for one in self._first[1:]:
+                self._advance(one)
+
+    def pose(self, stamp_ns: int, attitude: Sequence[float]) -> None:
+        """Take the body's true attitude, x, y, z, w."""
+        w, x, y, z = _product((attitude[3], *attitude[:3]), self._mounting)
+        self._truths[stamp_ns] = (x, y, z, w)
+        self._match(stamp_ns)
+
+    def _start(self, sample: tuple[int, np.ndarray, np.ndarray]) -> None:
+        self._step = FILTERS[self.name](self._period_ns / NANOSECONDS)
+        self._last = sample
+
+    def _advance(self, sample: tuple[int, np.ndarray, np.ndarray]) -> None:
+        stamp_ns, rates, force = sample
+        last_ns, last_rates, last_force = self._last
+        gap_ns = stamp_ns - last_ns
+        if not 0 < gap_ns <= max(LONGEST_GAP_NS, 2 * self._period_ns):
+            self.restarts += 1
+            self._start(sample)
+            return
+        steps = max(1, round(gap_ns / self._period_ns))
+        self.lost += steps - 1
+        for k in range(steps):
+            # A filter takes the rates for constant over its step; the samples are instants, and
+            # the top turns by 3 degrees from one to the next.
+            middle = (k + 0.5) / steps
+            estimate = self._step(last_rates + middle * (rates - last_rates),
+                                  last_force + (k + 1) / steps * (force - last_force))
+        self._last = sample
+        self._estimates[stamp_ns] = estimate
+        self._match(stamp_ns)
+
+    def _match(self, stamp_ns: int) -> None:
+        if stamp_ns in self._estimates and stamp_ns in self._truths:
+            self.errors.append(Error(stamp_ns, *error_of(self._estimates.pop(stamp_ns),
+                                                         self._truths.pop(stamp_ns))))
+        for waiting in (self._estimates, self._truths):
+            while waiting and (oldest := next(iter(waiting))) < stamp_ns - KEPT_NS:
+                del waiting[oldest]
+
+    def columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return t [s] from the first error on, tilt and continuous heading [deg], (n,) each."""
+        stamps, tilt, heading = zip(*sorted(self.errors), strict=True)
+        t = (np.array(stamps) - stamps[0]) / NANOSECONDS
+        return t, np.degrees(tilt), np.degrees(np.unwrap(heading))
+
+    def summary(self, settle: float) -> Summary:
+        """Return the errors after `settle` seconds.  Raises ValueError where there are none."""
+        if not self.errors:
+            raise ValueError(f'{self.name}: no sample of {IMU_TOPIC} had the stamp of a '
+                             f'{POSE_TOPIC}')
+        t, tilt, heading = self.columns()
+        if t[-1] <= settle:
+            raise ValueError(f'{self.name}: {t[-1]:g} s are compared; --settle {settle:g} must be '
+                             'less')
+        above = np.flatnonzero(tilt > CONVERGED_DEG)
+        end = 0 if not len(above) else above[-1] + 1
+        later = t > settle
+        drift = heading[later] - heading[later][0]
+        return Summary(
+            name=self.name, compared=len(t), seconds=float(t[-1]),
+            converged=float(t[end]) if end < len(t) else math.inf,
+            tilt_rms=float(np.sqrt(np.mean(tilt[later] ** 2))), tilt_max=float(tilt[later].max()),
+            heading_rate=float(drift[-1] / (t[-1] - t[later][0] or 1.0)),
+            lost=self.lost, restarts=self.restarts)
+
+
+class Summary(NamedTuple):
+    """
+    How a filter did after it has settled, angles in degrees.
+
+    converged: when the tilt has fallen below CONVERGED_DEG for good [s], inf: never;
+    heading_rate: drift of the heading [deg/s]
+    """
+
+    name: str
+    compared: int
+    seconds: float
+    converged: float
+    tilt_rms: float
+    tilt_max: float
+    heading_rate: float
+    lost: int
+    restarts: int
+
+    def __str__(self) -> str:
+        converged = (f'tilt below {CONVERGED_DEG:g} deg from {self.converged:.2f} s on'
+                     if math.isfinite(self.converged) else
+                     f'tilt not below {CONVERGED_DEG:g} deg for good')
+        holes = f'; {self.lost} samples lost, {self.restarts} restarts' * bool(
+            self.lost or self.restarts)
+        return (f'{self.name}: {converged}; after settling tilt error {self.tilt_rms:.3g} deg '
+                f'rms, {self.tilt_max:.3g} deg max, heading drift {self.heading_rate:+.3g} deg/s '
+                f'({self.compared} poses in {self.seconds:.2f} s{holes})')
+
+
+# -------------------------------------------------------------------------------------- from a log
+
+def compare(path: Path, names: Sequence[str], namespace: str = '/',
+            rpy: Sequence[float] | None = None) -> list[Comparison]:
+    """
+    Run filters through a log.
+
+    rpy: mounting of the IMU [rad], None: what the log says.  Raises ValueError for a log without
+    these topics, and LogError for what is none.
+    """
+    from rosbags.typesys import Stores, get_typestore
+
+    from spinning_top_sim.recording.reader import LogReader
+
+    typestore = get_typestore(Stores.ROS2_JAZZY)
+    with LogReader(path) as reader:
+        space = '/' + namespace.strip('/')
+        imu, pose = (f'{space.rstrip("/")}/{topic}' for topic in (IMU_TOPIC, POSE_TOPIC))
+        there = {topic.name: topic.type_name for topic in reader.topics}
+        for topic in (imu, pose):
+            if topic not in there:
+                raise ValueError(f'{path} has no topic {topic}; it has {", ".join(there)} '
+                                 '(--namespace)')
+        if rpy is None:
+            provenance = reader.metadata.get('spinning_top_sim', {})
+            rpy = json.loads(provenance.get('parameters', '{}')).get('imu.rpy', (0.0, 0.0, 0.0))
+        comparisons = [Comparison(name, mounting_of(*rpy)) for name in names]
+        for message in reader.messages([imu, pose]):
+            decoded = typestore.deserialize_cdr(message.data, there[message.topic])
+            for comparison in comparisons:
+                take(comparison, decoded)
+    return comparisons
+
+
+def take(comparison: Comparison, message: Any) -> None:
+    """Hand over a message, sensor_msgs/Imu or geometry_msgs/PoseStamped, of rclpy or rosbags."""
+    stamp = message.header.stamp
+    stamp_ns = stamp.sec * NANOSECONDS + stamp.nanosec
+    if hasattr(message, 'angular_velocity'):
+        rates, force = message.angular_velocity, message.linear_acceleration
+        comparison.imu(stamp_ns, (rates.x, rates.y, rates.z), (force.x, force.y, force.z))
+    else:
+        q = message.pose.orientation
+        comparison.pose(stamp_ns, (q.x, q.y, q.z, q.w))
+
+
+def draw(panels: Sequence[Any], comparison: Comparison, settle: float, **style: Any) -> None:
+    """Draw the tilt error, and if there is a second panel the drift of the heading."""
+    t, tilt, heading = comparison.columns()
+    panels[0].semilogy(t, np.maximum(tilt, 1e-6), label=comparison.name, **style)
+    panels[0].set_ylabel('tilt error [deg]')
+    if len(panels) > 1:
+        panels[1].plot(t, heading - heading[np.searchsorted(t, settle)], **style)
+        panels[1].set_ylabel('heading error, 0 when settled [deg]')
+    panels[-1].set_xlabel('t [s]')
+
+
+def plot(path: Path, comparisons: Sequence[Comparison], settle: float) -> None:
+    """Write a picture of the errors over time."""
+    import matplotlib as mpl
+    mpl.use('Agg')
+    import matplotlib.pyplot as plt
+
+    figure, panels = plt.subplots(2, 1, figsize=(9.0, 6.0), sharex=True)
+    for comparison in comparisons:
+        draw(panels, comparison, settle, linewidth=1.0)
+    for panel in panels:
+        panel.grid(color='#DDDDDD', linewidth=0.6)
+        panel.axvline(settle, color='#888888', linestyle=':', linewidth=1.0)
+    panels[0].legend()
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+# -------------------------------------------------------------------------------------------- live
+
+def make_node(arguments: argparse.Namespace) -> Any:
+    """Return the node; its `finished` completes after --duration with the exit code."""
+    from geometry_msgs.msg import PoseStamped
+    from rclpy.node import Node
+    from rclpy.qos import QoSProfile
+    from rclpy.task import Future
+    from sensor_msgs.msg import Imu
+
+    class AttitudeFilter(Node):
+        """Filters `imu/data_raw`, compares with `pose`, says every two seconds how well."""
+
+        def __init__(self) -> None:
+            super().__init__('attitude_filter')
+            self.finished: Future = Future()
+            mounting = mounting_of(*(arguments.rpy or (0.0, 0.0, 0.0)))
+            self._comparisons = [Comparison(name, mounting) for name in arguments.filter]
+            self._reported_ns = 0
+            # Deep: a sample lost is lost for the filter.
+            profile = QoSProfile(depth=1000)
+            for topic, kind in ((IMU_TOPIC, Imu), (POSE_TOPIC, PoseStamped)):
+                self.create_subscription(kind, topic, self._take, profile)
+
+        def start(self) -> None:
+            self.get_logger().info(
+                f'waiting for {self.resolve_topic_name(IMU_TOPIC)} and '
+                f'{self.resolve_topic_name(POSE_TOPIC)}')
+
+        def _take(self, message: Any) -> None:
+            if self.finished.done():
+                return
+            for comparison in self._comparisons:
+                take(comparison, message)
+            errors = self._comparisons[0].errors
+            if not errors:
+                return
+            first_ns, last_ns = errors[0].stamp_ns, errors[-1].stamp_ns
+            if last_ns - self._reported_ns >= REPORT_NS:
+                self._reported_ns = last_ns
+                for line in self._now((last_ns - first_ns) / NANOSECONDS):
+                    self.get_logger().info(line)
+            if arguments.duration and last_ns - first_ns >= arguments.duration * NANOSECONDS:
+                self.finished.set_result(0)
+
+        def _now(self, t: float) -> Iterator[str]:
+            for comparison in self._comparisons:
+                if comparison.errors:
+                    yield (f'{comparison.name} at {t:.2f} s: tilt error '
+                           f'{math.degrees(comparison.errors[-1].tilt):.3g} deg')
+
+        def stop(self) -> None:
+            report(self._comparisons, arguments)
+
+    return AttitudeFilter()
+
+
+# ---------------------------------------------------------------------------------------- commands
+
+def report(comparisons: Sequence[Comparison], arguments: argparse.Namespace) -> bool:
+    """Print a line for each filter, draw if asked; return whether there was anything to say."""
+    try:
+        for comparison in comparisons:
+            print(comparison.summary(arguments.settle), flush=True)
+    except ValueError as error:
+        print(f'attitude_filter: {error}', file=sys.stderr, flush=True)
+        return False
+    if arguments.plot:
+        plot(arguments.plot, comparisons, arguments.settle)
+        print(f'wrote {arguments.plot}', flush=True)
+    return True
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Compare; return 0, 1 where nothing could be compared, 2 for what could not be started."""
+    argv = sys.argv if argv is None else argv
+    own = argv[1:argv.index('--ros-args')] if '--ros-args' in argv else argv[1:]
+    arguments = _parser().parse_args(own)
+    if arguments.log is None:
+        return executable.run('attitude_filter', argv, lambda _: lambda: make_node(arguments))
+    from spinning_top_sim.recording.errors import LogError
+    try:
+        comparisons = compare(arguments.log, arguments.filter, arguments.namespace, arguments.rpy)
+    except (ValueError, LogError) as error:
+        print(f'attitude_filter: {error}', file=sys.stderr)
+        return 1
+    return 0 if report(comparisons, arguments) else 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='attitude_filter', description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('log', type=Path, nargs='?', metavar='LOG',
+                        help='a log (.mcap); without it a node listens')
+    parser.add_argument('--filter', nargs='+', choices=FILTERS, default=['vqf'], metavar='NAME',
+                        help=f'of {", ".join(FILTERS)}; default vqf')
+    parser.add_argument('--rpy', type=float, nargs=3, metavar=('R', 'P', 'Y'),
+                        help='mounting of the IMU [rad]; default: as in the log, live 0 0 0')
+    parser.add_argument('--settle', type=_not_negative, default=15.0, metavar='S',
+                        help='errors count from then on [s], default %(default)g')
+    parser.add_argument('--plot', type=Path, metavar='PNG', help='draw the errors over time')
+    parser.add_argument('--namespace', default='/', help='of the topics in the log')
+    parser.add_argument('--duration', type=_not_negative, default=0.0, metavar='S',
+                        help='live: end after this much of compared stamps, 0 = never')
+    return parser
+
+
+def _not_negative(text: str) -> float:
+    value = float(text)
+    if not (math.isfinite(value) and value >= 0.0):
+        raise argparse.ArgumentTypeError(f'{text}: must be a finite number >= 0')
+    return value
+
+
+if __name__ == '__main__':
+    sys.exit(main())

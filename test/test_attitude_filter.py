@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""examples/attitude_filter.py: against the truth from logs, and live beside a node."""
+
+import importlib.util
+import math
+import re
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from reference import ROOT
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim.tools.simulate import main as simulate
+
+EXAMPLE = ROOT / 'examples/attitude_filter.py'
+SETTLE = 15.0
+MOUNTING = (0.3, -0.2, 1.0)
+LOGS = {
+    'pivot': ['-p', f'imu.rpy:={list(MOUNTING)}'],
+    'pivot at 100 Hz': ['-p', 'imu.rate:=100.0'],
+    'lever arm': ['-p', f'imu.rpy:={list(MOUNTING)}', '-p', 'imu.lever_arm:=[0.1, 0.0, 0.0]'],
+    'noise': ['--params', str(ROOT / 'config/imu/bmi088.yaml')],
+}
+
+
+@pytest.fixture(scope='module')
+def example():
+    for library in ('ahrs', 'vqf'):
+        pytest.importorskip(library)
+    spec = importlib.util.spec_from_file_location('attitude_filter_example', EXAMPLE)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope='module')
+def logs(tmp_path_factory):
+    """Return half a minute of waves for each of LOGS."""
+    folder = tmp_path_factory.mktemp('logs')
+    paths = {name: folder / f'{number}.mcap' for number, name in enumerate(LOGS)}
+    for name, path in paths.items():
+        assert simulate(['--quiet', '-o', str(path), '--duration', '30', '-p',
+                         'solver.method:=exact', '--params', str(ROOT / 'config/wavy.yaml'),
+                         *LOGS[name]]) == 0
+    return paths
+
+
+def summaries(example, path, names=('vqf', 'madgwick', 'ekf'), **options):
+    return {one.name: one.summary(SETTLE) for one in example.compare(path, names, **options)}
+
+
+# ------------------------------------------------------------------------- bounds: 3 x measured
+
+def test_at_the_pivot_a_perfect_imu_leaves_the_filters_own_error(example, logs):
+    found = summaries(example, logs['pivot'])
+    assert found['vqf'].compared == 3000
+    assert found['vqf'].tilt_rms < 0.03 and found['vqf'].converged < 1.0
+    assert abs(found['vqf'].heading_rate) < 0.045
+    assert found['ekf'].tilt_rms < 0.06
+    # Madgwick compares a new force with an old attitude: one sample of lag, 1.4 degrees.
+    assert found['madgwick'].tilt_rms == pytest.approx(1.39, abs=0.1)
+    assert found['ekf'].heading_rate == pytest.approx(found['madgwick'].heading_rate, rel=0.1)
+
+
+def test_the_error_of_vqf_falls_with_the_square_of_the_step(example, logs):
+    fine = summaries(example, logs['pivot'], ['vqf'])['vqf']
+    coarse = summaries(example, logs['pivot at 100 Hz'], ['vqf'])['vqf']
+    assert coarse.tilt_rms / fine.tilt_rms == pytest.approx(4.0, abs=0.5)
+    assert coarse.heading_rate / fine.heading_rate == pytest.approx(4.0, abs=0.5)
+
+
+def test_a_lever_arm_misleads_what_takes_the_accelerometer_for_still(example, logs):
+    found = summaries(example, logs['lever arm'])
+    assert found['vqf'].tilt_rms < 0.3 and found['vqf'].converged < SETTLE
+    assert found['ekf'].tilt_rms > 1.0 and found['ekf'].converged == math.inf
+    assert found['madgwick'].tilt_rms > 1.0 and found['madgwick'].converged == math.inf
+
+
+def test_a_filter_converges_with_the_noise_of_a_real_device(example, logs):
+    found = summaries(example, logs['noise'], ['vqf'])['vqf']
+    assert found.converged < SETTLE
+    assert 0.03 < found.tilt_rms < 1.0
+
+
+def test_a_wrong_mounting_is_seen(example, logs):
+    found = summaries(example, logs['pivot'], ['vqf'], rpy=(0.3, -0.1, 1.0))['vqf']
+    assert found.tilt_rms == pytest.approx(math.degrees(0.1), rel=0.5)
+
+
+# ------------------------------------------------------------------------------ the comparison
+
+def test_tilt_and_heading_of_an_error(example):
+    truth = Rotation.from_euler('xyz', (0.4, 0.5, 0.6))
+    for axis, tilt, heading in (('x', 0.2, 0.0), ('y', 0.2, 0.0), ('z', 0.0, 0.2)):
+        w_first = np.roll((Rotation.from_euler(axis, 0.2) * truth).as_quat(), 1)
+        assert example.error_of(w_first, truth.as_quat()) == pytest.approx((tilt, heading),
+                                                                           abs=1e-7)
+        # In an order that tells world from sensor: the same turn about the sensor's axis.
+        turned = np.roll((truth * Rotation.from_euler(axis, 0.2)).as_quat(), 1)
+        assert example.error_of(turned, truth.as_quat())[0] > 0.05
+
+
+def test_the_mounting_is_the_urdfs(example):
+    w, x, y, z = example.mounting_of(*MOUNTING)
+    assert (x, y, z, w) == pytest.approx(Rotation.from_euler('xyz', MOUNTING).as_quat(),
+                                         abs=1e-15)
+
+
+def feed(example, samples):
+    """Return a comparison of samples (stamp, rate about the vertical), turning about z."""
+    comparison = example.Comparison('vqf')
+    for stamp_ns in samples:
+        comparison.imu(stamp_ns, (0.0, 0.0, 2.0), (0.0, 0.0, 9.81))
+        half = stamp_ns * 1e-9
+        comparison.pose(stamp_ns, (0.0, 0.0, math.sin(half), math.cos(half)))
+    return comparison
+
+
+def test_lost_samples_are_bridged(example):
+    stamps = [k * 5_000_000 for k in range(2000) if k % 7 != 3]
+    comparison = feed(example, stamps)
+    assert comparison.lost == 2000 - len(stamps) and comparison.restarts == 0
+    assert abs(comparison.summary(1.0).heading_rate) < 1e-3
+    assert len(comparison.errors) == len(stamps) - 1
+
+
+def test_after_a_long_gap_or_a_step_back_the_filter_starts_anew(example):
+    stamps = [*range(0, 10 ** 9, 5_000_000), *range(3 * 10 ** 9, 4 * 10 ** 9, 5_000_000),
+              *range(2 * 10 ** 9, 3 * 10 ** 9, 5_000_000)]
+    comparison = feed(example, stamps)
+    assert comparison.restarts == 2 and comparison.lost == 0
+    assert len(comparison.errors) == len(stamps) - 3
+
+
+def test_nothing_to_compare_is_said(example, logs, capsys):
+    with pytest.raises(ValueError, match='no sample of imu/data_raw had the stamp of a pose'):
+        example.Comparison('vqf').summary(1.0)
+    assert example.main(['it', str(logs['noise']), '--settle', '40']) == 1
+    assert '--settle 40' in capsys.readouterr().err
+    assert example.main(['it', str(logs['noise']), '--namespace', 'other']) == 1
+    assert 'no topic /other/imu/data_raw; it has /pose' in capsys.readouterr().err
+    assert example.main(['it', str(EXAMPLE)]) == 1
+    assert str(EXAMPLE) in capsys.readouterr().err
+
+
+def test_as_a_command_it_tells_and_draws(example, logs, tmp_path):
+    picture = tmp_path / 'out.png'
+    run = subprocess.run([sys.executable, EXAMPLE, logs['lever arm'], '--filter', 'vqf', 'ekf',
+                          '--plot', picture], capture_output=True, text=True, timeout=120,
+                         check=False)
+    assert run.returncode == 0, run.stderr
+    assert [line.split(':')[0] for line in run.stdout.splitlines()[:2]] == ['vqf', 'ekf']
+    assert picture.read_bytes().startswith(b'\x89PNG')
+
+
+# -------------------------------------------------------------------------------------------- live
+
+def test_live_it_follows_a_node_with_a_preset_and_ends_by_itself(example, peer, tmp_path):
+    from node_harness import SimNode
+
+    files = [item for name in ('wavy', 'imu/bmi088')
+             for item in ('--params-file', str(ROOT / f'config/{name}.yaml'))]
+    follower = [str(EXAMPLE), '--filter', 'vqf', '--duration', '4', '--settle', '2']
+    with (SimNode(tmp_path / 'top', namespace='/waves', arguments=files) as top,
+          SimNode(tmp_path / 'filter', namespace='/waves', program=follower) as node):
+        assert node.wait() == 0, node.err
+        noise, = peer.get(top, 'imu.gyroscope_noise_density')
+        assert noise == pytest.approx(1.72779e-4)
+        assert top.end() == 0
+    found = re.search(r'tilt error (\S+) deg rms, .* heading drift \S+ deg/s \((\d+) poses',
+                      node.out)
+    assert found, node.out
+    # Two degrees of bias of the force at most; a load that makes samples late costs poses.
+    assert float(found[1]) < 3.0
+    assert int(found[2]) > 100
+    assert 'vqf at' in node.err
+
+
+def test_live_it_ends_by_sigint_and_tells(example, tmp_path):
+    from node_harness import SimNode, wait_for
+
+    follower = [str(EXAMPLE), '--settle', '0']
+    with (SimNode(tmp_path / 'top', namespace='/signalled'),
+          SimNode(tmp_path / 'filter', namespace='/signalled', program=follower) as node):
+        wait_for('a report', lambda: len(re.findall(r'vqf at', node.err)) >= 2)
+        assert node.end(signal.SIGINT) == 0
+    assert 'heading drift' in node.out
+    assert 'Traceback' not in node.err
