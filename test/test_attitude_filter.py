@@ -13,6 +13,7 @@ import pytest
 from reference import ROOT
 from scipy.spatial.transform import Rotation
 
+from spinning_top_sim.tools.inspect import main as inspect
 from spinning_top_sim.tools.simulate import main as simulate
 
 EXAMPLE = ROOT / 'examples/attitude_filter.py'
@@ -165,7 +166,8 @@ def test_live_it_follows_a_node_with_a_preset_and_ends_by_itself(example, peer, 
     files = [item for name in ('wavy', 'imu/bmi088')
              for item in ('--params-file', str(ROOT / f'config/{name}.yaml'))]
     follower = [str(EXAMPLE), '--filter', 'vqf', '--duration', '4', '--settle', '2']
-    with (SimNode(tmp_path / 'top', namespace='/waves', arguments=files) as top,
+    with (SimNode(tmp_path / 'top', {'record.enabled': True}, namespace='/waves',
+                  arguments=files) as top,
           SimNode(tmp_path / 'filter', namespace='/waves', program=follower) as node):
         assert node.wait() == 0, node.err
         noise, = peer.get(top, 'imu.gyroscope_noise_density')
@@ -178,6 +180,8 @@ def test_live_it_follows_a_node_with_a_preset_and_ends_by_itself(example, peer, 
     assert float(found[1]) < 3.0
     assert int(found[2]) > 100
     assert 'vqf at' in node.err
+    # The noise too is what the same parameters give offline, byte for byte.
+    assert inspect([str(next(top.folder.glob('*.mcap'))), '--verify']) == 0
 
 
 def test_live_it_ends_by_sigint_and_tells(example, tmp_path):

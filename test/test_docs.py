@@ -20,9 +20,8 @@ def test_architecture_names_every_module_and_example_and_no_other():
     tests = {path.name for path in (ROOT / 'test').glob('*.py')}
     examples = {path.name for path in (ROOT / 'examples').glob('*.py')}
     assert named - tests <= modules | examples
-    missing = (modules | examples) - named - {name for name in modules if name.startswith(('exact_', 'theta_',
-                                                                              'long_', 'errors'))}
-    assert not missing
+    parts = {name for name in modules if name.startswith(('exact_', 'theta_', 'long_', 'errors'))}
+    assert not (modules | examples) - named - parts
 
 
 def test_the_readme_begins_with_the_two_commands_and_lists_every_scene():
