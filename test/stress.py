@@ -204,22 +204,23 @@ def check_integrations(found, cases, motions, times):
     """
     The exact solution against an independent integration, within the integration's own error.
 
-    That is told by a second one, of longer steps, from a start 64 roundings away: more than the
-    first one makes in its 100 steps or so.  Four times their distance is taken, and the largest
-    so far: at an unstable pole they meet again, wherever they come from.
+    That is told by two more, of longer steps, from starts 64 roundings away: more than the first
+    one makes in its 100 steps or so.  Four times their distance is taken, and the largest so far:
+    at an unstable pole they meet again, wherever they come from.
     """
-    paths = [taylor.Path(cases, times, math.exp(-share), nudge)
-             for share, nudge in ((2.3, 0.0), (2.0, 64.0))]
-    (q, q2), ((theta, rate), (_, rate2)) = (
-        [path.quaternions() for path in paths], [path.tilt() for path in paths])
+    path = taylor.Path(cases, times, math.exp(-2.3))
+    others = [taylor.Path(cases, times, math.exp(-2.0), 64.0, way) for way in (0, 1)]
+    q, (theta, rate) = path.quaternions(), path.tilt()
+    apart = np.max([np.abs(q - other.quaternions()) for other in others], axis=0)
+    rate_apart = np.max([np.abs(rate - other.tilt()[1]) for other in others], axis=0)
     for i, (case, motion) in enumerate(zip(cases, motions, strict=True)):
-        own = 4.0 * np.maximum.accumulate(np.abs(q[i] - q2[i]).max(axis=1))
+        own = 4.0 * np.maximum.accumulate(apart[i].max(axis=1))
         # theta turns as far as the axis, twice as far as q; the direction of theta' turns with the
         # axis about the vertical.
         sine = np.sin(motion.theta)
         unit = natural_rate(case.top, case.start)
         with np.errstate(divide='ignore', invalid='ignore'):
-            own_rate = 4.0 * np.abs(rate[i] - rate2[i]) + own * unit / np.abs(sine)
+            own_rate = 4.0 * rate_apart[i] + own * unit / np.abs(sine)
         told = own < JUDGE
         found.count('integrated' if told.all() else 'integrated, in part')
         found.check(case, 'integration: q', np.abs(motion.quaternion - q[i]).max(axis=1)[told],

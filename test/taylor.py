@@ -26,10 +26,13 @@ class Path:
     share: of the radius of convergence, a step; e^-2 leaves e^-(2 * 24), below a long double
     nudge: moves the start by so many roundings of a long double, of 1 in p, of its scale in L:
     more than all roundings on the way do together, so that the distance shows their effect
+    way: of two, across each other; by one alone a start may stay on the path that is not left
     """
 
-    def __init__(self, cases, times, share, nudge):
-        self.nudge = np.array([1, -1, -1, 1, 1, -1, 1]) * nudge * np.finfo(LONG).eps
+    WAYS = ((1, -1, -1, 1, 1, -1, 1), (1, 1, -1, -1, 1, 1, -1))
+
+    def __init__(self, cases, times, share, nudge=0.0, way=0):
+        self.nudge = np.array(self.WAYS[way]) * nudge * np.finfo(LONG).eps
         self.cases, self.times = cases, np.asarray(times, LONG)
         self.lambda1 = _column(cases, lambda c: LONG(c.top.lambda1))
         self.fall = _column(cases, lambda c: LONG(c.top.mass) * LONG(c.top.gravity)
