@@ -34,6 +34,9 @@ AFTER_TOPICS = """| `/diagnostics` | diagnostic_msgs/msg/DiagnosticArray | 1 | y
   The odometry's twist is in the body frame.
 - `~/invariants`: one labelled dimension, {invariants}. Drifts are relative to the value the motion
   began with; the orientation error [rad] is against the exact solution.
+- `markers`: in `world_frame`, so no TF is needed: a cylinder with the top's mass and moments of inertia,
+  lines on it that show the spin, and the trace of the tip over the last `markers.trace_length`. Every
+  message has the whole trace; it is the exact solution's, and ends at the tip as the solver has it.
 - While paused nothing is sent. Stamps are the time of each sample on the grid k × period.
 
 ## Topics, services, parameters it listens to

@@ -48,7 +48,7 @@ def stepped(folder):
     """Four motions by steps, with noise, in a namespace."""
     return log_of(folder / 'stepped.mcap', '--duration', 3, '--command', '1.0:2.0:1.5',
                   '--command', '0:1.7:1.4', '--command', '2.0031:1.6:1.0', '--namespace', '/a/b',
-                  '-p', 'imu.gyroscope_noise_density:=0.01')
+                  '-p', 'imu.gyroscope_noise_density:=0.01', '-p', 'markers.enabled:=true')
 
 
 @pytest.fixture(scope='module')
@@ -56,7 +56,8 @@ def columns(folder):
     """The exact solution in columns, with commands between the stretches."""
     return log_of(folder / 'columns.mcap', '--duration', 12, '--command', '1.7:2.0:1.5',
                   '--command', '3.1:1.7:1.4',
-                  '-p', 'solver.method:=exact', '-p', 'imu.accelerometer_random_walk:=0.01')
+                  '-p', 'solver.method:=exact', '-p', 'imu.accelerometer_random_walk:=0.01',
+                  '-p', 'markers.enabled:=true')
 
 
 def told(capsys, *arguments):

@@ -57,8 +57,12 @@ class Top:
         About the centre of mass the moments obey the triangle inequality, so with the parallel
         axis theorem lambda3 <= 2 (lambda1 - M R^2).  The equations of motion do not need it.
         """
-        across_at_com = self.lambda1 - self.mass * self.com_distance ** 2
-        return self.lambda3 <= 2.0 * across_at_com * (1.0 + 1e-12)
+        return self.lambda3 <= 2.0 * self.lambda1_at_com * (1.0 + 1e-12)
+
+    @property
+    def lambda1_at_com(self) -> float:
+        """Moment of inertia across the axis about the centre of mass [kg m^2], by Steiner."""
+        return self.lambda1 - self.mass * self.com_distance * self.com_distance
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -38,6 +38,21 @@ class CdrWriter:
         """Append a uint32; return its offset."""
         return self._append('I', 4, value)
 
+    def int32(self, value: int) -> int:
+        """Append an int32; return its offset."""
+        return self._append('i', 4, value)
+
+    def flag(self, value: bool) -> int:
+        """Append a bool; return its offset."""
+        return self._append('?', 1, value)
+
+    def floats(self, values: Iterable[float]) -> int:
+        """Append single precision floats one after the other; return the first one's offset."""
+        at = self._align(4)
+        for value in values:
+            self._append('f', 4, value)
+        return at
+
     def stamp(self) -> int:
         """Append a builtin_interfaces/Time of zero; return its offset."""
         at = self._append('i', 4, 0)
@@ -74,18 +89,19 @@ class CdrWriter:
 class Template:
     """A serialized message whose stamp and numbers are replaced in place."""
 
-    def __init__(self, writer: CdrWriter, stamp_at: int | None,
+    def __init__(self, writer: CdrWriter, stamps_at: Sequence[int],
                  fields: Sequence[tuple[int, int]]) -> None:
         """
-        Take the bytes, the stamp's offset, and (offset, count) of each run of doubles to patch.
+        Take the bytes, the offsets of the stamp (none, one, or one of each part of an array),
+        and (offset, count) of each run of doubles to patch.
 
         What lies between the runs keeps its bytes.
         """
         self._buffer = writer.buffer
-        self._stamp_at = stamp_at
+        self._stamps_at = tuple(stamps_at)
         self._fields = tuple(fields)
         self._rows: Any = None
-        self._stamp = struct.Struct('<iI')
+        self._pack_stamp_into = struct.Struct('<iI').pack_into
         self._runs = [(struct.Struct(f'<{count}d').pack_into, at) for at, count in fields]
 
     def __len__(self) -> int:
@@ -95,8 +111,8 @@ class Template:
     def encode(self, stamp_ns: int, *runs: Sequence[float]) -> bytes:
         """Return the message with this stamp [ns] and one sequence of numbers a run."""
         buffer = self._buffer
-        if self._stamp_at is not None:
-            self._stamp.pack_into(buffer, self._stamp_at, *divmod(stamp_ns, NANOSECONDS))
+        for at in self._stamps_at:
+            self._pack_stamp_into(buffer, at, *divmod(stamp_ns, NANOSECONDS))
         for (pack_into, at), values in zip(self._runs, runs, strict=True):
             pack_into(buffer, at, *values)
         return bytes(buffer)
@@ -115,8 +131,8 @@ class Template:
             self._rows = numpy.empty(count, self._row_type())
             self._rows.view('u1').reshape(count, -1)[:] = numpy.frombuffer(self._buffer, 'u1')
         rows = self._rows[:count]
-        if self._stamp_at is not None:
-            rows['sec'], rows['nanosec'] = numpy.divmod(stamps_ns, NANOSECONDS)
+        for at in self._stamps_at:
+            rows[f'sec{at}'], rows[f'nanosec{at}'] = numpy.divmod(stamps_ns, NANOSECONDS)
         for i, run in enumerate(runs):
             field = rows[f'run{i}']
             if isinstance(run, numpy.ndarray) and run.ndim == 2 and len(run) == count:
@@ -134,23 +150,24 @@ class Template:
         return tuple(rows[f'run{i}'] for i in range(len(self._fields)))
 
     def _row_type(self) -> Any:
-        """Return a message as a numpy type: the runs, and the stamp if there is one."""
+        """Return a message as a numpy type: the runs, and the stamps if there are any."""
         import numpy  # noqa: PLC0415
 
         names = [f'run{i}' for i in range(len(self._fields))]
         formats: list[Any] = [('<f8', (number,)) for _, number in self._fields]
         offsets = [at for at, _ in self._fields]
-        if self._stamp_at is not None:
-            names += ['sec', 'nanosec']
+        for at in self._stamps_at:
+            names += [f'sec{at}', f'nanosec{at}']
             formats += ['<i4', '<u4']
-            offsets += [self._stamp_at, self._stamp_at + 4]
+            offsets += [at, at + 4]
         return numpy.dtype({'names': names, 'formats': formats, 'offsets': offsets,
                             'itemsize': len(self._buffer)})
 
     def field_at(self, at: int) -> tuple[int, int, int] | None:
         """Return run, element and offset of what holds a byte: run -1 is the stamp."""
-        if self._stamp_at is not None and 0 <= at - self._stamp_at < 8:
-            return -1, 0, self._stamp_at
+        for stamp_at in self._stamps_at:
+            if 0 <= at - stamp_at < 8:
+                return -1, 0, stamp_at
         for run, (begin, count) in enumerate(self._fields):
             if 0 <= at - begin < 8 * count:
                 element = (at - begin) // 8

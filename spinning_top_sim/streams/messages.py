@@ -9,11 +9,16 @@ a test compares every template with what rclpy serializes.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from spinning_top_sim.streams.cdr import CdrWriter, Template
 
 UNKNOWN_ORIENTATION = (-1.0,) + 8 * (0.0,)      # REP-145: no orientation in this message
 EXACT = 9 * (0.0,)
+CYLINDER, LINE_STRIP, LINE_LIST = 3, 4, 5       # visualization_msgs/Marker
+BODY_COLOR = (0.20, 0.40, 0.70, 1.0)            # red, green, blue, alpha
+AXIS_COLOR = (0.95, 0.75, 0.20, 1.0)
+TRACE_COLOR = (0.90, 0.30, 0.20, 1.0)
 
 
 def diagonal(variance: float) -> tuple[float, ...]:
@@ -32,7 +37,7 @@ def pose_stamped(frame_id: str) -> Template:
     """geometry_msgs/PoseStamped at the origin; runs: orientation x, y, z, w."""
     writer, stamp_at = _header(frame_id)
     writer.doubles((0.0, 0.0, 0.0))
-    return Template(writer, stamp_at, [(writer.doubles((0.0, 0.0, 0.0, 1.0)), 4)])
+    return Template(writer, [stamp_at], [(writer.doubles((0.0, 0.0, 0.0, 1.0)), 4)])
 
 
 def joint_state(names: Sequence[str]) -> Template:
@@ -42,7 +47,7 @@ def joint_state(names: Sequence[str]) -> Template:
     zeros = len(names) * (0.0,)
     runs = [(writer.double_sequence(zeros), len(names)) for _ in ('position', 'velocity')]
     writer.double_sequence(())
-    return Template(writer, stamp_at, runs)
+    return Template(writer, [stamp_at], runs)
 
 
 def imu(frame_id: str, orientation_covariance: Sequence[float],
@@ -56,7 +61,7 @@ def imu(frame_id: str, orientation_covariance: Sequence[float],
     writer.doubles(angular_velocity_covariance)
     runs.append((writer.doubles(3 * (0.0,)), 3))
     writer.doubles(linear_acceleration_covariance)
-    return Template(writer, stamp_at, runs)
+    return Template(writer, [stamp_at], runs)
 
 
 def odometry(frame_id: str, child_frame_id: str) -> Template:
@@ -69,7 +74,7 @@ def odometry(frame_id: str, child_frame_id: str) -> Template:
     writer.doubles(3 * (0.0,))                              # linear velocity: the pivot is fixed
     runs.append((writer.doubles(3 * (0.0,)), 3))
     writer.doubles(36 * (0.0,))
-    return Template(writer, stamp_at, runs)
+    return Template(writer, [stamp_at], runs)
 
 
 def float64_multi_array(labels: Sequence[str]) -> Template:
@@ -80,14 +85,83 @@ def float64_multi_array(labels: Sequence[str]) -> Template:
     writer.uint32(len(labels))                              # size
     writer.uint32(len(labels))                              # stride
     writer.uint32(0)                                        # data offset
-    return Template(writer, None,
+    return Template(writer, [],
                     [(writer.double_sequence(len(labels) * (0.0,)), len(labels))])
 
 
 def clock() -> Template:
     """rosgraph_msgs/Clock; no runs."""
     writer = CdrWriter()
-    return Template(writer, writer.stamp(), [])
+    return Template(writer, [writer.stamp()], [])
+
+
+def markers(frame_id: str, size: Sequence[float], lines: Sequence[float], line_width: float,
+            trace_points: int) -> Template:
+    """
+    visualization_msgs/MarkerArray: a cylinder, lines on it, and the trace if it has points.
+
+    size: of the cylinder, diameters and height [m];  lines: x, y, z of begin and end of each, in
+    the body frame [m];  trace_points: how many
+    runs: position and orientation of the cylinder, orientation of the lines, the trace's points
+    """
+    writer = CdrWriter()
+    writer.uint32(3 if trace_points else 2)
+    body = _marker(writer, frame_id, 'body', CYLINDER, size, BODY_COLOR)
+    axis = _marker(writer, frame_id, 'axis', LINE_LIST, (line_width, 0.0, 0.0), AXIS_COLOR, lines)
+    placed = [body, axis]
+    runs = [(body.position_at, 3), (body.orientation_at, 4), (axis.orientation_at, 4)]
+    if trace_points:
+        numbers = 3 * trace_points
+        trace = _marker(writer, frame_id, 'trace', LINE_STRIP, (0.5 * line_width, 0.0, 0.0),
+                        TRACE_COLOR, numbers * (0.0,))
+        placed.append(trace)
+        runs.append((trace.points_at, numbers))
+    return Template(writer, [marker.stamp_at for marker in placed], runs)
+
+
+class _Marker(NamedTuple):
+    """Where the parts of a marker stand that change."""
+
+    stamp_at: int
+    position_at: int
+    orientation_at: int
+    points_at: int
+
+
+def _marker(writer: CdrWriter, frame_id: str, namespace: str, kind: int, scale: Sequence[float],
+            color: Sequence[float], points: Sequence[float] = ()) -> _Marker:
+    """
+    Append a visualization_msgs/Marker of id 0 that stays until another takes its place.
+
+    points: x, y, z of each [m]
+    """
+    stamp_at = writer.stamp()
+    writer.string(frame_id)
+    writer.string(namespace)
+    writer.int32(0)                                         # id
+    writer.int32(kind)
+    writer.int32(0)                                         # action: add, or modify
+    position_at = writer.doubles((0.0, 0.0, 0.0))
+    orientation_at = writer.doubles((0.0, 0.0, 0.0, 1.0))
+    writer.doubles(scale)
+    writer.floats(color)
+    writer.stamp()                                          # lifetime: for ever
+    writer.flag(False)                                      # frame_locked
+    writer.uint32(len(points) // 3)
+    points_at = writer.doubles(points) if points else len(writer.buffer)
+    writer.uint32(0)                                        # colors
+    writer.string('')                                       # texture_resource
+    writer.stamp()                                          # texture: header, format, data
+    writer.string('')
+    writer.string('')
+    writer.uint32(0)
+    writer.uint32(0)                                        # uv_coordinates
+    writer.string('')                                       # text
+    writer.string('')                                       # mesh_resource
+    writer.string('')                                       # mesh_file: filename, data
+    writer.uint32(0)
+    writer.flag(False)                                      # mesh_use_embedded_materials
+    return _Marker(stamp_at, position_at, orientation_at, points_at)
 
 
 def string(text: str) -> bytes:

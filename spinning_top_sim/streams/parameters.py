@@ -138,6 +138,7 @@ STREAM_DEFAULTS = (
     ('ground_truth_imu', 200.0, True, 'ground_truth/imu (sensor_msgs/Imu, noise-free)'),
     ('ground_truth_odom', 100.0, True, 'ground_truth/odom (nav_msgs/Odometry)'),
     ('invariants', 10.0, True, '~/invariants (std_msgs/Float64MultiArray)'),
+    ('markers', 20.0, False, 'markers (visualization_msgs/MarkerArray)'),
     ('clock', 100.0, False, '/clock (rosgraph_msgs/Clock)'),
 )
 HIGHEST_RATE = 10_000.0
@@ -217,6 +218,10 @@ TABLE: tuple[Parameter, ...] = (
               'yaw about fixed axes', 'rad', effect=Effect.RESET),
     *_axes('gyroscope', 'rad/s'),
     *_axes('accelerometer', 'm/s^2'),
+    Parameter('markers.trace_length', 4.0, 'How far back the trace of the tip goes, 0 = no trace',
+              's', minimum=0.0, maximum=3600.0, effect=Effect.RESET),
+    Parameter('markers.trace_points', 200, 'Points of the trace, evenly spaced in time',
+              minimum=1, maximum=10_000, effect=Effect.RESET),
     Parameter('duration', 0.0, 'End after this much simulated time, 0 = never', 's',
               minimum=0.0),
     Parameter('record.enabled', False, 'Record from the start', effect=Effect.START),

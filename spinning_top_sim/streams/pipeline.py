@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -24,8 +25,9 @@ from spinning_top_sim.solvers.propagator import (
     propagate,
 )
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.topics import Invariants, Stream, all_streams
+from spinning_top_sim.streams.topics import Invariants, Markers, Stream, all_streams
 
 if TYPE_CHECKING:
     from spinning_top_sim.solvers.motion import ExactGrid
@@ -79,6 +81,8 @@ class Simulation:
             new.sent, new.skipped = old.sent, old.skipped
         self.streams = streams
         self._invariants = next(s for s in streams if isinstance(s, Invariants))
+        self._past = _Past(top, round(values['markers.trace_length'] * NANOSECONDS))
+        next(s for s in streams if isinstance(s, Markers)).axis_at = self.axis_at
         self._begin(solver, start, state, 0)
 
     def _begin(self, solver: Propagator, start: State, state: OneState, at_ns: int) -> None:
@@ -152,6 +156,17 @@ class Simulation:
             with contextlib.suppress(ValueError):
                 self._reference = ExactPropagator(self.top, self._anchor)
         return self._reference
+
+    def axis_at(self, t_ns: int) -> tuple[float, float, float]:
+        """
+        Return e3 in the world by the exact solution, at a time within the trace of `now_ns`.
+
+        Each motion is followed from its anchor to the command that ended it, that instant
+        included.  One that the closed form cannot hold stands at its anchor.
+        """
+        if t_ns <= self.anchor_ns and self._past:
+            return self._past.axis_at(t_ns)
+        return _axis(self.exact(), self._anchor, t_ns - self.anchor_ns)
 
     def advance(self, target_ns: int, publish_from_ns: int = 0,
                 give_way: Callable[[], bool] = lambda: False) -> bool:
@@ -267,8 +282,48 @@ class Simulation:
             raise ValueError(f'l3 = {l3!r}, lz = {lz!r} kg m^2/s: no motion from theta = '
                              f'{state.theta!r} rad: {error}') from error
         self._steps_before, self._evaluations_before = self.steps, self.evaluations
+        self._past.end(self.anchor_ns, self._anchor, at_ns)
         self._begin(solver, start, state_after, at_ns)
         self.history.append((at_ns, l3, lz))
+
+
+class _Past:
+    """The motions that commands have ended, as far back as the trace goes."""
+
+    def __init__(self, top: Top, length_ns: int) -> None:
+        self._top, self._length_ns = top, length_ns
+        self._motions: deque[tuple[int, int, State]] = deque()      # begin, end, start
+        self._followed: tuple[State, ExactPropagator | None] | None = None
+
+    def __bool__(self) -> bool:
+        """Whether there are any."""
+        return bool(self._motions)
+
+    def end(self, begin_ns: int, start: State, end_ns: int) -> None:
+        """Add the motion that a command ends; forget those that no trace reaches any more."""
+        self._motions.append((begin_ns, end_ns, start))
+        while self._motions[0][1] < end_ns - self._length_ns:
+            self._motions.popleft()
+
+    def axis_at(self, t_ns: int) -> tuple[float, float, float]:
+        """Return e3 in the world at a time up to the newest command."""
+        begin_ns, start = next((begin, start) for begin, end, start in self._motions
+                               if t_ns <= end)
+        if self._followed is None or self._followed[0] is not start:
+            exact = None
+            with contextlib.suppress(ValueError):
+                exact = ExactPropagator(self._top, start)
+            self._followed = start, exact
+        return _axis(self._followed[1], start, t_ns - begin_ns)
+
+
+def _axis(exact: ExactPropagator | None, start: State, ns: int) -> tuple[float, float, float]:
+    """Return e3 in the world at a time after the start of a motion."""
+    if exact is None:
+        across = math.sin(start.theta)
+        return across * math.cos(start.phi), across * math.sin(start.phi), math.cos(start.theta)
+    xy, z = exact.at_ns(ns).axis
+    return xy.real, xy.imag, z
 
 
 def _first_step(top: Top, start: State, values: Mapping[str, Any]) -> tuple[Propagator, OneState]:

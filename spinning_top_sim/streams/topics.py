@@ -13,7 +13,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from spinning_top_sim.physics.kinematics import Columns, OneState
-from spinning_top_sim.streams import messages
+from spinning_top_sim.physics.shape import shape_of
+from spinning_top_sim.streams import messages, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS, Template
 from spinning_top_sim.streams.imu import Imu, Sensor
 
@@ -218,6 +219,79 @@ class Invariants(Stream):
                  self.orientation_error(state, self.next_ns)),)
 
 
+class Markers(Stream):
+    """
+    The top and the trace of its tip for Foxglove and RViz, in the world frame: no TF is needed.
+
+    The body is the cylinder of `shape_of`; a line along the axis and down its side shows the spin.
+
+    Every message has the whole trace, so that a viewer who comes late, or moves about in a log,
+    sees it at once; yet it remembers no sample, for what is sent must not depend on who listened
+    when.  Its points are those of the exact solution at fixed times m x spacing before the sample,
+    and the tip of the body ends it: with a coarse `solver.rtol` one sees the body leave the path.
+    Before t = 0 it rests at the start.
+    """
+
+    parameter, topic, type_name = 'markers', 'markers', 'visualization_msgs/msg/MarkerArray'
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        super().__init__(values)
+        shape = self._shape = shape_of(parameters.top_of(values))
+        length_ns = round(values['markers.trace_length'] * NANOSECONDS)
+        self._count = min(values['markers.trace_points'], length_ns)
+        self._spacing_ns = max(1, length_ns // max(self._count, 1))
+        self._points: dict[int, tuple[float, float, float]] = {}    # of the last trace, by m
+        self.axis_at: Callable[[int], tuple[float, float, float]] = lambda t_ns: (0.0, 0.0, 1.0)
+        side = math.copysign(0.5 * shape.height, shape.tip)
+        # Slightly outside, to be seen.
+        rim, far, near = (1.01 * shape.radius, shape.centre + 1.01 * side,
+                          shape.centre - 1.01 * side)
+        lines = (0.0, 0.0, 0.0, 0.0, 0.0, shape.tip,
+                 0.0, 0.0, far, rim, 0.0, far,
+                 rim, 0.0, far, rim, 0.0, near,
+                 rim, 0.0, near, 0.0, 0.0, near)
+        self.template = messages.markers(
+            values['world_frame'], (2.0 * shape.radius, 2.0 * shape.radius, shape.height), lines,
+            0.02 * abs(shape.tip), self._count + 1 if self._count else 0)
+
+    def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
+        across, along = state.axis
+        axis = across.real, across.imag, along
+        centre = tuple(self._shape.centre * part for part in axis)
+        body = centre, state.quaternion, state.quaternion
+        if not self._count:
+            return body
+        tip = tuple(self._shape.tip * part for part in axis)
+        if isinstance(index, int):
+            return (*body, [number for point in (*self._trace(self.next_ns), tip)
+                            for number in point])
+        return (*body, self._traces(len(index), tip))
+
+    def _trace(self, t_ns: int) -> list[tuple[float, float, float]]:
+        """Return where the tip was at the times of the grid before t."""
+        newest = (t_ns - 1) // self._spacing_ns
+        known = self._points
+        self._points = {m: known.get(m) or self._tip_at(m * self._spacing_ns)
+                        for m in range(newest - self._count + 1, newest + 1)}
+        return list(self._points.values())
+
+    def _traces(self, count: int, tips: tuple[Any, ...]) -> Any:
+        """Return the points of the next `count` samples as rows of numbers."""
+        import numpy  # noqa: PLC0415 - offline only
+
+        rows = numpy.empty((count, self._count + 1, 3))
+        for k in range(count):
+            rows[k, :-1] = self._trace(self.next_ns + k * self.period_ns)
+        for axis, column in enumerate(tips):
+            rows[:, -1, axis] = column
+        return rows.reshape(count, -1)
+
+    def _tip_at(self, t_ns: int) -> tuple[float, float, float]:
+        x, y, z = self.axis_at(max(t_ns, 0))
+        tip = self._shape.tip
+        return tip * x, tip * y, tip * z
+
+
 class Clock(Stream):
     """Simulated time as the ROS clock."""
 
@@ -235,4 +309,4 @@ def all_streams(values: Mapping[str, Any], imu: Imu) -> list[Stream]:
     """Return every stream there is, in the order in which samples of one instant are sent."""
     return [Clock(values), Pose(values), JointStates(values), ImuRaw(values, imu),
             ImuData(values, imu), ImuBias(values, imu), GroundTruthImu(values, imu),
-            GroundTruthOdometry(values), Invariants(values)]
+            GroundTruthOdometry(values), Invariants(values), Markers(values)]

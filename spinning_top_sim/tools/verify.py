@@ -24,6 +24,9 @@ FIELDS = {
     'sensor_msgs/msg/Imu': ('orientation', 'angular_velocity', 'linear_acceleration'),
     'nav_msgs/msg/Odometry': ('pose.pose.orientation', 'twist.twist.angular'),
     'std_msgs/msg/Float64MultiArray': ('data',),
+    'visualization_msgs/msg/MarkerArray': (
+        'markers[0].pose.position', 'markers[0].pose.orientation',
+        'markers[1].pose.orientation', 'markers[2].points'),
 }
 
 
