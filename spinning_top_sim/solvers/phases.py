@@ -105,6 +105,12 @@ class StepPhases:
         return 2.0 * (half_theta
                       + math.tau * round((self._half_theta - half_theta) / math.tau))
 
+    def on_lines(self, alpha: complex, beta: complex, line: float) -> tuple[complex, complex]:
+        """Return alpha and beta with the phases known of those that cross a pole."""
+        a, b = self._alpha, self._beta
+        return (cmath.rect(*a.on_line(alpha, a.phase + line)) if a.crosses else alpha,
+                cmath.rect(*b.on_line(beta, b.phase - line)) if b.crosses else beta)
+
     def _continue(self, alpha: complex, beta: complex, line: float) -> Polar:
         a, b = self._alpha, self._beta
         return (a.on_line(alpha, a.phase + line) if a.crosses
