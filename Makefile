@@ -46,7 +46,7 @@ help:
 	@echo '             through both solvers: an hour'
 	@echo 'make benchmark  accuracy, stability and cost beside other programs, and the noise of the'
 	@echo '             IMU, into docs/ (an hour, in an environment of its own, .venv-benchmark)'
-	@echo 'make docs    write the interface page and the pictures anew'
+	@echo 'make docs    write the interface page, the plain URDF and the pictures anew'
 	@echo 'make lint    ruff and mypy'
 	@echo 'make build   build with colcon in a temporary workspace and run what was installed'
 	@echo 'make clean   remove $(VENV) and caches; logs stay'
@@ -98,8 +98,9 @@ $(VENV)/.peers: benchmark/requirements.txt $(VENV)/.deps-test
 	@$(PIP) -r benchmark/requirements.txt
 	@touch '$@'
 
-docs: $(VENV)/.deps-plot $(VENV)/.package
+docs: $(VENV)/.deps-plot $(VENV)/.deps-test $(VENV)/.package
 	'$(VENV)/bin/python' docs/interface.py
+	'$(VENV)/bin/python' docs/urdf.py
 	'$(VENV)/bin/python' docs/figures.py
 
 lint: $(VENV)/.deps-test $(VENV)/.deps-lint $(VENV)/.package

@@ -65,6 +65,8 @@ setup(
             'rosbags>=0.10.11,<0.12',
             'scipy>=1.11,<2',
             'vqf>=2.1,<3',
+            'xacro>=2.1,<3',
+            'yourdfpy>=0.0.60,<0.1',
         ],
         # simulate: parameter files, a progress bar;  inspect: tables
         'tools': ['PyYAML>=6.0,<7', 'rich>=12', 'tqdm>=4.64,<5'],

@@ -2,6 +2,7 @@
 """The package as colcon, pip and `ros2 run` see it: manifest, versions, executables, files."""
 
 import os
+import re
 import subprocess
 import sys
 from importlib.metadata import PackageNotFoundError, distribution
@@ -76,15 +77,27 @@ def test_the_manifest_names_every_ros_package_that_is_imported():
     declared = {dependency.name for dependency in
                 parse_package(str(ROOT / 'package.xml')).exec_depends}
     imported = set()
-    for path in (ROOT / NAME).rglob('*.py'):
+    for path in (*(ROOT / NAME).rglob('*.py'), *(ROOT / 'launch').glob('*.py')):
         for line in path.read_text(encoding='utf-8').splitlines():
             words = line.split()
             if words[:1] in (['import'], ['from']) and len(words) > 1:
                 imported.add(words[1].split('.')[0])
     ros = {name for name in imported
-           if name in {'rclpy', 'launch', 'launch_ros', 'ament_index_python', 'rcl_interfaces'}
+           if name in {'rclpy', 'launch', 'launch_ros', 'ament_index_python', 'rcl_interfaces',
+                       'xacro'}
            or name.endswith(('_msgs', '_srvs'))}
     assert ros <= declared
+    assert {'launch', 'launch_ros', 'xacro'} <= ros
+
+
+def test_the_manifest_names_every_package_that_is_launched():
+    declared = {dependency.name for dependency in
+                parse_package(str(ROOT / 'package.xml')).exec_depends} | {NAME}
+    sources = [*(ROOT / 'launch').glob('*.py'), ROOT / NAME / 'nodes/launching.py']
+    named = re.compile(r"(?:package=|STATE_PUBLISHER = )'(\w+)'")
+    launched = {name for path in sources for name in named.findall(path.read_text())}
+    assert launched == {NAME, 'robot_state_publisher', 'rviz2'}
+    assert launched <= declared
 
 
 def test_versions_agree(setup_py):
@@ -124,6 +137,20 @@ def test_a_script_can_be_executed(script):
 
 
 @pytest.mark.parametrize('script', SCRIPTS, ids=lambda path: path.name)
+def test_a_script_helps_and_does_nothing(script, tmp_path):
+    if script.name in {'sim_node', 'replay_node'}:
+        pytest.importorskip('rclpy')
+    paths = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get('PYTHONPATH')])])
+    done = subprocess.run([sys.executable, script, '--help'], cwd=tmp_path, timeout=60,
+                          env={**os.environ, 'PYTHONPATH': paths}, capture_output=True, text=True,
+                          check=False)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert done.stdout.startswith(f'usage: {script.name} ')
+    assert len(done.stdout.splitlines()) > 8
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize('script', SCRIPTS, ids=lambda path: path.name)
 def test_an_installed_executable_runs_where_ros2_run_looks(script, prefix):
     installed = prefix / 'lib' / NAME / script.name
     search_path = f'{Path(sys.executable).parent}{os.pathsep}{os.environ.get("PATH", "")}'
@@ -142,6 +169,7 @@ def test_the_share_folder_is_complete(prefix):
     for folder, pattern in (('config', '*.yaml'), ('config/imu', '*.yaml'),
                             ('launch', '*.launch.*'), ('urdf', '*'), ('rviz', '*.rviz')):
         there = {path.name for path in (share / folder).glob('*') if path.is_file()}
+        assert there, folder
         assert there == {path.name for path in (ROOT / folder).glob(pattern)}, folder
 
 

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Replay a log, with the TF of the top that it is of and, if wanted, RViz.
+
+  ros2 launch spinning_top_sim replay.launch.py file:=run.mcap loop:=true rviz:=true
+"""
+
+from pathlib import Path
+
+from ament_index_python.packages import get_package_share_directory
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction
+from launch_ros.actions import Node
+
+from spinning_top_sim.nodes import launching
+from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.tools.rerun import NotOursError, read_account
+
+SHARE = Path(get_package_share_directory('spinning_top_sim'))
+SWITCH = ['true', 'false']
+
+
+def generate_launch_description() -> LaunchDescription:
+    return LaunchDescription([
+        DeclareLaunchArgument('file', description='The log (.mcap)'),
+        DeclareLaunchArgument('rate', default_value='1.0', description='Recorded over real time'),
+        DeclareLaunchArgument(
+            'start', default_value='0.0', description='Begin so many seconds after its begin'),
+        DeclareLaunchArgument(
+            'loop', default_value='false', choices=SWITCH, description='Begin again at the end'),
+        DeclareLaunchArgument(
+            'clock', default_value='false',
+            description="true, or Hz: publish the log's time on /clock; TF and RViz follow it"),
+        DeclareLaunchArgument(
+            'partial', default_value='false', choices=SWITCH,
+            description='Play what is whole of a torn log'),
+        DeclareLaunchArgument(
+            'tf', default_value='true', choices=SWITCH,
+            description="Run robot_state_publisher, for a log of sim_node's"),
+        DeclareLaunchArgument(
+            'rviz', default_value='false', choices=SWITCH, description='Run RViz'),
+        OpaqueFunction(function=_nodes)])
+
+
+def _nodes(context: LaunchContext) -> list:
+    given = {name: context.launch_configurations[name] for name in (
+        'file', 'rate', 'start', 'loop', 'clock', 'partial', 'tf', 'rviz')}
+    on = {name: launching.switch(name, given[name])
+          for name in ('loop', 'partial', 'tf', 'rviz')}
+    options = ['--rate', str(launching.number('rate', given['rate'])),
+               '--start', str(launching.number('start', given['start'], zero=True))]
+    options += [f'--{name}' for name in ('loop', 'partial') if on[name]]
+    clocked = given['clock'].lower() != 'false'
+    if clocked:
+        options.append('--clock')
+        if given['clock'].lower() != 'true':
+            options.append(str(launching.number('clock', given['clock'])))
+    node = Node(package='spinning_top_sim', executable='replay_node', output='screen',
+                emulate_tty=True, arguments=[given['file'], *options])
+    actions = launching.until_it_ends(node)
+    if not (on['tf'] or on['rviz']):
+        return actions
+    try:
+        with LogReader(Path(given['file'])) as log:
+            account = read_account(log)
+    except (LogError, NotOursError, OSError) as error:
+        # What cannot be played replay_node will tell.
+        return [*actions, LogInfo(msg=f'neither TF nor RViz: {error}')]
+    topics = {name: topic for topic, name in account.topics.items()}
+    namespace = _namespace(topics)
+    if on['tf'] and 'joint_states' in topics:
+        actions += launching.state_publisher(
+            SHARE, account.now, namespace, topics['joint_states'], clocked)
+    if on['rviz']:
+        actions.append(launching.rviz(SHARE, account.now['world_frame'], namespace, clocked))
+    return actions
+
+
+def _namespace(topics: dict[str, str]) -> str:
+    """Return the namespace that the node had: what its topics have before their own names."""
+    for name, topic in topics.items():
+        if not name.startswith(('/', '~')) and topic.endswith(f'/{name}'):
+            return topic.removesuffix(name).strip('/')
+    return ''

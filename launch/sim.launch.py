@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Simulate a scene, with TF and, if wanted, RViz.
+
+  ros2 launch spinning_top_sim sim.launch.py scene:=looping rviz:=true
+  ros2 launch spinning_top_sim sim.launch.py namespace:=left set:='spin.l3:=2.0 seed:=7'
+"""
+
+import shlex
+from pathlib import Path
+
+from ament_index_python.packages import get_package_share_directory
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+from spinning_top_sim.nodes import launching
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
+
+SHARE = Path(get_package_share_directory('spinning_top_sim'))
+SCENES = sorted(path.stem for path in (SHARE / 'config').glob('*.yaml'))
+SWITCH = ['true', 'false']
+
+
+def generate_launch_description() -> LaunchDescription:
+    return LaunchDescription([
+        DeclareLaunchArgument(
+            'scene', default_value='cusp',
+            description=f'Parameter file: one of {", ".join(SCENES)}, or a path'),
+        DeclareLaunchArgument(
+            'params_file', default_value='',
+            description="Another parameter file whose values replace the scene's"),
+        DeclareLaunchArgument(
+            'set', default_value='',
+            description='Parameters that replace those of the files: '
+            "'NAME:=VALUE NAME:=VALUE ...'"),
+        DeclareLaunchArgument(
+            'namespace', default_value='', description='Namespace of all nodes'),
+        DeclareLaunchArgument(
+            'frame_prefix', default_value='auto',
+            description='Before the names of all frames but world_frame; auto: the namespace '
+            'and a /, so that two tops share one TF tree'),
+        DeclareLaunchArgument(
+            'record', default_value='false',
+            description='true: record into the working directory; or the path of a file (.mcap) '
+            'or folder'),
+        DeclareLaunchArgument(
+            'use_sim_time', default_value='false', choices=SWITCH,
+            description="Follow another node's /clock"),
+        DeclareLaunchArgument(
+            'tf', default_value='true', choices=SWITCH,
+            description='Run robot_state_publisher'),
+        DeclareLaunchArgument(
+            'rviz', default_value='false', choices=SWITCH, description='Run RViz'),
+        DeclareLaunchArgument(
+            'markers', default_value=LaunchConfiguration('rviz'), choices=SWITCH,
+            description='Publish the topic markers'),
+        OpaqueFunction(function=_nodes)])
+
+
+def _nodes(context: LaunchContext) -> list:
+    given = {name: context.launch_configurations[name] for name in (
+        'scene', 'params_file', 'set', 'namespace', 'frame_prefix', 'record', 'use_sim_time',
+        'tf', 'rviz', 'markers')}
+    on = {name: launching.switch(name, given[name])
+          for name in ('use_sim_time', 'tf', 'rviz', 'markers')}
+    namespace = given['namespace'].strip('/')
+    files = [_scene_file(given['scene']), *filter(None, [given['params_file']])]
+    values = {}
+    for path in files:
+        values.update(read_scene(path))
+    asked = dict(map(parse_assignment, shlex.split(given['set'])))
+    values = parameters.checked({**values, **asked})
+    prefix = given['frame_prefix']
+    if prefix == 'auto':
+        prefix = f'{namespace}/' if namespace else ''
+    asked |= {name: prefix + values[name] for name in ('body_frame', 'imu.frame_id')}
+    if on['markers']:
+        asked['markers.enabled'] = True
+    if given['record'] != 'false':
+        asked['record.enabled'] = True
+        if given['record'] != 'true':
+            asked['record.uri'] = given['record']
+    values = parameters.checked({**values, **asked})
+
+    node = Node(package='spinning_top_sim', executable='sim_node', namespace=namespace,
+                output='screen', emulate_tty=True, sigterm_timeout='15',
+                parameters=[*map(str, files), {
+                    **{name: list(value) if isinstance(value, tuple) else value
+                       for name, value in asked.items()},
+                    'use_sim_time': on['use_sim_time']}])
+    actions = launching.until_it_ends(node)
+    if on['tf']:
+        actions += launching.state_publisher(
+            SHARE, values, namespace, launching.absolute(namespace, 'joint_states'),
+            on['use_sim_time'])
+    if on['rviz']:
+        actions.append(launching.rviz(SHARE, values['world_frame'], namespace,
+                                      on['use_sim_time']))
+    return actions
+
+
+def _scene_file(scene: str) -> Path:
+    if scene in SCENES:
+        return SHARE / 'config' / f'{scene}.yaml'
+    if not Path(scene).is_file():
+        raise ValueError(f'scene = {scene!r}: there is no such file; must be a path or one of '
+                         f'{", ".join(SCENES)}')
+    return Path(scene)

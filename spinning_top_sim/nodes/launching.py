@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the launch files share: switches, the frames of a top, and who shows them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ament_index_python.packages import PackageNotFoundError, get_package_prefix
+from launch import Action
+from launch.actions import EmitEvent, LogInfo, RegisterEventHandler
+from launch.event_handlers import OnProcessExit
+from launch.events import Shutdown
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+
+from spinning_top_sim.tools.urdf import inertia_warning, robot_description
+
+STATE_PUBLISHER = 'robot_state_publisher'
+# The highest it takes [Hz].
+HIGHEST_PUBLISH_FREQUENCY = 1000.0
+SWITCHES = {'true': True, 'false': False}
+
+
+def switch(name: str, text: str) -> bool:
+    """Return whether an argument is true.  Raises ValueError where it is neither."""
+    if text.lower() not in SWITCHES:
+        raise ValueError(f'{name} = {text!r}: must be true or false')
+    return SWITCHES[text.lower()]
+
+
+def number(name: str, text: str, *, zero: bool = False) -> float:
+    """Return a number > 0 (or >= 0).  Raises ValueError for anything else."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and (value > 0.0 or (zero and value == 0.0))):
+        raise ValueError(f'{name} = {text!r}: must be a number {">=" if zero else ">"} 0')
+    return value
+
+
+def absolute(namespace: str, topic: str) -> str:
+    """Return a topic's full name in a namespace."""
+    return '/'.join(['', *filter(None, [namespace.strip('/'), topic])])
+
+
+def state_publisher(share: Path, values: Mapping[str, Any], namespace: str, joint_states: str,
+                    use_sim_time: bool) -> list[Action]:
+    """
+    Return what puts joint states (the topic's full name) into TF.
+
+    share: of this package;  values: checked parameters.  Raises ValueError for impossible frames.
+    Where robot_state_publisher is not installed there is no TF, and a line that says so.
+    """
+    try:
+        get_package_prefix(STATE_PUBLISHER)
+    except PackageNotFoundError:
+        return [LogInfo(msg=f'no TF: the package {STATE_PUBLISHER} is not installed')]
+    try:
+        description = robot_description(values, share / 'urdf')
+    except ImportError:
+        return [LogInfo(msg='no TF: the package xacro is not installed')]
+    warning = inertia_warning(values)
+    said: list[Action] = [LogInfo(msg=f'WARNING: {warning}')] if warning else []
+    return [*said, Node(
+        package=STATE_PUBLISHER, executable=STATE_PUBLISHER, namespace=namespace,
+        remappings=[('joint_states', joint_states)], parameters=[{
+            'robot_description': ParameterValue(description, value_type=str),
+            'publish_frequency': min(values['joint_states.rate'], HIGHEST_PUBLISH_FREQUENCY),
+            'use_sim_time': use_sim_time}])]
+
+
+def rviz(share: Path, world_frame: str, namespace: str, use_sim_time: bool) -> Node:
+    """Return RViz, looking at the top of a namespace.  Raises LookupError without rviz2."""
+    get_package_prefix('rviz2')     # before anything is started
+    return Node(
+        package='rviz2', executable='rviz2', namespace=namespace,
+        arguments=['-d', str(share / 'rviz/spinning_top.rviz'), '-f', world_frame],
+        remappings=[(f'/{topic}', absolute(namespace, topic))
+                    for topic in ('markers', 'robot_description')],
+        parameters=[{'use_sim_time': use_sim_time}])
+
+
+def until_it_ends(node: Node) -> list[Action]:
+    """Return a node, and the end of everything when it ends."""
+    return [node, RegisterEventHandler(OnProcessExit(
+        target_action=node, on_exit=[EmitEvent(event=Shutdown(reason='it has ended'))]))]

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The robot description of a scene: urdf/spinning_top.urdf.xacro with the scene's parameters."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from spinning_top_sim.streams import parameters
+
+NAME = 'spinning_top.urdf.xacro'
+# Arguments of the xacro file and the parameters they are.
+NUMBERS = {name: f'top.{name}' for name in ('mass', 'com_distance', 'lambda1', 'lambda3')}
+VECTORS = {'imu_lever_arm': 'imu.lever_arm', 'imu_rpy': 'imu.rpy'}
+FRAMES = {'world_frame': 'world_frame', 'body_frame': 'body_frame', 'imu_frame_id': 'imu.frame_id'}
+BETWEEN = ('precession_link', 'nutation_link')
+FRAME_NAME = re.compile(r'[\w.-]+(/[\w.-]+)*')
+
+
+def arguments(values: Mapping[str, Any]) -> dict[str, str]:
+    """
+    Return the arguments of the xacro file for checked parameters.
+
+    The frames between world and body have the prefix of the body's: a/base_link, a/nutation_link.
+    Raises ValueError for frames that no tree can have, naming the parameter and what is allowed.
+    """
+    for name in FRAMES.values():
+        if not FRAME_NAME.fullmatch(values[name]):
+            raise ValueError(f'{name} = {values[name]!r}: must be letters, digits, _ . - with / '
+                             'between, to be a frame of the robot description')
+    world, body, imu = (values[name] for name in FRAMES.values())
+    prefix = body[:body.rfind('/') + 1]
+    between = [prefix + name for name in BETWEEN]
+    for name, value, others in (('world_frame', world, [body, imu, *between]),
+                                ('body_frame', body, between), ('imu.frame_id', imu, between)):
+        if value in others:
+            raise ValueError(f'{name} = {value!r}: is the name of another frame of the robot '
+                             'description; must be one of its own')
+    mounted = any(values['imu.lever_arm']) or any(values['imu.rpy'])
+    if imu == body and mounted:
+        raise ValueError(f'imu.frame_id = {imu!r}: must not be body_frame, for imu.lever_arm or '
+                         'imu.rpy is not zero')
+    return {**{name: repr(values[parameter]) for name, parameter in NUMBERS.items()},
+            **{name: ' '.join(map(repr, values[parameter]))
+               for name, parameter in VECTORS.items()},
+            **{name: values[parameter] for name, parameter in FRAMES.items()}, 'prefix': prefix}
+
+
+def robot_description(values: Mapping[str, Any], folder: str | Path) -> str:
+    """
+    Return the URDF for checked parameters.
+
+    folder: with the xacro file.  Raises ValueError as `arguments` does, ImportError without xacro.
+    """
+    import xacro  # noqa: PLC0415
+
+    document = xacro.process_file(str(Path(folder) / NAME), mappings=arguments(values))
+    text: str = document.documentElement.toprettyxml(indent='  ')
+    return f'<?xml version="1.0"?>\n{text}'
+
+
+def inertia_warning(values: Mapping[str, Any]) -> str:
+    """Return why the robot description has no inertia, '' if it has."""
+    top = parameters.top_of(values)
+    if top.mass > 0.0 and top.lambda1_at_com > 0.0 and top.is_realizable:
+        return ''
+    return (f'top.mass = {top.mass!r} kg, top.com_distance = {top.com_distance!r} m, '
+            f'top.lambda1 = {top.lambda1!r} and top.lambda3 = {top.lambda3!r} kg m^2: '
+            'no rigid body has these (mass > 0, lambda3 <= 2 (lambda1 - M R^2)), so the '
+            'body is without <inertial>; frames and shapes are there')

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The robot description: its forward kinematics, by a library of other people, are the pose."""
+
+import runpy
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from reference import ROOT, SCENES, scene_parameters
+
+from spinning_top_sim.physics.shape import shape_of
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.imu import Imu
+from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.topics import JOINTS, JointStates, Pose
+from spinning_top_sim.tools import urdf
+
+pytest.importorskip('xacro')
+SECOND = 1_000_000_000
+MOUNTED = {'imu.lever_arm': (0.1, -0.05, 0.3), 'imu.rpy': (0.3, -0.2, 1.1)}
+ILLEGAL = {'no mass': {'top.mass': 0.0}, 'too flat': {'top.lambda3': 1.0},
+           'too far out': {'top.com_distance': 1.0}, 'at the edge': {'top.lambda3': 0.1561}}
+
+
+def described(values, folder=ROOT / 'urdf'):
+    return urdf.robot_description(parameters.checked(values), folder)
+
+
+def element(values):
+    return ElementTree.fromstring(described(values))
+
+
+def robot(tmp_path, values):
+    yourdfpy = pytest.importorskip('yourdfpy')
+    path = tmp_path / 'top.urdf'
+    path.write_text(described(values), encoding='utf-8')
+    return yourdfpy.URDF.load(str(path), build_scene_graph=True, load_meshes=False)
+
+
+def matrix(q):
+    x, y, z, w = q
+    return np.array([
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+        [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
+        [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)]])
+
+
+# ---------------------------------------------------------------------------------- kinematics
+
+
+@pytest.mark.parametrize('scene', SCENES)
+def test_the_joint_states_put_base_link_where_the_pose_is(tmp_path, scene):
+    values = {**scene_parameters(scene), **MOUNTED}
+    model = robot(tmp_path, values)
+    simulation = Simulation(parameters.checked(values))
+    pose = next(s for s in simulation.streams if isinstance(s, Pose))
+    joints = next(s for s in simulation.streams if isinstance(s, JointStates))
+    poses, positions = [], []
+    pose.record = lambda stamp, data: poses.append(pose.template.decode_many(data)[0][0])
+    joints.record = lambda stamp, data: positions.append(joints.template.decode_many(data)[0][0])
+    simulation.advance(5 * SECOND)
+    assert len(poses) == len(positions) == 501
+    assert model.actuated_joint_names == list(JOINTS)
+    arm = np.array(MOUNTED['imu.lever_arm'])
+    mounting = Imu(simulation.values)
+    state = simulation.state()
+    imu = matrix(mounting.orientation(state))
+    # Unwrapped angles of thousands of radians cannot be told to 1e-12.
+    limit = max(1e-12, 2.0 * np.spacing(np.abs(positions).max()))
+    worst = 0.0
+    for q, angles in zip(poses, positions, strict=True):
+        model.update_cfg(dict(zip(JOINTS, angles, strict=True)))
+        found = model.get_transform('base_link', 'world')
+        worst = max(worst, np.abs(found[:3, :3] - matrix(q)).max(), np.abs(found[:3, 3]).max())
+        place = model.get_transform('imu_link', 'world')[:3, 3]
+        worst = max(worst, np.abs(place - matrix(q) @ arm).max())
+    assert worst < limit
+    assert np.abs(model.get_transform('imu_link', 'world')[:3, :3] - imu).max() < limit
+
+
+# ------------------------------------------------------------------------------------- frames
+
+
+def links(values):
+    return [link.get('name') for link in element(values).iter('link')]
+
+
+def test_frames_are_those_of_the_parameters():
+    assert links({}) == ['world', 'precession_link', 'nutation_link', 'base_link', 'imu_link']
+    assert links({'world_frame': 'map', 'body_frame': 'a/b/wheel', 'imu.frame_id': 'a/sensor'}
+                 ) == ['map', 'a/b/precession_link', 'a/b/nutation_link', 'a/b/wheel', 'a/sensor']
+
+
+def test_an_imu_in_the_body_frame_has_no_frame_of_its_own():
+    assert links({'imu.frame_id': 'base_link'})[-1] == 'base_link'
+    with pytest.raises(ValueError, match=r"imu\.frame_id = 'base_link'.*lever_arm"):
+        described({'imu.frame_id': 'base_link', **MOUNTED})
+
+
+@pytest.mark.parametrize(('values', 'named'), [
+    ({'world_frame': ''}, "world_frame = ''"), ({'body_frame': '/base'}, "body_frame = '/base'"),
+    ({'body_frame': 'a b'}, 'body_frame'), ({'imu.frame_id': '${1}'}, r'imu\.frame_id'),
+    ({'world_frame': 'base_link'}, 'world_frame'), ({'imu.frame_id': 'world'}, 'world_frame'),
+    ({'body_frame': 'nutation_link'}, 'body_frame'),
+    ({'imu.frame_id': 'precession_link'}, r'imu\.frame_id')])
+def test_frames_that_no_tree_has_are_refused(values, named):
+    with pytest.raises(ValueError, match=f'{named}.*must be'):
+        described(values)
+
+
+# ------------------------------------------------------------------------- inertia, appearance
+
+
+@pytest.mark.parametrize('scene', SCENES)
+def test_the_inertia_is_that_of_the_top_about_its_centre_of_mass(scene):
+    top = parameters.top_of(parameters.checked(scene_parameters(scene)))
+    (inertial,) = element(scene_parameters(scene)).iter('inertial')
+    mass = float(inertial.find('mass').get('value'))
+    *xy, com = map(float, inertial.find('origin').get('xyz').split())
+    moments = {name: float(value) for name, value in inertial.find('inertia').attrib.items()}
+    assert (mass, xy, com) == (top.mass, [0.0, 0.0], top.com_distance)
+    assert moments['ixx'] == moments['iyy']
+    assert moments['ixx'] + mass * com * com == pytest.approx(top.lambda1, rel=1e-14)
+    assert moments['izz'] == top.lambda3
+    assert moments['ixy'] == moments['ixz'] == moments['iyz'] == 0.0
+    assert urdf.inertia_warning(parameters.checked(scene_parameters(scene))) == ''
+
+
+@pytest.mark.parametrize('name', ILLEGAL)
+def test_an_inertia_that_no_body_has_is_left_out_with_a_warning(name):
+    values = ILLEGAL[name]
+    assert list(element(values).iter('inertial')) == []
+    warning = urdf.inertia_warning(parameters.checked(values))
+    for parameter, value in values.items():
+        assert f'{parameter} = {value!r}' in warning
+    assert 'lambda3 <= 2' in warning
+
+
+@pytest.mark.parametrize('values', [{}, *ILLEGAL.values(), {'top.com_distance': -0.1},
+                                    {'top.com_distance': 0.0}, *map(scene_parameters, SCENES)])
+def test_it_looks_as_the_markers_do(values):
+    shape = shape_of(parameters.top_of(parameters.checked(values)))
+    visuals = {visual.get('name'): visual for visual in element(values).iter('visual')}
+    body, axis = (visuals[name].find('geometry/cylinder') for name in ('body', 'axis'))
+    found = [float(body.get('radius')), float(body.get('length')),
+             *(float(visuals[name].find('origin').get('xyz').split()[2])
+               for name in ('body', 'axis')), float(axis.get('length'))]
+    expected = [shape.radius, shape.height, shape.centre, 0.5 * shape.tip, abs(shape.tip)]
+    assert found == pytest.approx(expected, rel=1e-12)
+
+
+# -------------------------------------------------------------------------------------- files
+
+
+def test_the_defaults_of_the_xacro_file_are_the_nodes():
+    import xacro
+
+    bare = xacro.process_file(str(ROOT / 'urdf' / urdf.NAME)).documentElement.toxml()
+    full = ElementTree.canonicalize(described({}), strip_text=True)
+    assert ElementTree.canonicalize(bare, strip_text=True) == full
+
+
+def test_the_plain_file_is_written_from_the_xacro_file():
+    text = runpy.run_path(str(ROOT / 'docs/urdf.py'))['description']()
+    assert (ROOT / 'urdf/spinning_top.urdf').read_text(encoding='utf-8') == text
+    assert str(ROOT) not in text
