@@ -29,6 +29,10 @@ class CdrWriter:
         self.buffer += bytes(-(len(self.buffer) - len(ENCAPSULATION)) % size)
         return len(self.buffer)
 
+    def end(self) -> None:
+        """Pad to four bytes, as RTPS does: what arrives is then what was sent."""
+        self._align(4)
+
     def _append(self, code: str, size: int, value: float) -> int:
         at = self._align(size)
         self.buffer += struct.pack('<' + code, value)

@@ -116,6 +116,7 @@ def markers(frame_id: str, size: Sequence[float], lines: Sequence[float], line_w
                         TRACE_COLOR, numbers * (0.0,))
         placed.append(trace)
         runs.append((trace.points_at, numbers))
+    writer.end()
     return Template(writer, [marker.stamp_at for marker in placed], runs)
 
 
