@@ -48,7 +48,7 @@ help:
 	@echo '             IMU, into docs/ (an hour, in an environment of its own, .venv-benchmark)'
 	@echo 'make docs    write the interface page, the plain URDF and the pictures anew'
 	@echo 'make lint    ruff and mypy'
-	@echo 'make build   build with colcon in a temporary workspace and run what was installed'
+	@echo 'make build   build with colcon in a temporary workspace, run and test what was installed'
 	@echo 'make clean   remove $(VENV) and caches; logs stay'
 	@echo
 	@echo 'PYTHON=$(PYTHON)  the interpreter (3.11 or newer)   VENV=$(VENV)  where to install'
@@ -107,7 +107,7 @@ lint: $(VENV)/.deps-test $(VENV)/.deps-lint $(VENV)/.package
 	'$(VENV)/bin/ruff' check . scripts/*
 	'$(VENV)/bin/mypy'
 
-build: $(VENV)/.deps-colcon $(VENV)/.package
+build: $(VENV)/.deps-colcon $(VENV)/.deps-test $(VENV)/.package
 	.ci/colcon-build '$(VENV)'
 
 clean:
