@@ -99,6 +99,26 @@ def test_a_stream_sends_the_same_whoever_else_listens():
     assert [entry for entry in taken if entry[0] == 'pose'] == taken_alone
 
 
+def test_where_publishing_fails_the_log_has_the_instant_whole():
+    """So it is when a signal takes the context away in the midst of it."""
+    undisturbed = simulate()
+    expected = listen(undisturbed)
+    undisturbed.advance(SECOND)
+    simulation = simulate()
+    taken = listen(simulation)
+
+    def fail(data):
+        if simulation.now_ns >= SECOND // 3:
+            raise RuntimeError('the context is gone')
+
+    stream(simulation, 'joint_states').publish = fail
+    with pytest.raises(RuntimeError, match='gone'):
+        simulation.advance(SECOND)
+    last = taken[-1][1]
+    assert EPOCH_NS + SECOND // 3 < last < EPOCH_NS + SECOND // 2
+    assert taken == [entry for entry in expected if entry[1] <= last]
+
+
 def test_samples_are_on_the_grid_and_in_order_of_time():
     simulation = simulate()
     taken = listen(simulation)

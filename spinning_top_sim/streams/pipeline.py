@@ -243,6 +243,7 @@ class Simulation:
     def _send(self, t_ns: int, streams: list[Stream], in_time: bool) -> None:
         state = self.solver.at_ns(t_ns - self.anchor_ns)
         stamp_ns = self.epoch_ns + t_ns
+        live: list[tuple[Stream, bytes]] = []
         for stream in streams:
             if stream.next_ns != t_ns:
                 continue
@@ -252,10 +253,14 @@ class Simulation:
                 stream.record(stamp_ns, data)
             if stream.publish is not None:
                 if in_time:
-                    stream.publish(data)
-                    stream.sent += 1
+                    live.append((stream, data))
                 else:
                     stream.skipped += 1
+        # After all is recorded: where it fails, as the node ends, the log has the instant whole.
+        for stream, data in live:
+            if stream.publish is not None:
+                stream.publish(data)
+                stream.sent += 1
 
     def command(self, l3: float, lz: float) -> None:
         """
