@@ -174,6 +174,7 @@ def test_unit_quaternion_and_invariants_in_every_sample():
     top, start, _ = cusp_scene()
     motion = solve(top, start, np.linspace(0.0, 20.0, 5003), method='rk45')
     assert np.abs(np.linalg.norm(motion.quaternion, axis=1) - 1.0).max() <= 4e-16
+    assert np.abs(motion.energy / motion.energy[0] - 1.0).max() <= 1e-13
     assert np.abs(motion.l3 / start.l3 - 1.0).max() <= 1e-13
 
 
@@ -319,3 +320,14 @@ def test_through_a_pole_the_attitude_is_that_of_the_angles(l3, lz):
     expected = np.array([-sine * np.sin(minus), sine * np.cos(minus),
                          cosine * np.sin(plus), cosine * np.cos(plus)]).T
     assert np.abs(motion.quaternion - expected).max() < 1e-13         # of angles up to 70 rad
+
+
+@pytest.mark.parametrize(('l3', 'theta'), [(1.0, 1.2), (1.0, 0.001), (0.0, 0.001)])
+def test_through_a_pole_the_invariants_hold(l3, theta):
+    """At the pole, beside it, and where the axis turns back."""
+    top = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
+    start = State(theta=theta, theta_dot=0.3, phi=0.4, psi=-0.7, l3=l3, lz=l3)
+    motion = solve(top, start, np.linspace(0.0, 30.0, 30_001), method='rk45')
+    assert np.abs(np.linalg.norm(motion.quaternion, axis=1) - 1.0).max() <= 5e-16
+    assert np.abs(motion.energy - motion.energy[0]).max() <= 1e-12
+    assert np.abs(motion.l3 - l3).max() <= 1e-14

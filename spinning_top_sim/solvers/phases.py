@@ -105,11 +105,16 @@ class StepPhases:
         return 2.0 * (half_theta
                       + math.tau * round((self._half_theta - half_theta) / math.tau))
 
-    def on_lines(self, alpha: complex, beta: complex, line: float) -> tuple[complex, complex]:
-        """Return alpha and beta with the phases known of those that cross a pole."""
+    @property
+    def crosses(self) -> bool:
+        """Whether one of the parameters, or both, can vanish."""
+        return self._alpha.crosses or self._beta.crosses
+
+    def on_lines(self, alpha: complex, beta: complex, line: float) -> Polar:
+        """Return alpha and beta as (modulus, phase), on the known line where one crosses."""
         a, b = self._alpha, self._beta
-        return (cmath.rect(*a.on_line(alpha, a.phase + line)) if a.crosses else alpha,
-                cmath.rect(*b.on_line(beta, b.phase - line)) if b.crosses else beta)
+        return (a.on_line(alpha, a.phase + line) if a.crosses else cmath.polar(alpha),
+                b.on_line(beta, b.phase - line) if b.crosses else cmath.polar(beta))
 
     def _continue(self, alpha: complex, beta: complex, line: float) -> Polar:
         a, b = self._alpha, self._beta

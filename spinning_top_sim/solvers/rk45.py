@@ -200,7 +200,6 @@ class TransportMotion(_Stepped):
         self._form = TransportForm(top, start, rtol, atol)
         super().__init__(self._form, self._form.start, self._form.first_step)
         alpha, beta = windings(start)
-        self._crosses = alpha.crosses or beta.crosses
         self._phases = StepPhases(0.5 * spin_excess(top, start.l3), alpha, beta,
                                   0.5 * start.theta)
         self._carried_rate = 0.5 * self._form.spin_carried / top.lambda1
@@ -208,10 +207,10 @@ class TransportMotion(_Stepped):
     def at(self, t: float) -> OneState:
         """Return the state at t [s], on the invariants."""
         alpha, beta, m = self._read(t)
-        if self._crosses:
-            # Also what the steps have left of the line: the attitude is that of the angles.
-            alpha, beta = self._phases.on_lines(alpha, beta, -self._carried_rate * t)
-        if t < self._integrator.t1 or self._crosses:
+        if self._phases.crosses:
+            lines = self._phases.on_lines(alpha, beta, -self._carried_rate * t)
+            alpha, beta, m = self._form.project_on_lines((alpha, beta, m), *lines)
+        elif t < self._integrator.t1:
             alpha, beta, m = self._form.project((alpha, beta, m))
         spin = cmath.rect(1.0, 0.5 * self._form.spin_rate * t)
         return MomentumState(self._top, self._start, alpha * spin, beta * spin.conjugate(),

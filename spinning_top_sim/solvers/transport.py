@@ -128,3 +128,34 @@ class TransportForm:
             if root > 0.0:
                 u = math.copysign(math.sqrt(root), u)
         return alpha, beta, complex(u, v) * half_axis / square
+
+    def project_on_lines(self, y: Vector, alpha: tuple[float, float],
+                         beta: tuple[float, float]) -> Vector:
+        """
+        Return what `project` does, for a top that passes a pole: Lz = L3 or Lz = -L3.
+
+        alpha, beta: of y, as signed moduli and phases; of one that can vanish the phase is known
+        without the steps.  Then the meridian of the axis is, at a pole too, and m has its place.
+        """
+        (cosine, phase_a), (sine, phase_b) = alpha, beta
+        shrink = 1.0 / math.hypot(cosine, sine)
+        cosine *= shrink
+        sine *= shrink
+        lambda1 = self.top.lambda1
+        # As above, with L3 -+ Lz cos(theta) = 2 L3 sin^2(theta/2) or 2 L3 cos^2(theta/2).
+        v = 0.0
+        if self.l3:
+            v = 0.5 * self.l3 / lambda1 * (sine / cosine if self.lz == self.l3 else cosine / sine)
+        meridian = cmath.rect(1.0, phase_a + phase_b)
+        half_axis = cosine * sine
+        if half_axis * half_axis > POLE_SHARE:      # the steps' own meridian goes with their m
+            u = (y[2] * (y[0] * y[1]).conjugate()).real / half_axis
+        else:
+            u = (y[2] * meridian.conjugate()).real
+        if u * u > self._large_enough:
+            root = (self._energy - self.top.gravity_torque * (cosine - sine) * (cosine + sine)
+                    ) / (2.0 * lambda1) - v * v
+            if root > 0.0:
+                u = math.copysign(math.sqrt(root), u)
+        return (cmath.rect(cosine, phase_a), cmath.rect(sine, phase_b),
+                complex(u, v) * meridian)
