@@ -38,6 +38,9 @@ EPOCH_GRID_NS = 10_000_000
 OPENING_NS = 60_000_000
 # How often subscriptions are counted; a new subscriber waits at most this long.
 LISTENERS_PERIOD_NS = 50_000_000
+# So many instants are computed at once, where the steps of the solver reach: 0.2 ms of work.
+LOOK_AHEAD = 8
+NEVER_NS = 2 ** 63 - 1
 # One tick works at most this long before services and signals get their turn.
 TICK_BUDGET_S = 0.05
 # One ~/step works at most this long.
@@ -65,6 +68,7 @@ class Simulator(Node):
         values = start_values(self)
         self._lock = threading.RLock()          # the simulation, between ticks and callbacks
         self._simulation = Simulation(values)
+        self._simulation.look_ahead = LOOK_AHEAD
         self._counters = reports.Counters()
         self._speed = reports.Speedometer()
         self._terminal = reports.Terminal()
@@ -92,10 +96,11 @@ class Simulator(Node):
         self._simulated_clock = SimulatedClock(
             (lambda: self._date.now().nanoseconds) if self._follows else time.monotonic_ns,
             values['time_scale'])
-        self._begun = False
+        self._take_pace(self._values)
+        self._begun = self._ended = False
         self._paused = values['start_paused']
         self._listeners_due = 0
-        self._last_tick = 0
+        self._stop_at = 0.0
         self._pacer: DeadlineThread | None = None
         self._tick_timer: Any = None
         if not self._simulation.top.is_realizable:
@@ -205,6 +210,7 @@ class Simulator(Node):
             if publisher.get_subscription_count():
                 left = max(0.0, give_up - time.monotonic())
                 publisher.wait_for_all_acked(Duration(nanoseconds=int(left * NANOSECONDS)))
+        self._ended = True
         if not self.finished.done():
             self.finished.set_result(None)
 
@@ -222,61 +228,76 @@ class Simulator(Node):
         with self._lock:
             if not (self._begun or self._begin()):
                 return
-            if self._paused or self._failure or self.finished.done():
+            if self._paused or self._failure or self._ended:
                 return
-            self._count_tick()
+            now = time.monotonic_ns()
+            if now > self._late_from:
+                self._count_late_tick(now)
+            self._late_from = now + self._late_after_ns
+            if now >= self._listeners_due:
+                self._look_for_listeners()
+                self._listeners_due = now + LISTENERS_PERIOD_NS
             self._advance(self._due())
-            duration = self._duration_ns()
-            if duration and self._simulation.now_ns >= duration:
+            if self._duration_ns and self._simulation.now_ns >= self._duration_ns:
                 self._finish()
 
-    def _duration_ns(self) -> int:
-        return round(self._values['duration'] * NANOSECONDS)
+    def _take_pace(self, values: dict[str, Any]) -> None:
+        """Hold in nanoseconds what every tick asks for."""
+        self._duration_ns = round(values['duration'] * NANOSECONDS)     # 0: for ever
+        self._tick_period_ns = NANOSECONDS / values['tick_rate']
+        self._late_after_ns = round(1.5 * self._tick_period_ns)
+        self._late_from = NEVER_NS
+        self._latest_ns = int(LATEST_NS * values['time_scale'])
 
     def _due(self) -> int:
         """Return the simulated time to go to: that of the clock, not beyond the duration."""
-        now, duration = self._simulated_clock.now(), self._duration_ns()
+        now, duration = self._simulated_clock.now(), self._duration_ns
         return min(now, duration) if duration else now
 
-    def _count_tick(self) -> None:
-        now = time.monotonic_ns()
-        period = NANOSECONDS / self._values['tick_rate']
-        if self._last_tick and now - self._last_tick > 1.5 * period:
-            self._counters.late_ticks += 1
-            self._counters.skipped_ticks += round((now - self._last_tick) / period) - 1
-        self._last_tick = now
-        if now >= self._listeners_due:
-            self._look_for_listeners()
-            self._listeners_due = now + LISTENERS_PERIOD_NS
+    def _count_late_tick(self, now: int) -> None:
+        since_last = now - self._late_from + self._late_after_ns
+        self._counters.late_ticks += 1
+        self._counters.skipped_ticks += round(since_last / self._tick_period_ns) - 1
 
     def _look_for_listeners(self) -> None:
         for stream in self._simulation.streams:
             publisher = self._outputs.get(stream.topic)
             heard = publisher is not None and publisher.get_subscription_count() > 0
-            stream.publish = publisher.publish if heard else None
+            # The handle's own: rclpy's publish first finds out, for 3 us, that these are bytes.
+            stream.publish = publisher.handle.publish_raw if publisher and heard else None
 
     def _advance(self, target_ns: int) -> None:
         simulation = self._simulation
-        stop_at = time.perf_counter() + TICK_BUDGET_S
-        recorder = self._recorder
-
-        def give_way() -> bool:
-            return time.perf_counter() > stop_at or (recorder is not None and not recorder.room)
-
-        skipped = sum(stream.skipped for stream in simulation.streams)
-        scale = self._values['time_scale']
+        publish_from_ns = target_ns - self._latest_ns
+        late = simulation.now_ns < publish_from_ns
+        skipped = self._skipped() if late else 0
+        self._stop_at = time.monotonic() + TICK_BUDGET_S
         try:
-            arrived = simulation.advance(target_ns, target_ns - int(LATEST_NS * scale), give_way)
+            arrived = self._has_room() and simulation.advance(target_ns, publish_from_ns,
+                                                              self._gives_way)
         except IntegrationError as error:
             self._fail(str(error))
             return
-        lag = target_ns - simulation.now_ns
-        if not arrived and lag > LONGEST_LAG_NS * scale:
-            self._counters.slipped_ns += lag
-            self._simulated_clock.start(simulation.now_ns)
-            self._warn_overload('the clock slips')
-        elif sum(stream.skipped for stream in simulation.streams) > skipped:
+        if not arrived:
+            lag = target_ns - simulation.now_ns
+            if lag > LONGEST_LAG_NS * self._values['time_scale']:
+                self._counters.slipped_ns += lag
+                self._simulated_clock.start(simulation.now_ns)
+                self._warn_overload('the clock slips')
+                return
+        if late and self._skipped() > skipped:
             self._warn_overload('live topics skip samples')
+
+    def _gives_way(self) -> bool:
+        """Whether this tick shall end before it has sent all that is due."""
+        return time.monotonic() > self._stop_at or not self._has_room()
+
+    def _has_room(self) -> bool:
+        """Whether the recorder, if there is one, takes more."""
+        return self._recorder is None or self._recorder.room
+
+    def _skipped(self) -> int:
+        return sum(stream.skipped for stream in self._simulation.streams)
 
     def _warn_overload(self, consequence: str) -> None:
         if not self._warned_overload:
@@ -361,6 +382,7 @@ class Simulator(Node):
                 self._pacer.set_rate(values['tick_rate'])
             elif self._tick_timer is not None:
                 self._tick_timer.timer_period_ns = round(NANOSECONDS / values['tick_rate'])
+        self._take_pace(values)
 
     # ---------------------------------------------------------------------------- services
 
@@ -373,7 +395,7 @@ class Simulator(Node):
                 self._paused = True
             elif not request.data and self._paused:
                 self._paused = False
-                self._last_tick = 0
+                self._late_from = NEVER_NS
                 if self._begun and not self._failure:
                     self._simulated_clock.start(max(self._simulation.now_ns, 0))
             response.success = True
@@ -542,7 +564,7 @@ class Simulator(Node):
         with self._lock:
             simulation, counters = self._simulation, self._counters
             self._factor = self._speed.read(max(simulation.now_ns, 0))
-            skipped = sum(stream.skipped for stream in simulation.streams)
+            skipped = self._skipped()
             sent = sum(stream.sent for stream in simulation.streams)
             problems = []
             if self._paused:

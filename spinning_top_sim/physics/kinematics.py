@@ -19,6 +19,8 @@ from spinning_top_sim.physics.top import Top
 
 Value = TypeVar('Value')
 
+PIVOT = (0.0, 0.0, 0.0)
+
 
 class lazy(Generic[Value]):  # noqa: N801 - a decorator, like functools.cached_property
     """A column computed at its first use: functools.cached_property without its 3.11 lock."""
@@ -115,6 +117,9 @@ class Columns:
     def specific_force(self, point: tuple[float, float, float]) -> tuple[Any, Any, Any]:
         """Return the specific force at a body point r [m], in the body frame [m/s^2]."""
         transverse, along = self.vertical
+        if point == PIVOT:                      # at rest: nothing of the motion is needed
+            gravity = self.top.gravity
+            return gravity * transverse.real, gravity * transverse.imag, gravity * along
         return attitude.specific_force(
             self.top.gravity, point, self.body_rates, self.body_acceleration,
             (transverse.real, transverse.imag, along))

@@ -173,6 +173,18 @@ class MomentumState(OneState):
         return self._polar[1][1]
 
     @lazy
+    def phi(self) -> float:
+        """Precession angle, unwrapped [rad]."""
+        (_, half_sum), (_, half_difference) = self._polar
+        return half_sum + half_difference
+
+    @lazy
+    def psi(self) -> float:
+        """Spin angle, unwrapped [rad]."""
+        (_, half_sum), (_, half_difference) = self._polar
+        return half_sum - half_difference
+
+    @lazy
     def theta(self) -> float:
         """Tilt, continued through the poles [rad]."""
         (cosine, _), (sine, _) = self._polar

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from spinning_top_sim.physics.kinematics import OneState, lazy
 from spinning_top_sim.physics.top import ContinuedState, State, Top
-from spinning_top_sim.solvers.rk45 import rk45
+from spinning_top_sim.solvers.rk45 import ENDLESS_NS, rk45
 
 if TYPE_CHECKING:
     from spinning_top_sim.solvers.motion import ExactGrid
@@ -34,6 +34,10 @@ class Propagator(Protocol):
     @property
     def earliest_ns(self) -> int:
         """The first nanosecond that can still be read after the steps taken."""
+
+    @property
+    def latest_ns(self) -> int:
+        """The last nanosecond that can be read without more of them."""
 
     def reach_ns(self, ns: int, max_steps: int | None = None) -> bool:
         """Compute what the state at `ns` nanoseconds needs; False if max_steps did not do."""
@@ -68,6 +72,7 @@ class ExactPropagator:
     steps = 0
     evaluations = 0
     earliest_ns = 0
+    latest_ns = ENDLESS_NS
 
     def __init__(self, top: Top, start: State) -> None:
         # 1.5 ms of long decimals, and their import, for those who ask for it only.

@@ -24,6 +24,8 @@ from spinning_top_sim.solvers.phases import (
 from spinning_top_sim.solvers.transport import TransportForm
 
 NANOSECONDS = 1_000_000_000
+# Later than any time: 292 years.
+ENDLESS_NS = 2 ** 63 - 1
 EQUATIONS = ('transport', 'euler')
 # Larger energies and rates leave no room for their products in doubles.
 MOST = 1e290
@@ -113,6 +115,7 @@ class SteppedOrClosed(ABC):
     steps = 0
     evaluations = 0
     earliest_ns = 0
+    latest_ns = ENDLESS_NS
 
     @abstractmethod
     def at(self, t: float) -> OneState:
@@ -152,6 +155,13 @@ class _Stepped(SteppedOrClosed):
         ns = math.ceil(start * NANOSECONDS)
         return ns if ns / NANOSECONDS >= start else ns + 1
 
+    @property
+    def latest_ns(self) -> int:  # type: ignore[override]
+        """See `Propagator`."""
+        end = self._integrator.t1
+        ns = math.floor(end * NANOSECONDS)
+        return ns if ns / NANOSECONDS <= end else ns - 1
+
     def reach(self, t: float, max_steps: int | None = None) -> bool:
         integrator = self._integrator
         taken = 0
@@ -172,11 +182,14 @@ class _Stepped(SteppedOrClosed):
         self._integrator.step()
 
     def _read(self, t: float) -> Vector:
-        if t < self._integrator.t0:
+        integrator = self._integrator
+        if integrator.t0 <= t <= integrator.t1:
+            return integrator.interpolate(t)
+        if t < integrator.t0:
             raise ValueError(f't = {t!r} s: steps go forward, and the newest one began at '
-                             f'{self._integrator.t0!r} s; times must not decrease')
+                             f'{integrator.t0!r} s; times must not decrease')
         self.reach(t)
-        return self._integrator.interpolate(t)
+        return integrator.interpolate(t)
 
 
 class EulerMotion(_Stepped):

@@ -11,7 +11,7 @@ equal messages are equal bytes.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 ENCAPSULATION = b'\x00\x01\x00\x00'
@@ -91,7 +91,14 @@ class CdrWriter:
 
 
 class Template:
-    """A serialized message whose stamp and numbers are replaced in place."""
+    """
+    A serialized message whose stamp and numbers are replaced.
+
+    encode(stamp_ns, *runs): return the message with this stamp [ns] and one sequence of numbers a
+    run, as bytes.
+    """
+
+    encode: Callable[..., bytes]
 
     def __init__(self, writer: CdrWriter, stamps_at: Sequence[int],
                  fields: Sequence[tuple[int, int]]) -> None:
@@ -105,21 +112,37 @@ class Template:
         self._stamps_at = tuple(stamps_at)
         self._fields = tuple(fields)
         self._rows: Any = None
-        self._pack_stamp_into = struct.Struct('<iI').pack_into
-        self._runs = [(struct.Struct(f'<{count}d').pack_into, at) for at, count in fields]
+        self.encode = self._written_out()
 
     def __len__(self) -> int:
         """Return the size of every message [bytes]."""
         return len(self._buffer)
 
-    def encode(self, stamp_ns: int, *runs: Sequence[float]) -> bytes:
-        """Return the message with this stamp [ns] and one sequence of numbers a run."""
-        buffer = self._buffer
-        for at in self._stamps_at:
-            self._pack_stamp_into(buffer, at, *divmod(stamp_ns, NANOSECONDS))
-        for (pack_into, at), values in zip(self._runs, runs, strict=True):
-            pack_into(buffer, at, *values)
-        return bytes(buffer)
+    def _written_out(self) -> Callable[..., bytes]:
+        """
+        Return `encode`: one call that packs what varies between what does not.
+
+        Written out as source text once, because a loop over the runs takes twice the time.
+        """
+        pieces = [(at, 8 * count, f'{count}d', f'*run{i}')
+                  for i, (at, count) in enumerate(self._fields)]
+        pieces += [(at, 8, 'iI', f'*divmod(stamp_ns, {NANOSECONDS})') for at in self._stamps_at]
+        scope: dict[str, Any] = {}
+        formats, arguments, end = ['<'], [], 0
+        for at, size, code, argument in [*sorted(pieces), (len(self._buffer), 0, '', '')]:
+            if at > end:
+                scope[f'fixed{end}'] = bytes(self._buffer[end:at])
+                formats.append(f'{at - end}s')
+                arguments.append(f'fixed{end}')
+            if size:
+                formats.append(code)
+                arguments.append(argument)
+            end = at + size
+        scope['pack'] = struct.Struct(''.join(formats)).pack
+        names = ', '.join(['stamp_ns', *(f'run{i}' for i in range(len(self._fields)))])
+        function: Callable[..., bytes] = eval(
+            f'lambda {names}: pack({", ".join(arguments)})', scope)
+        return function
 
     def encode_many(self, stamps_ns: Any, *runs: Any) -> Any:
         """

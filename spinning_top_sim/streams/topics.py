@@ -30,7 +30,8 @@ class Stream:
     One topic: samples at t = k x period, k = 0, 1, 2.., whoever listens and however ticks fall.
 
     publish, record: what a sample is handed to, None while nobody wants it;  sent, skipped:
-    counts of samples published, and of those that came too late to be published.
+    counts of samples published, and of those that came too late to be published
+    ready: messages computed ahead of their time, by time [ns]
     """
 
     parameter: str
@@ -42,6 +43,7 @@ class Stream:
         self.publish: Callable[[bytes], None] | None = None
         self.record: Callable[[int, bytes], None] | None = None
         self.sent = self.skipped = 0
+        self.ready: dict[int, bytes] = {}
         self.next_ns = 0
         self.period_ns = 1
         self.set_rate(values[f'{self.parameter}.rate'])
@@ -52,6 +54,7 @@ class Stream:
 
     def resume(self, after_ns: int) -> None:
         """Make the first grid point later than `after_ns` the next sample."""
+        self.ready.clear()
         self.next_ns = (after_ns // self.period_ns + 1) * self.period_ns
 
     @property
@@ -64,9 +67,11 @@ class Stream:
         """Number k of the next sample."""
         return self.next_ns // self.period_ns
 
-    def encode(self, state: OneState, stamp_ns: int) -> bytes:
-        """Return the serialized message of the next sample: a state, and its stamp [ns]."""
-        return self.template.encode(stamp_ns, *self.runs(state, self.index))
+    def encode(self, state: OneState, stamp_ns: int, t_ns: int | None = None) -> bytes:
+        """Return the serialized message of a state, its stamp, and its time (default: next)."""
+        if t_ns is None:
+            t_ns = self.next_ns
+        return self.template.encode(stamp_ns, *self.runs(state, t_ns // self.period_ns))
 
     def encode_many(self, states: Columns, stamps_ns: Any) -> Any:
         """Return the messages of the next n samples as rows of bytes, (n, size) uint8."""
@@ -212,11 +217,12 @@ class Invariants(Stream):
         self._start = (state.energy, state.l3_start, state.lz_start)
 
     def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
+        first = index.start if isinstance(index, range) else index
         now = (state.energy, state.l3, state.lz)
         drifts = [(value - start) / (abs(start) or 1.0)
                   for value, start in zip(now, self._start, strict=True)]
         return ((*now, *drifts, state.norm_error,
-                 self.orientation_error(state, self.next_ns)),)
+                 self.orientation_error(state, first * self.period_ns)),)
 
 
 class Markers(Stream):
@@ -263,7 +269,7 @@ class Markers(Stream):
             return body
         tip = tuple(self._shape.tip * part for part in axis)
         if isinstance(index, int):
-            return (*body, [number for point in (*self._trace(self.next_ns), tip)
+            return (*body, [number for point in (*self._trace(index * self.period_ns), tip)
                             for number in point])
         return (*body, self._traces(len(index), tip))
 

@@ -1,0 +1,119 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""
+A node that only publishes: the floor under `sim_node`, for `node_cpu.py` and `startup.py`.
+
+The same bytes again and again, by an rclpy timer or by a thread that sleeps to absolute
+deadlines; nothing is computed, counted or patched.  With parameters (a JSON file of name, value,
+description and range), services and subscription like those of `sim_node` where it is asked for.
+
+    python benchmark/bare_node.py --ros-args -p rate:=1000.0 -p pacing:=thread
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from pathlib import Path
+
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from rclpy.clock import Clock, ClockType
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import Imu, JointState
+
+
+class Bare(Node):
+    """Publishes pose, joint_states and imu/data_raw at one rate, all of them constant."""
+
+    def __init__(self) -> None:
+        super().__init__('spinning_top')
+        rate = self.declare_parameter('rate', 100.0).value
+        pacing = self.declare_parameter('pacing', 'timer').value
+        like = self.declare_parameter('like', '').value
+        self.sinks = []
+        if like:
+            self._pretend(Path(like))
+        self._add(PoseStamped, 'pose', PoseStamped())
+        self._add(JointState, 'joint_states',
+                  JointState(name=['precession_joint', 'nutation_joint', 'spin_joint'],
+                             position=3 * [0.0], velocity=3 * [0.0]))
+        self._add(Imu, 'imu/data_raw', Imu())
+        self.rate, self.stopped = rate, False
+        if pacing == 'thread':
+            self.thread = threading.Thread(target=self._run, daemon=True)
+            self.thread.start()
+        else:
+            self.create_timer(1.0 / rate, self._publish,
+                              clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _add(self, kind, topic, message) -> None:
+        for frame in ('header',):
+            getattr(message, frame).frame_id = 'imu_link'
+        self.sinks.append((self.create_publisher(kind, topic, 10).publish,
+                           serialize_message(message)))
+
+    def _pretend(self, path: Path) -> None:
+        """Have what sim_node has besides."""
+        from diagnostic_msgs.msg import DiagnosticArray
+        from nav_msgs.msg import Odometry
+        from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+        from std_msgs.msg import Float64MultiArray
+        from std_srvs.srv import SetBool, Trigger
+
+        rows = []
+        for name, value, description, bounds in json.loads(path.read_text()):
+            descriptor = ParameterDescriptor(description=description, dynamic_typing=True)
+            if bounds and isinstance(value, float):
+                descriptor.floating_point_range = [FloatingPointRange(
+                    from_value=float(bounds[0]), to_value=float(bounds[1]))]
+            elif bounds:
+                descriptor.integer_range = [IntegerRange(from_value=bounds[0],
+                                                         to_value=bounds[1])]
+            if not self.has_parameter(name):
+                rows.append((name, value, descriptor))
+        self.declare_parameters('', rows)
+        for kind, topic in ((Imu, 'ground_truth/imu_bias'), (Imu, 'ground_truth/imu'),
+                            (Odometry, 'ground_truth/odom'),
+                            (Float64MultiArray, '~/invariants'),
+                            (DiagnosticArray, '/diagnostics')):
+            self.create_publisher(kind, topic, 10)
+        self.create_subscription(Float64MultiArray, '~/commands', lambda _: None, 10)
+        for name, service in (('set_pause', SetBool), ('step', Trigger), ('reset', Trigger),
+                              ('record', SetBool)):
+            self.create_service(service, f'~/{name}', lambda request, response: response)
+
+    def _publish(self) -> None:
+        for publish, data in self.sinks:
+            publish(data)
+
+    def _run(self) -> None:
+        deadline, period = time.monotonic(), 1.0 / self.rate
+        while not self.stopped:
+            deadline = max(deadline + period, time.monotonic())
+            time.sleep(max(0.0, deadline - time.monotonic()))
+            if not self.stopped:
+                self._publish()
+
+
+def main() -> None:
+    rclpy.init(args=sys.argv)
+    node = Bare()
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        node.stopped = True
+        if hasattr(node, 'thread'):
+            node.thread.join(1.0)
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+if __name__ == '__main__':
+    main()

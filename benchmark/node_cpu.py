@@ -1,0 +1,266 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""
+Processor time of `sim_node`, beside an ordinary rclpy node and beside one that only publishes.
+
+    python benchmark/node_cpu.py                                # all of it, half an hour
+    python benchmark/node_cpu.py --rates 1000 --subscribers 1 --rounds 5 --no-report
+
+Three streams (pose, joint_states, imu/data_raw) at the same rate, one tick a sample, for 0, 1 and
+3 other processes that subscribe to all three.  Everything takes turns, in every round; what is
+reported are medians of rounds and of ratios within a round.  Processor time is that of the whole
+process, its DDS threads too, over the time measured; arrivals are when the middleware of a
+subscriber received a message, jitter how far the time between two on a topic is from the period.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from processes import SIM_NODE, Process, load, median, quantile, ros_arguments, script
+from report import number, preamble, table, write
+
+STREAMS = ('pose', 'joint_states', 'imu')
+OTHERS = ('ground_truth_imu', 'ground_truth_odom', 'invariants')
+RATES = (100, 200, 500, 1000, 2000)
+SUBSCRIBERS = (0, 1, 3)
+KINDS = {
+    'ours, timer, recording': ('timer', True), 'ours, timer': ('timer', False),
+    'ours, thread, recording': ('thread', True), 'ours, thread': ('thread', False),
+    'straightforward': None, 'floor, timer': None, 'floor, thread': None,
+}
+STRAIGHT = 'straightforward'
+ACCOUNT = """Ratios above 1 cost more than what they are compared with."""
+
+
+@dataclass
+class Result:
+    """What one run of one node was measured at; arrivals of all subscribers together."""
+
+    share: float                                # processor seconds a second
+    rates: list[float] = field(default_factory=list)
+    jitter_ms: list[float] = field(default_factory=list)
+    lost: int = 0
+    gaps: int = 0                               # samples missing in the stamps
+
+
+def program(kind: str, rate: float, namespace: str, folder: Path) -> list[str]:
+    """Return what python is given to run this kind of node."""
+    ours = KINDS[kind]
+    if ours is not None:
+        pacing, records = ours
+        parameters = {'pacing': pacing, 'tick_rate': float(rate), 'status_period': 0.0,
+                      'record.enabled': records, 'record.uri': str(folder) + '/',
+                      **{f'{name}.rate': float(rate) for name in STREAMS},
+                      **{f'{name}.enabled': False for name in OTHERS}}
+        return [*SIM_NODE, *ros_arguments(namespace, parameters)]
+    if kind == STRAIGHT:
+        return [*script('straightforward_node.py'),
+                *ros_arguments(namespace, {'rate': float(rate)})]
+    return [*script('bare_node.py'), *ros_arguments(
+        namespace, {'rate': float(rate), 'pacing': kind.split()[-1]})]
+
+
+_namespaces = itertools.count(1)
+
+
+def measure(kind: str, rate: float, subscribers: int, seconds: float, warm_up: float,
+            folder: Path) -> Result | None:
+    """Run one node with its subscribers; None where something did not start."""
+    namespace = f'/n{next(_namespaces)}'
+    listeners = [Process((*script('listener.py'), namespace), talks=True)
+                 for _ in range(subscribers)]
+    try:
+        for listener in listeners:
+            listener.line()
+        with Process(program(kind, rate, namespace, folder)) as node:
+            if not settled(listeners, warm_up):
+                return None
+            for listener in listeners:
+                listener.tell('report')
+                listener.line()
+            cpu, begin = node.cpu_ns(), time.monotonic_ns()
+            time.sleep(seconds)
+            cpu, taken = node.cpu_ns() - cpu, time.monotonic_ns() - begin
+            for listener in listeners:
+                listener.tell('report')
+            said = [json.loads(listener.line()) for listener in listeners]
+            if not node.alive:
+                return None
+        return result(cpu / taken, said, rate, kind)
+    finally:
+        for listener in listeners:
+            listener.end()
+        for path in folder.iterdir():
+            path.unlink()
+
+
+def settled(listeners: list[Process], warm_up: float) -> bool:
+    """Wait until every listener has heard from every topic, and a while longer."""
+    give_up = time.monotonic() + 30.0
+    for listener in listeners:
+        heard: set[str] = set()
+        while len(heard) < len(STREAMS):
+            if time.monotonic() > give_up:
+                return False
+            time.sleep(0.05)
+            listener.tell('report')
+            heard |= {topic for topic, got in json.loads(listener.line()).items() if got[0]}
+    time.sleep(warm_up if listeners else 1.5 + warm_up)     # a start takes a second
+    return True
+
+
+def result(share: float, said: list[dict], rate: float, kind: str) -> Result:
+    """Put together what the listeners have said."""
+    found = Result(share)
+    period_ns = 1e9 / rate
+    for times, numbers, stamps in (got for one in said for got in one.values()):
+        if len(times) < 2:
+            found.rates.append(0.0)
+            continue
+        found.rates.append((len(times) - 1) / (times[-1] - times[0]) * 1e9)
+        found.jitter_ms += [abs(b - a - period_ns) / 1e6 for a, b in itertools.pairwise(times)]
+        found.lost += numbers[-1] - numbers[0] + 1 - len(numbers)
+        if KINDS[kind] is not None:
+            found.gaps += round((stamps[-1] - stamps[0]) / period_ns) + 1 - len(stamps)
+    return found
+
+
+def cases(arguments: argparse.Namespace) -> Iterator[tuple[int, int]]:
+    yield from itertools.product(arguments.rates, arguments.subscribers)
+
+
+def measured(arguments: argparse.Namespace) -> dict:
+    """Return {(rate, subscribers): {kind: [Result of each round]}}."""
+    found: dict = {case: {kind: [] for kind in arguments.kinds} for case in cases(arguments)}
+    folder = Path(tempfile.mkdtemp(prefix='node_cpu_'))
+    try:
+        for number_ in range(arguments.rounds):
+            for case in cases(arguments):
+                for kind in arguments.kinds:
+                    one = measure(kind, *case, arguments.seconds, arguments.warm_up, folder)
+                    found[case][kind].append(one)
+                    print(f'round {number_ + 1}, {case[0]} Hz, {case[1]} subscribers, {kind}: '
+                          + ('failed' if one is None else
+                             f'{100 * one.share:.1f} %, {mean_rate(one):.0f} Hz')
+                          + f', load {load():.1f}', flush=True)
+    finally:
+        shutil.rmtree(folder)
+    return found
+
+
+def mean_rate(one: Result) -> float:
+    return sum(one.rates) / len(one.rates) if one.rates else float('nan')
+
+
+def ratio(runs: dict, kind: str, to: str) -> float:
+    """Return the median of the ratios within rounds; NaN where one is missing."""
+    return median([a.share / b.share for a, b in zip(runs.get(kind, ()), runs.get(to, ()),
+                                                      strict=False) if a and b])
+
+
+def share_table(found: dict) -> str:
+    """Return the processor time of every kind in every case."""
+    kinds = list(next(iter(found.values())))
+    rows = [(str(rate), str(subscribers),
+             *(f'{100 * median([run.share for run in runs[kind] if run]):.1f}'
+               for kind in kinds)) for (rate, subscribers), runs in found.items()]
+    return table(('Hz', 'subscribers', *kinds), rows)
+
+
+COMPARED = (('ours, thread, recording', STRAIGHT), ('ours, thread', STRAIGHT),
+            ('ours, timer, recording', STRAIGHT), ('ours, timer', STRAIGHT),
+            ('floor, timer', STRAIGHT),
+            ('ours, thread, recording', 'floor, thread'), ('ours, thread', 'floor, thread'),
+            ('ours, timer', 'floor, timer'))
+
+
+def ratio_table(found: dict) -> str:
+    """Return the ratios that can be made."""
+    kinds = next(iter(found.values()))
+    pairs = [pair for pair in COMPARED if set(pair) <= set(kinds)]
+    rows = [(str(rate), str(subscribers), *(number(ratio(runs, *pair)) for pair in pairs))
+            for (rate, subscribers), runs in found.items()]
+    return table(('Hz', 'subscribers', *(f'{a} / {b}' for a, b in pairs)), rows)
+
+
+def arrival_table(found: dict) -> str:
+    """Return rate, jitter and loss of what one subscriber got."""
+    rows = []
+    for (rate, subscribers), kinds in found.items():
+        for kind, runs in kinds.items():
+            runs = [run for run in runs if run and run.rates]
+            if not runs:
+                continue
+            rows.append((
+                str(rate), str(subscribers), kind, f'{median([mean_rate(r) for r in runs]):.1f}',
+                *(f'{median([quantile(r.jitter_ms, share) for r in runs]):.3f}'
+                  for share in (0.5, 0.99, 1.0)),
+                str(sum(run.lost for run in runs)),
+                str(sum(run.gaps for run in runs)) if KINDS[kind] else '–'))
+    return table(('Hz', 'subscribers', 'node', 'arrived [Hz]', 'jitter p50 [ms]', 'p99 [ms]',
+                  'max [ms]', 'lost on the way', 'missing in the stamps'), rows)
+
+
+def figure(found: dict, path: Path) -> None:
+    """Draw processor time over rate, a panel for each number of subscribers."""
+    from matplotlib.figure import Figure
+
+    subscribers = sorted({case[1] for case in found})
+    drawing = Figure(figsize=(4.0 * len(subscribers), 3.6), layout='constrained')
+    axes = drawing.subplots(1, len(subscribers), sharey=True, squeeze=False)[0]
+    for panel, count in zip(axes, subscribers, strict=True):
+        rates = [rate for rate, n in found if n == count]
+        for kind in next(iter(found.values())):
+            style = {'floor': ':', 'straightforward': '--'}.get(kind.split(',')[0], '-')
+            panel.plot(rates, [100 * median([run.share for run in found[rate, count][kind] if run])
+                               for rate in rates], style, marker='.', label=kind)
+        panel.set(xscale='log', yscale='log', xlabel='rate of three streams [Hz]',
+                  title=f'{count} subscribing process{"" if count == 1 else "es"}')
+        panel.set_xticks(rates, [str(rate) for rate in rates])
+        panel.minorticks_off()
+        panel.grid(alpha=0.3)
+    axes[0].set_ylabel('processor time [% of a core]')
+    axes[0].legend(fontsize=7)
+    drawing.savefig(path, dpi=110)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--rates', type=int, nargs='+', default=RATES, help='Hz')
+    parser.add_argument('--subscribers', type=int, nargs='+', default=SUBSCRIBERS)
+    parser.add_argument('--kinds', nargs='+', default=list(KINDS), choices=KINDS, metavar='KIND',
+                        help=f'of {list(KINDS)}')
+    parser.add_argument('--rounds', type=int, default=3)
+    parser.add_argument('--seconds', type=float, default=2.5, help='measured, each run')
+    parser.add_argument('--warm-up', type=float, default=0.5, help='before that')
+    parser.add_argument('--no-report', action='store_true', help='print the tables only')
+    arguments = parser.parse_args()
+    at_first = load()
+    found = measured(arguments)
+    text = '\n'.join((
+        f'Load average at the begin {at_first:.1f}, at the end {load():.1f} (the benchmark '
+        f'itself is in the latter); {arguments.rounds} rounds of {arguments.seconds:g} s.\n',
+        '## Processor time [% of a core]\n', share_table(found),
+        '## Ratios\n', ratio_table(found), '## Arrivals\n', arrival_table(found)))
+    print(text)
+    if not arguments.no_report:
+        docs = Path(__file__).resolve().parent.parent / 'docs'
+        figure(found, docs / 'node_cpu.png')
+        write('node_cpu.md', '\n'.join((
+            preamble('Processor time of the node'), __doc__.strip().split('\n\n')[-1] + '\n',
+            '![Processor time over rate](node_cpu.png)\n', text)))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

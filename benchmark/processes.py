@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes in processes of their own: started on this machine only, watched, and ended."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+os.environ.setdefault('ROS_DOMAIN_ID', '46')
+os.environ.setdefault('ROS_LOG_DIR', tempfile.gettempdir())
+
+
+def ros_arguments(namespace: str, parameters: Mapping[str, Any]) -> list[str]:
+    """Return the arguments behind the program's."""
+    return ['--ros-args', '-r', f'__ns:={namespace}',
+            *(item for name, value in parameters.items() for item in (
+                '-p', f'{name}:={value if isinstance(value, str) else json.dumps(value)}'))]
+
+
+SIM_NODE = ('-m', 'spinning_top_sim.nodes.sim_node')
+
+
+def script(name: str) -> tuple[str]:
+    """Return what python is given to run a file of this folder."""
+    return (str(ROOT / 'benchmark' / name),)
+
+
+class Process:
+    """A python process in a group of its own; ends with the `with`."""
+
+    def __init__(self, program: Sequence[str], arguments: Sequence[str] = (), *,
+                 talks: bool = False) -> None:
+        environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(
+            filter(None, [str(ROOT), os.environ.get('PYTHONPATH')]))}
+        self._process = subprocess.Popen(
+            [sys.executable, *program, *arguments], env=environment, start_new_session=True,
+            stdin=subprocess.PIPE if talks else subprocess.DEVNULL,
+            stdout=subprocess.PIPE if talks else subprocess.DEVNULL, text=True)
+        self.pid = self._process.pid
+
+    def __enter__(self) -> Process:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    @property
+    def alive(self) -> bool:
+        return self._process.poll() is None
+
+    def line(self) -> str:
+        """Return the next line that it says."""
+        assert self._process.stdout
+        return self._process.stdout.readline()
+
+    def tell(self, text: str) -> None:
+        """Write a line to it."""
+        assert self._process.stdin
+        self._process.stdin.write(f'{text}\n')
+        self._process.stdin.flush()
+
+    def cpu_ns(self) -> int:
+        """Return the processor time of all its threads, past and present [ns]."""
+        # The clock id of another process, as clock_getcpuclockid(3) makes it on Linux.
+        return time.clock_gettime_ns((~self.pid << 3) | 2)
+
+    def memory(self) -> int:
+        """Return its resident set [bytes]."""
+        for line in Path(f'/proc/{self.pid}/status').read_text().splitlines():
+            if line.startswith('VmRSS:'):
+                return 1024 * int(line.split()[1])
+        raise ProcessLookupError(self.pid)
+
+    def end(self) -> int:
+        """Interrupt it, kill it if need be; return its exit code."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.pid, signal.SIGINT)
+        if self._process.stdin:
+            with contextlib.suppress(OSError):
+                self._process.stdin.close()
+        try:
+            return self._process.wait(15.0)
+        except subprocess.TimeoutExpired:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.pid, signal.SIGKILL)
+            return self._process.wait()
+
+
+def load() -> float:
+    """Return how many processes have wanted to run in the last minute, of late."""
+    return os.getloadavg()[0]
+
+
+def quantile(values: Sequence[float], share: float) -> float:
+    """Return the value below which this share of them is; NaN of none."""
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else float('nan')
+
+
+def median(values: Sequence[float]) -> float:
+    """Return the median; NaN of none."""
+    return statistics.median(values) if values else float('nan')
