@@ -12,6 +12,7 @@ description and range), services and subscription like those of `sim_node` where
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 import threading
@@ -52,8 +53,7 @@ class Bare(Node):
                               clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _add(self, kind, topic, message) -> None:
-        for frame in ('header',):
-            getattr(message, frame).frame_id = 'imu_link'
+        message.header.frame_id = 'imu_link'
         self.sinks.append((self.create_publisher(kind, topic, 10).publish,
                            serialize_message(message)))
 
@@ -96,8 +96,9 @@ class Bare(Node):
         while not self.stopped:
             deadline = max(deadline + period, time.monotonic())
             time.sleep(max(0.0, deadline - time.monotonic()))
-            if not self.stopped:
-                self._publish()
+            if not self.stopped and rclpy.ok():
+                with contextlib.suppress(RuntimeError):     # the context has just gone down
+                    self._publish()
 
 
 def main() -> None:

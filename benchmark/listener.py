@@ -16,6 +16,7 @@ from __future__ import annotations
 import json
 import os
 import select
+import signal
 import struct
 import sys
 
@@ -23,6 +24,7 @@ import rclpy
 from geometry_msgs.msg import PoseStamped
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Imu, JointState
 
 KINDS = {'pose': PoseStamped, 'joint_states': JointState, 'imu/data_raw': Imu}
@@ -67,7 +69,9 @@ class Listener:
 
 
 def main() -> None:
-    rclpy.init()
+    # Ends with its standard input: an interrupt is for the node that it listens to.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     listener = Listener(sys.argv[1], list(KINDS))
     print('ready', flush=True)
     while True:

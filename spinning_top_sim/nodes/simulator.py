@@ -6,6 +6,7 @@ from __future__ import annotations
 import functools
 import gc
 import math
+import sys
 import threading
 import time
 from pathlib import Path
@@ -40,6 +41,7 @@ OPENING_NS = 60_000_000
 LISTENERS_PERIOD_NS = 50_000_000
 # So many instants are computed at once, where the steps of the solver reach: 0.2 ms of work.
 LOOK_AHEAD = 8
+SWITCH_INTERVAL_S = 1e-4
 NEVER_NS = 2 ** 63 - 1
 # One tick works at most this long before services and signals get their turn.
 TICK_BUDGET_S = 0.05
@@ -166,6 +168,8 @@ class Simulator(Node):
             self._begin()
         tick_rate = self._values['tick_rate']
         if self._values['pacing'] == 'thread':
+            # What else runs in Python lets go of the interpreter this soon, and not after 5 ms.
+            sys.setswitchinterval(SWITCH_INTERVAL_S)
             self._pacer = DeadlineThread(self._tick_in_thread, tick_rate)
             self._pacer.start()
         else:
@@ -561,6 +565,8 @@ class Simulator(Node):
     def _report(self) -> None:
         """Publish /diagnostics, once a second."""
         self._check_recorder()
+        if self._values['max_error'] > 0.0:
+            self._know_exact()
         with self._lock:
             simulation, counters = self._simulation, self._counters
             self._factor = self._speed.read(max(simulation.now_ns, 0))
@@ -599,6 +605,12 @@ class Simulator(Node):
             self.get_clock().now().to_msg(), self.get_fully_qualified_name().lstrip('/'),
             problems, numbers))
 
+    def _know_exact(self) -> None:
+        """Have the exact solution of the present motion, without keeping ticks waiting for it."""
+        with self._lock:
+            set_up = self._simulation.exact_in_advance()
+        set_up()
+
     def _orientation_error(self) -> float:
         """Return the present error of rk45 [rad]; NaN where nobody wants to know."""
         simulation = self._simulation
@@ -617,6 +629,7 @@ class Simulator(Node):
                 'longest flush [s]': f'{counters.longest_flush:.3f}'}
 
     def _show_status(self) -> None:
+        self._know_exact()
         with self._lock:
             simulation = self._simulation
             state = simulation.state()

@@ -159,8 +159,7 @@ class Simulation:
         if isinstance(self.solver, ExactPropagator):
             return self.solver
         if self._reference is None:
-            with contextlib.suppress(ValueError):
-                self._reference = ExactPropagator(self.top, self._anchor)
+            self.exact_in_advance()()
         return self._reference
 
     def axis_at(self, t_ns: int) -> tuple[float, float, float]:
@@ -173,6 +172,24 @@ class Simulation:
         if t_ns <= self.anchor_ns and self._past:
             return self._past.axis_at(t_ns)
         return _axis(self.exact(), self._anchor, t_ns - self.anchor_ns)
+
+    def exact_in_advance(self) -> Callable[[], None]:
+        """
+        Return what sets up `exact` for the present motion, if it is not there yet.
+
+        That may run in another thread than the simulation: it takes milliseconds, 30 ms at the
+        first time for its modules.
+        """
+        motion = self._first
+
+        def set_up() -> None:
+            if self._reference is None and not isinstance(self.solver, ExactPropagator):
+                with contextlib.suppress(ValueError):
+                    reference = ExactPropagator(top, anchor)
+                    if motion is self._first:
+                        self._reference = reference
+        top, anchor = self.top, self._anchor
+        return set_up
 
     def advance(self, target_ns: int, publish_from_ns: int = 0,
                 give_way: Callable[[], bool] = lambda: False) -> bool:
