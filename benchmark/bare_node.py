@@ -36,6 +36,7 @@ class Bare(Node):
         rate = self.declare_parameter('rate', 100.0).value
         pacing = self.declare_parameter('pacing', 'timer').value
         like = self.declare_parameter('like', '').value
+        self.once = self.declare_parameter('once', False).value
         self.sinks = []
         if like:
             self._pretend(Path(like))
@@ -90,6 +91,8 @@ class Bare(Node):
     def _publish(self) -> None:
         for publish, data in self.sinks:
             publish(data)
+        if self.once:
+            rclpy.try_shutdown()
 
     def _run(self) -> None:
         deadline, period = time.monotonic(), 1.0 / self.rate

@@ -14,7 +14,7 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -42,13 +42,13 @@ class Process:
     """A python process in a group of its own; ends with the `with`."""
 
     def __init__(self, program: Sequence[str], arguments: Sequence[str] = (), *,
-                 talks: bool = False) -> None:
+                 talks: bool = False, stderr: IO[str] | None = None) -> None:
         environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(
             filter(None, [str(ROOT), os.environ.get('PYTHONPATH')]))}
         self._process = subprocess.Popen(
             [sys.executable, *program, *arguments], env=environment, start_new_session=True,
             stdin=subprocess.PIPE if talks else subprocess.DEVNULL,
-            stdout=subprocess.PIPE if talks else subprocess.DEVNULL, text=True)
+            stdout=subprocess.PIPE if talks else subprocess.DEVNULL, stderr=stderr, text=True)
         self.pid = self._process.pid
 
     def __enter__(self) -> Process:
@@ -83,6 +83,10 @@ class Process:
             if line.startswith('VmRSS:'):
                 return 1024 * int(line.split()[1])
         raise ProcessLookupError(self.pid)
+
+    def wait(self, seconds: float) -> int:
+        """Wait for its end; return its exit code.  Raises subprocess.TimeoutExpired."""
+        return self._process.wait(seconds)
 
     def end(self) -> int:
         """Interrupt it, kill it if need be; return its exit code."""

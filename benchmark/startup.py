@@ -1,0 +1,166 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""
+From the start of a process to the first message that another process receives.
+
+    python benchmark/startup.py                 # two minutes
+    python benchmark/startup.py --imports 30    # and what is imported, by time
+
+`sim_node` with its defaults and with recording, beside `bare_node.py` with the same publishers,
+subscription, services and parameters (their descriptions and ranges too), and beside that node
+without parameters and services.  All take turns; what is reported are medians, and medians of
+ratios within a round.  Discovery is in the time to the first message received, and takes now 0.1 s,
+now 3 s, whoever publishes; so there is also a run without subscriber that ends itself at the first
+sample: its time from start to end, and its processor time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from processes import ROOT, SIM_NODE, Process, load, median, quantile, ros_arguments, script
+from report import preamble, table, write
+
+from spinning_top_sim.streams import parameters
+
+OURS, RECORDING, LIKE, BARE = 'ours', 'ours, recording', 'bare, like ours', 'bare'
+KINDS = (OURS, RECORDING, LIKE, BARE)
+
+
+def parameter_file(path: Path) -> None:
+    """Write name, value, description and range of our parameters, as the bare node reads them."""
+    rows = []
+    for parameter in parameters.TABLE:
+        value = parameter.default
+        lowest = parameter.minimum if parameter.above is None else parameter.above
+        largest = sys.float_info.max if parameter.is_double else 2 ** 62
+        bounds = None
+        if lowest is not None or parameter.maximum is not None:
+            bounds = [-largest if lowest is None else lowest,
+                      largest if parameter.maximum is None else parameter.maximum]
+        rows.append([parameter.name, 1.0 if value is None else value, parameter.description,
+                     bounds])
+    path.write_text(json.dumps(rows))
+
+
+def program(kind: str, namespace: str, folder: Path, once: bool) -> list[str]:
+    """Return what python is given to run this kind of node, for ever or to its first sample."""
+    if kind in (OURS, RECORDING):
+        return [*SIM_NODE, *ros_arguments(namespace, {
+            'record.enabled': kind == RECORDING, 'duration': 0.001 if once else 0.0,
+            'record.uri': f'{folder}{namespace}{"_once" if once else ""}.mcap'})]
+    like = {'like': str(folder / 'parameters.json')} if kind == LIKE else {}
+    return [*script('bare_node.py'),
+            *ros_arguments(namespace, {'rate': 100.0, 'once': once, **like})]
+
+
+def one_sample(kind: str, namespace: str, folder: Path) -> tuple[float, float]:
+    """Return wall and processor time [s] of a run that ends itself at its first sample."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    begin = time.monotonic()
+    with Process(program(kind, namespace, folder, once=True)) as node:
+        code = node.wait(30.0)
+        wall = time.monotonic() - begin
+    if code:
+        raise SystemExit(f'{kind} ended with exit code {code}')
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def seconds_to_first(kind: str, namespace: str, folder: Path) -> float:
+    """Return the time [s] to the first message of `pose` elsewhere; NaN if none comes."""
+    listener = Process((*script('listener.py'), namespace), talks=True)
+    try:
+        listener.line()
+        time.sleep(0.3)
+        begin_wall = time.time_ns()
+        with Process(program(kind, namespace, folder, once=False)) as node:
+            give_up = time.monotonic() + 30.0
+            while time.monotonic() < give_up and node.alive:
+                time.sleep(0.02)
+                listener.tell('report')
+                got = json.loads(listener.line())['pose']
+                if got[0]:
+                    return (got[0][0] - begin_wall) / 1e9
+        return float('nan')
+    finally:
+        listener.end()
+
+
+def import_times(count: int) -> str:
+    """Return the slowest imports of `sim_node` by their own time, from -X importtime."""
+    program_ = ('import sys; from spinning_top_sim.nodes import sim_node; '
+                'import spinning_top_sim.nodes.simulator')
+    run = subprocess.run([sys.executable, '-X', 'importtime', '-c', program_], check=True,
+                         capture_output=True, text=True, timeout=60,
+                         env={**os.environ, 'PYTHONPATH': str(ROOT)})
+    own: dict[str, int] = {}
+    for line in run.stderr.splitlines():
+        found = re.match(r'import time:\s+(\d+) \|\s+\d+ \|\s+(\S+)', line)
+        if found:
+            root = found.group(2).split('.')[0]
+            own[root] = own.get(root, 0) + int(found.group(1))
+    rows = sorted(own.items(), key=lambda item: -item[1])
+    total = sum(own.values())
+    return table(('package', 'import [ms]'),
+                 [('all', f'{total / 1e3:.1f}'),
+                  *((f'`{name}`', f'{time_ / 1e3:.1f}') for name, time_ in rows[:count])])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--rounds', type=int, default=11)
+    parser.add_argument('--imports', type=int, default=10, help='how many to list')
+    parser.add_argument('--no-report', action='store_true', help='print only')
+    arguments = parser.parse_args()
+    at_first = load()
+    found: dict[str, list[tuple[float, float, float]]] = {kind: [] for kind in KINDS}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        parameter_file(folder / 'parameters.json')
+        for number in range(arguments.rounds):
+            for i, kind in enumerate(KINDS):
+                namespace = f'/s{number}_{i}'
+                one = (*one_sample(kind, namespace, folder),
+                       seconds_to_first(kind, namespace, folder))
+                found[kind].append(one)
+                print(f'round {number + 1}, {kind}: one sample {one[0]:.3f} s, processor '
+                      f'{one[1]:.3f} s; received after {one[2]:.3f} s, load {load():.1f}',
+                      flush=True)
+    rows = []
+    for kind, runs in found.items():
+        cells = [kind]
+        for i in range(3):
+            values = [run[i] for run in runs]
+            ratio = median([a[i] / b[i] for a, b in zip(runs, found[LIKE], strict=True)])
+            cells += [f'{median(values):.3f}', f'{ratio:.2f}']
+        received = [run[2] for run in runs]
+        rows.append((*cells, *(f'{quantile(received, share):.3f}' for share in (0.0, 0.25, 1.0))))
+    text = '\n'.join((
+        f'{arguments.rounds} rounds; load average at the begin {at_first:.1f}, at the end '
+        f'{load():.1f}.\n',
+        table(('node', 'one sample and end [s]', 'ratio', 'processor time of that [s]', 'ratio',
+               'first message received after [s]', 'ratio', 'soonest', '25 % within',
+               'all within'), rows),
+        f'Ratios are to the node called "{LIKE}".\n',
+        '## Imports of `sim_node`\n',
+        'Own time of the modules of each package, one run of `python -X importtime`.\n',
+        import_times(arguments.imports)))
+    print(text)
+    if not arguments.no_report:
+        write('startup.md', '\n'.join((preamble('Start-up'),
+                                       __doc__.strip().split('\n\n')[-1] + '\n', text)))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
