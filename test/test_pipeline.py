@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pipeline without ROS: what is sent depends on the parameters and the commands alone."""
 
+import gc
 import math
 import random
 import struct
+import sys
+import tracemalloc
 
 import pytest
 
@@ -172,6 +175,83 @@ def test_a_command_in_the_midst_of_a_long_integration_is_taken():
     assert stamps(taken, 'joint_states') == list(range(0, SECOND + 1, POSE_RATE_NS))
 
 
+# ------------------------------------------------------------------------- computed ahead
+
+@pytest.mark.parametrize('name', VARIANTS)
+def test_what_is_sent_does_not_depend_on_how_far_is_computed_ahead(name):
+    """With commands, changes of rate, and listeners who come and go in between."""
+    def run(look_ahead):
+        values = {**VARIANTS[name], 'imu.gyroscope_noise_density': 1e-3}
+        simulation = Simulation(parameters.checked(values), EPOCH_NS)
+        simulation.look_ahead = look_ahead
+        taken = listen(simulation)
+        l3, lz = simulation.l3, simulation.lz
+        for tick in range(1, 61):
+            simulation.advance(tick * 7_654_321)
+            if tick == 20:
+                simulation.command(1.01 * l3, 1.01 * lz)
+            if tick == 30:
+                one = stream(simulation, 'joint_states')
+                one.set_rate(250.0)
+                one.resume(simulation.now_ns)
+            if tick == 40:
+                stream(simulation, 'imu/data_raw').record = None
+            if tick == 50:
+                one = stream(simulation, 'imu/data_raw')
+                one.record = lambda stamp, data: taken.append(('back', stamp, data))
+                simulation.command(l3, lz)
+        return taken
+
+    once = run(1)
+    assert len(once) > 300
+    assert run(2) == once
+    assert run(8) == once
+
+
+def test_computing_ahead_computes_each_sample_once_and_little_in_vain():
+    simulation = simulate(pose__rate=1000.0, joint_states__rate=500.0)
+    simulation.look_ahead = 8
+    taken = listen(simulation, 'pose', 'joint_states')
+    encodes = {one.topic: Counting(one, 'encode') for one in simulation.streams}
+    samples = Counting(simulation.solver, 'at_ns')
+    for tick in range(1, 1001):
+        simulation.advance(tick * 1_000_000)
+        assert all(len(one.ready) < simulation.look_ahead for one in simulation.streams)
+    assert [len(stamps(taken, topic)) for topic in ('pose', 'joint_states')] == [1001, 501]
+    assert 1001 <= encodes['pose'].count <= 1008
+    assert 501 <= encodes['joint_states'].count <= 508
+    assert 1001 <= samples.count <= 1008, 'two streams share the states'
+
+
+def test_what_was_computed_ahead_is_forgotten_when_it_no_longer_holds():
+    simulation = simulate(solver__method='exact', pose__rate=1000.0)
+    simulation.look_ahead = 8
+    listen(simulation, 'pose')
+    pose = stream(simulation, 'pose')
+    simulation.advance(1_000_000)
+    assert pose.ready
+    simulation.command(2.0, 1.5)
+    assert not pose.ready
+    simulation.advance(2_000_000)
+    assert pose.ready
+    pose.set_rate(300.0)
+    pose.resume(simulation.now_ns)
+    assert not pose.ready
+
+
+def test_an_exact_solution_made_beside_is_taken_for_its_own_motion_only():
+    simulation = simulate()
+    late = simulation.exact_in_advance()
+    simulation.command(2.0, 1.5)
+    late()
+    assert simulation.exact().solution.start.l3 == 2.0
+    simulation.command(1.8, 1.4)
+    simulation.exact_in_advance()()
+    there = simulation.exact()
+    assert there.solution.start.l3 == 1.8
+    assert simulation.exact() is there
+
+
 # --------------------------------------------------------------------- nothing for nobody
 
 class Counting:
@@ -211,6 +291,81 @@ def test_only_the_stream_that_is_listened_to_is_encoded(topic):
     assert len(taken) == rate
     assert encodes.pop(topic).count == samples.count == rate
     assert all(counted.count == 0 for counted in encodes.values())
+
+
+def test_a_sample_is_encoded_once_for_all_who_take_it():
+    simulation = simulate()
+    encodes = {one.topic: Counting(one, 'encode') for one in simulation.streams}
+    published, recorded = [], []
+    pose = stream(simulation, 'pose')
+    pose.publish = published.append
+    pose.record = lambda stamp, data: recorded.append(data)
+    simulation.advance(SECOND)
+    assert encodes['pose'].count == len(published) == len(recorded) == 101
+    assert all(a is b for a, b in zip(published, recorded, strict=True))
+
+
+@pytest.mark.parametrize('look_ahead', [1, 8])
+def test_ticks_leave_nothing_behind(look_ahead):
+    """Blocks of memory in use do not become more, whoever listens, however long it runs."""
+    simulation = simulate(imu__rate=1000.0, pose__rate=1000.0, joint_states__rate=1000.0)
+    simulation.look_ahead = look_ahead
+    for one in simulation.streams:
+        one.publish = len
+        one.record = lambda stamp, data: None
+
+    def run(ticks, to=[0]):         # noqa: B006 - goes on where it ended
+        for to[0] in range(to[0] + 1, to[0] + 1 + ticks):
+            simulation.advance(to[0] * 1_000_000)
+        gc.collect()
+        return sys.getallocatedblocks()
+
+    run(2000)
+    before = run(1000)
+    assert run(3000) - before < 100
+
+
+def test_a_tick_allocates_little():
+    """The most that is in use at a time during a tick, over that between two: a few states."""
+    simulation = simulate(imu__rate=1000.0, pose__rate=1000.0, joint_states__rate=1000.0)
+    for topic in ('pose', 'joint_states', 'imu/data_raw'):
+        stream(simulation, topic).publish = len
+    for tick in range(1, 101):
+        simulation.advance(tick * 1_000_000)
+    tracemalloc.start()
+    try:
+        most = 0
+        for tick in range(101, 201):
+            before, _ = tracemalloc.get_traced_memory()
+            tracemalloc.reset_peak()
+            simulation.advance(tick * 1_000_000)
+            most = max(most, tracemalloc.get_traced_memory()[1] - before)
+    finally:
+        tracemalloc.stop()
+    assert 500 < most < 16_000
+
+
+def test_a_tick_without_listeners_costs_the_same_however_many_streams_there_are():
+    """Calls of Python functions, not seconds."""
+    def calls(**values):
+        simulation = simulate(**values)
+        simulation.advance(1_000_000)
+        count = [0]
+
+        def count_call(frame, event, argument):
+            count[0] += event == 'call'
+        before = sys.getprofile()
+        sys.setprofile(count_call)
+        try:
+            for tick in range(2, 1002):
+                simulation.advance(tick * 1_000_000)
+        finally:
+            sys.setprofile(before)
+        return count[0]
+
+    few = calls()
+    assert calls(imu_data__enabled=True, clock__enabled=True, pose__rate=5000.0,
+                 imu__rate=5000.0) == few
 
 
 def test_a_column_that_nobody_needs_is_not_computed(monkeypatch):

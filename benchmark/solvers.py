@@ -1,0 +1,144 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""
+Time per state over the number of states, ours beside others at their fine settings.
+
+    python benchmark/solvers.py                 # two minutes
+
+Two states, a hundred and a hundred thousand of the cusping scene, 512 a second from the start on,
+by the very calls of `peers.py`.  Time is processor time of the whole call over the number of
+states, medians of interleaved rounds in one process and one thread; setting up our exact solution
+is part of it except where it says "prepared", compiling and loading of others are not.  "any
+times" are the same instants in random order, which steppers do not take.  Error: the largest
+rotation angle from the exact solution, whose own error stands in work_precision.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+
+import numpy as np
+from cases import FINEST_NS, WORK_PRECISION, Case
+from peers import FailedError, Peer, Runner, angles_between, peer
+from report import number, preamble, table, write
+from timing import TimeUpError, interleaved, one_thread, seconds_of, time_limit
+
+from spinning_top_sim.solvers.exact import ExactSolution
+
+COUNTS = (2, 100, 100_000)
+CHOSEN = (('exact, state by state', 0.0), ('exact, array', 0.0), ('exact, grid', 0.0),
+          ('rk45 transport', 1e-9), ('rk45 transport', 1e-11), ('SciPy RK45', 1e-9),
+          ('SciPy DOP853', 1e-12), ('heyoka quadratic', 1e-12), ('heyoka quadratic', 2.0 ** -52),
+          ('diffrax Dopri8 quadratic', 1e-12), ('MuJoCo RK4', 2048.0))
+LONGEST_S = 20.0
+
+
+class _Prepared(Runner):
+    """The exact solution, set up before."""
+
+    def __init__(self, case: Case, setting: float) -> None:
+        super().__init__(case, setting)
+        self.solution = ExactSolution(case.top, case.start)
+
+
+class _PreparedOne(_Prepared):
+    def attitudes(self, ns):
+        return np.array([self.solution.quaternion_at(n) for n in ns.tolist()])
+
+
+class _PreparedArray(_Prepared):
+    def attitudes(self, ns):
+        shuffled = np.random.default_rng(1).permutation(len(ns))
+        result = np.empty((len(ns), 4))
+        result[shuffled] = self.solution.quaternion(ns[shuffled] / 1e9)
+        return result
+
+
+class _PreparedGrid(_Prepared):
+    def attitudes(self, ns):
+        return self.solution.quaternion_grid(0, int(ns[1]), len(ns))
+
+
+PREPARED = (Peer('exact, prepared, state by state', 'ours', _PreparedOne, (0.0,)),
+            Peer('exact, prepared, any times', 'ours', _PreparedArray, (0.0,)),
+            Peer('exact, prepared, grid', 'ours', _PreparedGrid, (0.0,)))
+
+
+def absent() -> list[str]:
+    """Return what cannot be compared, and why."""
+    found = {}
+    for name, _ in CHOSEN:
+        one = peer(name)
+        reason = one.missing()
+        if reason:
+            found[one.family] = reason
+    try:
+        __import__('numbalsoda')
+        found['numbalsoda'] = 'is installed, but nothing here drives it'
+    except Exception as error:      # whatever a foreign package raises is the reason
+        found['numbalsoda'] = f'{type(error).__name__}: {error}'
+    return [f'- {name}: {reason}' for name, reason in found.items()]
+
+
+def measure(case: Case, count: int, rounds: int) -> dict[str, tuple[float, float] | str]:
+    """Return (seconds per state, error) of each method, or what happened to it."""
+    ns = np.arange(count, dtype=np.int64) * FINEST_NS
+    truth = case.exact.quaternion(ns / 1e9)
+    found: dict[str, tuple[float, float] | str] = {}
+    runs: dict[object, Callable[[], object]] = {}
+    errors = {}
+    for one, setting in [*((p, 0.0) for p in PREPARED), *((peer(n), s) for n, s in CHOSEN)]:
+        name = f'{one.name} {one.setting_text(setting)}'.strip()
+        if one.missing():
+            found[name] = 'absent'
+            continue
+        try:
+            with time_limit(LONGEST_S):
+                runner = one.ready(case, setting)
+                runner.compile(ns)
+                _, result = seconds_of(lambda runner=runner: runner.attitudes(ns))
+        except (FailedError, TimeUpError) as error:
+            found[name] = str(error)
+            continue
+        errors[name] = float(angles_between(result, truth).max())
+        runs[name] = lambda runner=runner: runner.attitudes(ns)
+        found[name] = ''
+    times = interleaved(runs, rounds)
+    for name, seconds in times.items():
+        found[name] = seconds / count, errors[name]
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--rounds', type=int, default=5)
+    parser.add_argument('--no-report', action='store_true', help='print only')
+    arguments = parser.parse_args()
+    one_thread()
+    case = WORK_PRECISION[0]
+    found = {count: measure(case, count, arguments.rounds) for count in COUNTS}
+    rows = []
+    for name in found[COUNTS[0]]:
+        cells = [name]
+        for count in COUNTS:
+            one = found[count][name]
+            cells += [one, '–'] if isinstance(one, str) else [number(1e6 * one[0], 3),
+                                                              number(one[1])]
+        rows.append(cells)
+    heads = ['method', *(head for count in COUNTS
+                         for head in (f'{count} states: µs a state', 'error [rad]'))]
+    missing = absent()
+    text = '\n'.join((
+        f'{case.title}; {arguments.rounds} rounds.\n', table(heads, rows),
+        'Not compared:\n' if missing else 'Nothing is missing.', *missing, ''))
+    print(text)
+    if not arguments.no_report:
+        write('solvers.md', '\n'.join((preamble('Time per state'),
+                                       __doc__.strip().split('\n\n')[-1] + '\n', text)))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
