@@ -174,6 +174,8 @@ def main() -> int:
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         seen = soak(arguments.minutes, arguments.log_every, arguments.listen_every, Path(name))
+    print('resident memory, every 10 s [MB]:',
+          *(f'{size / 1e6:.1f}' for _, size in seen['memory'][::10]))
     rows, fine = judge(seen)
     text = '\n'.join((f'{arguments.minutes:g} minutes; load average at the end {load():.1f}.\n',
                       table(('', ''), rows)))

@@ -212,10 +212,10 @@ class Noise:
         while len(self._bias_starts) <= block:
             before = len(self._bias_starts) - 1
             _, bias = self._draw(before)
-            self._bias_starts.append(bias[-1])
+            self._bias_starts.append(bias[-1].copy())    # not a view that keeps all
         white, bias = self._draw(block)
         if len(self._bias_starts) == block + 1:
-            self._bias_starts.append(bias[-1])
+            self._bias_starts.append(bias[-1].copy())    # not a view that keeps all
         return white, bias
 
     def _draw(self, block: int) -> tuple[Any, Any]:
