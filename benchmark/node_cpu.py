@@ -162,6 +162,29 @@ def measured(arguments: argparse.Namespace) -> dict:
     return found
 
 
+def idle(rounds: int, seconds: float) -> str:
+    """Return the table of what streams cost that nobody listens to."""
+    all_streams = {f'{name}.enabled': True for name in (*STREAMS, 'imu_data', *OTHERS, 'clock')}
+    nodes = {(pacing, what): {'pacing': pacing, 'tick_rate': 1000.0, 'status_period': 0.0,
+                              **{name: what == 'all' for name in all_streams}}
+             for pacing in ('timer', 'thread') for what in ('all', 'none')}
+    shares: dict[tuple[str, str], list[float]] = {key: [] for key in nodes}
+    for _ in range(rounds):
+        for key, parameters in nodes.items():
+            with Process((*SIM_NODE, *ros_arguments(f'/n{next(_namespaces)}',
+                                                    parameters))) as node:
+                time.sleep(3.0)
+                cpu, begin = node.cpu_ns(), time.monotonic_ns()
+                time.sleep(seconds)
+                shares[key].append((node.cpu_ns() - cpu) / (time.monotonic_ns() - begin))
+    rows = []
+    for pacing in ('timer', 'thread'):
+        every, none = shares[pacing, 'all'], shares[pacing, 'none']
+        rows.append((pacing, f'{100 * median(every):.1f}', f'{100 * median(none):.1f}',
+                     number(median([a / b for a, b in zip(every, none, strict=True)]), 3)))
+    return table(('pacing', 'all streams enabled [%]', 'none enabled [%]', 'ratio'), rows)
+
+
 def mean_rate(one: Result) -> float:
     return sum(one.rates) / len(one.rates) if one.rates else float('nan')
 
@@ -251,9 +274,13 @@ def main() -> None:
     parser.add_argument('--rounds', type=int, default=3)
     parser.add_argument('--seconds', type=float, default=2.0, help='measured, each run')
     parser.add_argument('--warm-up', type=float, default=1.5, help='before that')
+    parser.add_argument('--idle-rounds', type=int, default=3,
+                        help='of the table of streams that nobody listens to')
     parser.add_argument('--no-report', action='store_true', help='print the tables only')
     arguments = parser.parse_args()
     at_first = load()
+    unheard = idle(arguments.idle_rounds, 2.0 * arguments.seconds)
+    print(unheard, flush=True)
     found = measured(arguments)
     text = '\n'.join((
         f'Load average at the begin {at_first:.1f}, at the end {load():.1f} (the benchmark '
@@ -261,7 +288,10 @@ def main() -> None:
         '## Processor time [% of a core]\n', share_table(found),
         '## Ratios of processor time\n', ratio_table(found),
         '## Ratios of processor time for each sample that arrived\n',
-        ratio_table(found, per_sample=True), '## Arrivals\n', arrival_table(found)))
+        ratio_table(found, per_sample=True),
+        '## Streams that nobody listens to\n',
+        'Processor time at 1000 ticks a second, default rates, no subscriber.\n', unheard,
+        '## Arrivals\n', arrival_table(found)))
     print(text)
     if not arguments.no_report:
         docs = Path(__file__).resolve().parent.parent / 'docs'
