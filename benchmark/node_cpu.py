@@ -278,6 +278,7 @@ def main() -> None:
                         help='of the table of streams that nobody listens to')
     parser.add_argument('--no-report', action='store_true', help='print the tables only')
     arguments = parser.parse_args()
+    head = preamble('Processor time of the node')        # with the commit that is there now
     at_first = load()
     unheard = idle(arguments.idle_rounds, 2.0 * arguments.seconds)
     print(unheard, flush=True)
@@ -297,7 +298,7 @@ def main() -> None:
         docs = Path(__file__).resolve().parent.parent / 'docs'
         figure(found, docs / 'node_cpu.png')
         write('node_cpu.md', '\n'.join((
-            preamble('Processor time of the node'), __doc__.strip().split('\n\n')[-1] + '\n',
+            head, __doc__.strip().split('\n\n')[-1] + '\n',
             '![Processor time over rate](node_cpu.png)\n', text)))
 
 

@@ -172,6 +172,7 @@ def main() -> int:
                         help='s, between the comings and goings of a subscriber')
     parser.add_argument('--no-report', action='store_true', help='print only')
     arguments = parser.parse_args()
+    head = preamble('A long run')        # with the commit that is there now
     with tempfile.TemporaryDirectory() as name:
         seen = soak(arguments.minutes, arguments.log_every, arguments.listen_every, Path(name))
     print('resident memory, every 10 s [MB]:',
@@ -181,7 +182,7 @@ def main() -> int:
                       table(('', ''), rows)))
     print(text)
     if not arguments.no_report:
-        write('soak.md', '\n'.join((preamble('A long run'),
+        write('soak.md', '\n'.join((head,
                                     __doc__.strip().split('\n\n')[-1] + '\n', text)))
     return 0 if fine else 1
 

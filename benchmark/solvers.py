@@ -117,6 +117,7 @@ def main() -> None:
     parser.add_argument('--rounds', type=int, default=5)
     parser.add_argument('--no-report', action='store_true', help='print only')
     arguments = parser.parse_args()
+    head = preamble('Time per state')        # with the commit that is there now
     one_thread()
     case = WORK_PRECISION[0]
     found = {count: measure(case, count, arguments.rounds) for count in COUNTS}
@@ -136,7 +137,7 @@ def main() -> None:
         'Not compared:\n' if missing else 'Nothing is missing.', *missing, ''))
     print(text)
     if not arguments.no_report:
-        write('solvers.md', '\n'.join((preamble('Time per state'),
+        write('solvers.md', '\n'.join((head,
                                        __doc__.strip().split('\n\n')[-1] + '\n', text)))
 
 

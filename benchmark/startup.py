@@ -123,6 +123,7 @@ def main() -> None:
     parser.add_argument('--imports', type=int, default=10, help='how many to list')
     parser.add_argument('--no-report', action='store_true', help='print only')
     arguments = parser.parse_args()
+    head = preamble('Start-up')        # with the commit that is there now
     at_first = load()
     found: dict[str, list[tuple[float, float, float]]] = {kind: [] for kind in KINDS}
     with tempfile.TemporaryDirectory() as name:
@@ -158,7 +159,7 @@ def main() -> None:
         import_times(arguments.imports)))
     print(text)
     if not arguments.no_report:
-        write('startup.md', '\n'.join((preamble('Start-up'),
+        write('startup.md', '\n'.join((head,
                                        __doc__.strip().split('\n\n')[-1] + '\n', text)))
 
 
