@@ -31,7 +31,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from processes import SIM_NODE, Process, load, median, quantile, ros_arguments, script
-from report import number, preamble, table, write
+from report import number, preamble, table, write_section
 
 STREAMS = ('pose', 'joint_states', 'imu')
 OTHERS = ('ground_truth_imu', 'ground_truth_odom', 'invariants')
@@ -71,7 +71,7 @@ def program(kind: str, rate: float, namespace: str, folder: Path) -> list[str]:
         return [*script('straightforward_node.py'),
                 *ros_arguments(namespace, {'rate': float(rate)})]
     return [*script('bare_node.py'), *ros_arguments(
-        namespace, {'rate': float(rate), 'pacing': kind.split()[-1]})]
+        namespace, {'rate': float(rate), 'pacing': kind.rsplit(maxsplit=1)[-1]})]
 
 
 _namespaces = itertools.count(1)
@@ -164,9 +164,9 @@ def measured(arguments: argparse.Namespace) -> dict:
 
 def idle(rounds: int, seconds: float) -> str:
     """Return the table of what streams cost that nobody listens to."""
-    all_streams = {f'{name}.enabled': True for name in (*STREAMS, 'imu_data', *OTHERS, 'clock')}
+    switches = [f'{name}.enabled' for name in (*STREAMS, 'imu_data', *OTHERS, 'clock')]
     nodes = {(pacing, what): {'pacing': pacing, 'tick_rate': 1000.0, 'status_period': 0.0,
-                              **{name: what == 'all' for name in all_streams}}
+                              **dict.fromkeys(switches, what == 'all')}
              for pacing in ('timer', 'thread') for what in ('all', 'none')}
     shares: dict[tuple[str, str], list[float]] = {key: [] for key in nodes}
     for _ in range(rounds):
@@ -194,7 +194,7 @@ def ratio(runs: dict, kind: str, to: str, per_sample: bool) -> float:
     def cost(one: Result) -> float:
         return one.share / mean_rate(one) if per_sample else one.share
     return median([cost(a) / cost(b) for a, b in zip(runs[kind], runs[to], strict=True)
-                   if a and b and (not per_sample or mean_rate(a) and mean_rate(b))])
+                   if a and b and (not per_sample or (mean_rate(a) and mean_rate(b)))])
 
 
 def share_table(found: dict) -> str:
@@ -227,8 +227,8 @@ def arrival_table(found: dict) -> str:
     """Return rate, jitter and loss of what one subscriber got."""
     rows = []
     for (rate, subscribers), kinds in found.items():
-        for kind, runs in kinds.items():
-            runs = [run for run in runs if run and run.rates]
+        for kind, all_runs in kinds.items():
+            runs = [run for run in all_runs if run and run.rates]
             if not runs:
                 continue
             rows.append((
@@ -297,7 +297,7 @@ def main() -> None:
     if not arguments.no_report:
         docs = Path(__file__).resolve().parent.parent / 'docs'
         figure(found, docs / 'node_cpu.png')
-        write('node_cpu.md', '\n'.join((
+        write_section('node_cpu', '\n'.join((
             head, __doc__.strip().split('\n\n')[-1] + '\n',
             '![Processor time over rate](node_cpu.png)\n', text)))
 

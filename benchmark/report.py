@@ -7,6 +7,7 @@ import datetime
 import importlib.metadata
 import os
 import platform
+import re
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
@@ -53,6 +54,21 @@ def write(name: str, text: str) -> None:
     path = ROOT / 'docs' / name
     path.write_text(text)
     print(f'wrote {path.relative_to(ROOT)}')
+
+
+# What docs/performance.md holds, in this order; each benchmark writes its own section.
+SECTIONS = ('node_cpu', 'startup', 'solvers', 'soak')
+
+
+def write_section(name: str, page: str) -> None:
+    """Put a page into docs/performance.md as one of its SECTIONS, in place of what it was."""
+    path = ROOT / 'docs' / 'performance.md'
+    before = path.read_text() if path.exists() else ''
+    sections = dict(re.findall(r'<!-- (\w+) -->\n(.*?)<!-- end -->\n', before, re.DOTALL))
+    sections[name] = re.sub('^#', '##', page, flags=re.MULTILINE).strip() + '\n'
+    write('performance.md', '\n'.join(['# Performance\n', *(
+        f'<!-- {key} -->\n{sections[key]}<!-- end -->\n'
+        for key in SECTIONS if key in sections)]))
 
 
 def _commit() -> str:

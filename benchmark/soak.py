@@ -24,7 +24,7 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 from processes import SIM_NODE, Process, load, ros_arguments, script
-from report import preamble, table, write
+from report import preamble, table, write_section
 
 RATE = 1000.0
 STREAMS = ('pose', 'joint_states', 'imu')
@@ -182,7 +182,7 @@ def main() -> int:
                       table(('', ''), rows)))
     print(text)
     if not arguments.no_report:
-        write('soak.md', '\n'.join((head,
+        write_section('soak', '\n'.join((head,
                                     __doc__.strip().split('\n\n')[-1] + '\n', text)))
     return 0 if fine else 1
 

@@ -22,7 +22,7 @@ from collections.abc import Callable
 import numpy as np
 from cases import FINEST_NS, WORK_PRECISION, Case
 from peers import FailedError, Peer, Runner, angles_between, peer
-from report import number, preamble, table, write
+from report import number, preamble, table, write_section
 from timing import TimeUpError, interleaved, one_thread, seconds_of, time_limit
 
 from spinning_top_sim.solvers.exact import ExactSolution
@@ -137,7 +137,7 @@ def main() -> None:
         'Not compared:\n' if missing else 'Nothing is missing.', *missing, ''))
     print(text)
     if not arguments.no_report:
-        write('solvers.md', '\n'.join((head,
+        write_section('solvers', '\n'.join((head,
                                        __doc__.strip().split('\n\n')[-1] + '\n', text)))
 
 

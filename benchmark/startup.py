@@ -9,9 +9,9 @@ From the start of a process to the first message that another process receives.
 `sim_node` with its defaults and with recording, beside `bare_node.py` with the same publishers,
 subscription, services and parameters (their descriptions and ranges too), and beside that node
 without parameters and services.  All take turns; what is reported are medians, and medians of
-ratios within a round.  Discovery is in the time to the first message received, and takes now 0.1 s,
-now 3 s, whoever publishes; so there is also a run without subscriber that ends itself at the first
-sample: its time from start to end, and its processor time.
+ratios within a round.  Discovery is in the time to the first message received, and takes now
+0.1 s, now 3 s, whoever publishes; so there is also a run without subscriber that ends itself at
+the first sample: its time from start to end, and its processor time.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import time
 from pathlib import Path
 
 from processes import ROOT, SIM_NODE, Process, load, median, quantile, ros_arguments, script
-from report import preamble, table, write
+from report import preamble, table, write_section
 
 from spinning_top_sim.streams import parameters
 
@@ -159,7 +159,7 @@ def main() -> None:
         import_times(arguments.imports)))
     print(text)
     if not arguments.no_report:
-        write('startup.md', '\n'.join((head,
+        write_section('startup', '\n'.join((head,
                                        __doc__.strip().split('\n\n')[-1] + '\n', text)))
 
 

@@ -314,9 +314,9 @@ def test_ticks_leave_nothing_behind(look_ahead):
         one.publish = len
         one.record = lambda stamp, data: None
 
-    def run(ticks, to=[0]):         # noqa: B006 - goes on where it ended
-        for to[0] in range(to[0] + 1, to[0] + 1 + ticks):
-            simulation.advance(to[0] * 1_000_000)
+    def run(ticks):
+        for _ in range(ticks):
+            simulation.advance(simulation.now_ns + 1_000_000)
         gc.collect()
         return sys.getallocatedblocks()
 

@@ -213,7 +213,7 @@ class Simulation:
                 stream.resume(publish_from_ns - 1)
                 stream.skipped += (stream.next_ns - next_ns) // stream.period_ns
                 next_ns = stream.next_ns
-            if next_ns < due:
+            if next_ns < due:       # noqa: PLR1730 - min() takes twice the time
                 due = next_ns
         while due <= target_ns:
             if due > self._known_ns and not self._reach(due, give_way):
@@ -225,7 +225,7 @@ class Simulation:
                 return False
         if target_ns > self._known_ns and not self._reach(target_ns, give_way):
             return False
-        if target_ns > self.now_ns:
+        if target_ns > self.now_ns:     # noqa: PLR1730
             self.now_ns = target_ns
         return True
 
@@ -319,7 +319,7 @@ class Simulation:
                             state = self.solver.at_ns(t_ns - self.anchor_ns)
                         stream.ready[t_ns] = stream.encode(state, self.epoch_ns + t_ns, t_ns)
                     at_ns += period_ns
-                if at_ns < next_ns:
+                if at_ns < next_ns:     # noqa: PLR1730
                     next_ns = at_ns
             if next_ns > last_ns:
                 return
