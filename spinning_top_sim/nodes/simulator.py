@@ -25,6 +25,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes import reports
 from spinning_top_sim.nodes.message_types import message_type
+from spinning_top_sim.nodes.occasional import OccasionalGroup
 from spinning_top_sim.nodes.pacing import DeadlineThread, SimulatedClock
 from spinning_top_sim.nodes.ros_parameters import SPIN, ParameterChanges, declare, start_values
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
@@ -87,6 +88,7 @@ class Simulator(Node):
         declare(self, values)
         self._changes = ParameterChanges(self, values, start_spin, self._apply)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._publisher_events = OccasionalGroup()
         self._qos: dict[str, QoSProfile] = {}
         self._outputs: dict[str, Publisher] = {}
         self._open_publishers()
@@ -134,7 +136,7 @@ class Simulator(Node):
     def _publisher(self, message_type: type, topic: str) -> Publisher:
         qos = QoSProfile(depth=10)
         publisher = self.create_publisher(
-            message_type, topic, qos,
+            message_type, topic, qos, callback_group=self._publisher_events,
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
         self._qos[publisher.topic_name] = qos       # with the overrides put in
         return publisher
@@ -564,6 +566,7 @@ class Simulator(Node):
 
     def _report(self) -> None:
         """Publish /diagnostics, once a second."""
+        self._publisher_events.open()
         self._check_recorder()
         if self._values['max_error'] > 0.0:
             self._know_exact()
