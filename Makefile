@@ -45,7 +45,7 @@ help:
 	@echo 'make stress  200 recording nodes killed (KILLS=...), then 100 000 random tops (STRESS=...)'
 	@echo '             through both solvers: an hour'
 	@echo 'make benchmark  accuracy, stability and cost beside other programs, and the noise of the'
-	@echo '             IMU, into docs/ (an hour, in an environment of its own, .venv-benchmark)'
+	@echo '             IMU, into docs/ (three hours, in an environment of its own, .venv-benchmark)'
 	@echo 'make docs    write the interface page, the plain URDF and the pictures anew'
 	@echo 'make lint    ruff and mypy'
 	@echo 'make build   build with colcon in a temporary workspace, run and test what was installed'
@@ -86,7 +86,12 @@ benchmark:
 	    .venv-benchmark/.peers
 	.venv-benchmark/bin/python benchmark/heavy_top.py
 	.venv-benchmark/bin/python benchmark/exact_cost.py
+	.venv-benchmark/bin/python benchmark/solvers.py
 	.venv-benchmark/bin/python benchmark/offline.py --hour
+	.venv-benchmark/bin/python benchmark/offline_scaling.py --long
+	.venv-benchmark/bin/python benchmark/startup.py
+	.venv-benchmark/bin/python benchmark/node_cpu.py
+	.venv-benchmark/bin/python benchmark/soak.py
 	.venv-benchmark/bin/python benchmark/gauge.py
 	.venv-benchmark/bin/python benchmark/stability.py
 	.venv-benchmark/bin/python benchmark/work_precision.py

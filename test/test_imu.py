@@ -4,6 +4,7 @@
 import math
 import subprocess
 import sys
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -239,3 +240,20 @@ def test_a_perfect_imu_does_not_import_numpy():
     run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                          timeout=60, check=True)
     assert run.stdout.strip() == '[]'
+
+
+def test_noise_that_was_read_is_not_kept():
+    """Only where the bias of each block ends: some 200 of the 25 000 bytes of a block."""
+    sensor = Sensor(parameters.checked(NOISY), 1_000_000)
+    exact = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    block = 512
+    sensor.read(exact, 10 * block)
+    tracemalloc.start()
+    try:
+        sensor.read(exact, 20 * block)
+        before, _ = tracemalloc.get_traced_memory()
+        sensor.read(exact, 120 * block)
+        after, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert after - before < 100 * 500

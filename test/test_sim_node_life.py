@@ -124,6 +124,29 @@ def test_what_a_scene_does_not_need_is_not_imported(finished):
         assert ('spinning_top_sim.recording.writer' in modules) == records
 
 
+def test_the_default_scene_imports_just_what_it_uses(finished):
+    node = next(node for node in finished.nodes if node.namespace == '/silent')
+    modules = json.loads((node.folder / 'modules.json').read_text())
+    ours = {name.removeprefix('spinning_top_sim.') for name in modules
+            if name.startswith('spinning_top_sim.') and name.count('.') == 2}
+    assert ours == {
+        *(f'nodes.{name}' for name in (
+            'executable', 'message_types', 'occasional', 'pacing', 'reports', 'ros_parameters',
+            'simulator')),
+        *(f'physics.{name}' for name in ('attitude', 'kinematics', 'regimes', 'top')),
+        *(f'solvers.{name}' for name in (
+            'dormand_prince', 'phases', 'propagator', 'rk45', 'transport')),
+        # `max_error` asks for the exact solution.
+        *(f'solvers.{name}' for name in (
+            'exact', 'exact_attitude', 'long_decimals', 'theta_series', 'theta_setup')),
+        *(f'streams.{name}' for name in (
+            'cdr', 'imu', 'journal', 'messages', 'parameters', 'pipeline', 'topics'))}
+    messages = {name.split('.')[0] for name in modules if name.endswith('_msgs')}
+    assert messages <= {
+        'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'sensor_msgs', 'std_msgs',      # ours
+        'rosgraph_msgs', 'service_msgs'}                                              # rclpy's
+
+
 # ------------------------------------------------------------------------------------ the end
 
 ENDS = {'sigint': (signal.SIGINT, 1, 0.0), 'sigterm': (signal.SIGTERM, 1, 0.0),

@@ -27,11 +27,12 @@ from node_logs import (
     stamps_of,
     the_log,
 )
-from rclpy.qos import ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.highlevel import AnyReader
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu
 
+from spinning_top_sim.nodes.occasional import OccasionalGroup
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.pipeline import Simulation
 
@@ -192,6 +193,28 @@ def test_remapping_and_qos_overrides_work(peer, tmp_path):
                    and connection.ext.offered_qos_profiles}
     assert offered['/ns/attitude'].reliability.value == 2
     assert offered['/ns/imu/data_raw'].depth == 3
+
+
+@pytest.mark.parametrize('pacing', ['timer', 'thread'])
+def test_a_subscription_with_another_qos_is_warned_about(peer, tmp_path, pacing):
+    """The publishers' events are looked at now and then only, but they are."""
+    with SimNode(tmp_path, {**QUIET, 'pacing': pacing}) as node:
+        topic = node.topic('pose')
+        subscription = peer.node.create_subscription(
+            PoseStamped, topic, lambda _: None, QoSProfile(
+                depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+        wait_for('a warning of the QoS', lambda: 'incompatible QoS' in node.err + node.out)
+        assert "on topic 'pose'" in node.err + node.out
+        assert_clean_end(node, node.end())
+        assert subscription.topic_name == topic
+
+
+def test_publishers_events_are_left_out_of_the_wait_set_but_for_a_moment():
+    group = OccasionalGroup()
+    assert not group.can_execute(None)
+    group.open()
+    assert group.can_execute(None)
+    wait_for('the end of the moment', lambda: not group.can_execute(None))
 
 
 def test_a_dump_of_the_parameters_makes_the_same_run(peer, tmp_path):

@@ -12,7 +12,6 @@ from spinning_top_sim.physics.kinematics import AxisState, OneState
 from spinning_top_sim.physics.regimes import cubic
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.dormand_prince import Form, IntegrationError, Integrator, Vector
-from spinning_top_sim.solvers.euler_form import EulerForm
 from spinning_top_sim.solvers.phases import (
     MomentumState,
     Polar,
@@ -196,6 +195,8 @@ class EulerMotion(_Stepped):
     """Equations (29)-(32) to the letter."""
 
     def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
+        from spinning_top_sim.solvers.euler_form import EulerForm  # noqa: PLC0415 - for study
+
         self._top, self._start = top, start
         form = EulerForm(top, start, rtol, atol)
         super().__init__(form, form.start, form.first_step)

@@ -1,0 +1,82 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""
+`simulate` over duration and number of streams: does it stay linear, and its memory flat?
+
+    python benchmark/offline_scaling.py             # to an hour, a minute
+    python benchmark/offline_scaling.py --long      # to ten hours
+
+Each run is a process of its own, from start to exit, with streams at 100 Hz into a zstd log.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from mcap.reader import make_reader
+from processes import ROOT, load
+from report import preamble, table, write_section
+
+STREAMS = ('pose', 'joint_states', 'imu', 'ground_truth_imu', 'ground_truth_odom', 'invariants')
+RATE = 100.0
+THREE = STREAMS[:3]
+
+
+def run(method: str, streams: tuple[str, ...], seconds: float, path: Path) -> list[str]:
+    """Simulate in a process of its own; return messages, time, rate and memory as cells."""
+    parameters = {'solver.method': method, 'max_error': 0.0,
+                  **{f'{name}.enabled': str(name in streams).lower() for name in STREAMS},
+                  **{f'{name}.rate': RATE for name in streams}}
+    arguments = [item for name, value in parameters.items() for item in ('-p', f'{name}:={value}')]
+    begin = time.monotonic()
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'spinning_top_sim.tools.simulate', '-o', str(path), '--duration',
+         str(seconds), '--quiet', *arguments], env={**os.environ, 'PYTHONPATH': str(ROOT)})
+    _, status, usage = os.wait4(process.pid, 0)
+    taken = time.monotonic() - begin
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise SystemExit(f'simulate ended with exit code {process.returncode}')
+    with path.open('rb') as file:
+        summary = make_reader(file).get_summary()
+    assert summary and summary.statistics
+    count = summary.statistics.message_count
+    path.unlink()
+    return [f'{count}', f'{taken:.2f}', f'{count / taken:,.0f}', f'{usage.ru_maxrss / 1e3:.0f}']
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--long', action='store_true', help='also ten hours')
+    parser.add_argument('--no-report', action='store_true', help='print only')
+    arguments = parser.parse_args()
+    head = preamble('`simulate` over duration and streams')
+    heads = ('messages', 'time [s]', 'messages/s', 'peak memory [MB]')
+    minutes = (1, 10, 60, 600) if arguments.long else (1, 10, 60)
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / 'run.mcap'
+        duration_rows = [[method, str(m), *run(method, THREE, 60.0 * m, path)]
+                         for method in ('exact', 'rk45')
+                         for m in (minutes if method == 'exact' else minutes[:2])]
+        stream_rows = [[str(n), *run('exact', STREAMS[:n], 600.0, path)]
+                       for n in range(1, len(STREAMS) + 1)]
+    text = '\n'.join((f'Load average at the end {load():.1f}.\n',
+                      f'Three streams ({", ".join(THREE)}):\n',
+                      table(('solver', 'simulated [min]', *heads), duration_rows),
+                      'Ten minutes by the exact solution, more and more streams:\n',
+                      table(('streams', *heads), stream_rows)))
+    print(text)
+    if not arguments.no_report:
+        write_section('offline_scaling', '\n'.join((
+            head, __doc__.strip().split('\n\n')[-1] + '\n', text)))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
