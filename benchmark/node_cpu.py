@@ -157,6 +157,9 @@ def measured(arguments: argparse.Namespace) -> dict:
                           + ('failed' if one is None else
                              f'{100 * one.share:.1f} %, {mean_rate(one):.0f} Hz')
                           + f', load {load():.1f}', flush=True)
+    except KeyboardInterrupt:
+        print('interrupted: the tables show what there is, and are not written')
+        arguments.no_report = True
     finally:
         shutil.rmtree(folder)
     return found
