@@ -133,7 +133,7 @@ def test_the_default_scene_imports_just_what_it_uses(finished):
         *(f'nodes.{name}' for name in (
             'executable', 'message_types', 'occasional', 'pacing', 'reports', 'ros_parameters',
             'simulator')),
-        *(f'physics.{name}' for name in ('attitude', 'kinematics', 'regimes', 'top')),
+        *(f'physics.{name}' for name in ('attitude', 'kinematics', 'regimes', 'shape', 'top')),
         *(f'solvers.{name}' for name in (
             'dormand_prince', 'phases', 'propagator', 'rk45', 'transport')),
         # `max_error` asks for the exact solution.
