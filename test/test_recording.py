@@ -9,6 +9,7 @@ serialized by rosbags.  Children are killed for good after a timeout, whatever t
 import io
 import json
 import os
+import random
 import signal
 import struct
 import subprocess
@@ -512,16 +513,42 @@ def test_closing_twice_changes_nothing(tmp_path):
     assert first.bytes == len(content) == len(second.path.read_bytes())
 
 
+def test_messages_of_any_length_are_all_kept(tmp_path):
+    """Those of one length go in bulk, others and few one by one; chunks stay of a size."""
+    rng = random.Random(5)
+    wanted = [[], [], []]
+    with McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=100.0,
+                           min_free_bytes=0) as recorder:
+        for time_ns in range(5000):
+            topic = rng.randrange(3)
+            size = (1000, rng.choice([12, 12, 12, 700]), time_ns % 7)[topic]
+            data = rng.randbytes(size)
+            wanted[topic].append((time_ns, data))
+            recorder.write(topic, time_ns, data)
+    found = [[], [], []]
+    names = [topic.name for topic in TOPICS]
+    with (tmp_path / 'run.mcap').open('rb') as file:
+        reader = make_reader(file)
+        for _, channel, message in reader.iter_messages():
+            of_topic = found[names.index(channel.topic)]
+            assert message.sequence == len(of_topic)
+            of_topic.append((message.log_time, message.data))
+        chunks = reader.get_summary().chunk_indexes
+    assert found == wanted
+    assert 2 <= len(chunks) <= 4
+    assert max(chunk.uncompressed_size for chunk in chunks) < 1.5 * CHUNK_BYTES
+
+
 def test_a_full_queue_says_so_and_loses_nothing(tmp_path, monkeypatch):
     blocked, disk_is_back = threading.Event(), threading.Event()
-    append = McapFile.append
+    append = McapFile.append_all
 
     def append_slowly(self, *message):
         blocked.set()
         disk_is_back.wait(PATIENCE_S)
         return append(self, *message)
 
-    monkeypatch.setattr(McapFile, 'append', append_slowly)
+    monkeypatch.setattr(McapFile, 'append_all', append_slowly)
     recorder = McapRecorder.open(
         tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.01, min_free_bytes=0,
         queue_bytes=10_000)
@@ -651,7 +678,7 @@ def test_a_full_disk_stops_the_recording_and_leaves_an_indexed_file(tmp_path):
     recorder = McapRecorder.open(
         sys.argv[1], TOPICS, {}, min_free_bytes=0, max_loss=100.0, queue_bytes=200_000)
     write(recorder, 1500)
-    wait_until(lambda: recorder.counters.messages > 0)
+    wait_until(lambda: recorder.counters.messages > 1000)
     limit(recorder.counters.bytes + 100_000)
     write(recorder, 3000)
     wait_until(lambda: recorder.state == 'failed')

@@ -13,6 +13,7 @@ import contextlib
 import os
 import threading
 import time
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,14 +92,16 @@ class McapRecorder:
         self._file = file
         self._flush_interval = max_loss / 2.0
         self._min_free_bytes = min_free_bytes
-        self._queue_bytes = queue_bytes
+        self._queue_bytes, self._half_full = queue_bytes, queue_bytes // 2
 
+        # Appending to a deque and taking from its other end need no lock between threads.
+        self._queue: deque[Message] = deque()
+        self._bytes_in = self._bytes_out = 0    # of the queue, ever
+        self._taken_count = 0          # messages that have left the queue, ever
         # Held for a few instructions, never during I/O; reentrant, because a signal handler may
         # close the recording while its thread is inside write().
         self._lock = threading.RLock()
-        self._queue: list[Message] = []
-        self._load = 0                 # bytes in the queue
-        self._offered = 0              # messages handed over, ever
+        self._refused = 0              # messages handed over after the end
         self._accepting = True
         self._state: Literal['recording', 'closed', 'failed'] = 'recording'
         self._error: str | None = None
@@ -174,14 +177,14 @@ class McapRecorder:
         Where it has none, hold the simulation's clock instead of dropping anything; a burst that
         began with room may be written to its end.  True also when the recording has stopped.
         """
-        return self._load < self._queue_bytes
+        return self._bytes_in - self._bytes_out < self._queue_bytes
 
     @property
     def counters(self) -> RecorderCounters:
         """Where the recording stands now."""
         with self._lock:
             messages = sum(self._file.counts)
-            missing = self._offered - messages
+            missing = self._offered() - messages
             running = self._state == 'recording'
             return RecorderCounters(
                 messages=messages, queued=missing if running else 0,
@@ -190,7 +193,7 @@ class McapRecorder:
 
     def write(self, topic_index: int, log_time_ns: int, data: bytes) -> None:
         """
-        Hand over a message; any thread may, and messages keep their order.
+        Hand over a message, from one thread at a time; messages keep their order.
 
         topic_index: in the `topics` of `open`
         log_time_ns: the message's stamp [ns], >= 0; log and publish time alike
@@ -199,17 +202,18 @@ class McapRecorder:
         Never waits for the disk, never raises for its sake.  After the recording stopped the
         message is only counted, as lost.
         """
-        with self._lock:
-            self._offered += 1
-            if not self._accepting:
-                return
-            self._queue.append((topic_index, log_time_ns, data))
-            before = self._load
-            self._load = before + len(data) + _ENTRY_BYTES
-            half = self._queue_bytes >> 1
-            half_full = before < half <= self._load
-        if half_full:
+        if not self._accepting:
+            with self._lock:
+                self._refused += 1
+            return
+        self._queue.append((topic_index, log_time_ns, data))
+        self._bytes_in += len(data) + _ENTRY_BYTES
+        if self._bytes_in - self._bytes_out >= self._half_full and not self._wake.is_set():
             self._wake.set()
+
+    def _offered(self) -> int:
+        """Return how many messages have been handed over."""
+        return self._taken_count + len(self._queue) + self._refused
 
     def wait_for_room(self, timeout: float) -> bool:
         """Wait until there is room, at most `timeout` [s]; return whether there is."""
@@ -241,7 +245,7 @@ class McapRecorder:
                             strict=True))
         return RecordingSummary(
             path=self._path, bytes=self._file.size, counts=messages,
-            lost=self._offered - sum(messages.values()), error=error, indexed=self._indexed)
+            lost=self._offered() - sum(messages.values()), error=error, indexed=self._indexed)
 
     def __enter__(self) -> McapRecorder:
         return self
@@ -265,10 +269,7 @@ class McapRecorder:
         while self._state == 'recording':
             self._wake.clear()
             closing = self._closing  # read before the queue: once set, nothing more comes
-            for message in self._take():
-                if self._file.append(*message):
-                    self._file.write_chunk()
-                    self._flush_if_due()
+            self._file.append_all(self._take())
             self._flush_if_due()
             if closing:
                 self._finish()
@@ -276,10 +277,12 @@ class McapRecorder:
             self._wake.wait(max(0.0, self._next_flush - time.monotonic()))
 
     def _take(self) -> list[Message]:
-        """Return what is queued and leave the queue empty."""
-        with self._lock:
-            messages, self._queue = self._queue, []
-            self._load = 0
+        """Return what is queued, and take it out of the queue."""
+        take = self._queue.popleft
+        messages = [take() for _ in range(len(self._queue))]
+        self._taken_count += len(messages)
+        self._bytes_out += (sum(len(data) for _, _, data in messages)
+                            + _ENTRY_BYTES * len(messages))
         self._taken.set()
         return messages
 
@@ -310,11 +313,9 @@ class McapRecorder:
         """Stop accepting, say why, and leave behind the best file that the disk allows."""
         with self._lock:
             self._accepting = False
-            self._queue.clear()
-            self._load = 0
             self._error = error
             self._state = 'failed'
-        self._taken.set()
+        self._take()
         # Little space is left, or none: cutting off the torn chunk may have made enough of it.
         with contextlib.suppress(Exception):
             self._file.finish()

@@ -118,6 +118,14 @@ class Template:
         """Return the size of every message [bytes]."""
         return len(self._buffer)
 
+    def with_fixed(self, *runs: Sequence[float]) -> Template:
+        """Return the message with these numbers for good: `encode` takes no runs then."""
+        writer = CdrWriter()
+        writer.buffer[:] = self.encode(0, *runs)
+        template = Template(writer, self._stamps_at, ())
+        template._fields = self._fields
+        return template
+
     def _written_out(self) -> Callable[..., bytes]:
         """
         Return `encode`: one call that packs what varies between what does not.

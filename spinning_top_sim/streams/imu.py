@@ -126,7 +126,7 @@ class Sensor:
     """
     What the IMU reads at a rate: noise of sample k depends on the seed and on k alone.
 
-    gyroscope, accelerometer: their `Axes`.
+    gyroscope, accelerometer: their `Axes`;  is_random: whether anything is drawn for them
     """
 
     def __init__(self, values: Mapping[str, Any], period_ns: int) -> None:
@@ -135,7 +135,8 @@ class Sensor:
         self.accelerometer = Axes.of(values, 'accelerometer', period)
         self._perfect = self.gyroscope == self.accelerometer == PERFECT
         self._noise: Noise | None = None
-        if self.gyroscope.is_random or self.accelerometer.is_random:
+        self.is_random = self.gyroscope.is_random or self.accelerometer.is_random
+        if self.is_random:
             self._noise = Noise(values['seed'], self.gyroscope, self.accelerometer)
 
     def read(self, exact: tuple[Vector, Vector], index: int | range) -> tuple[Vector, Vector]:

@@ -183,8 +183,13 @@ class ImuBias(ImuStream):
 
     parameter, topic, oriented = 'imu', 'ground_truth/imu_bias', False
 
+    def set_rate(self, rate: float) -> None:
+        super().set_rate(rate)
+        if not self._sensor.is_random:
+            self.template = self.template.with_fixed(IDENTITY, *self._sensor.bias(0))
+
     def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
-        return (IDENTITY, *self._sensor.bias(index))
+        return (IDENTITY, *self._sensor.bias(index)) if self._sensor.is_random else ()
 
 
 class GroundTruthImu(ImuStream):
