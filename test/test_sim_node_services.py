@@ -158,6 +158,10 @@ def test_recordings_start_and_stop_and_overwrite_nothing(peer, diagnostics, serv
     answer = peer.switch(node, 'record', True)
     assert not answer.success
     assert str(nowhere) in answer.message
+    # Who asks need not know where the node runs.
+    assert peer.set_together(node, record__uri='here.mcap').successful
+    assert str(node.folder / 'here.mcap') in peer.switch(node, 'record', True).message
+    assert peer.switch(node, 'record', False).success
     # A folder takes any number, each under a name of its own.
     assert peer.set_together(node, record__uri=str(node.folder)).successful
     paths = set()

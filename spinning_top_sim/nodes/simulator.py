@@ -667,8 +667,8 @@ def _ceil_to(value: int, grid: int) -> int:
 
 
 def _free_path(uri: str) -> Path:
-    """Return the file to record to: `uri`, or a new one named by date in it or here."""
-    path = Path(uri).expanduser()
+    """Return where to record to, absolute: `uri`, or a new file named by date in it or here."""
+    path = Path(uri).expanduser().absolute()
     if uri and not path.is_dir():
         return path
     stem = time.strftime('spinning_top_%Y-%m-%d_%H-%M-%S')
