@@ -40,7 +40,7 @@ from spinning_top_sim.recording.errors import DefinitionNotFoundError, Recording
 from spinning_top_sim.recording.mcap_file import CHUNK_BYTES, McapFile
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic
 from spinning_top_sim.recording.schemas import find_definition
-from spinning_top_sim.recording.writer import COMPRESSIONS, McapRecorder
+from spinning_top_sim.recording.writer import COMPRESSIONS, McapRecorder, create_file
 
 ROOT = Path(__file__).parents[1]
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
@@ -514,11 +514,15 @@ def test_closing_twice_changes_nothing(tmp_path):
 
 
 def test_messages_of_any_length_are_all_kept(tmp_path):
-    """Those of one length go in bulk, others and few one by one; chunks stay of a size."""
+    """
+    Those of one length go in bulk, others and few one by one; chunks stay of a size.
+
+    In the file, too, the messages of a topic are in the order in which they were handed over.
+    """
     rng = random.Random(5)
     wanted = [[], [], []]
     with McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=100.0,
-                           min_free_bytes=0) as recorder:
+                           min_free_bytes=0, queue_bytes=20_000_000) as recorder:
         for time_ns in range(5000):
             topic = rng.randrange(3)
             size = (1000, rng.choice([12, 12, 12, 700]), time_ns % 7)[topic]
@@ -529,7 +533,7 @@ def test_messages_of_any_length_are_all_kept(tmp_path):
     names = [topic.name for topic in TOPICS]
     with (tmp_path / 'run.mcap').open('rb') as file:
         reader = make_reader(file)
-        for _, channel, message in reader.iter_messages():
+        for _, channel, message in reader.iter_messages(log_time_order=False):
             of_topic = found[names.index(channel.topic)]
             assert message.sequence == len(of_topic)
             of_topic.append((message.log_time, message.data))
@@ -537,6 +541,26 @@ def test_messages_of_any_length_are_all_kept(tmp_path):
     assert found == wanted
     assert 2 <= len(chunks) <= 4
     assert max(chunk.uncompressed_size for chunk in chunks) < 1.5 * CHUNK_BYTES
+
+
+def test_few_and_many_keep_their_order_in_the_file(tmp_path):
+    file = create_file(tmp_path / 'run.mcap', TOPICS, METADATA, compression='none')
+    stamps = iter(range(1000))
+    for count in (3, 100, 1, 2, 50, 7):
+        file.append_all([(topic, stamp, pose_cdr(stamp)) for stamp in
+                         (next(stamps) for _ in range(count)) for topic in (0, 2)])
+        file.append_all([(1, count, b'odd')])
+    file.append_all([])
+    file.finish()
+    found = {}
+    with (tmp_path / 'run.mcap').open('rb') as stream:
+        reader = make_reader(stream)
+        for _, channel, message in reader.iter_messages(log_time_order=False):
+            found.setdefault(channel.topic, []).append(message.log_time)
+        in_order = [message.log_time for _, _, message in reader.iter_messages()]
+    assert found[TOPICS[0].name] == found[TOPICS[2].name] == list(range(163))
+    assert found[TOPICS[1].name] == [3, 100, 1, 2, 50, 7]
+    assert in_order == sorted(in_order)
 
 
 def test_a_full_queue_says_so_and_loses_nothing(tmp_path, monkeypatch):

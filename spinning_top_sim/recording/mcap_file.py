@@ -381,10 +381,11 @@ class McapFile(IndexedFile):
 
     def append_all(self, messages: Sequence[tuple[int, int, bytes]]) -> None:
         """
-        Add many messages: topic index, log time [ns], CDR.
+        Write many messages: topic index, log time [ns], CDR.
 
-        Those of one length a topic become chunks of their own, written at once and for a tenth of
-        the work; the others stand in the chunk in memory.
+        Those of a topic that are of one length go into their chunk as rows, for a tenth of the
+        work.  Nothing is left in memory, so that the messages of a topic keep their order in the
+        file.
         """
         if not messages:
             return
@@ -415,7 +416,11 @@ class McapFile(IndexedFile):
                 if self.append(topic_index, time_ns, one):
                     self.write_chunk()
         if parts:
-            self.put_plain_chunk(self.chunk_of_rows(parts))
+            rest = self._chunk_parts, self._chunk_entries
+            self._clear_chunk()
+            self.put_plain_chunk(_with_rest(self.chunk_of_rows(parts), *rest))
+        else:
+            self.write_chunk()
 
     def chunk_of_rows(self, parts: Sequence[tuple[int, NDArray[Any], NDArray[Any]]]) -> PlainChunk:
         """
@@ -477,6 +482,19 @@ def record_bytes(record: McapRecord) -> bytes:
 
 def _joined(records: Iterable[McapRecord]) -> bytes:
     return b''.join(map(record_bytes, records))
+
+
+def _with_rest(chunk: PlainChunk, records: list[bytes], entries: Entries) -> PlainChunk:
+    """Return a chunk and, behind it, records of other topics with their entries."""
+    if not records:
+        return chunk
+    size = len(chunk.data)
+    for numbers in entries.values():
+        for i in range(1, len(numbers), 2):
+            numbers[i] += size
+    spans = chunk.span, time_span(entries)
+    return PlainChunk(b''.join((chunk.data, *records)), {**chunk.entries, **entries},
+                      (min(start for start, _ in spans), max(end for _, end in spans)))
 
 
 def message_indexes(entries: Entries) -> dict[int, bytes]:
