@@ -700,9 +700,9 @@ def test_a_full_disk_stops_the_recording_and_leaves_an_indexed_file(tmp_path):
     """The torn chunk is cut off, and where it stood there is room for the summary."""
     child = start_child(FILL + """
     recorder = McapRecorder.open(
-        sys.argv[1], TOPICS, {}, min_free_bytes=0, max_loss=100.0, queue_bytes=200_000)
-    write(recorder, 1500)
-    wait_until(lambda: recorder.counters.messages > 1000)
+        sys.argv[1], TOPICS, {}, min_free_bytes=0, max_loss=100.0, queue_bytes=4_000_000)
+    write(recorder, 2000)       # half full, so that chunks of 1 MB are made
+    wait_until(lambda: recorder.counters.messages > 1700)
     limit(recorder.counters.bytes + 100_000)
     write(recorder, 3000)
     wait_until(lambda: recorder.state == 'failed')
