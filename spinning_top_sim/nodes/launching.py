@@ -16,6 +16,7 @@ from launch.events import Shutdown
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
+from spinning_top_sim.tools.simulate import resolve
 from spinning_top_sim.tools.urdf import inertia_warning, robot_description
 
 STATE_PUBLISHER = 'robot_state_publisher'
@@ -40,11 +41,6 @@ def number(name: str, text: str, *, zero: bool = False) -> float:
     if not (math.isfinite(value) and (value > 0.0 or (zero and value == 0.0))):
         raise ValueError(f'{name} = {text!r}: must be a number {">=" if zero else ">"} 0')
     return value
-
-
-def absolute(namespace: str, topic: str) -> str:
-    """Return a topic's full name in a namespace."""
-    return '/'.join(['', *filter(None, [namespace.strip('/'), topic])])
 
 
 def state_publisher(share: Path, values: Mapping[str, Any], namespace: str, joint_states: str,
@@ -79,7 +75,7 @@ def rviz(share: Path, world_frame: str, namespace: str, use_sim_time: bool) -> N
     return Node(
         package='rviz2', executable='rviz2', namespace=namespace,
         arguments=['-d', str(share / 'rviz/spinning_top.rviz'), '-f', world_frame],
-        remappings=[(f'/{topic}', absolute(namespace, topic))
+        remappings=[(f'/{topic}', resolve(topic, namespace))
                     for topic in ('markers', 'robot_description')],
         parameters=[{'use_sim_time': use_sim_time}])
 

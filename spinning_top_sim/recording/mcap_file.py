@@ -430,7 +430,7 @@ class McapFile(IndexedFile):
             uint8), each topic at most once and not empty.  The messages of a chunk need no order
             of time: its message indexes have it (MCAP specification, "Message Index").
         """
-        import numpy  # noqa: PLC0415 - a live recording needs none
+        import numpy  # noqa: PLC0415 - recovery needs none
 
         head = numpy.dtype([
             ('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),

@@ -278,9 +278,9 @@ class McapRecorder:
 
     def _take(self) -> list[Message]:
         """Return what is queued, and take it out of the queue."""
-        take = self._queue.popleft
-        messages = [take() for _ in range(len(self._queue))]
-        self._taken_count += len(messages)
+        count, take = len(self._queue), self._queue.popleft
+        self._taken_count += count      # before they leave, so that `counters` never misses any
+        messages = [take() for _ in range(count)]
         self._bytes_out += (sum(len(data) for _, _, data in messages)
                             + _ENTRY_BYTES * len(messages))
         self._taken.set()
