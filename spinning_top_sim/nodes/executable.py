@@ -107,7 +107,10 @@ def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode],
         node.start()
         # rclpy ends the spin at any signal; an exception in the midst of its code only does harm.
         interrupt.told = True
-        executor.spin_until_future_complete(node.finished)
+        # rclpy's spin_until_future_complete leaves a callback at the future at each wake-up.
+        node.finished.add_done_callback(lambda _: executor.create_task(lambda: None))
+        while rclpy.ok() and not node.finished.done():
+            executor.spin_once()
         if node.finished.done():
             return node.finished.result() or 0
     except (KeyboardInterrupt, ExternalShutdownException):

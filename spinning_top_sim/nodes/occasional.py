@@ -23,6 +23,11 @@ class OccasionalGroup(ReentrantCallbackGroup):
         super().__init__()
         self._until = 0.0
 
+    def add_entity(self, entity: Any) -> None:
+        """See `rclpy.callback_groups.CallbackGroup`, which never forgets one."""
+        self.entities = {known for known in self.entities if known() is not None}
+        super().add_entity(entity)
+
     def open(self) -> None:
         """Have the group looked at by the wait that follows."""
         self._until = time.monotonic() + OPEN_S
