@@ -2,6 +2,7 @@
 """The IMU: kinematics against differences of the exact pose, noise against its own numbers."""
 
 import math
+import random
 import subprocess
 import sys
 import tracemalloc
@@ -243,17 +244,27 @@ def test_a_perfect_imu_does_not_import_numpy():
 
 
 def test_noise_that_was_read_is_not_kept():
-    """Only where the bias of each block ends: some 200 of the 25 000 bytes of a block."""
     sensor = Sensor(parameters.checked(NOISY), 1_000_000)
     exact = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     block = 512
     sensor.read(exact, 10 * block)
     tracemalloc.start()
     try:
-        sensor.read(exact, 20 * block)
+        sensor.read(exact, 100 * block)
         before, _ = tracemalloc.get_traced_memory()
-        sensor.read(exact, 120 * block)
+        sensor.read(exact, 500 * block)
         after, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert after - before < 100 * 500
+    assert after - before < 5000
+
+
+def test_noise_is_the_same_read_forwards_backwards_and_at_random():
+    noise = Sensor(parameters.checked(NOISY), 1_000_000)
+    indices = list(range(0, 20_000, 173))
+    forwards = {k: list(noise.bias(k)) for k in indices}
+    for order in (indices[::-1], random.Random(1).sample(indices, len(indices))):
+        assert {k: list(noise.bias(k)) for k in order} == forwards
+        many = noise.bias(range(7_000, 9_000))
+        assert [list(many[0][:, k]) for k in range(3)] == [
+            list(noise.bias(7_000 + k)[0]) for k in range(3)]

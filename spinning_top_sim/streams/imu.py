@@ -169,10 +169,12 @@ class Noise:
 
     Block b of 512 samples is drawn from a generator keyed by seed and b (Philox, counter-based:
     Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC11), so that samples can be
-    read from anywhere; the bias at the start of a block is the sum over the blocks before.
+    read from anywhere; the bias at the start of a block is the sum over the blocks before, at hand
+    for the newest few: who goes further back begins from the start.
     """
 
     BLOCK = 512
+    STARTS_KEPT = 4
 
     def __init__(self, seed: int, gyroscope: Axes, accelerometer: Axes) -> None:
         # 80 ms of numpy for those who want noise only.
@@ -183,8 +185,8 @@ class Noise:
         self._white = numpy.repeat([kind.white for kind in kinds], 3)
         self._walk = numpy.repeat([kind.walk for kind in kinds], 3)
         # Where the bias of block b begins; that of block 0 is the turn-on bias.
-        self._bias_starts = [numpy.repeat([kind.turn_on for kind in kinds], 3)
-                             * self._normal(0, 6, turn_on=True)[0]]
+        self._bias_starts = {0: numpy.repeat([kind.turn_on for kind in kinds], 3)
+                                * self._normal(0, 6, turn_on=True)[0]}
         self._block = -1
         self._rows: list[list[float]] = []
 
@@ -209,23 +211,22 @@ class Noise:
         self._block = block
 
     def _drawn(self, block: int) -> tuple[Any, Any]:
-        """Return white noise and bias of a block, with the biases of those before it."""
-        while len(self._bias_starts) <= block:
-            before = len(self._bias_starts) - 1
-            _, bias = self._draw(before)
-            self._bias_starts.append(bias[-1].copy())    # not a view that keeps all
-        white, bias = self._draw(block)
-        if len(self._bias_starts) == block + 1:
-            self._bias_starts.append(bias[-1].copy())    # not a view that keeps all
-        return white, bias
-
-    def _draw(self, block: int) -> tuple[Any, Any]:
-        """Return white noise and bias of a block, (512, 6) each."""
-        normal = self._normal(block, 12)
-        steps = normal[:, 6:] * self._walk
-        if block == 0:
-            steps[0] = 0.0              # sample 0 has the turn-on bias itself
-        bias = self._bias_starts[block] + self._numpy.cumsum(steps, axis=0)
+        """Return white noise and bias of a block, (512, 6) each, by way of those before it."""
+        starts = self._bias_starts
+        at = max(b for b in starts if b <= block)
+        start = starts[at]
+        while True:
+            normal = self._normal(at, 12)
+            steps = normal[:, 6:] * self._walk
+            if at == 0:
+                steps[0] = 0.0          # sample 0 has the turn-on bias itself
+            bias = start + self._numpy.cumsum(steps, axis=0)
+            at, start = at + 1, bias[-1].copy()         # not a view that keeps all
+            if at > block:
+                break
+        starts[at] = starts.pop(at, start)
+        if len(starts) > self.STARTS_KEPT:
+            del starts[list(starts)[1]]                 # the oldest; that of block 0 stays
         return normal[:, :6] * self._white, bias
 
     def _normal(self, block: int, columns: int, turn_on: bool = False) -> Any:
