@@ -102,16 +102,16 @@ def between_steps(case: Case) -> tuple[float, ...]:
     integrator = Integrator(form, form.start, form.first_step)
     ends, middles = [], []
     found: tuple[list, ...] = [], [], []
-    while integrator.t1 < 10.0:
-        integrator.step()
-        h, middle = integrator.t1 - integrator.t0, 0.5 * (integrator.t0 + integrator.t1)
-        slopes0, slopes1 = form.rates(*integrator.y0), form.rates(*integrator.y1)
+    while integrator.newest.t1 < 10.0:
+        step = integrator.step()
+        h, middle = step.t1 - step.t0, 0.5 * (step.t0 + step.t1)
+        slopes0, slopes1 = form.rates(*step.y0), form.rates(*step.y1)
         cubic = tuple(0.5 * (a + b) + 0.125 * h * (p - q) for a, b, p, q in zip(
-            integrator.y0, integrator.y1, slopes0, slopes1, strict=True))
-        ends.append(integrator.t1)
+            step.y0, step.y1, slopes0, slopes1, strict=True))
+        ends.append(step.t1)
         middles.append(middle)
-        for rows, y, t in zip(found, (integrator.y1, integrator.interpolate(middle), cubic),
-                              (integrator.t1, middle, middle), strict=True):
+        for rows, y, t in zip(found, (step.y1, step.interpolate(middle), cubic),
+                              (step.t1, middle, middle), strict=True):
             rows.append(attitude_of(form, y, t))
     return tuple(float(angles_between(np.array(rows), case.exact.quaternion(np.array(t))).max())
                  for rows, t in zip(found, (ends, middles, middles), strict=True))
@@ -130,9 +130,9 @@ def run(form: TransportForm, case: Case, duration: int, rate: int) -> tuple[floa
     ns = grid_ns(duration, rate)
     attitudes = []
     for t in (ns / 1e9).tolist():
-        while integrator.t1 < t:
+        while integrator.newest.t1 < t:
             integrator.step()
-        attitudes.append(attitude_of(form, integrator.interpolate(t), t))
+        attitudes.append(attitude_of(form, integrator.newest.interpolate(t), t))
     truth = case.exact.states_at_ns(ns).quaternion
     return float(angles_between(np.array(attitudes), truth).max()), integrator.evaluations
 

@@ -18,6 +18,7 @@ from spinning_top_sim.streams.pipeline import Simulation
 SECOND = 1_000_000_000
 EPOCH_NS = 1_700_000_000 * SECOND
 POSE_RATE_NS = 10_000_000
+MILLISECOND = 1_000_000
 VARIANTS = {
     'rk45': {},
     'exact': {'solver.method': 'exact'},
@@ -180,14 +181,15 @@ def test_a_command_in_the_midst_of_a_long_integration_is_taken():
 @pytest.mark.parametrize('name', VARIANTS)
 def test_what_is_sent_does_not_depend_on_how_far_is_computed_ahead(name):
     """With commands, changes of rate, and listeners who come and go in between."""
-    def run(look_ahead):
+    def run(instants):
         values = {**VARIANTS[name], 'imu.gyroscope_noise_density': 1e-3}
         simulation = Simulation(parameters.checked(values), EPOCH_NS)
-        simulation.look_ahead = look_ahead
         taken = listen(simulation)
         l3, lz = simulation.l3, simulation.lz
         for tick in range(1, 61):
             simulation.advance(tick * 7_654_321)
+            if instants:
+                simulation.prepare((tick + 1) * 7_654_321, instants)
             if tick == 20:
                 simulation.command(1.01 * l3, 1.01 * lz)
             if tick == 30:
@@ -202,41 +204,84 @@ def test_what_is_sent_does_not_depend_on_how_far_is_computed_ahead(name):
                 simulation.command(l3, lz)
         return taken
 
-    once = run(1)
+    once = run(0)
     assert len(once) > 300
-    assert run(2) == once
-    assert run(8) == once
+    assert run(1) == once
+    assert run(16) == once
 
 
 def test_computing_ahead_computes_each_sample_once_and_little_in_vain():
     simulation = simulate(pose__rate=1000.0, joint_states__rate=500.0)
-    simulation.look_ahead = 8
     taken = listen(simulation, 'pose', 'joint_states')
     encodes = {one.topic: Counting(one, 'encode') for one in simulation.streams}
     samples = Counting(simulation.solver, 'at_ns')
     for tick in range(1, 1001):
-        simulation.advance(tick * 1_000_000)
-        assert all(len(one.ready) < simulation.look_ahead for one in simulation.streams)
+        simulation.advance(tick * MILLISECOND)
+        simulation.prepare((tick + 1) * MILLISECOND, 16)
     assert [len(stamps(taken, topic)) for topic in ('pose', 'joint_states')] == [1001, 501]
-    assert 1001 <= encodes['pose'].count <= 1008
-    assert 501 <= encodes['joint_states'].count <= 508
-    assert 1001 <= samples.count <= 1008, 'two streams share the states'
+    assert 1001 <= encodes['pose'].count <= 1017
+    assert 501 <= encodes['joint_states'].count <= 509
+    assert 1001 <= samples.count <= 1017, 'two streams share the states'
 
 
-def test_what_was_computed_ahead_is_forgotten_when_it_no_longer_holds():
-    simulation = simulate(solver__method='exact', pose__rate=1000.0)
-    simulation.look_ahead = 8
-    listen(simulation, 'pose')
-    pose = stream(simulation, 'pose')
-    simulation.advance(1_000_000)
-    assert pose.ready
-    simulation.command(2.0, 1.5)
-    assert not pose.ready
-    simulation.advance(2_000_000)
-    assert pose.ready
-    pose.set_rate(300.0)
-    pose.resume(simulation.now_ns)
-    assert not pose.ready
+def test_ticks_that_find_all_prepared_compute_nothing():
+    simulation = simulate(pose__rate=1000.0)
+    taken = listen(simulation, 'pose')
+    simulation.advance(0)
+    simulation.prepare(10 * MILLISECOND, 1)
+    samples = Counting(simulation.solver, 'at_ns')
+    steps = Counting(simulation.solver, 'reach_ns')
+    for tick in range(1, 11):
+        simulation.advance(tick * MILLISECOND)
+    assert (samples.count, steps.count) == (0, 0)
+    assert len(taken) == 11
+    simulation.prepare(10 * MILLISECOND, 16)
+    assert samples.count == 0, 'there was nothing to do'
+    simulation.prepare(11 * MILLISECOND, 16)
+    assert samples.count == 16
+
+
+@pytest.mark.parametrize('change', ['command', 'rate', 'listener', 'recorder', 'restart'])
+def test_what_was_computed_ahead_is_forgotten_when_it_no_longer_holds(change):
+    def run(ahead):
+        simulation = simulate(pose__rate=1000.0)
+        taken = listen(simulation, 'pose')
+        simulation.advance(5 * MILLISECOND)
+        if ahead:
+            simulation.prepare(6 * MILLISECOND, 16)
+        pose, imu = stream(simulation, 'pose'), stream(simulation, 'imu/data_raw')
+        if change == 'command':
+            simulation.command(2.0, 1.5)
+        elif change == 'rate':
+            pose.set_rate(300.0)
+            pose.resume(simulation.now_ns)
+        elif change == 'listener':
+            imu.publish = lambda data: taken.append(('imu', None, data))
+        elif change == 'recorder':
+            pose.record = lambda stamp, data: taken.append(('other', stamp, data))
+        else:
+            simulation.restart(parameters.checked({'initial.theta': 1.0}))
+        if ahead:
+            simulation.prepare(30 * MILLISECOND, 1)
+        simulation.advance(60 * MILLISECOND)
+        return taken
+
+    assert run(True) == run(False)
+
+
+@pytest.mark.parametrize('l3', [1.6, 1e3, 1e5])
+def test_however_far_is_computed_ahead_the_present_state_can_be_read(l3):
+    """Also where a tick takes many steps, and where the clock stands still meanwhile."""
+    simulation, beside = simulate(spin__l3=l3), simulate(spin__l3=l3)
+    listen(simulation)
+    for tick in range(1, 41):
+        now = tick // 4 * 5 * MILLISECOND
+        simulation.advance(now)
+        simulation.prepare(now + 8 * MILLISECOND, 16)
+        beside.advance(now)
+        assert simulation.now_ns == beside.now_ns == now
+        assert simulation.state().quaternion == beside.state().quaternion
+    assert simulation.steps > beside.steps
 
 
 def test_an_exact_solution_made_beside_is_taken_for_its_own_motion_only():
@@ -305,18 +350,19 @@ def test_a_sample_is_encoded_once_for_all_who_take_it():
     assert all(a is b for a, b in zip(published, recorded, strict=True))
 
 
-@pytest.mark.parametrize('look_ahead', [1, 8])
-def test_ticks_leave_nothing_behind(look_ahead):
+@pytest.mark.parametrize('ahead', [0, 16])
+def test_ticks_leave_nothing_behind(ahead):
     """Blocks of memory in use do not become more, whoever listens, however long it runs."""
     simulation = simulate(imu__rate=1000.0, pose__rate=1000.0, joint_states__rate=1000.0)
-    simulation.look_ahead = look_ahead
     for one in simulation.streams:
         one.publish = len
         one.record = lambda stamp, data: None
 
     def run(ticks):
         for _ in range(ticks):
-            simulation.advance(simulation.now_ns + 1_000_000)
+            simulation.advance(simulation.now_ns + MILLISECOND)
+            if ahead:
+                simulation.prepare(simulation.now_ns + MILLISECOND, ahead)
         gc.collect()
         return sys.getallocatedblocks()
 
@@ -599,6 +645,21 @@ def test_the_euler_form_fails_at_a_pole_with_a_reason_and_can_be_restarted():
     simulation.restart(parameters.checked({'initial.theta': 0.5, 'initial.theta_dot': -3.0,
                                            'spin.l3': 0.2, 'spin.lz': -0.2}))
     assert simulation.advance(5 * SECOND)
+
+
+def test_what_cannot_go_on_fails_at_the_same_time_when_computed_ahead():
+    def run(ahead):
+        simulation = simulate(solver__equations='euler', initial__theta=0.5,
+                              initial__theta_dot=-3.0, spin__l3=0.2, spin__lz=-0.2)
+        taken = listen(simulation, 'joint_states')
+        with pytest.raises(IntegrationError) as failure:
+            for tick in range(20_000):
+                simulation.advance(tick * MILLISECOND)
+                if ahead:
+                    simulation.prepare((tick + 1) * MILLISECOND, 16)
+        return taken, str(failure.value), simulation.now_ns
+
+    assert run(True) == run(False)
 
 
 def test_the_euler_form_cannot_start_at_a_pole():

@@ -73,7 +73,7 @@ def test_dense_output_is_as_good_as_the_steps(form_type):
         integrator = Integrator(form, form.start, h)
         form.error = lambda y, y_new, difference: 0.9 ** 5      # accept, keep the step
         integrator.step()
-        middle = integrator.interpolate(0.37 * h)
+        middle = integrator.newest.interpolate(0.37 * h)
         truth = fixed_steps(form, 64, 0.37 * h)
         errors.append(max(abs(a - b) for a, b in zip(middle, truth, strict=True)))
     ratios = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))

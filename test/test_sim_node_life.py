@@ -33,6 +33,24 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 
+# What there is after 1000 ticks, and after 3000.
+OBJECTS = """
+import gc, json, sys
+from spinning_top_sim.nodes.sim_node import main
+from spinning_top_sim.nodes.simulator import Simulator
+ordinary, counts = Simulator._tick, []
+def tick(self):
+    ordinary(self)
+    counts.append(None)
+    if len(counts) in (1000, 3000):
+        gc.collect()
+        counts[-1] = len(gc.get_objects())
+    if len(counts) == 3000:
+        open('objects.json', 'w').write(json.dumps([counts[999], counts[2999]]))
+        self._finish()
+Simulator._tick = tick
+sys.exit(main())
+"""
 EXIT_HOOK = """
 import atexit, json, os, runpy, sys
 atexit.register(lambda: open('modules.json', 'w').write(json.dumps(sorted(sys.modules))))
@@ -47,7 +65,7 @@ def finished(tmp_path_factory):
     values = {'duration': 1.5, 'record.enabled': True, 'invariants.rate': 100.0,
               'imu.gyroscope_noise_density': 0.001, 'seed': 5}
     runs = {'/one': values, '/two': {**values, 'tick_rate': 77.0},
-            '/three': {**values, 'pacing': 'thread', 'tick_rate': 500.0},
+            '/three': {**values, 'pacing': 'thread', 'tick_rate': 1000.0},
             '/silent': {'duration': 1.5, **QUIET}}
     nodes = [SimNode(folder, values, namespace=name, program=('-c', EXIT_HOOK))
              for name, values in runs.items()]
@@ -122,6 +140,15 @@ def test_what_a_scene_does_not_need_is_not_imported(finished):
         assert ('mcap' in roots) == records
         assert 'visualization_msgs' not in roots
         assert ('spinning_top_sim.recording.writer' in modules) == records
+
+
+@pytest.mark.parametrize('pacing', ['timer', 'thread'])
+def test_wake_ups_leave_no_objects_behind(tmp_path, pacing):
+    with SimNode(tmp_path, {**QUIET, 'pacing': pacing, 'tick_rate': 1000.0},
+                 program=('-c', OBJECTS)) as node:
+        assert_clean_end(node, node.wait())
+    early, late = json.loads((node.folder / 'objects.json').read_text())
+    assert 0 < late < early + 500, 'two thousand wake-ups'
 
 
 def test_the_default_scene_imports_just_what_it_uses(finished):

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import functools
 import gc
 import math
 import sys
@@ -40,8 +39,11 @@ EPOCH_GRID_NS = 10_000_000
 OPENING_NS = 60_000_000
 # How often subscriptions are counted; a new subscriber waits at most this long.
 LISTENERS_PERIOD_NS = 50_000_000
-# So many instants are computed at once, where the steps of the solver reach: 0.2 ms of work.
-LOOK_AHEAD = 8
+# Instants computed at once, ahead of their time: what fills this share of the time between two
+# ticks at about INSTANT_NS each, so that the next tick finds the processor free.
+BUSY_SHARE = 0.6
+INSTANT_NS = 20_000
+FEWEST_AHEAD, MOST_AHEAD = 8, 48
 SWITCH_INTERVAL_S = 1e-4
 NEVER_NS = 2 ** 63 - 1
 # One tick works at most this long before services and signals get their turn.
@@ -71,7 +73,6 @@ class Simulator(Node):
         values = start_values(self)
         self._lock = threading.RLock()          # the simulation, between ticks and callbacks
         self._simulation = Simulation(values)
-        self._simulation.look_ahead = LOOK_AHEAD
         self._counters = reports.Counters()
         self._speed = reports.Speedometer()
         self._terminal = reports.Terminal()
@@ -104,6 +105,8 @@ class Simulator(Node):
         self._begun = self._ended = False
         self._paused = values['start_paused']
         self._listeners_due = 0
+        # Simulated time before which a tick in time has only to send what is ready.
+        self._plain_until_ns = -1
         self._stop_at = 0.0
         self._pacer: DeadlineThread | None = None
         self._tick_timer: Any = None
@@ -131,7 +134,7 @@ class Simulator(Node):
             elif there and not wanted:
                 stream.publish = None
                 self.destroy_publisher(self._outputs.pop(stream.topic))
-        self._listeners_due = 0
+        self._listeners_due, self._plain_until_ns = 0, -1
 
     def _publisher(self, message_type: type, topic: str) -> Publisher:
         qos = QoSProfile(depth=10)
@@ -166,6 +169,9 @@ class Simulator(Node):
         """Let time run: simulated t = 0 is the next point of the stamps' grid."""
         gc.collect()
         gc.freeze()             # what there is now stays: no full collection in the middle of it
+        # Which waits until there is a quarter more than the one before has found: of nothing now,
+        # so that cyclic garbage (rclpy makes some with every service call) does not pile up.
+        gc.collect()
         with self._lock:
             self._begin()
         tick_rate = self._values['tick_rate']
@@ -232,19 +238,36 @@ class Simulator(Node):
     def _tick(self) -> None:
         """Send what is due."""
         with self._lock:
+            now, late_from = time.monotonic_ns(), self._late_from
+            self._late_from = now + self._late_after_ns
+            due_ns = self._simulated_clock.now()
+            # Most ticks have nothing more to do than this, and touch little.
+            if (due_ns < self._plain_until_ns and now <= late_from
+                    and self._simulation.send_ready(due_ns)):
+                return
             if not (self._begun or self._begin()):
                 return
             if self._paused or self._failure or self._ended:
                 return
-            now = time.monotonic_ns()
-            if now > self._late_from:
-                self._count_late_tick(now)
-            self._late_from = now + self._late_after_ns
-            if now >= self._listeners_due:
-                self._look_for_listeners()
-                self._listeners_due = now + LISTENERS_PERIOD_NS
-            self._advance(self._due())
-            if self._duration_ns and self._simulation.now_ns >= self._duration_ns:
+            if now > late_from:
+                self._count_late_tick(now - late_from)
+            self._attend(now)
+
+    def _attend(self, now: int) -> None:
+        """Send what is due, and look after all else."""
+        if now >= self._listeners_due:
+            self._look_for_listeners()
+            self._listeners_due = now + LISTENERS_PERIOD_NS
+        simulation, due_ns = self._simulation, self._due()
+        self._advance(due_ns)
+        if simulation.now_ns >= due_ns:
+            # There is time until the next tick, and nobody waits for anything now.
+            simulation.prepare(due_ns + self._ahead_ns, self._instants_ahead)
+        self._plain_until_ns = min(due_ns + self._listeners_period_ns,
+                                   simulation.ready_ns - self._ahead_ns)
+        if self._duration_ns:
+            self._plain_until_ns = min(self._plain_until_ns, self._duration_ns)
+            if simulation.now_ns >= self._duration_ns:
                 self._finish()
 
     def _take_pace(self, values: dict[str, Any]) -> None:
@@ -253,6 +276,11 @@ class Simulator(Node):
         self._tick_period_ns = NANOSECONDS / values['tick_rate']
         self._late_after_ns = round(1.5 * self._tick_period_ns)
         self._late_from = NEVER_NS
+        self._instants_ahead = max(FEWEST_AHEAD, min(
+            MOST_AHEAD, round(BUSY_SHARE * self._tick_period_ns / INSTANT_NS)))
+        self._listeners_period_ns = round(LISTENERS_PERIOD_NS * values['time_scale'])
+        # In simulated time: up to the next tick, should it be late by half a period.
+        self._ahead_ns = round(1.5 * self._tick_period_ns * values['time_scale'])
         self._latest_ns = int(LATEST_NS * values['time_scale'])
 
     def _due(self) -> int:
@@ -260,8 +288,8 @@ class Simulator(Node):
         now, duration = self._simulated_clock.now(), self._duration_ns
         return min(now, duration) if duration else now
 
-    def _count_late_tick(self, now: int) -> None:
-        since_last = now - self._late_from + self._late_after_ns
+    def _count_late_tick(self, late_ns: int) -> None:
+        since_last = late_ns + self._late_after_ns
         self._counters.late_ticks += 1
         self._counters.skipped_ticks += round(since_last / self._tick_period_ns) - 1
 
@@ -515,8 +543,7 @@ class Simulator(Node):
                 _free_path(values['record.uri']), topics, self._log_metadata(),
                 max_loss=values['record.max_loss'], compression=values['record.compression'],
                 min_free_bytes=values['record.min_free_bytes'])
-            for index, stream in enumerate(streams):
-                stream.record = functools.partial(recorder.write, index)
+            simulation.log_to(recorder.write_all, streams)
             self._journal_topics = {name: len(streams) + i
                                     for i, (name, _) in enumerate(journal.TOPICS)}
             self._recorder, self._record_error = recorder, None
@@ -536,8 +563,8 @@ class Simulator(Node):
         """Close the log; return what to tell, None if there was none."""
         with self._lock:
             recorder, self._recorder = self._recorder, None
-            for stream in self._simulation.streams:
-                stream.record = None
+            if recorder is not None:
+                self._simulation.log_to(recorder.write_all, ())
         if recorder is None:
             return None
         summary = recorder.close()

@@ -80,6 +80,16 @@ class Columns:
         """Spin angle, unwrapped [rad]."""
         return self.half_sum - self.half_difference
 
+    @property
+    def euler_angles(self) -> tuple[Any, Any, Any]:
+        """(phi, theta, psi), unwrapped and continued [rad]."""
+        return self.phi, self.theta, self.psi
+
+    @property
+    def euler_rates(self) -> tuple[Any, Any, Any]:
+        """(phi', theta', psi') [rad/s]."""
+        return self.phi_dot, self.theta_dot, self.psi_dot
+
     @lazy
     def phi_dot(self) -> Any:
         """Precession rate [rad/s], eq. (31)."""

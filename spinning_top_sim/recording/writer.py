@@ -192,22 +192,26 @@ class McapRecorder:
                 longest_flush=self._longest_flush)
 
     def write(self, topic_index: int, log_time_ns: int, data: bytes) -> None:
-        """
-        Hand over a message, from one thread at a time; messages keep their order.
+        """Hand over one message; see `write_all`."""
+        self.write_all(((topic_index, log_time_ns, data),), len(data))
 
-        topic_index: in the `topics` of `open`
-        log_time_ns: the message's stamp [ns], >= 0; log and publish time alike
-        data: CDR with its four bytes of header
+    def write_all(self, messages: Sequence[Message], size: int) -> None:
+        """
+        Hand over messages, from one thread at a time; they keep their order.
+
+        messages: of each, its topic's index in the `topics` of `open`; its stamp [ns], >= 0, log
+            and publish time alike; CDR with its four bytes of header
+        size: of the CDR of all together [bytes]
 
         Never waits for the disk, never raises for its sake.  After the recording stopped the
-        message is only counted, as lost.
+        messages are only counted, as lost.
         """
         if not self._accepting:
             with self._lock:
-                self._refused += 1
+                self._refused += len(messages)
             return
-        self._queue.append((topic_index, log_time_ns, data))
-        self._bytes_in += len(data) + _ENTRY_BYTES
+        self._queue.extend(messages)
+        self._bytes_in += size + _ENTRY_BYTES * len(messages)
         if self._bytes_in - self._bytes_out >= self._half_full and not self._wake.is_set():
             self._wake.set()
 

@@ -75,10 +75,10 @@ class Form(Protocol):
         """Raise IntegrationError if a step that passed cannot be trusted all the same."""
 
 
-Step = Callable[..., tuple[Vector, Vector, Vector]]
+StepFunction = Callable[..., tuple[Vector, Vector, Vector]]
 
 
-def unrolled_step(size: int, number: type) -> Step:
+def unrolled_step(size: int, number: type) -> StepFunction:
     """
     Return step(f, h, y, k1) -> (y_new, k7, error estimate) for vectors of `size` numbers.
 
@@ -108,27 +108,71 @@ def unrolled_step(size: int, number: type) -> Step:
     return scope['step']
 
 
+class DenseStep:
+    """
+    One accepted step, to be read anywhere between its ends.
+
+    t0, t1: the ends [s];  y0, y1: the states there;  slope0, slope1: their derivatives
+    """
+
+    __slots__ = ('_form', '_polynomial', 'slope0', 'slope1', 't0', 't1', 'y0', 'y1')
+
+    def __init__(self, form: Form, t0: float, y0: Vector, slope0: Vector,
+                 t1: float, y1: Vector, slope1: Vector) -> None:
+        self._form = form
+        self.t0, self.y0, self.slope0 = t0, y0, slope0
+        self.t1, self.y1, self.slope1 = t1, y1, slope1
+        self._polynomial: list[tuple[Any, ...]] | None = None
+
+    def interpolate(self, t: float) -> Vector:
+        """Return y at t in [t0, t1] [s]; the ends exactly."""
+        if t >= self.t1:
+            return self.y1
+        if self._polynomial is None:
+            self._polynomial = self._hermite()
+        s = (t - self.t0) / (self.t1 - self.t0)
+        return tuple([((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0
+                      for c0, c1, c2, c3, c4, c5 in self._polynomial])
+
+    def _hermite(self) -> list[tuple[Any, ...]]:
+        """Coefficients of the quintic in s = (t - t0)/h, one tuple a component."""
+        h = self.t1 - self.t0
+        bend0 = self._form.curvatures(self.y0, self.slope0)
+        bend1 = self._form.curvatures(self.y1, self.slope1)
+        rows = []
+        for a, b, k0, k1, c0, c1 in zip(self.y0, self.y1, self.slope0, self.slope1, bend0, bend1,
+                                        strict=True):
+            rise, p, q = b - a, h * k0, h * k1
+            u, v = 0.5 * h * h * c0, 0.5 * h * h * c1
+            rows.append((a, p, u,
+                         10.0 * rise - 6.0 * p - 4.0 * q - 3.0 * u + v,
+                         -15.0 * rise + 8.0 * p + 7.0 * q + 3.0 * u - 2.0 * v,
+                         6.0 * rise - 3.0 * p - 3.0 * q - u + v))
+        return rows
+
+
 class Integrator:
     """
-    Takes steps forward from t = 0 and interpolates inside the newest one.
+    Takes steps forward from t = 0.
 
-    t0, t1: the step's ends [s];  y0, y1: the states there;  steps, rejected, evaluations: counts.
+    newest: the latest step (one of no length before the first);  steps, rejected, evaluations:
+    counts
     """
 
     def __init__(self, form: Form, start: Vector, first_step: float) -> None:
         self.form = form
         self._step = unrolled_step(len(start), form.number)
-        self.t0 = self.t1 = 0.0
-        self.y0 = self.y1 = form.project(start)
-        self._k0 = self._k1 = form.rates(*self.y1)
+        start = form.project(start)
+        slope = form.rates(*start)
+        self.newest = DenseStep(form, 0.0, start, slope, 0.0, start, slope)
         self._next_step = first_step
-        self._polynomial: list[tuple[Any, ...]] | None = None
         self.steps = self.rejected = 0
         self.evaluations = 1
 
-    def step(self) -> None:
+    def step(self) -> DenseStep:
         """Take one accepted step.  Raises IntegrationError where none can be taken."""
-        form, t, y, slope = self.form, self.t1, self.y1, self._k1
+        form, newest = self.form, self.newest
+        t, y, slope = newest.t1, newest.y1, newest.slope1
         grow = GROW
         while True:
             end = t + self._next_step
@@ -151,34 +195,7 @@ class Integrator:
         factor = SAFETY * error ** -0.2 if error > 0.0 else grow
         self._next_step = h * min(grow, max(SHRINK, factor))
         self.steps += 1
-        self.t0, self.y0, self._k0 = t, y, slope
         # First same as last: the projection moves y by less than the step's own error, so the
         # slope at the unprojected end serves the next step too.
-        self.t1, self.y1, self._k1 = end, form.project(y_new), slope_new
-        self._polynomial = None
-
-    def interpolate(self, t: float) -> Vector:
-        """Return y at t in [t0, t1] [s]; the ends exactly."""
-        if t >= self.t1:
-            return self.y1
-        if self._polynomial is None:
-            self._polynomial = self._hermite()
-        s = (t - self.t0) / (self.t1 - self.t0)
-        return tuple([((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0
-                      for c0, c1, c2, c3, c4, c5 in self._polynomial])
-
-    def _hermite(self) -> list[tuple[Any, ...]]:
-        """Coefficients of the quintic in s = (t - t0)/h, one tuple a component."""
-        h = self.t1 - self.t0
-        bend0 = self.form.curvatures(self.y0, self._k0)
-        bend1 = self.form.curvatures(self.y1, self._k1)
-        rows = []
-        for a, b, k0, k1, c0, c1 in zip(self.y0, self.y1, self._k0, self._k1, bend0, bend1,
-                                        strict=True):
-            rise, p, q = b - a, h * k0, h * k1
-            u, v = 0.5 * h * h * c0, 0.5 * h * h * c1
-            rows.append((a, p, u,
-                         10.0 * rise - 6.0 * p - 4.0 * q - 3.0 * u + v,
-                         -15.0 * rise + 8.0 * p + 7.0 * q + 3.0 * u - 2.0 * v,
-                         6.0 * rise - 3.0 * p - 3.0 * q - u + v))
-        return rows
+        self.newest = DenseStep(form, t, y, slope, end, form.project(y_new), slope_new)
+        return self.newest

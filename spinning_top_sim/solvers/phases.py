@@ -34,21 +34,21 @@ class Phases(Protocol):
 
 
 class Winding:
-    """How one Cayley-Klein parameter winds: its sense, its sign, and the phase it began with."""
+    """
+    How one Cayley-Klein parameter winds: its sense, its sign, and the phase it began with.
+
+    crosses: whether it can vanish; it then moves on a straight line through zero
+    """
 
     def __init__(self, momentum: float, modulus: float, phase: float) -> None:
         """Take Lz +- L3, and the signed modulus and the phase at the start."""
         self.momentum, self.phase = momentum, phase
         self.sign = math.copysign(1.0, modulus)
+        self.crosses = momentum == 0.0
 
     def moved_to(self, phase: float) -> Winding:
         """Return the same winding at another phase."""
         return Winding(self.momentum, self.sign, phase)
-
-    @property
-    def crosses(self) -> bool:
-        """Whether this parameter can vanish: it then moves on a straight line through zero."""
-        return self.momentum == 0.0
 
     def on_line(self, z: complex, phase: float) -> tuple[float, float]:
         """Return the signed modulus of a parameter that crosses, on its known phase."""
@@ -88,6 +88,7 @@ class StepPhases:
     See `Phases`; t lies in a step that began with the phases and theta/2 that are given here.
 
     A state read in that step keeps this: its angles stay right when the steps go on.
+    crosses: whether one of the parameters, or both, can vanish
     """
 
     def __init__(self, line_rate: float, alpha: Winding, beta: Winding,
@@ -95,6 +96,7 @@ class StepPhases:
         """Take Omega/2 [rad/s], and the windings' phases less that line."""
         self._line_rate, self._alpha, self._beta = line_rate, alpha, beta
         self._half_theta = half_theta
+        self.crosses = alpha.crosses or beta.crosses
 
     def polar(self, alpha: complex, beta: complex, t: float) -> Polar:
         """See `Phases`."""
@@ -104,11 +106,6 @@ class StepPhases:
         """See `Phases`; theta/2 turns by less than pi within a step."""
         return 2.0 * (half_theta
                       + math.tau * round((self._half_theta - half_theta) / math.tau))
-
-    @property
-    def crosses(self) -> bool:
-        """Whether one of the parameters, or both, can vanish."""
-        return self._alpha.crosses or self._beta.crosses
 
     def on_lines(self, alpha: complex, beta: complex, line: float) -> Polar:
         """Return alpha and beta as (modulus, phase), on the known line where one crosses."""
@@ -194,3 +191,25 @@ class MomentumState(OneState):
     def theta_dot(self) -> float:
         """Nutation rate [rad/s]: the momentum along e2' over lambda1."""
         return (self.momentum * cmath.rect(1.0, -self.phi)).imag / self.top.lambda1
+
+    # What is above and in `Columns`, to the last bit, in a third of the time.
+
+    @property
+    def euler_angles(self) -> tuple[float, float, float]:
+        """See `Columns`."""
+        (cosine, half_sum), (sine, half_difference) = self._polar
+        return (half_sum + half_difference,
+                self._phases.theta(math.atan2(sine, cosine), self._t),
+                half_sum - half_difference)
+
+    @property
+    def euler_rates(self) -> tuple[float, float, float]:
+        """See `Columns`."""
+        top, l3, lz = self.top, self.l3_start, self.lz_start
+        (_, half_sum), (_, half_difference) = self._polar
+        cos2 = attitude.squared_modulus(self.alpha)
+        sin2 = attitude.squared_modulus(self.beta)
+        phi_dot = attitude.precession_rate(top, l3, lz, cos2, sin2)
+        turned = self.momentum * cmath.rect(1.0, -(half_sum + half_difference))
+        return (phi_dot, turned.imag / top.lambda1,
+                l3 / top.lambda3 - phi_dot * (cos2 - sin2))

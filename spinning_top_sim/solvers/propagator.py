@@ -20,7 +20,7 @@ class Propagator(Protocol):
     """
     A motion from its start at t = 0 on, one state at a time, at integer nanoseconds.
 
-    One that takes steps goes forward only: not back behind the newest step's start.
+    One that takes steps goes forward only; a few of the steps behind it can still be read.
     """
 
     @property
@@ -41,6 +41,9 @@ class Propagator(Protocol):
 
     def reach_ns(self, ns: int, max_steps: int | None = None) -> bool:
         """Compute what the state at `ns` nanoseconds needs; False if max_steps did not do."""
+
+    def reach_ahead_ns(self, ns: int, now_ns: int) -> bool:
+        """Compute that only as far as the state at now_ns can still be read; False if not all."""
 
     def at_ns(self, ns: int) -> OneState:
         """Return the state at `ns` nanoseconds."""
@@ -90,6 +93,10 @@ class ExactPropagator:
         self.branch = Branch(side, turns * math.tau, half_turn, 1.0 - 2.0 * (turns % 2))
 
     def reach_ns(self, ns: int, max_steps: int | None = None) -> bool:
+        """Nothing needs computing."""
+        return True
+
+    def reach_ahead_ns(self, ns: int, now_ns: int) -> bool:
         """Nothing needs computing."""
         return True
 

@@ -6,12 +6,19 @@ from __future__ import annotations
 import cmath
 import math
 from abc import ABC, abstractmethod
+from collections import deque
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.kinematics import AxisState, OneState
 from spinning_top_sim.physics.regimes import cubic
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.dormand_prince import Form, IntegrationError, Integrator, Vector
+from spinning_top_sim.solvers.dormand_prince import (
+    DenseStep,
+    Form,
+    IntegrationError,
+    Integrator,
+    Vector,
+)
 from spinning_top_sim.solvers.phases import (
     MomentumState,
     Polar,
@@ -36,6 +43,8 @@ TRIAL_STEPS = 100
 REST_ULPS = 2.0
 # And how far the axis may swing all the same, in cos(theta) over sin^2(theta).
 REST_SWING = 1e-12
+# So many of the newest steps can still be read, for who computes ahead of the time that it is.
+STEPS_KEPT = 64
 
 
 def rk45(top: Top, start: State, *, equations: str = 'transport', rtol: float = 1e-11,
@@ -132,12 +141,23 @@ class SteppedOrClosed(ABC):
         """See `Propagator`."""
         return self.reach(ns / NANOSECONDS, max_steps)
 
+    def reach_ahead_ns(self, ns: int, now_ns: int) -> bool:
+        """See `Propagator`."""
+        return True
+
+
+# A step, and the phases at its begin where the motion follows them.
+Kept = tuple[DenseStep, StepPhases | None]
+
 
 class _Stepped(SteppedOrClosed):
     """A motion by steps: what both forms share."""
 
-    def __init__(self, form: Form, start: Vector, first_step: float) -> None:
+    def __init__(self, form: Form, start: Vector, first_step: float,
+                 phases: StepPhases | None = None) -> None:
         self._integrator = Integrator(form, start, first_step)
+        self._newest: Kept = (self._integrator.newest, phases)
+        self._kept = deque([self._newest], STEPS_KEPT)
 
     @property
     def steps(self) -> int:  # type: ignore[override]
@@ -150,45 +170,66 @@ class _Stepped(SteppedOrClosed):
     @property
     def earliest_ns(self) -> int:  # type: ignore[override]
         """See `Propagator`."""
-        start = self._integrator.t0
+        start = self._kept[0][0].t0
         ns = math.ceil(start * NANOSECONDS)
         return ns if ns / NANOSECONDS >= start else ns + 1
 
     @property
     def latest_ns(self) -> int:  # type: ignore[override]
         """See `Propagator`."""
-        end = self._integrator.t1
+        end = self._newest[0].t1
         ns = math.floor(end * NANOSECONDS)
         return ns if ns / NANOSECONDS <= end else ns - 1
 
     def reach(self, t: float, max_steps: int | None = None) -> bool:
-        integrator = self._integrator
         taken = 0
-        while integrator.t1 < t:
+        while self._newest[0].t1 < t:
             if taken == max_steps:
                 return False
             self._step()
             taken += 1
-            step = integrator.t1 - integrator.t0
-            if max_steps is None and taken == TRIAL_STEPS and t - integrator.t1 > (
-                    MOST_STEPS * step):
+            newest = self._newest[0]
+            step = newest.t1 - newest.t0
+            if max_steps is None and taken == TRIAL_STEPS and t - newest.t1 > MOST_STEPS * step:
                 raise IntegrationError(
                     f't = {t:.9g} s is more than {MOST_STEPS:.0e} steps of {step:.3g} s away: '
                     "use method = 'exact'")
         return True
 
-    def _step(self) -> None:
-        self._integrator.step()
+    def reach_ahead_ns(self, ns: int, now_ns: int) -> bool:
+        """See `Propagator`."""
+        t, now = ns / NANOSECONDS, now_ns / NANOSECONDS
+        while self._newest[0].t1 < t:
+            # The oldest one would go, and the second has to hold that time then.
+            if len(self._kept) == STEPS_KEPT and self._kept[1][0].t0 >= now:
+                return False
+            self._step()
+        return True
 
-    def _read(self, t: float) -> Vector:
-        integrator = self._integrator
-        if integrator.t0 <= t <= integrator.t1:
-            return integrator.interpolate(t)
-        if t < integrator.t0:
-            raise ValueError(f't = {t!r} s: steps go forward, and the newest one began at '
-                             f'{integrator.t0!r} s; times must not decrease')
-        self.reach(t)
-        return integrator.interpolate(t)
+    def _step(self) -> None:
+        self._newest = self._integrator.step(), self._phases_onward()
+        self._kept.append(self._newest)
+
+    def _phases_onward(self) -> StepPhases | None:
+        """Return the phases at the begin of the step that follows the newest one."""
+        return None
+
+    def _step_at(self, t: float) -> Kept:
+        """Return the step that holds t [s], of two that meet there the earlier one."""
+        newest = self._newest[0]
+        if newest.t0 < t <= newest.t1:
+            return self._newest
+        if t > newest.t1:
+            self.reach(t)
+            return self._newest
+        for kept in reversed(self._kept):
+            if kept[0].t0 < t:
+                return kept
+        oldest = self._kept[0]
+        if t < oldest[0].t0:
+            raise ValueError(f't = {t!r} s: steps go forward, and the oldest one that is kept '
+                             f'began at {oldest[0].t0!r} s; times must not decrease by much')
+        return oldest
 
 
 class EulerMotion(_Stepped):
@@ -203,7 +244,8 @@ class EulerMotion(_Stepped):
 
     def at(self, t: float) -> OneState:
         """Return the state at t [s]."""
-        return AxisState(self._top, self._start.l3, self._start.lz, *self._read(t))
+        step, _ = self._step_at(t)
+        return AxisState(self._top, self._start.l3, self._start.lz, *step.interpolate(t))
 
 
 class TransportMotion(_Stepped):
@@ -212,31 +254,36 @@ class TransportMotion(_Stepped):
     def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
         self._top, self._start = top, start
         self._form = TransportForm(top, start, rtol, atol)
-        super().__init__(self._form, self._form.start, self._form.first_step)
         alpha, beta = windings(start)
-        self._phases = StepPhases(0.5 * spin_excess(top, start.l3), alpha, beta,
-                                  0.5 * start.theta)
+        super().__init__(self._form, self._form.start, self._form.first_step,
+                         StepPhases(0.5 * spin_excess(top, start.l3), alpha, beta,
+                                    0.5 * start.theta))
         self._carried_rate = 0.5 * self._form.spin_carried / top.lambda1
+        self._half_spin_rate = 0.5 * self._form.spin_rate
+        self._momentum_unit = -2j * top.lambda1
 
     def at(self, t: float) -> OneState:
         """Return the state at t [s], on the invariants."""
-        alpha, beta, m = self._read(t)
-        if self._phases.crosses:
-            lines = self._phases.on_lines(alpha, beta, -self._carried_rate * t)
+        step, phases = self._newest
+        if not step.t0 < t <= step.t1:
+            step, phases = self._step_at(t)
+        assert phases is not None
+        alpha, beta, m = step.interpolate(t)
+        if phases.crosses:
+            lines = phases.on_lines(alpha, beta, -self._carried_rate * t)
             alpha, beta, m = self._form.project_on_lines((alpha, beta, m), *lines)
-        elif t < self._integrator.t1:
+        elif t < step.t1:
             alpha, beta, m = self._form.project((alpha, beta, m))
-        spin = cmath.rect(1.0, 0.5 * self._form.spin_rate * t)
+        spin = cmath.rect(1.0, self._half_spin_rate * t)
         return MomentumState(self._top, self._start, alpha * spin, beta * spin.conjugate(),
-                             -2j * self._top.lambda1 * m, t, self._phases)
+                             self._momentum_unit * m, t, phases)
 
-    def _step(self) -> None:
-        """Take a step, after moving the phases to where it starts."""
-        integrator = self._integrator
-        alpha, beta, _ = integrator.y1
+    def _phases_onward(self) -> StepPhases:
+        step, phases = self._newest
+        assert phases is not None
+        alpha, beta, _ = step.y1
         # The stepped frame lacks the spin of `TransportForm.spin_rate`: so does its line.
-        self._phases = self._phases.moved_to(alpha, beta, -self._carried_rate * integrator.t1)
-        integrator.step()
+        return phases.moved_to(alpha, beta, -self._carried_rate * step.t1)
 
 
 class FreeMotion(SteppedOrClosed):

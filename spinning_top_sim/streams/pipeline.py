@@ -11,13 +11,14 @@ from __future__ import annotations
 import contextlib
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.kinematics import Columns, OneState
 from spinning_top_sim.physics.regimes import Description, describe
 from spinning_top_sim.physics.top import State, Top, pole_momentum
+from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.propagator import (
     ExactPropagator,
     Propagator,
@@ -34,20 +35,37 @@ if TYPE_CHECKING:
 
 # Integration steps between two looks at whether to give way: about 5 ms.
 STEPS_AT_ONCE = 500
+# Instants that are computed at most ahead of their time in one go.
+MOST_AT_ONCE = 64
+NEVER_NS = 2 ** 63 - 1
+
+# A sample on its way to a log: number of its stream there, stamp [ns], message.
+Row = tuple[int, int, bytes]
+
+
+class Instant(NamedTuple):
+    """
+    The samples of one time, with all who take them.
+
+    size: of the messages in `rows` [bytes]
+    """
+
+    t_ns: int
+    rows: list[Row]
+    size: int
+    records: list[tuple[Callable[[int, bytes], Any], int, bytes]]
+    publications: list[tuple[Callable[[bytes], Any], bytes, Stream]]
 
 
 class Simulation:
     """
     One top in motion.
 
-    streams: all of them, whose `publish` and `record` the caller sets;  now_ns: simulated time up
-    to which every sample has been sent (-1: not even that of t = 0);  l3, lz: as last commanded;
-    solver: the present motion, whose t = 0 is anchor_ns;  history: applied commands since the
-    start as (t_ns, l3, lz);  look_ahead: how many instants may be computed at once, as long as
-    the steps taken so far reach.  Nothing of what is sent depends on it.
+    streams: all of them, whose `publish` and `record` the caller sets, besides `log_to`
+    now_ns: simulated time up to which every sample has been sent (-1: not even that of t = 0)
+    l3, lz: as last commanded;  history: applied commands since the start as (t_ns, l3, lz)
+    solver: the present motion, whose t = 0 is anchor_ns
     """
-
-    look_ahead = 1
 
     def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
         """
@@ -56,6 +74,12 @@ class Simulation:
         Raises ValueError or IntegrationError where there is no motion from their start state.
         """
         self.epoch_ns = epoch_ns
+        # What comes next: the instants that are computed already, and from when on there is more
+        # to compute; of each stream that anybody takes, its first sample from there on, and who.
+        self._ready: deque[Instant] = deque()
+        self._beyond_ns = -1
+        self._cursors: list[list[Any]] = []
+        self._log: Callable[[list[Row], int], Any] | None = None
         self._steps_before = self._evaluations_before = 0
         self.streams: list[Stream] = []
         self._load(values)
@@ -80,8 +104,10 @@ class Simulation:
         self.now_ns = -1
         streams = all_streams(values, Imu(values))
         for new, old in zip(streams, self.streams, strict=False):
-            new.publish, new.record = old.publish, old.record
+            new.publish, new.record, new.log_index = old.publish, old.record, old.log_index
             new.sent, new.skipped = old.sent, old.skipped
+        for stream in streams:
+            stream.changed = self._forget
         self.streams = streams
         self._invariants = next(s for s in streams if isinstance(s, Invariants))
         self._past = _Past(top, round(values['markers.trace_length'] * NANOSECONDS))
@@ -90,8 +116,7 @@ class Simulation:
 
     def _begin(self, solver: Propagator, start: State, state: OneState, at_ns: int) -> None:
         """Let a motion begin at a time."""
-        for stream in self.streams:
-            stream.ready.clear()
+        self._forget()
         self.solver, self._anchor, self.anchor_ns, self._first = solver, start, at_ns, state
         self._known_ns = at_ns                  # no further steps are needed up to here
         self._reference: ExactPropagator | None = None
@@ -191,6 +216,18 @@ class Simulation:
         top, anchor = self.top, self._anchor
         return set_up
 
+    def log_to(self, write: Callable[[list[Row], int], Any], streams: Sequence[Stream]) -> None:
+        """
+        Have the samples of these streams taken by a log from now on, those of an instant at once.
+
+        write: gets the rows of an instant, in which a stream has the number that it has in
+            `streams`, and the size of their messages together [bytes].  No streams: no log.
+        """
+        self._log = write
+        for stream in self.streams:
+            stream.log_index = streams.index(stream) if stream in streams else None
+        self._forget()
+
     def advance(self, target_ns: int, publish_from_ns: int = 0,
                 give_way: Callable[[], bool] = lambda: False) -> bool:
         """
@@ -201,33 +238,82 @@ class Simulation:
             with nothing lost: the next call goes on there.
         Raises IntegrationError where the equations cannot go on.
         """
-        now_ns = self.now_ns
-        streams = [stream for stream in self.streams
-                   if stream.publish is not None or stream.record is not None]
-        due = target_ns + 1
-        for stream in streams:
-            if stream.next_ns <= now_ns:
-                stream.resume(now_ns)
-            next_ns = stream.next_ns
-            if next_ns < publish_from_ns and stream.record is None:
-                stream.resume(publish_from_ns - 1)
-                stream.skipped += (stream.next_ns - next_ns) // stream.period_ns
-                next_ns = stream.next_ns
-            if next_ns < due:       # noqa: PLR1730 - min() takes twice the time
-                due = next_ns
-        while due <= target_ns:
-            if due > self._known_ns and not self._reach(due, give_way):
+        if self.now_ns < publish_from_ns:
+            self._skip(publish_from_ns)
+        ready = self._ready
+        sent = False
+        while True:
+            if not ready:
+                due_ns = self._next_due()
+                if due_ns > target_ns:
+                    break
+                if due_ns > self._known_ns and not self._reach(due_ns, give_way):
+                    return False
+                self._compute()
+            instant = ready[0]
+            if instant.t_ns > target_ns:
+                break
+            if sent and give_way():
                 return False
-            next_due = self._send(due, streams, due >= publish_from_ns)
-            self.now_ns = due
-            due = next_due
-            if due <= target_ns and give_way():
-                return False
+            ready.popleft()
+            if instant.t_ns >= publish_from_ns:
+                self._send(*instant)
+            else:
+                for _, _, stream in instant.publications:
+                    stream.skipped += 1
+                self._send(*instant[:-1], [])
+            sent = True
         if target_ns > self._known_ns and not self._reach(target_ns, give_way):
             return False
-        if target_ns > self.now_ns:     # noqa: PLR1730
+        if target_ns > self.now_ns:     # noqa: PLR1730 - max() takes twice the time
             self.now_ns = target_ns
         return True
+
+    def send_ready(self, target_ns: int) -> bool:
+        """
+        Do what `advance` does if everything due is computed; return False, and do nothing, if not.
+
+        For the tick that comes in time: what it touches is little, for little of it is in the
+        processor's caches after a rest.
+        """
+        if target_ns >= self._beyond_ns or target_ns > self._known_ns:
+            return False
+        ready = self._ready
+        while ready and ready[0].t_ns <= target_ns:
+            self._send(*ready.popleft())
+        if target_ns > self.now_ns:     # noqa: PLR1730 - max() takes twice the time
+            self.now_ns = target_ns
+        return True
+
+    @property
+    def ready_ns(self) -> int:
+        """Before this time everything due is sent or computed [ns]."""
+        return self._beyond_ns
+
+    def prepare(self, until_ns: int, instants: int) -> None:
+        """
+        Compute now what is due up to `until_ns`, if it is not yet: many at once are cheap.
+
+        instants: compute so many at least, where any are to be computed
+        What is sent does not depend on it, a command finds the state that it would have found;
+        what then no longer holds is forgotten.  Gives up where the motion takes many steps, or
+        cannot go on: `advance` deals with that in its time.
+        """
+        if self._next_due() > until_ns:
+            return
+        for count in range(MOST_AT_ONCE):
+            due_ns = self._beyond_ns
+            if (count >= instants and due_ns > until_ns) or due_ns == NEVER_NS:
+                return
+            if due_ns > self._known_ns:
+                try:
+                    if not self.solver.reach_ahead_ns(due_ns - self.anchor_ns,
+                                                      self.now_ns - self.anchor_ns):
+                        return
+                except IntegrationError:
+                    return
+                self._known_ns = self.anchor_ns + self.solver.latest_ns
+            self._compute()
 
     def advance_in_columns(self, target_ns: int,
                            send: Callable[[Stream, Any, Any], None]) -> None:
@@ -243,6 +329,7 @@ class Simulation:
 
         if not isinstance(self.solver, ExactPropagator):
             raise ValueError("solver.method: columns need 'exact'")
+        self._forget()
         grids: dict[tuple[int, int], ExactGrid] = {}
         for stream in self.streams:
             if not stream.wanted:
@@ -265,65 +352,80 @@ class Simulation:
         while not self.solver.reach_ns(local_ns, STEPS_AT_ONCE):
             if give_way():
                 # Nothing is due before t_ns, and the steps taken cannot be taken back.
-                reached_ns = self.anchor_ns + self.solver.earliest_ns
+                reached_ns = self.anchor_ns + self.solver.latest_ns
                 self.now_ns = max(self.now_ns, min(reached_ns, t_ns - 1))
                 return False
         self._known_ns = self.anchor_ns + self.solver.latest_ns
         return True
 
-    def _send(self, t_ns: int, streams: list[Stream], in_time: bool) -> int:
-        """Send the samples of one instant; return when the next ones are due."""
+    def _forget(self) -> None:
+        """Drop what is computed ahead: it is not what comes next any more."""
+        self._ready.clear()
+        self._beyond_ns = -1
+
+    def _next_due(self) -> int:
+        """Return when there is more to compute than what is ready [ns]."""
+        if self._beyond_ns <= self.now_ns:
+            now_ns, due_ns = self.now_ns, NEVER_NS
+            streams = [stream for stream in self.streams if stream.wanted]
+            for stream in streams:
+                if stream.next_ns <= now_ns:
+                    stream.resume(now_ns)
+                due_ns = min(due_ns, stream.next_ns)
+            self._cursors = [[stream.next_ns, stream, stream.log_index, stream.record,
+                              stream.publish] for stream in streams]
+            self._ready.clear()
+            self._beyond_ns = due_ns
+        return self._beyond_ns
+
+    def _skip(self, until_ns: int) -> None:
+        """Leave out the samples before a time that are not recorded, and count them."""
+        for stream in self.streams:
+            if stream.publish is None or stream.recorded:
+                continue
+            first_ns = max(stream.next_ns, (self.now_ns // stream.period_ns + 1)
+                           * stream.period_ns)
+            if first_ns < until_ns:
+                stream.resume(until_ns - 1)
+                stream.skipped += (stream.next_ns - first_ns) // stream.period_ns
+
+    def _compute(self) -> None:
+        """Compute the messages of the next instant, which the solver has reached."""
+        t_ns, next_ns = self._beyond_ns, NEVER_NS
+        state = self.solver.at_ns(t_ns - self.anchor_ns)
         stamp_ns = self.epoch_ns + t_ns
-        publications = []
-        next_ns = None
-        for stream in streams:
-            if stream.next_ns == t_ns:
-                if t_ns not in stream.ready:
-                    self._encode(t_ns, streams)
-                data = stream.ready.pop(t_ns)
-                stream.next_ns += stream.period_ns
-                if stream.record is not None:
-                    stream.record(stamp_ns, data)
-                if stream.publish is not None:
-                    if in_time:
-                        publications.append((stream, stream.publish, data))
-                    else:
-                        stream.skipped += 1
-            if next_ns is None or stream.next_ns < next_ns:
-                next_ns = stream.next_ns
+        rows, size, records, publications = [], 0, [], []
+        for cursor in self._cursors:
+            due_ns, stream, log_index, record, publish = cursor
+            if due_ns == t_ns:
+                data = stream.encode(state, stamp_ns, t_ns)
+                if log_index is not None:
+                    rows.append((log_index, stamp_ns, data))
+                    size += len(data)
+                if record is not None:
+                    records.append((record, stamp_ns, data))
+                if publish is not None:
+                    publications.append((publish, data, stream))
+                cursor[0] = due_ns = t_ns + stream.period_ns
+            if due_ns < next_ns:        # noqa: PLR1730 - min() takes twice the time
+                next_ns = due_ns
+        self._ready.append(Instant(t_ns, rows, size, records, publications))
+        self._beyond_ns = next_ns
+
+    def _send(self, t_ns: int, rows: list[Row], size: int, records: list[Any],
+              publications: list[Any]) -> None:
+        """Hand out the samples of an instant: an `Instant`, in pieces."""
+        if rows:
+            assert self._log is not None
+            self._log(rows, size)
+        for record, stamp_ns, data in records:
+            record(stamp_ns, data)
         # After all is recorded: where it fails, as the node ends, the log has the instant whole.
         # One right after the other: each finds the middleware still awake from the one before.
-        for stream, publish, data in publications:
+        self.now_ns = t_ns
+        for publish, data, stream in publications:
             publish(data)
             stream.sent += 1
-        assert next_ns is not None
-        return next_ns
-
-    def _encode(self, t_ns: int, streams: list[Stream]) -> None:
-        """
-        Compute the messages of an instant, and of some that follow.
-
-        Five instants in a row take half the time of five that come after a rest each, when
-        nothing of all this is in the processor's caches any more.
-        """
-        last_ns = max(t_ns, self._known_ns)
-        for _ in range(self.look_ahead):
-            state = None
-            next_ns = last_ns + 1
-            for stream in streams:
-                period_ns = stream.period_ns
-                at_ns = max(stream.next_ns, -(-t_ns // period_ns) * period_ns)
-                if at_ns == t_ns:
-                    if t_ns not in stream.ready:
-                        if state is None:
-                            state = self.solver.at_ns(t_ns - self.anchor_ns)
-                        stream.ready[t_ns] = stream.encode(state, self.epoch_ns + t_ns, t_ns)
-                    at_ns += period_ns
-                if at_ns < next_ns:     # noqa: PLR1730
-                    next_ns = at_ns
-            if next_ns > last_ns:
-                return
-            t_ns = next_ns
 
     def command(self, l3: float, lz: float) -> None:
         """

@@ -29,9 +29,11 @@ class Stream:
     """
     One topic: samples at t = k x period, k = 0, 1, 2.., whoever listens and however ticks fall.
 
-    publish, record: what a sample is handed to, None while nobody wants it;  sent, skipped:
-    counts of samples published, and of those that came too late to be published
-    ready: messages computed ahead of their time, by time [ns]
+    sent, skipped: counts of samples published, and of those that came too late to be published
+    log_index: its number in a log that takes the samples of all streams, None for none; see
+    `Simulation.log_to`
+    next_ns: when the next sample is due, if anybody takes it
+    changed: called when what comes next is not what it would have been
     """
 
     parameter: str
@@ -40,13 +42,36 @@ class Stream:
     template: Template
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        self.publish: Callable[[bytes], None] | None = None
-        self.record: Callable[[int, bytes], None] | None = None
+        self._publish: Callable[[bytes], Any] | None = None
+        self._record: Callable[[int, bytes], Any] | None = None
+        self.log_index: int | None = None
+        self.changed: Callable[[], None] = lambda: None
         self.sent = self.skipped = 0
-        self.ready: dict[int, bytes] = {}
         self.next_ns = 0
         self.period_ns = 1
         self.set_rate(values[f'{self.parameter}.rate'])
+
+    @property
+    def publish(self) -> Callable[[bytes], Any] | None:
+        """What a sample is handed to in time; None while nobody listens."""
+        return self._publish
+
+    @publish.setter
+    def publish(self, sink: Callable[[bytes], Any] | None) -> None:
+        if sink != self._publish:
+            self._publish = sink
+            self.changed()
+
+    @property
+    def record(self) -> Callable[[int, bytes], Any] | None:
+        """What every sample is handed to, with its stamp [ns]; None for nothing."""
+        return self._record
+
+    @record.setter
+    def record(self, sink: Callable[[int, bytes], Any] | None) -> None:
+        if sink != self._record:
+            self._record = sink
+            self.changed()
 
     def set_rate(self, rate: float) -> None:
         """Put the samples on the grid of another rate [Hz]; call `resume` after."""
@@ -54,23 +79,26 @@ class Stream:
 
     def resume(self, after_ns: int) -> None:
         """Make the first grid point later than `after_ns` the next sample."""
-        self.ready.clear()
         self.next_ns = (after_ns // self.period_ns + 1) * self.period_ns
+        self.changed()
 
     @property
     def wanted(self) -> bool:
         """Whether anybody takes the samples: else nothing is computed."""
-        return self.publish is not None or self.record is not None
+        return self._publish is not None or self.recorded
+
+    @property
+    def recorded(self) -> bool:
+        """Whether somebody takes every sample, however late."""
+        return self._record is not None or self.log_index is not None
 
     @property
     def index(self) -> int:
         """Number k of the next sample."""
         return self.next_ns // self.period_ns
 
-    def encode(self, state: OneState, stamp_ns: int, t_ns: int | None = None) -> bytes:
-        """Return the serialized message of a state, its stamp, and its time (default: next)."""
-        if t_ns is None:
-            t_ns = self.next_ns
+    def encode(self, state: OneState, stamp_ns: int, t_ns: int) -> bytes:
+        """Return the serialized message of a state, its stamp, and its time [ns]."""
         return self.template.encode(stamp_ns, *self.runs(state, t_ns // self.period_ns))
 
     def encode_many(self, states: Columns, stamps_ns: Any) -> Any:
@@ -111,8 +139,7 @@ class JointStates(Stream):
         self.template = messages.joint_state(JOINTS)
 
     def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
-        return ((state.phi, state.theta, state.psi),
-                (state.phi_dot, state.theta_dot, state.psi_dot))
+        return state.euler_angles, state.euler_rates
 
 
 class GroundTruthOdometry(Stream):
