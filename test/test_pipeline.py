@@ -186,8 +186,13 @@ def test_what_is_sent_does_not_depend_on_how_far_is_computed_ahead(name):
         simulation = Simulation(parameters.checked(values), EPOCH_NS)
         taken = listen(simulation)
         l3, lz = simulation.l3, simulation.lz
+        ready = 0
         for tick in range(1, 61):
-            simulation.advance(tick * 7_654_321)
+            if instants and simulation.send_ready(tick * 7_654_321):
+                ready += 1
+            else:
+                simulation.advance(tick * 7_654_321)
+            assert simulation.now_ns == tick * 7_654_321
             if instants:
                 simulation.prepare((tick + 1) * 7_654_321, instants)
             if tick == 20:
@@ -202,6 +207,7 @@ def test_what_is_sent_does_not_depend_on_how_far_is_computed_ahead(name):
                 one = stream(simulation, 'imu/data_raw')
                 one.record = lambda stamp, data: taken.append(('back', stamp, data))
                 simulation.command(l3, lz)
+        assert not instants or ready > 50
         return taken
 
     once = run(0)
@@ -224,6 +230,43 @@ def test_computing_ahead_computes_each_sample_once_and_little_in_vain():
     assert 1001 <= samples.count <= 1017, 'two streams share the states'
 
 
+def test_a_log_gets_the_rows_of_an_instant_at_once_and_the_same_bytes():
+    simulation, beside = simulate(pose__rate=1000.0), simulate(pose__rate=1000.0)
+    calls = []
+    chosen = [stream(simulation, topic) for topic in ('imu/data_raw', 'pose', '~/invariants')]
+    simulation.log_to(lambda rows, size: calls.append((list(rows), size)), chosen)
+    expected = listen(beside, *(one.topic for one in chosen))
+    beside.advance(SECOND)
+    simulation.advance(SECOND // 2)
+    assert [one.recorded for one in simulation.streams].count(True) == 3
+    for tick in range(501, 1001):
+        simulation.prepare(tick * MILLISECOND, 16)
+        assert simulation.send_ready(tick * MILLISECOND)
+    assert len(calls) == 1001, 'an instant is one call'
+    assert all(size == sum(len(data) for _, _, data in rows) for rows, size in calls)
+    assert [(chosen[index].topic, stamp, data)
+            for rows, _ in calls for index, stamp, data in rows] == expected
+    simulation.log_to(calls.append, ())
+    simulation.advance(2 * SECOND)
+    assert len(calls) == 1001
+    assert not any(one.wanted for one in simulation.streams)
+
+
+def test_late_samples_go_to_the_log_all_the_same():
+    simulation = simulate()
+    calls = []
+    pose = stream(simulation, 'pose')
+    simulation.log_to(lambda rows, size: calls.extend(rows), [pose])
+    published = listen(simulation, 'pose', 'joint_states', sink='publish')
+    simulation.advance(0)
+    simulation.prepare(SECOND, 1)
+    simulation.advance(10 * SECOND, publish_from_ns=9 * SECOND + 1)
+    assert len(calls) == 1001
+    assert len(published) == 2 * 101
+    for topic in ('pose', 'joint_states'):
+        assert (stream(simulation, topic).sent, stream(simulation, topic).skipped) == (101, 900)
+
+
 def test_ticks_that_find_all_prepared_compute_nothing():
     simulation = simulate(pose__rate=1000.0)
     taken = listen(simulation, 'pose')
@@ -232,9 +275,12 @@ def test_ticks_that_find_all_prepared_compute_nothing():
     samples = Counting(simulation.solver, 'at_ns')
     steps = Counting(simulation.solver, 'reach_ns')
     for tick in range(1, 11):
-        simulation.advance(tick * MILLISECOND)
+        assert simulation.send_ready(tick * MILLISECOND)
+        assert simulation.now_ns == tick * MILLISECOND
     assert (samples.count, steps.count) == (0, 0)
     assert len(taken) == 11
+    assert not simulation.send_ready(11 * MILLISECOND)
+    assert simulation.now_ns == 10 * MILLISECOND
     simulation.prepare(10 * MILLISECOND, 16)
     assert samples.count == 0, 'there was nothing to do'
     simulation.prepare(11 * MILLISECOND, 16)

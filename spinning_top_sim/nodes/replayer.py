@@ -219,7 +219,8 @@ class Replayer(Node):
                                   lambda index, data: publish[index](data),
                                   paused=self._options.paused)
         if self._options.clock:
-            self._clock_thread = DeadlineThread(self._publish_clock, self._options.clock, 'clock')
+            self._clock_thread = DeadlineThread(self._publish_clock, self._options.clock,
+                                                name='clock')
             self._clock_thread.start()
         self._thread.start()
 

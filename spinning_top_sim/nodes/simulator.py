@@ -41,9 +41,9 @@ OPENING_NS = 60_000_000
 LISTENERS_PERIOD_NS = 50_000_000
 # Instants computed at once, ahead of their time: what fills this share of the time between two
 # ticks at about INSTANT_NS each, so that the next tick finds the processor free.
-BUSY_SHARE = 0.6
-INSTANT_NS = 20_000
-FEWEST_AHEAD, MOST_AHEAD = 8, 48
+BUSY_SHARE = 0.5
+INSTANT_NS = 30_000
+FEWEST_AHEAD, MOST_AHEAD = 8, 16
 SWITCH_INTERVAL_S = 1e-4
 NEVER_NS = 2 ** 63 - 1
 # One tick works at most this long before services and signals get their turn.
@@ -105,8 +105,6 @@ class Simulator(Node):
         self._begun = self._ended = False
         self._paused = values['start_paused']
         self._listeners_due = 0
-        # Simulated time before which a tick in time has only to send what is ready.
-        self._plain_until_ns = -1
         self._stop_at = 0.0
         self._pacer: DeadlineThread | None = None
         self._tick_timer: Any = None
@@ -178,10 +176,12 @@ class Simulator(Node):
         if self._values['pacing'] == 'thread':
             # What else runs in Python lets go of the interpreter this soon, and not after 5 ms.
             sys.setswitchinterval(SWITCH_INTERVAL_S)
-            self._pacer = DeadlineThread(self._tick_in_thread, tick_rate)
+            self._pacer = DeadlineThread(self._tick_in_thread, tick_rate, self._prepare)
+            self._align_ticks()
             self._pacer.start()
         else:
-            self._tick_timer = self.create_timer(1.0 / tick_rate, self._tick, clock=self._steady)
+            self._tick_timer = self.create_timer(1.0 / tick_rate, self._tick_by_timer,
+                                                 clock=self._steady)
 
     def _begin(self) -> bool:
         """Fix the stamp of t = 0; False as long as the /clock that we follow says nothing."""
@@ -202,9 +202,19 @@ class Simulator(Node):
             time.sleep(max(0.0, (epoch - self._date.now().nanoseconds) / NANOSECONDS))
         self._speed.read(0)
         if not self._paused:
-            self._simulated_clock.start(0)
+            self._start_clock(0)
         self._begun = True
         return True
+
+    def _start_clock(self, simulated_ns: int) -> None:
+        self._simulated_clock.start(simulated_ns)
+        self._align_ticks()
+
+    def _align_ticks(self) -> None:
+        """Have ticks just after samples are due, and not now before and now after."""
+        origin_ns = self._simulated_clock.when(0)
+        if self._pacer is not None and origin_ns is not None and not self._follows:
+            self._pacer.align(origin_ns / NANOSECONDS)
 
     def stop(self) -> None:
         """End the motion and close the recording; safe whatever state the context is in."""
@@ -228,15 +238,20 @@ class Simulator(Node):
 
     # ------------------------------------------------------------------------------- ticks
 
-    def _tick_in_thread(self) -> None:
+    def _tick_in_thread(self) -> bool:
         try:
-            self._tick()
+            return self._tick()
         except Exception:
             if self.context.ok():       # else: publishing fails once the context is down
                 raise
+            return False
 
-    def _tick(self) -> None:
-        """Send what is due."""
+    def _tick_by_timer(self) -> None:
+        if self._tick():
+            self._prepare()
+
+    def _tick(self) -> bool:
+        """Send what is due; return whether `_prepare` is wanted before the next tick."""
         with self._lock:
             now, late_from = time.monotonic_ns(), self._late_from
             self._late_from = now + self._late_after_ns
@@ -244,31 +259,41 @@ class Simulator(Node):
             # Most ticks have nothing more to do than this, and touch little.
             if (due_ns < self._plain_until_ns and now <= late_from
                     and self._simulation.send_ready(due_ns)):
-                return
+                return False
             if not (self._begun or self._begin()):
-                return
+                return False
             if self._paused or self._failure or self._ended:
-                return
+                return False
             if now > late_from:
                 self._count_late_tick(now - late_from)
-            self._attend(now)
+            return self._attend(now)
 
-    def _attend(self, now: int) -> None:
-        """Send what is due, and look after all else."""
+    def _attend(self, now: int) -> bool:
+        """Send what is due, and look after all else; see `_tick`."""
         if now >= self._listeners_due:
             self._look_for_listeners()
             self._listeners_due = now + LISTENERS_PERIOD_NS
         simulation, due_ns = self._simulation, self._due()
         self._advance(due_ns)
-        if simulation.now_ns >= due_ns:
-            # There is time until the next tick, and nobody waits for anything now.
-            simulation.prepare(due_ns + self._ahead_ns, self._instants_ahead)
-        self._plain_until_ns = min(due_ns + self._listeners_period_ns,
-                                   simulation.ready_ns - self._ahead_ns)
-        if self._duration_ns:
-            self._plain_until_ns = min(self._plain_until_ns, self._duration_ns)
-            if simulation.now_ns >= self._duration_ns:
-                self._finish()
+        if self._duration_ns and simulation.now_ns >= self._duration_ns:
+            self._finish()
+            return False
+        self._foresee()
+        return simulation.now_ns >= due_ns >= self._plain_until_ns
+
+    def _prepare(self) -> None:
+        """Compute what comes next, while nobody waits for anything."""
+        with self._lock:
+            simulation = self._simulation
+            simulation.prepare(simulation.now_ns + self._ahead_ns, self._instants_ahead)
+            self._foresee()
+
+    def _foresee(self) -> None:
+        """Say until when ticks are plain."""
+        simulation = self._simulation
+        self._plain_until_ns = min(simulation.now_ns + self._listeners_period_ns,
+                                   simulation.ready_ns - self._ahead_ns,
+                                   self._duration_ns or NEVER_NS)
 
     def _take_pace(self, values: dict[str, Any]) -> None:
         """Hold in nanoseconds what every tick asks for."""
@@ -276,6 +301,8 @@ class Simulator(Node):
         self._tick_period_ns = NANOSECONDS / values['tick_rate']
         self._late_after_ns = round(1.5 * self._tick_period_ns)
         self._late_from = NEVER_NS
+        # Simulated time before which a tick in time has only to send what is ready.
+        self._plain_until_ns = -1
         self._instants_ahead = max(FEWEST_AHEAD, min(
             MOST_AHEAD, round(BUSY_SHARE * self._tick_period_ns / INSTANT_NS)))
         self._listeners_period_ns = round(LISTENERS_PERIOD_NS * values['time_scale'])
@@ -316,7 +343,7 @@ class Simulator(Node):
             lag = target_ns - simulation.now_ns
             if lag > LONGEST_LAG_NS * self._values['time_scale']:
                 self._counters.slipped_ns += lag
-                self._simulated_clock.start(simulation.now_ns)
+                self._start_clock(simulation.now_ns)
                 self._warn_overload('the clock slips')
                 return
         if late and self._skipped() > skipped:
@@ -409,6 +436,7 @@ class Simulator(Node):
             self._open_publishers()
         if 'time_scale' in changed:
             self._simulated_clock.set_scale(values['time_scale'])
+            self._align_ticks()
         if 'status_period' in changed:
             self._restart_status()
         if 'tick_rate' in changed:
@@ -431,7 +459,7 @@ class Simulator(Node):
                 self._paused = False
                 self._late_from = NEVER_NS
                 if self._begun and not self._failure:
-                    self._simulated_clock.start(max(self._simulation.now_ns, 0))
+                    self._start_clock(max(self._simulation.now_ns, 0))
             response.success = True
             state = 'paused' if self._paused else 'running'
             response.message = f'{state} at t = {self._seconds():.9g} s'
@@ -465,7 +493,7 @@ class Simulator(Node):
                 arrived = self._simulation.advance(target, give_way=give_way)
             except IntegrationError as error:
                 self._fail(str(error))
-            self._simulated_clock.start(max(self._simulation.now_ns, 0))
+            self._start_clock(max(self._simulation.now_ns, 0))
             self._simulated_clock.stop()
             response.success = arrived
             response.message = self._failure or f'at t = {self._seconds():.9g} s'
@@ -494,7 +522,7 @@ class Simulator(Node):
             now = self._date.now().nanoseconds
             simulation.epoch_ns = _ceil_to(max(last_stamp + 1, now), EPOCH_GRID_NS)
             self._failure = None
-            self._simulated_clock.start(0)
+            self._start_clock(0)
             if self._paused:
                 self._simulated_clock.stop()
             self._speed.read(0)

@@ -301,16 +301,19 @@ class Simulation:
         """
         if self._next_due() > until_ns:
             return
+        try:
+            self._compute_ahead(until_ns, instants)
+        except IntegrationError:
+            self._forget()
+
+    def _compute_ahead(self, until_ns: int, instants: int) -> None:
         for count in range(MOST_AT_ONCE):
             due_ns = self._beyond_ns
             if (count >= instants and due_ns > until_ns) or due_ns == NEVER_NS:
                 return
             if due_ns > self._known_ns:
-                try:
-                    if not self.solver.reach_ahead_ns(due_ns - self.anchor_ns,
-                                                      self.now_ns - self.anchor_ns):
-                        return
-                except IntegrationError:
+                if not self.solver.reach_ahead_ns(due_ns - self.anchor_ns,
+                                                  self.now_ns - self.anchor_ns):
                     return
                 self._known_ns = self.anchor_ns + self.solver.latest_ns
             self._compute()
