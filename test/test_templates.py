@@ -185,9 +185,9 @@ def test_every_stream_sends_a_message_of_its_type_with_the_frames_of_the_paramet
                 'ground_truth/imu_bias': frames['imu.frame_id']}
     seen = set()
     for stream in simulation.streams:
-        message = deserialize_message(stream.encode(state, stamp_ns),
+        message = deserialize_message(stream.encode(state, stamp_ns, 0),
                                       message_class(stream.type_name))
-        assert_same(stream.encode(state, stamp_ns), message)
+        assert_same(stream.encode(state, stamp_ns, 0), message)
         seen.add(stream.topic)
         if stream.topic in expected:
             assert message.header.frame_id == expected[stream.topic], stream.topic
@@ -201,7 +201,7 @@ def test_imu_covariances_follow_rep_145():
     """No orientation estimate: first element -1; every other covariance 0 or positive."""
     simulation = Simulation(parameters.checked({}))
     state = simulation.state()
-    by_topic = {stream.topic: deserialize_message(stream.encode(state, 0), Imu)
+    by_topic = {stream.topic: deserialize_message(stream.encode(state, 0, 0), Imu)
                 for stream in simulation.streams if stream.type_name == 'sensor_msgs/msg/Imu'}
     for topic in ('imu/data_raw', 'ground_truth/imu_bias'):
         assert by_topic[topic].orientation_covariance[0] == -1.0, topic

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""When ticks come: the thread that paces them, on a clock of its own."""
+
+import pytest
+
+from spinning_top_sim.nodes import pacing
+
+BEGIN = 1000.0
+PERIOD = 1.0 / 128          # sums of it are exact
+
+
+class Time:
+    """Stands in for the module `time`: sleeping takes as long as it says, and all else nothing."""
+
+    def __init__(self):
+        self.now, self.naps = BEGIN, []
+
+    def monotonic(self):
+        return self.now
+
+    def sleep(self, seconds):
+        self.naps.append(seconds)
+        self.now += seconds
+
+
+class Run:
+    """
+    A DeadlineThread run here; `seen` are its ticks, in periods after the begin.
+
+    costs: time that some ticks take, by their number [periods];  wants: ticks that ask for spare
+    time;  at: what happens in some ticks, by their number
+    """
+
+    def __init__(self, monkeypatch, count, costs=None, wants=(), at=None):
+        self.time, self.seen, self.spared = Time(), [], []
+        self._count, self._costs, self._wants, self._at = count, costs or {}, wants, at or {}
+        monkeypatch.setattr(pacing, 'time', self.time)
+        self.thread = pacing.DeadlineThread(self._tick, 1.0 / PERIOD, self._spare)
+        self.thread.run()
+
+    def _tick(self):
+        number = len(self.seen)
+        self.seen.append((self.time.now - BEGIN) / PERIOD)
+        self.time.now += PERIOD * self._costs.get(number, 0.25)
+        self._at.get(number, lambda run: None)(self)
+        if len(self.seen) == self._count:
+            self.thread._stopped = True
+        return number in self._wants
+
+    def _spare(self):
+        self.spared.append((self.time.now - BEGIN) / PERIOD)
+        self.time.now += 0.125 * PERIOD
+
+
+def test_ticks_fall_on_the_grid(monkeypatch):
+    assert Run(monkeypatch, 5).seen == [1.0, 2.0, 3.0, 4.0, 5.0]
+
+
+def test_a_late_tick_comes_at_once_what_has_passed_is_skipped_and_the_grid_stays(monkeypatch):
+    assert Run(monkeypatch, 5, {1: 1.25}).seen == [1.0, 2.0, 3.25, 4.0, 5.0]
+    assert Run(monkeypatch, 5, {1: 3.75}).seen == [1.0, 2.0, 5.75, 6.0, 7.0]
+
+
+def test_ticks_that_take_longer_than_a_period_follow_each_other(monkeypatch):
+    seen = Run(monkeypatch, 5, dict.fromkeys(range(5), 1.5)).seen
+    assert seen == [1.0, 2.5, 4.0, 5.5, 7.0]
+
+
+def test_the_grid_is_aligned_with_a_time_before_or_after(monkeypatch):
+    for origin in (-7.5, 0.5, 12.5):
+        def align(run, origin=origin):
+            run.thread.align(BEGIN + origin * PERIOD)
+        assert Run(monkeypatch, 5, at={1: align}).seen == [1.0, 2.0, 2.5, 3.5, 4.5]
+
+
+def test_a_new_rate_holds_from_the_next_deadline_on(monkeypatch):
+    seen = Run(monkeypatch, 6, at={1: lambda run: run.thread.set_rate(0.5 / PERIOD)}).seen
+    assert seen == [1.0, 2.0, 4.0, 6.0, 8.0, 10.0]
+    seen = Run(monkeypatch, 4, at={1: lambda run: run.thread.set_rate(2.0 / PERIOD)}).seen
+    assert seen == [1.0, 2.0, 2.5, 3.0]
+
+
+def test_spare_time_begins_a_moment_after_the_tick_that_asks_for_it(monkeypatch):
+    run = Run(monkeypatch, 5, wants={1, 3})
+    assert run.seen == [1.0, 2.0, 3.0, 4.0, 5.0]
+    assert run.spared == pytest.approx([2.25 + run.thread.NAP, 4.25 + run.thread.NAP])
+
+
+def test_a_far_deadline_is_waited_for_in_pieces(monkeypatch):
+    run = Run(monkeypatch, 2, at={0: lambda run: run.thread.set_rate(1.0)})
+    assert max(run.time.naps) <= run.thread.LONGEST_SLEEP
+    assert run.seen[1] * PERIOD == pytest.approx(1.0)
+
+
+def test_simulated_time_knows_when_it_will_be_what():
+    now = [5_000]
+    clock = pacing.SimulatedClock(lambda: now[0], 2.0)
+    assert (clock.now(), clock.when(0), clock.running) == (0, None, False)
+    clock.start(100)
+    now[0] += 50
+    assert (clock.now(), clock.when(0), clock.when(200)) == (200, 4_950, 5_050)
+    clock.set_scale(0.5)
+    now[0] += 100
+    assert (clock.now(), clock.when(250)) == (250, 5_150)
+    clock.stop()
+    now[0] += 100
+    assert (clock.now(), clock.when(250)) == (250, None)
