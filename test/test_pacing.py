@@ -105,3 +105,10 @@ def test_simulated_time_knows_when_it_will_be_what():
     clock.stop()
     now[0] += 100
     assert (clock.now(), clock.when(250)) == (250, None)
+
+
+def test_a_followed_clock_goes_on_where_it_steps_back():
+    readings = iter([100, 150, 40, 41, 90, 10, 20])
+    onward = pacing.Onward(lambda: next(readings))
+    assert [onward() for _ in range(7)] == [100, 150, 150, 151, 200, 200, 210]
+    assert onward.stepped_back_ns == 110 + 80

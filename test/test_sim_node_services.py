@@ -28,6 +28,7 @@ from node_logs import (
     the_log,
 )
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.time import Time
 from rosbags.highlevel import AnyReader
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu
@@ -290,6 +291,33 @@ def test_a_follower_moves_with_the_clock_of_another_node(peer, diagnostics, tmp_
     times = [time for time, _ in log['/follower/pose']]
     assert times[0] == epoch > SECOND * 1_000_000_000
     assert set(np.diff(times)) == {PERIODS_NS['pose']}
+
+
+def test_a_clock_that_steps_back_is_told_and_the_motion_goes_on(peer, tmp_path):
+    """As when a log is played in a loop."""
+    publisher = peer.node.create_publisher(Clock, '/clock', 10)
+
+    def drive(begin_ns, until):
+        now_ns = begin_ns
+        def goes_on():
+            nonlocal now_ns
+            now_ns += 5_000_000
+            publisher.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
+            return until()
+        wait_for('samples', goes_on)
+
+    with SimNode(tmp_path, {**QUIET, 'use_sim_time': True}, namespace='/looped') as node:
+        pose = peer.listen(node.topic('pose'), PoseStamped)
+        drive(500 * SECOND, lambda: len(pose.raw) > 100)
+        count = len(pose.raw)
+        drive(100 * SECOND, lambda: len(pose.raw) > count + 100)
+        stamps = stamps_of(pose)
+        assert (np.diff(stamps) > 0).all()
+        assert stamps[0] >= 500 * SECOND
+        wait_for('a warning', lambda: '/clock stepped back by 40' in node.err)
+        peer.stop_listening(pose)
+        assert_clean_end(node, node.end())
+    peer.node.destroy_publisher(publisher)
 
 
 def test_two_sources_of_time_do_not_lock_each_other(peer, tmp_path):

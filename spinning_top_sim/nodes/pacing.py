@@ -57,6 +57,26 @@ class SimulatedClock:
             self.start(now)
 
 
+class Onward:
+    """
+    The readings of a clock less the steps back that it takes: a log that is played anew.
+
+    source: returns nanoseconds;  stepped_back_ns: by how much it has gone back, all together
+    """
+
+    def __init__(self, source: Callable[[], int]) -> None:
+        self._source = source
+        self._newest: int | None = None
+        self.stepped_back_ns = 0
+
+    def __call__(self) -> int:
+        reading = self._source()
+        if self._newest is not None and reading < self._newest:
+            self.stepped_back_ns += self._newest - reading
+        self._newest = reading
+        return reading + self.stepped_back_ns
+
+
 class DeadlineThread(threading.Thread):
     """
     Calls `tick` at absolute deadlines, rate times a second, until it is stopped.

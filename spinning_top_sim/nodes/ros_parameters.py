@@ -82,12 +82,13 @@ class ParameterChanges:
 
     values: as they are;  start_spin: spin.* as the node was started with
     apply(values, changed): called with every parameter's value and the names that changed;
-    raises ValueError to refuse.
+    raises ValueError to refuse.  refused(names): called with what was not to be changed
     """
 
     def __init__(self, node: Node, values: Mapping[str, Any], start_spin: Mapping[str, Any],
-                 apply: Callable[[dict[str, Any], set[str]], None]) -> None:
-        self._node, self._apply = node, apply
+                 apply: Callable[[dict[str, Any], set[str]], None],
+                 refused: Callable[[set[str]], None]) -> None:
+        self._node, self._apply, self._refused = node, apply, refused
         self.values = dict(values)
         self.start_spin = dict(start_spin)
         self._following = False
@@ -115,6 +116,7 @@ class ParameterChanges:
                            for name in SPIN})
             self._apply(values, set(ours))
         except (ValueError, RuntimeError) as error:
+            self._refused(set(ours))
             return SetParametersResult(successful=False, reason=str(error))
         self.values = values
         return SetParametersResult(successful=True)

@@ -25,7 +25,7 @@ from std_srvs.srv import SetBool, Trigger
 from spinning_top_sim.nodes import reports
 from spinning_top_sim.nodes.message_types import message_type
 from spinning_top_sim.nodes.occasional import OccasionalGroup
-from spinning_top_sim.nodes.pacing import DeadlineThread, SimulatedClock
+from spinning_top_sim.nodes.pacing import DeadlineThread, Onward, SimulatedClock
 from spinning_top_sim.nodes.ros_parameters import SPIN, ParameterChanges, declare, start_values
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal
@@ -87,7 +87,8 @@ class Simulator(Node):
         start_spin = {name: values[name] for name in SPIN}
         values = {**values, 'spin.lz': self._simulation.lz}
         declare(self, values)
-        self._changes = ParameterChanges(self, values, start_spin, self._apply)
+        self._changes = ParameterChanges(self, values, start_spin, self._apply,
+                                         self._count_refusal)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._publisher_events = OccasionalGroup()
         self._qos: dict[str, QoSProfile] = {}
@@ -98,9 +99,10 @@ class Simulator(Node):
         self._follows = (self.get_parameter('use_sim_time').value
                          and not journal.is_enabled('clock', self._values))
         self._date = self.get_clock() if self._follows else Clock(clock_type=ClockType.SYSTEM_TIME)
+        self._followed = Onward(lambda: self._date.now().nanoseconds)
+        self._told_stepped_back_ns = 0
         self._simulated_clock = SimulatedClock(
-            (lambda: self._date.now().nanoseconds) if self._follows else time.monotonic_ns,
-            values['time_scale'])
+            self._followed if self._follows else time.monotonic_ns, values['time_scale'])
         self._take_pace(self._values)
         self._begun = self._ended = False
         self._paused = values['start_paused']
@@ -405,7 +407,7 @@ class Simulator(Node):
         """Put a validated change of parameters into effect.  Raises ValueError to refuse."""
         with self._lock:
             if changed & {'spin.l3', 'spin.lz'}:
-                self._refuse_counted(values['spin.l3'], values['spin.lz'])
+                self._command(values['spin.l3'], values['spin.lz'])
             rest = changed - {'spin.l3', 'spin.lz'}
             if rest:
                 now_ns = self._simulation.now_ns
@@ -419,12 +421,9 @@ class Simulator(Node):
                 self._changes.values = before
                 raise
 
-    def _refuse_counted(self, l3: float, lz: float) -> None:
-        try:
-            self._command(l3, lz)
-        except ValueError:
+    def _count_refusal(self, names: set[str]) -> None:
+        if names & set(SPIN):
             self._counters.rejected_commands += 1
-            raise
 
     def _put_into_effect(self, values: dict[str, Any], changed: set[str]) -> None:
         simulation = self._simulation
@@ -619,9 +618,19 @@ class Simulator(Node):
 
     # ----------------------------------------------------------------------------- reports
 
+    def _check_clock(self) -> None:
+        """Tell of a followed /clock that has stepped back, as one does that is played anew."""
+        back_ns = self._followed.stepped_back_ns
+        if back_ns > self._told_stepped_back_ns:
+            self.get_logger().warning(
+                f'/clock stepped back by {(back_ns - self._told_stepped_back_ns) / NANOSECONDS:g} '
+                's: the motion and its stamps go on from where they are')
+            self._told_stepped_back_ns = back_ns
+
     def _report(self) -> None:
         """Publish /diagnostics, once a second."""
         self._publisher_events.open()
+        self._check_clock()
         self._check_recorder()
         if self._values['max_error'] > 0.0:
             self._know_exact()
