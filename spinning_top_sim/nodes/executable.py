@@ -77,6 +77,10 @@ def run(name: str, argv: list[str],
         return 0 if make_node is None else _run(name, argv, make_node, interrupt)
     except KeyboardInterrupt:           # before the node was there
         return 130
+    except ImportError:                 # what rclpy makes of one in the midst of its own import
+        if interrupt.told:
+            return 130
+        raise
 
 
 def _cannot_start(name: str, error: Exception) -> int:
