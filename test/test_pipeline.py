@@ -693,6 +693,15 @@ def test_the_euler_form_fails_at_a_pole_with_a_reason_and_can_be_restarted():
     assert simulation.advance(5 * SECOND)
 
 
+@pytest.mark.parametrize('name', VARIANTS)
+def test_angles_and_rates_are_the_same_together_and_one_by_one(name):
+    solver = Simulation(parameters.checked(VARIANTS[name])).solver
+    for ns in range(0, SECOND, 7_654_321):
+        together, each = solver.at_ns(ns), solver.at_ns(ns)
+        assert together.euler_angles == (each.phi, each.theta, each.psi)
+        assert together.euler_rates == (each.phi_dot, each.theta_dot, each.psi_dot)
+
+
 def test_what_cannot_go_on_fails_at_the_same_time_when_computed_ahead():
     def run(ahead):
         simulation = simulate(solver__equations='euler', initial__theta=0.5,

@@ -65,7 +65,7 @@ def finished(tmp_path_factory):
     values = {'duration': 1.5, 'record.enabled': True, 'invariants.rate': 100.0,
               'imu.gyroscope_noise_density': 0.001, 'seed': 5}
     runs = {'/one': values, '/two': {**values, 'tick_rate': 77.0},
-            '/three': {**values, 'pacing': 'thread', 'tick_rate': 1000.0},
+            '/three': {**values, 'pacing': 'thread', 'tick_rate': 500.0},
             '/silent': {'duration': 1.5, **QUIET}}
     nodes = [SimNode(folder, values, namespace=name, program=('-c', EXIT_HOOK))
              for name, values in runs.items()]

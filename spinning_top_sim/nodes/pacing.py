@@ -115,11 +115,11 @@ class DeadlineThread(threading.Thread):
         grid: tuple[float, float] | None = None
         newest = 0
         while not self._stopped:
-            now = time.monotonic()
-            if grid is not self._grid:
-                grid = origin, period = self._grid
-                newest = int((now - origin) // period)
-            passed = int((now - origin) // period)      # number of the deadline before now
+            before, grid = grid, self._grid     # which another thread may change at any time
+            origin, period = grid
+            passed = int((time.monotonic() - origin) // period)     # the deadline before now
+            if grid is not before:
+                newest = passed
             if passed <= newest:
                 newest += 1
                 deadline = origin + newest * period

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import gc
 import math
 import sys
 import threading
@@ -206,11 +205,6 @@ class Replayer(Node):
 
     def start(self) -> None:
         """Begin to play, after what the options say to wait for."""
-        gc.collect()
-        gc.freeze()             # what there is now stays: no full collection in the middle of it
-        # Which waits until there is a quarter more than the one before has found: of nothing now,
-        # so that cyclic garbage (rclpy makes some with every service call) does not pile up.
-        gc.collect()
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         self._ahead = ReadAhead(
             rounds(self._messages, self._length_ns, self._options.loop))

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import gc
 import math
 import sys
 import threading
@@ -30,7 +29,7 @@ from spinning_top_sim.nodes.ros_parameters import SPIN, ParameterChanges, declar
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.pipeline import NEVER_NS, Simulation
 
 OK, WARN, ERROR = 0, 1, 2
 
@@ -45,7 +44,6 @@ BUSY_SHARE = 0.5
 INSTANT_NS = 30_000
 FEWEST_AHEAD, MOST_AHEAD = 8, 16
 SWITCH_INTERVAL_S = 1e-4
-NEVER_NS = 2 ** 63 - 1
 # One tick works at most this long before services and signals get their turn.
 TICK_BUDGET_S = 0.05
 # One ~/step works at most this long.
@@ -167,11 +165,6 @@ class Simulator(Node):
 
     def start(self) -> None:
         """Let time run: simulated t = 0 is the next point of the stamps' grid."""
-        gc.collect()
-        gc.freeze()             # what there is now stays: no full collection in the middle of it
-        # Which waits until there is a quarter more than the one before has found: of nothing now,
-        # so that cyclic garbage (rclpy makes some with every service call) does not pile up.
-        gc.collect()
         with self._lock:
             self._begin()
         tick_rate = self._values['tick_rate']
