@@ -12,6 +12,7 @@ import pytest
 
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.phases import MomentumState
+from spinning_top_sim.solvers.step_columns import StepColumns
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.pipeline import Simulation
 
@@ -27,6 +28,13 @@ VARIANTS = {
     'near a pole': {'initial.theta': 1e-7, 'spin.l3': 0.5, 'spin.lz': 0.5},
     'sleeping': {'initial.theta': 0.0, 'spin.l3': 3.0},
     'no gravity': {'top.gravity': 0.0, 'spin.lz': 0.2},
+    'through a pole': {'initial.theta': 0.5, 'spin.l3': 0.2, 'spin.lz': 0.2},
+    'a noisy sensor elsewhere': {
+        'initial.theta': 2.0, 'initial.phi': 0.3, 'imu.lever_arm': (0.1, -0.2, 0.3),
+        'imu.rpy': (0.1, 0.2, 0.3), 'imu.gyroscope_noise_density': 1e-3,
+        'imu.accelerometer_noise_density': 1e-2, 'imu.gyroscope_random_walk': 1e-4,
+        'imu.accelerometer_range': 12.0, 'imu.accelerometer_resolution': 0.01,
+        'imu.gyroscope_resolution': 0.5},
     'uneven rates': {'pose.rate': 333.0, 'imu.rate': 77.7, 'joint_states.rate': 7.0},
 }
 
@@ -216,18 +224,46 @@ def test_what_is_sent_does_not_depend_on_how_far_is_computed_ahead(name):
     assert run(16) == once
 
 
+@pytest.mark.parametrize('name', VARIANTS)
+def test_messages_in_columns_are_those_of_single_states(name):
+    simulation = Simulation(parameters.checked({**VARIANTS[name], 'imu_data.enabled': True}))
+    beside = Simulation(parameters.checked({**VARIANTS[name], 'imu_data.enabled': True}))
+    topics = ('pose', 'joint_states', 'imu/data_raw', 'imu/data', 'ground_truth/imu_bias',
+              'ground_truth/imu', 'ground_truth/odom', '/clock')
+    for topic in topics:
+        taken = listen(simulation, topic)
+        simulation.advance(simulation.now_ns + SECOND)
+        assert len(taken) > 5
+        one = stream(beside, topic)
+        for _, stamp_ns, data in taken:
+            assert data == one.encode(beside.solver.at_ns(stamp_ns), stamp_ns, stamp_ns), topic
+        stream(simulation, topic).record = None
+    assert simulation.in_columns == (name in ('rk45', 'wild', 'uneven rates',
+                                              'a noisy sensor elsewhere'))
+
+
 def test_computing_ahead_computes_each_sample_once_and_little_in_vain():
     simulation = simulate(pose__rate=1000.0, joint_states__rate=500.0)
     taken = listen(simulation, 'pose', 'joint_states')
-    encodes = {one.topic: Counting(one, 'encode') for one in simulation.streams}
-    samples = Counting(simulation.solver, 'at_ns')
+    encodes = messages_of(simulation)
+    samples = samples_of(simulation.solver)
     for tick in range(1, 1001):
         simulation.advance(tick * MILLISECOND)
         simulation.prepare((tick + 1) * MILLISECOND, 16)
     assert [len(stamps(taken, topic)) for topic in ('pose', 'joint_states')] == [1001, 501]
     assert 1001 <= encodes['pose'].count <= 1017
     assert 501 <= encodes['joint_states'].count <= 509
-    assert 1001 <= samples.count <= 1017, 'two streams share the states'
+    assert samples.count == encodes['pose'].count + encodes['joint_states'].count
+
+
+@pytest.mark.parametrize('name', ['rk45', 'exact'])
+def test_streams_of_one_rate_share_the_states(name):
+    simulation = Simulation(parameters.checked(VARIANTS[name]))
+    taken = listen(simulation, 'pose', 'joint_states', 'ground_truth/odom')
+    samples = samples_of(simulation.solver)
+    simulation.advance(SECOND)
+    assert len(taken) == 3 * 101
+    assert samples.count == 101
 
 
 def test_a_log_gets_the_rows_of_an_instant_at_once_and_the_same_bytes():
@@ -272,7 +308,7 @@ def test_ticks_that_find_all_prepared_compute_nothing():
     taken = listen(simulation, 'pose')
     simulation.advance(0)
     simulation.prepare(10 * MILLISECOND, 1)
-    samples = Counting(simulation.solver, 'at_ns')
+    samples = samples_of(simulation.solver)
     steps = Counting(simulation.solver, 'reach_ns')
     for tick in range(1, 11):
         assert simulation.send_ready(tick * MILLISECOND)
@@ -346,21 +382,39 @@ def test_an_exact_solution_made_beside_is_taken_for_its_own_motion_only():
 # --------------------------------------------------------------------- nothing for nobody
 
 class Counting:
-    """Counts the calls of a method of one object."""
+    """Counts what methods of one object are called for."""
 
     def __init__(self, owner, name):
-        self._call, self.count = getattr(owner, name), 0
-        setattr(owner, name, self)
+        self.count = 0
+        self.also(owner, name, lambda *args: 1)
 
-    def __call__(self, *args, **kwargs):
-        self.count += 1
-        return self._call(*args, **kwargs)
+    def also(self, owner, name, number):
+        """Count calls of another method too, as many as `number` says of its arguments."""
+        original = getattr(owner, name)
+
+        def counted(*args):
+            self.count += number(*args)
+            return original(*args)
+        setattr(owner, name, counted)
+        return self
+
+
+def samples_of(solver):
+    """Count the states that are asked of a solver, one by one or as columns."""
+    return Counting(solver, 'at_ns').also(solver, 'columns_ns', len)
+
+
+def messages_of(simulation):
+    """Count the messages that are encoded of each topic."""
+    return {one.topic: Counting(one, 'encode').also(
+        one, 'encode_columns', lambda states, epoch_ns, times: len(times))
+        for one in simulation.streams}
 
 
 def test_without_a_listener_nothing_is_encoded_and_the_solver_is_not_sampled():
     simulation = simulate()
-    encodes = {one.topic: Counting(one, 'encode') for one in simulation.streams}
-    samples = Counting(simulation.solver, 'at_ns')
+    encodes = messages_of(simulation)
+    samples = samples_of(simulation.solver)
     for tick in range(1, 101):
         simulation.advance(tick * POSE_RATE_NS)
     assert simulation.now_ns == SECOND
@@ -373,8 +427,8 @@ def test_without_a_listener_nothing_is_encoded_and_the_solver_is_not_sampled():
 @pytest.mark.parametrize('topic', ['pose', 'imu/data_raw', '~/invariants', '/clock'])
 def test_only_the_stream_that_is_listened_to_is_encoded(topic):
     simulation = simulate()
-    encodes = {one.topic: Counting(one, 'encode') for one in simulation.streams}
-    samples = Counting(simulation.solver, 'at_ns')
+    encodes = messages_of(simulation)
+    samples = samples_of(simulation.solver)
     simulation.advance(SECOND)
     taken = listen(simulation, topic, sink='publish')
     simulation.advance(2 * SECOND)
@@ -386,7 +440,7 @@ def test_only_the_stream_that_is_listened_to_is_encoded(topic):
 
 def test_a_sample_is_encoded_once_for_all_who_take_it():
     simulation = simulate()
-    encodes = {one.topic: Counting(one, 'encode') for one in simulation.streams}
+    encodes = messages_of(simulation)
     published, recorded = [], []
     pose = stream(simulation, 'pose')
     pose.publish = published.append
@@ -460,20 +514,25 @@ def test_a_tick_without_listeners_costs_the_same_however_many_streams_there_are(
                  imu__rate=5000.0) == few
 
 
-def test_a_column_that_nobody_needs_is_not_computed(monkeypatch):
+@pytest.mark.parametrize('how', ['columns', 'one by one'])
+def test_a_column_that_nobody_needs_is_not_computed(how, monkeypatch):
     """A pose needs no angle and no rate, joints no body rate, odometry no angle."""
     computed = set()
 
-    def watch(name):
-        original = getattr(MomentumState, name)
-        monkeypatch.setattr(MomentumState, name, property(
+    def watch(kind, name):
+        original = getattr(kind, name)
+        monkeypatch.setattr(kind, name, property(
             lambda self: (computed.add(name), original._compute(self))[1]))
 
-    watch('_polar')
-    watch('transverse_rate')
-    for topic, needed in (('pose', set()), ('joint_states', {'_polar'}),
+    kind, angles, values = {
+        'columns': (StepColumns, 'half_sum', {}),
+        'one by one': (MomentumState, '_polar',        # it passes the top
+                       {'initial__theta': 0.5, 'spin__l3': 0.2, 'spin__lz': 0.2})}[how]
+    watch(kind, angles)
+    watch(kind, 'transverse_rate')
+    for topic, needed in (('pose', set()), ('joint_states', {angles}),
                           ('ground_truth/odom', {'transverse_rate'})):
-        simulation = simulate()
+        simulation = simulate(**values)
         taken = listen(simulation, topic)
         computed.clear()
         simulation.advance(SECOND)

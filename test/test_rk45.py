@@ -13,6 +13,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from random_tops import random_case
 from reference import CASES, angle, quaternion_of, scene_parameters, start_of, top_of
 
 from spinning_top_sim import State, Top, solve
@@ -26,6 +27,7 @@ from spinning_top_sim.solvers.dormand_prince import (
 )
 from spinning_top_sim.solvers.euler_form import EulerForm
 from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.solvers.propagator import propagate
 from spinning_top_sim.solvers.rk45 import rk45
 from spinning_top_sim.solvers.transport import TransportForm
 from spinning_top_sim.streams import parameters
@@ -41,6 +43,7 @@ def test_tableau_satisfies_the_order_conditions_exactly():
     assert sum(ERROR) == 0
 
 
+SECOND = 1_000_000_000
 LOOPING = CASES['loop-a']
 
 
@@ -331,3 +334,69 @@ def test_through_a_pole_the_invariants_hold(l3, theta):
     assert np.abs(np.linalg.norm(motion.quaternion, axis=1) - 1.0).max() <= 5e-16
     assert np.abs(motion.energy - motion.energy[0]).max() <= 1e-12
     assert np.abs(motion.l3 - l3).max() <= 1e-14
+
+
+# ------------------------------------------------------------------------------- columns
+
+def bits(value):
+    """Return the real numbers of a value, or of its column, to be compared to the last bit."""
+    if isinstance(value, tuple):
+        return [number for part in value for number in bits(part)]
+    if isinstance(value, (float, np.ndarray)):
+        return [np.array(value, float).reshape(-1).view(np.int64).tolist()]
+    return bits((value.real, value.imag))
+
+
+NAMES = ('quaternion', 'euler_angles', 'euler_rates', 'body_rates', 'body_acceleration', 'axis',
+         'vertical', 'l3', 'energy', 'norm_error', 'theta', 'phi', 'psi', 'phi_dot', 'psi_dot')
+
+
+def assert_columns_are_single_states(motion, instants):
+    columns = motion.columns_ns(instants)
+    states = [motion.at_ns(ns) for ns in instants]
+    for name in NAMES:
+        # The third body rate and acceleration are constants.
+        parts = slice(2) if name.startswith('body_') else slice(None)
+        together, *each = (bits(value[parts] if isinstance(value, tuple) else value)
+                           for value in (getattr(one, name) for one in (columns, *states)))
+        assert [list(row) for row in zip(*together, strict=True)] == [
+            [number for [number] in state] for state in each], name
+
+
+@pytest.mark.filterwarnings('error')
+def test_columns_are_single_states_to_the_last_bit():
+    """Of random tops: far from poles and close, fast and slow, at a step's ends too."""
+    checked = 0
+    for seed in range(300):
+        case = random_case(seed)
+        motion = propagate(case.top, case.start, method='rk45', rtol=1e-9, atol=0.0)
+        if not motion.in_columns:
+            continue
+        assert motion.reach_ns(1, 500)
+        for _ in range(40):
+            motion.reach_ns(motion.latest_ns + 1)
+        begin, end = motion.earliest_ns, motion.latest_ns
+        if end - begin > 50:
+            assert_columns_are_single_states(motion, range(begin, end, (end - begin) // 50))
+            checked += 1
+    assert checked > 100
+
+
+def test_columns_at_the_start_and_where_two_steps_meet():
+    case = LOOPING
+    motion = rk45(top_of(case), start_of(case))
+    step_ns = SECOND // 512                     # a binary fraction: such a sum is exact
+    motion._integrator._next_step = 1.0 / 512.0
+    motion.reach_ns(step_ns)
+    assert motion.latest_ns == step_ns
+    motion.reach_ns(4 * step_ns)
+    assert_columns_are_single_states(motion, range(0, 2 * step_ns + 1, step_ns))
+    assert_columns_are_single_states(motion, range(step_ns, step_ns + 1))
+
+
+def test_columns_do_not_reach_behind_the_steps_that_are_kept():
+    motion = rk45(top_of(LOOPING), start_of(LOOPING))
+    motion.reach_ns(60 * SECOND)
+    assert motion.earliest_ns > SECOND
+    with pytest.raises(ValueError, match='oldest'):
+        motion.columns_ns(range(SECOND, 2 * SECOND, SECOND))

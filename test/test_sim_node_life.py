@@ -160,7 +160,8 @@ def test_the_default_scene_imports_just_what_it_uses(finished):
         *(f'nodes.{name}' for name in (
             'executable', 'message_types', 'occasional', 'pacing', 'reports', 'ros_parameters',
             'simulator')),
-        *(f'physics.{name}' for name in ('attitude', 'kinematics', 'regimes', 'shape', 'top')),
+        *(f'physics.{name}' for name in (
+            'attitude', 'kinematics', 'pairs', 'regimes', 'shape', 'top')),
         *(f'solvers.{name}' for name in (
             'dormand_prince', 'phases', 'propagator', 'rk45', 'transport')),
         # `max_error` asks for the exact solution.
@@ -236,21 +237,20 @@ def test_a_reader_of_the_terminal_who_goes_away_does_not_end_the_motion(peer, tm
 # ------------------------------------------------------------------- nobody listens, overload
 
 def test_only_what_is_listened_to_is_encoded(peer, tmp_path):
-    """The node counts its own calls of encode, stream by stream, and prints them when asked."""
+    """The node counts the samples whose numbers it puts into messages, stream by stream."""
     counting = """
 import atexit, json, runpy
 from spinning_top_sim.streams import topics
 counts = {}
 def count(kind):
-    original = kind.encode
-    def encode(self, *args):
-        counts[self.topic] = counts.get(self.topic, 0) + 1
-        return original(self, *args)
-    kind.encode = encode
-count(topics.Stream)
-for kind in vars(topics).values():
-    if isinstance(kind, type) and issubclass(kind, topics.Stream) and (
-            kind is not topics.Stream and 'encode' in vars(kind)):
+    original = kind.runs
+    def runs(self, state, index):
+        number = len(index) if isinstance(index, range) else 1
+        counts[self.topic] = counts.get(self.topic, 0) + number
+        return original(self, state, index)
+    kind.runs = runs
+for kind in list(vars(topics).values()):
+    if isinstance(kind, type) and issubclass(kind, topics.Stream) and 'runs' in vars(kind):
         count(kind)
 atexit.register(lambda: open('counts.json', 'w').write(json.dumps(counts)))
 runpy.run_module('spinning_top_sim.nodes.sim_node', run_name='__main__')

@@ -39,10 +39,10 @@ OPENING_NS = 60_000_000
 # How often subscriptions are counted; a new subscriber waits at most this long.
 LISTENERS_PERIOD_NS = 50_000_000
 # Instants computed at once, ahead of their time: what fills this share of the time between two
-# ticks at about INSTANT_NS each, so that the next tick finds the processor free.
+# ticks, so that the next tick finds the processor free; as columns, or at ONE_NS each.
 BUSY_SHARE = 0.5
-INSTANT_NS = 30_000
-FEWEST_AHEAD, MOST_AHEAD = 8, 16
+COLUMNS_NS, ROW_NS = 150_000, 5_000
+ONE_NS = 30_000
 SWITCH_INTERVAL_S = 1e-4
 # One tick works at most this long before services and signals get their turn.
 TICK_BUDGET_S = 0.05
@@ -280,7 +280,8 @@ class Simulator(Node):
         """Compute what comes next, while nobody waits for anything."""
         with self._lock:
             simulation = self._simulation
-            simulation.prepare(simulation.now_ns + self._ahead_ns, self._instants_ahead)
+            simulation.prepare(simulation.now_ns + self._ahead_ns,
+                               self._rows_ahead if simulation.in_columns else self._ones_ahead)
             self._foresee()
 
     def _foresee(self) -> None:
@@ -298,8 +299,9 @@ class Simulator(Node):
         self._late_from = NEVER_NS
         # Simulated time before which a tick in time has only to send what is ready.
         self._plain_until_ns = -1
-        self._instants_ahead = max(FEWEST_AHEAD, min(
-            MOST_AHEAD, round(BUSY_SHARE * self._tick_period_ns / INSTANT_NS)))
+        busy_ns = BUSY_SHARE * self._tick_period_ns
+        self._rows_ahead = max(32, min(64, int((busy_ns - COLUMNS_NS) / ROW_NS)))
+        self._ones_ahead = max(8, min(16, int(busy_ns / ONE_NS)))
         self._listeners_period_ns = round(LISTENERS_PERIOD_NS * values['time_scale'])
         # In simulated time: up to the next tick, should it be late by half a period.
         self._ahead_ns = round(1.5 * self._tick_period_ns * values['time_scale'])

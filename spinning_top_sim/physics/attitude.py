@@ -73,16 +73,16 @@ def precession_rate(top: Top, l3: float, lz: float, cos2_half: Scalar,
 
 
 def angular_acceleration(top: Top, omega: tuple[Scalar, Scalar, Scalar],
-                         vertical: Scalar) -> Scalar:
+                         vertical: Scalar) -> tuple[Scalar, Scalar]:
     """
-    Return omega_1' + i omega_2' [rad/s^2] in the body frame (omega_3' = 0): Euler's equations.
+    Return omega_1' and omega_2' [rad/s^2] in the body frame (omega_3' = 0): Euler's equations.
 
     omega: body rates [rad/s]; vertical: z_1 + i z_2 of `vertical_in_body`.
     """
     gyroscopic = (top.lambda1 - top.lambda3) * omega[2]
     torque = top.gravity_torque
-    return (gyroscopic * (omega[1] - 1j * omega[0])
-            + torque * (vertical.imag - 1j * vertical.real)) / top.lambda1
+    return ((gyroscopic * omega[1] + torque * vertical.imag) / top.lambda1,
+            -(gyroscopic * omega[0] + torque * vertical.real) / top.lambda1)
 
 
 def specific_force(gravity: float, point: tuple[float, float, float],

@@ -121,8 +121,7 @@ class Columns:
     @lazy
     def body_acceleration(self) -> tuple[Any, Any, float]:
         """Angular acceleration in the body frame [rad/s^2]."""
-        rate = attitude.angular_acceleration(self.top, self.body_rates, self.vertical[0])
-        return rate.real, rate.imag, 0.0
+        return (*attitude.angular_acceleration(self.top, self.body_rates, self.vertical[0]), 0.0)
 
     def specific_force(self, point: tuple[float, float, float]) -> tuple[Any, Any, Any]:
         """Return the specific force at a body point r [m], in the body frame [m/s^2]."""

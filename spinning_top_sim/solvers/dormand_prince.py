@@ -128,14 +128,18 @@ class DenseStep:
         """Return y at t in [t0, t1] [s]; the ends exactly."""
         if t >= self.t1:
             return self.y1
-        if self._polynomial is None:
-            self._polynomial = self._hermite()
         s = (t - self.t0) / (self.t1 - self.t0)
         return tuple([((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0
-                      for c0, c1, c2, c3, c4, c5 in self._polynomial])
+                      for c0, c1, c2, c3, c4, c5 in self._polynomial or self.coefficients])
+
+    @property
+    def coefficients(self) -> list[tuple[Any, ...]]:
+        """Of the quintic in s = (t - t0)/h, one tuple a component."""
+        if self._polynomial is None:
+            self._polynomial = self._hermite()
+        return self._polynomial
 
     def _hermite(self) -> list[tuple[Any, ...]]:
-        """Coefficients of the quintic in s = (t - t0)/h, one tuple a component."""
         h = self.t1 - self.t0
         bend0 = self._form.curvatures(self.y0, self.slope0)
         bend1 = self._form.curvatures(self.y1, self.slope1)

@@ -66,7 +66,7 @@ class Winding:
         It turns by (-pi/2, 3 pi/2) in that sense: backwards by rounding at most, and forwards by
         half a turn where one step passes close by a pole.
         """
-        phase = cmath.phase(self.sign * z)
+        phase = cmath.phase(z if self.sign > 0.0 else -z)
         turned = phase - before
         if self.momentum > 0.0:
             turns = -math.floor((turned + 0.5 * math.pi) / math.tau)
@@ -88,33 +88,34 @@ class StepPhases:
     See `Phases`; t lies in a step that began with the phases and theta/2 that are given here.
 
     A state read in that step keeps this: its angles stay right when the steps go on.
+    line_rate, alpha, beta, half_theta: as given
     crosses: whether one of the parameters, or both, can vanish
     """
 
     def __init__(self, line_rate: float, alpha: Winding, beta: Winding,
                  half_theta: float) -> None:
         """Take Omega/2 [rad/s], and the windings' phases less that line."""
-        self._line_rate, self._alpha, self._beta = line_rate, alpha, beta
-        self._half_theta = half_theta
+        self.line_rate, self.alpha, self.beta = line_rate, alpha, beta
+        self.half_theta = half_theta
         self.crosses = alpha.crosses or beta.crosses
 
     def polar(self, alpha: complex, beta: complex, t: float) -> Polar:
         """See `Phases`."""
-        return self._continue(alpha, beta, self._line_rate * t)
+        return self._continue(alpha, beta, self.line_rate * t)
 
     def theta(self, half_theta: float, t: float) -> float:
         """See `Phases`; theta/2 turns by less than pi within a step."""
         return 2.0 * (half_theta
-                      + math.tau * round((self._half_theta - half_theta) / math.tau))
+                      + math.tau * round((self.half_theta - half_theta) / math.tau))
 
     def on_lines(self, alpha: complex, beta: complex, line: float) -> Polar:
         """Return alpha and beta as (modulus, phase), on the known line where one crosses."""
-        a, b = self._alpha, self._beta
+        a, b = self.alpha, self.beta
         return (a.on_line(alpha, a.phase + line) if a.crosses else cmath.polar(alpha),
                 b.on_line(beta, b.phase - line) if b.crosses else cmath.polar(beta))
 
     def _continue(self, alpha: complex, beta: complex, line: float) -> Polar:
-        a, b = self._alpha, self._beta
+        a, b = self.alpha, self.beta
         return (a.on_line(alpha, a.phase + line) if a.crosses
                 else a.onward(alpha, a.phase + line),
                 b.on_line(beta, b.phase - line) if b.crosses
@@ -124,8 +125,8 @@ class StepPhases:
         """Return those of the step that begins with alpha and beta, whose phases have `line`."""
         (cosine, phase_a), (sine, phase_b) = self._continue(alpha, beta, line)
         return StepPhases(
-            self._line_rate, self._alpha.moved_to(phase_a - line),
-            self._beta.moved_to(phase_b + line),
+            self.line_rate, self.alpha.moved_to(phase_a - line),
+            self.beta.moved_to(phase_b + line),
             0.5 * self.theta(math.atan2(sine, cosine), 0.0))
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Protocol
 
-from spinning_top_sim.physics.kinematics import OneState, lazy
+from spinning_top_sim.physics.kinematics import Columns, OneState, lazy
 from spinning_top_sim.physics.top import ContinuedState, State, Top
 from spinning_top_sim.solvers.rk45 import ENDLESS_NS, rk45
 
@@ -48,6 +48,17 @@ class Propagator(Protocol):
     def at_ns(self, ns: int) -> OneState:
         """Return the state at `ns` nanoseconds."""
 
+    @property
+    def in_columns(self) -> bool:
+        """Whether `columns_ns` is to be had."""
+
+    def columns_ns(self, instants: range) -> Columns:
+        """
+        Return the states at ascending nanoseconds that are reached, as numpy columns.
+
+        To the last bit those of `at_ns`.
+        """
+
 
 def propagate(top: Top, start: State, *, method: str, equations: str = 'transport',
               rtol: float = 1e-11, atol: float = 1e-12) -> Propagator:
@@ -76,6 +87,7 @@ class ExactPropagator:
     evaluations = 0
     earliest_ns = 0
     latest_ns = ENDLESS_NS
+    in_columns = False
 
     def __init__(self, top: Top, start: State) -> None:
         # 1.5 ms of long decimals, and their import, for those who ask for it only.
@@ -99,6 +111,10 @@ class ExactPropagator:
     def reach_ahead_ns(self, ns: int, now_ns: int) -> bool:
         """Nothing needs computing."""
         return True
+
+    def columns_ns(self, instants: range) -> Columns:
+        """Those of `grid` differ in their last bits."""
+        raise NotImplementedError('these states are told one by one')
 
     def at_ns(self, ns: int) -> OneState:
         """Return the state at `ns` nanoseconds, before or after the start."""

@@ -6,10 +6,13 @@ from __future__ import annotations
 import cmath
 import math
 from abc import ABC, abstractmethod
+from bisect import bisect_left
 from collections import deque
+from typing import Any
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.kinematics import AxisState, OneState
+from spinning_top_sim.physics.kinematics import AxisState, Columns, OneState
+from spinning_top_sim.physics.pairs import Pairs
 from spinning_top_sim.physics.regimes import cubic
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.dormand_prince import (
@@ -124,6 +127,7 @@ class SteppedOrClosed(ABC):
     evaluations = 0
     earliest_ns = 0
     latest_ns = ENDLESS_NS
+    in_columns = False
 
     @abstractmethod
     def at(self, t: float) -> OneState:
@@ -145,9 +149,17 @@ class SteppedOrClosed(ABC):
         """See `Propagator`."""
         return True
 
+    def columns_ns(self, instants: range) -> Columns:
+        """See `Propagator`."""
+        raise NotImplementedError('these states are told one by one')
+
 
 # A step, and the phases at its begin where the motion follows them.
 Kept = tuple[DenseStep, StepPhases | None]
+
+
+def _end(kept: tuple[DenseStep, Any]) -> float:
+    return kept[0].t1
 
 
 class _Stepped(SteppedOrClosed):
@@ -258,11 +270,13 @@ class TransportMotion(_Stepped):
         super().__init__(self._form, self._form.start, self._form.first_step,
                          StepPhases(0.5 * spin_excess(top, start.l3), alpha, beta,
                                     0.5 * start.theta))
+        # A top that passes a pole has phases that are known otherwise.
+        self.in_columns = not (alpha.crosses or beta.crosses)
         self._carried_rate = 0.5 * self._form.spin_carried / top.lambda1
         self._half_spin_rate = 0.5 * self._form.spin_rate
         self._momentum_unit = -2j * top.lambda1
 
-    def at(self, t: float) -> OneState:
+    def at(self, t: float) -> MomentumState:
         """Return the state at t [s], on the invariants."""
         step, phases = self._newest
         if not step.t0 < t <= step.t1:
@@ -277,6 +291,23 @@ class TransportMotion(_Stepped):
         spin = cmath.rect(1.0, self._half_spin_rate * t)
         return MomentumState(self._top, self._start, alpha * spin, beta * spin.conjugate(),
                              self._momentum_unit * m, t, phases)
+
+    def columns_ns(self, instants: range) -> Columns:
+        """See `Propagator`."""
+        from spinning_top_sim.solvers import step_columns  # noqa: PLC0415 - for its numpy
+
+        t = [ns / NANOSECONDS for ns in instants]
+        self._step_at(t[0])
+        assert t[-1] <= self._newest[0].t1
+        kept = [(step, phases) for step, phases in self._kept if phases is not None]
+        first, last = (bisect_left(kept, time, key=_end) for time in (t[0], t[-1]))
+        samples = step_columns.read(kept[first:last + 1], t)
+        alpha, beta, m = self._form.project_columns(*samples.unknowns)
+        spin = step_columns.rotations(self._half_spin_rate * samples.t)
+        turn = self._momentum_unit.imag
+        return step_columns.StepColumns(
+            self._top, self._start, alpha * spin, beta * spin.conjugate(),
+            Pairs(-turn * m.imag, turn * m.real), samples, self.at)
 
     def _phases_onward(self) -> StepPhases:
         step, phases = self._newest

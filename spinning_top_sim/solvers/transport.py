@@ -25,6 +25,7 @@ import cmath
 import math
 
 from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.pairs import Pairs
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.dormand_prince import Vector
 
@@ -114,7 +115,8 @@ class TransportForm:
         beta *= shrink
         cos_theta = (cos2 - sin2) * shrink * shrink
         half_axis = alpha * beta                # (e3_x + i e3_y)/2
-        square = cos2 * sin2 * (shrink * shrink) ** 2
+        share = shrink * shrink
+        square = cos2 * sin2 * (share * share)
         if square <= POLE_SHARE:
             return alpha, beta, m
         lambda1 = self.top.lambda1
@@ -128,6 +130,32 @@ class TransportForm:
             if root > 0.0:
                 u = math.copysign(math.sqrt(root), u)
         return alpha, beta, complex(u, v) * half_axis / square
+
+    def project_columns(self, alpha: Pairs, beta: Pairs, m: Pairs) -> tuple[Pairs, Pairs, Pairs]:
+        """Return what `project` does, to the last bit, of columns."""
+        import numpy as np  # noqa: PLC0415 - who reads one state at a time does without
+
+        cos2 = alpha.real * alpha.real + alpha.imag * alpha.imag
+        sin2 = beta.real * beta.real + beta.imag * beta.imag
+        shrink = 1.0 / np.sqrt(cos2 + sin2)
+        alpha, beta = alpha * shrink, beta * shrink
+        cos_theta = (cos2 - sin2) * shrink * shrink
+        half_axis = alpha * beta
+        share = shrink * shrink
+        square = cos2 * sin2 * (share * share)
+        lambda1 = self.top.lambda1
+        v = 0.25 * (self.l3 - self.lz * cos_theta) / lambda1
+        u = (m * half_axis.conjugate()).real
+        wanted = (self._energy - self.top.gravity_torque * cos_theta) / (2.0 * lambda1) * square
+        root = wanted - v * v
+        mended = (u * u > self._large_enough * square) & (root > 0.0)
+        u = np.where(mended, np.copysign(np.sqrt(np.where(mended, root, 0.0)), u), u)
+        at_pole = square <= POLE_SHARE
+        if not at_pole.any():
+            return alpha, beta, Pairs(u, v) * half_axis / square
+        elsewhere = Pairs(u, v) * half_axis / np.where(at_pole, 1.0, square)
+        return alpha, beta, Pairs(np.where(at_pole, m.real, elsewhere.real),
+                                  np.where(at_pole, m.imag, elsewhere.imag))
 
     def project_on_lines(self, y: Vector, alpha: tuple[float, float],
                          beta: tuple[float, float]) -> Vector:

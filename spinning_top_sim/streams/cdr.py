@@ -156,7 +156,7 @@ class Template:
         """
         Return n messages of equal length as rows of bytes, (n, size) uint8.
 
-        stamps_ns: (n,) int64 [ns];  runs: (n, count) arrays, or sequences of `count` columns or
+        stamps_ns: (n,) int64 [ns];  runs: (n, count) arrays, or tuples of `count` columns or
         numbers.  The rows are valid until the next call.
         """
         import numpy  # noqa: PLC0415 - offline only
@@ -170,7 +170,7 @@ class Template:
             rows[f'sec{at}'], rows[f'nanosec{at}'] = numpy.divmod(stamps_ns, NANOSECONDS)
         for i, run in enumerate(runs):
             field = rows[f'run{i}']
-            if isinstance(run, numpy.ndarray) and run.ndim == 2 and len(run) == count:
+            if isinstance(run, numpy.ndarray):
                 field[:] = run
             else:
                 for column, values in enumerate(run):

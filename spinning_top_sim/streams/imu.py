@@ -146,14 +146,15 @@ class Sensor:
         row, functions = self._drawn(index), ONE
         if isinstance(index, range):
             import numpy  # noqa: PLC0415
-            functions = Functions(numpy.clip, numpy.rint)
+            # Nothing is -0 then, as with whole numbers.
+            functions = Functions(numpy.clip, lambda x: numpy.rint(x) + 0.0)
         return (self.gyroscope.read(exact[0], row[0:3], row[6:9], functions),
                 self.accelerometer.read(exact[1], row[3:6], row[9:12], functions))
 
     def bias(self, index: int | range) -> tuple[Sequence[Any], Sequence[Any]]:
         """Return the bias in sample `index`, or in many: [rad/s], [m/s^2]."""
         row = self._drawn(index)
-        return row[6:9], row[9:12]
+        return tuple(row[6:9]), tuple(row[9:12])
 
     def _drawn(self, index: int | range) -> Sequence[Any]:
         if self._noise is None:

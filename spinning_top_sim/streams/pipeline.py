@@ -12,7 +12,7 @@ import contextlib
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.kinematics import Columns, OneState
@@ -35,26 +35,25 @@ if TYPE_CHECKING:
 
 # Integration steps between two looks at whether to give way: about 5 ms.
 STEPS_AT_ONCE = 500
-# Instants that are computed at most ahead of their time in one go.
-MOST_AT_ONCE = 64
+# Instants that are computed at most in one go.
+MOST_AT_ONCE = 256
 NEVER_NS = 2 ** 63 - 1
 
 # A sample on its way to a log: number of its stream there, stamp [ns], message.
 Row = tuple[int, int, bytes]
 
 
-class Instant(NamedTuple):
-    """
-    The samples of one time, with all who take them.
+class Instant:
+    """The samples of one time, with all who take them; size: of the messages in `rows` [bytes]."""
 
-    size: of the messages in `rows` [bytes]
-    """
+    __slots__ = ('publications', 'records', 'rows', 'size', 't_ns')
 
-    t_ns: int
-    rows: list[Row]
-    size: int
-    records: list[tuple[Callable[[int, bytes], Any], int, bytes]]
-    publications: list[tuple[Callable[[bytes], Any], bytes, Stream]]
+    def __init__(self, t_ns: int) -> None:
+        self.t_ns = t_ns
+        self.rows: list[Row] = []
+        self.size = 0
+        self.records: list[tuple[Callable[[int, bytes], Any], int, bytes]] = []
+        self.publications: list[tuple[Callable[[bytes], Any], bytes, Stream]] = []
 
 
 class Simulation:
@@ -249,19 +248,18 @@ class Simulation:
                     break
                 if due_ns > self._known_ns and not self._reach(due_ns, give_way):
                     return False
-                self._compute()
+                self._compute(target_ns)
             instant = ready[0]
             if instant.t_ns > target_ns:
                 break
             if sent and give_way():
                 return False
             ready.popleft()
-            if instant.t_ns >= publish_from_ns:
-                self._send(*instant)
-            else:
+            if instant.t_ns < publish_from_ns:
                 for _, _, stream in instant.publications:
                     stream.skipped += 1
-                self._send(*instant[:-1], [])
+                instant.publications.clear()
+            self._send(instant)
             sent = True
         if target_ns > self._known_ns and not self._reach(target_ns, give_way):
             return False
@@ -280,7 +278,7 @@ class Simulation:
             return False
         ready = self._ready
         while ready and ready[0].t_ns <= target_ns:
-            self._send(*ready.popleft())
+            self._send(ready.popleft())
         if target_ns > self.now_ns:     # noqa: PLR1730 - max() takes twice the time
             self.now_ns = target_ns
         return True
@@ -299,24 +297,16 @@ class Simulation:
         what then no longer holds is forgotten.  Gives up where the motion takes many steps, or
         cannot go on: `advance` deals with that in its time.
         """
-        if self._next_due() > until_ns:
+        due_ns = self._next_due()
+        if due_ns > until_ns:
             return
-        try:
-            self._compute_ahead(until_ns, instants)
-        except IntegrationError:
-            self._forget()
+        shortest_ns = min(cursor[1].period_ns for cursor in self._cursors)
+        self._compute(max(until_ns, due_ns + (instants - 1) * shortest_ns))
 
-    def _compute_ahead(self, until_ns: int, instants: int) -> None:
-        for count in range(MOST_AT_ONCE):
-            due_ns = self._beyond_ns
-            if (count >= instants and due_ns > until_ns) or due_ns == NEVER_NS:
-                return
-            if due_ns > self._known_ns:
-                if not self.solver.reach_ahead_ns(due_ns - self.anchor_ns,
-                                                  self.now_ns - self.anchor_ns):
-                    return
-                self._known_ns = self.anchor_ns + self.solver.latest_ns
-            self._compute()
+    @property
+    def in_columns(self) -> bool:
+        """Whether many instants are computed in little more time than one."""
+        return self.solver.in_columns
 
     def advance_in_columns(self, target_ns: int,
                            send: Callable[[Stream, Any, Any], None]) -> None:
@@ -392,41 +382,59 @@ class Simulation:
                 stream.resume(until_ns - 1)
                 stream.skipped += (stream.next_ns - first_ns) // stream.period_ns
 
-    def _compute(self) -> None:
-        """Compute the messages of the next instant, which the solver has reached."""
-        t_ns, next_ns = self._beyond_ns, NEVER_NS
-        state = self.solver.at_ns(t_ns - self.anchor_ns)
-        stamp_ns = self.epoch_ns + t_ns
-        rows, size, records, publications = [], 0, [], []
+    def _compute(self, until_ns: int) -> None:
+        """Compute the messages of what is due next, up to a time or as far as the steps allow."""
+        until_ns = min(until_ns, self._beyond_ns + (MOST_AT_ONCE - 1) * min(
+            cursor[1].period_ns for cursor in self._cursors))
+        if until_ns > self._known_ns:
+            # What cannot go on may not concern anybody; `advance` meets it in its time.
+            with contextlib.suppress(IntegrationError):
+                self.solver.reach_ahead_ns(until_ns - self.anchor_ns,
+                                           self.now_ns - self.anchor_ns)
+            self._known_ns = max(self._known_ns, self.anchor_ns + self.solver.latest_ns)
+            until_ns = min(until_ns, self._known_ns)
+        instants: dict[int, Instant] = {}
+        states = _States(self.solver, self.anchor_ns)
+        next_ns = NEVER_NS
         for cursor in self._cursors:
             due_ns, stream, log_index, record, publish = cursor
-            if due_ns == t_ns:
-                data = stream.encode(state, stamp_ns, t_ns)
-                if log_index is not None:
-                    rows.append((log_index, stamp_ns, data))
-                    size += len(data)
-                if record is not None:
-                    records.append((record, stamp_ns, data))
-                if publish is not None:
-                    publications.append((publish, data, stream))
-                cursor[0] = due_ns = t_ns + stream.period_ns
-            if due_ns < next_ns:        # noqa: PLR1730 - min() takes twice the time
-                next_ns = due_ns
-        self._ready.append(Instant(t_ns, rows, size, records, publications))
+            times = range(due_ns, until_ns + 1, stream.period_ns)
+            if times:
+                size = len(stream.template)
+                for t_ns, data in zip(times, self._messages(stream, times, states), strict=True):
+                    stamp_ns = self.epoch_ns + t_ns
+                    instant = instants.get(t_ns)
+                    if instant is None:
+                        instant = instants[t_ns] = Instant(t_ns)
+                    if log_index is not None:
+                        instant.rows.append((log_index, stamp_ns, data))
+                        instant.size += size
+                    if record is not None:
+                        instant.records.append((record, stamp_ns, data))
+                    if publish is not None:
+                        instant.publications.append((publish, data, stream))
+                cursor[0] = due_ns = times[-1] + stream.period_ns
+            next_ns = min(next_ns, due_ns)
+        self._ready.extend(instants[t_ns] for t_ns in sorted(instants))
         self._beyond_ns = next_ns
 
-    def _send(self, t_ns: int, rows: list[Row], size: int, records: list[Any],
-              publications: list[Any]) -> None:
-        """Hand out the samples of an instant: an `Instant`, in pieces."""
-        if rows:
+    def _messages(self, stream: Stream, times: range, states: _States) -> Sequence[bytes]:
+        """Return the messages of a stream at these times [ns]."""
+        if stream.one_by_one or not self.solver.in_columns:
+            return [stream.encode(states.at(t_ns), self.epoch_ns + t_ns, t_ns) for t_ns in times]
+        return stream.encode_columns(states.columns(times), self.epoch_ns, times)
+
+    def _send(self, instant: Instant) -> None:
+        """Hand out the samples of an instant."""
+        if instant.rows:
             assert self._log is not None
-            self._log(rows, size)
-        for record, stamp_ns, data in records:
+            self._log(instant.rows, instant.size)
+        for record, stamp_ns, data in instant.records:
             record(stamp_ns, data)
         # After all is recorded: where it fails, as the node ends, the log has the instant whole.
         # One right after the other: each finds the middleware still awake from the one before.
-        self.now_ns = t_ns
-        for publish, data, stream in publications:
+        self.now_ns = instant.t_ns
+        for publish, data, stream in instant.publications:
             publish(data)
             stream.sent += 1
 
@@ -458,6 +466,30 @@ class Simulation:
         self._past.end(self.anchor_ns, self._anchor, at_ns)
         self._begin(solver, start, state_after, at_ns)
         self.history.append((at_ns, l3, lz))
+
+
+class _States:
+    """The states of a motion at some times, each computed once for all streams."""
+
+    def __init__(self, solver: Propagator, anchor_ns: int) -> None:
+        self._solver, self._anchor_ns = solver, anchor_ns
+        self._single: dict[int, OneState] = {}
+        self._columns: dict[range, Columns] = {}
+
+    def at(self, t_ns: int) -> OneState:
+        """Return the state at a time."""
+        state = self._single.get(t_ns)
+        if state is None:
+            state = self._single[t_ns] = self._solver.at_ns(t_ns - self._anchor_ns)
+        return state
+
+    def columns(self, times: range) -> Columns:
+        """Return the states at these times, which `in_columns` has to allow."""
+        states = self._columns.get(times)
+        if states is None:
+            states = self._columns[times] = self._solver.columns_ns(
+                range(times.start - self._anchor_ns, times.stop - self._anchor_ns, times.step))
+        return states
 
 
 class _Past:

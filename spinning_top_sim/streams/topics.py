@@ -33,6 +33,7 @@ class Stream:
     log_index: its number in a log that takes the samples of all streams, None for none; see
     `Simulation.log_to`
     next_ns: when the next sample is due, if anybody takes it
+    one_by_one: whether live samples are computed so: few, each with an exact solution of its own
     changed: called when what comes next is not what it would have been
     """
 
@@ -40,6 +41,7 @@ class Stream:
     topic: str
     type_name: str
     template: Template
+    one_by_one = False
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self._publish: Callable[[bytes], Any] | None = None
@@ -106,6 +108,17 @@ class Stream:
         first = self.index
         return self.template.encode_many(
             stamps_ns, *self.runs(states, range(first, first + len(stamps_ns))))
+
+    def encode_columns(self, states: Columns, epoch_ns: int, times: range) -> list[bytes]:
+        """Return the messages at these times [ns] after the stamp epoch_ns, each by itself."""
+        import numpy  # noqa: PLC0415 - where it is there already
+
+        stamps_ns = numpy.arange(epoch_ns + times.start, epoch_ns + times.stop, times.step)
+        first = times.start // self.period_ns
+        data = self.template.encode_many(
+            stamps_ns, *self.runs(states, range(first, first + len(times)))).tobytes()
+        size = len(self.template)
+        return [data[at:at + size] for at in range(0, len(data), size)]
 
     def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
         """
@@ -237,6 +250,7 @@ class Invariants(Stream):
     """
 
     parameter, topic, type_name = 'invariants', '~/invariants', 'std_msgs/msg/Float64MultiArray'
+    one_by_one = True
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         super().__init__(values)
@@ -271,6 +285,7 @@ class Markers(Stream):
     """
 
     parameter, topic, type_name = 'markers', 'markers', 'visualization_msgs/msg/MarkerArray'
+    one_by_one = True
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         super().__init__(values)
