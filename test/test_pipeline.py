@@ -189,7 +189,7 @@ def test_a_command_in_the_midst_of_a_long_integration_is_taken():
 @pytest.mark.parametrize('name', VARIANTS)
 def test_what_is_sent_does_not_depend_on_how_far_is_computed_ahead(name):
     """With commands, changes of rate, and listeners who come and go in between."""
-    def run(instants):
+    def run(instants, budget_ns=None):
         values = {**VARIANTS[name], 'imu.gyroscope_noise_density': 1e-3}
         simulation = Simulation(parameters.checked(values), EPOCH_NS)
         taken = listen(simulation)
@@ -202,7 +202,8 @@ def test_what_is_sent_does_not_depend_on_how_far_is_computed_ahead(name):
                 simulation.advance(tick * 7_654_321)
             assert simulation.now_ns == tick * 7_654_321
             if instants:
-                simulation.prepare((tick + 1) * 7_654_321, instants)
+                for _ in range(tick % 5):
+                    simulation.prepare((tick + 9) * 7_654_321, instants, budget_ns)
             if tick == 20:
                 simulation.command(1.01 * l3, 1.01 * lz)
             if tick == 30:
@@ -222,6 +223,56 @@ def test_what_is_sent_does_not_depend_on_how_far_is_computed_ahead(name):
     assert len(once) > 300
     assert run(1) == once
     assert run(16) == once
+    assert run(64) == once
+    assert run(16, budget_ns=0) == once
+    assert run(64, budget_ns=100_000) == once
+
+
+@pytest.mark.parametrize('name', ['rk45', 'exact', 'through a pole'])
+def test_a_computation_without_time_goes_on_with_the_next_call(name):
+    simulation = Simulation(parameters.checked(VARIANTS[name]))
+    taken = listen(simulation, 'pose', 'joint_states')
+    simulation.advance(0)
+    calls = 1
+    while not simulation.prepare(SECOND // 10, 8, budget_ns=0):
+        assert not simulation.send_ready(SECOND // 20), 'nothing is ready before all is'
+        calls += 1
+    assert 4 < calls < 100
+    assert simulation.prepare(SECOND // 10, 8, budget_ns=0), 'there is nothing left to do'
+    samples = samples_of(simulation.solver)
+    assert simulation.send_ready(SECOND // 10)
+    assert (samples.count, len(taken)) == (0, 22)
+
+
+def test_a_tick_that_finds_a_computation_under_way_finishes_it():
+    simulation = simulate(pose__rate=1000.0)
+    taken = listen(simulation, 'pose')
+    simulation.advance(0)
+    samples = samples_of(simulation.solver)
+    while samples.count == 0:
+        assert not simulation.prepare(10 * MILLISECOND, 32, budget_ns=0)
+    simulation.advance(MILLISECOND)
+    assert len(taken) == 2
+    assert samples.count == 32
+    assert simulation.send_ready(32 * MILLISECOND)
+    assert len(taken) == 33
+
+
+def test_what_fails_in_a_computation_leaves_nothing_half_done():
+    def fail(stamp_ns, *runs):
+        raise MemoryError
+
+    simulation = simulate(pose__rate=1000.0, solver__method='exact')
+    taken = listen(simulation, 'pose', 'joint_states')
+    simulation.advance(0)
+    pose = stream(simulation, 'pose')
+    original, pose.template.encode = pose.template.encode, fail
+    with pytest.raises(MemoryError):
+        simulation.prepare(10 * MILLISECOND, 16)
+    pose.template.encode = original
+    simulation.advance(20 * MILLISECOND)
+    assert stamps(taken, 'pose') == list(range(0, 21 * MILLISECOND, MILLISECOND))
+    assert stamps(taken, 'joint_states') == [0, 10 * MILLISECOND, 20 * MILLISECOND]
 
 
 @pytest.mark.parametrize('name', VARIANTS)
@@ -270,7 +321,7 @@ def test_a_log_gets_the_rows_of_an_instant_at_once_and_the_same_bytes():
     simulation, beside = simulate(pose__rate=1000.0), simulate(pose__rate=1000.0)
     calls = []
     chosen = [stream(simulation, topic) for topic in ('imu/data_raw', 'pose', '~/invariants')]
-    simulation.log_to(lambda rows, size: calls.append((list(rows), size)), chosen)
+    simulation.log_to(lambda *call: calls.append(call), chosen)
     expected = listen(beside, *(one.topic for one in chosen))
     beside.advance(SECOND)
     simulation.advance(SECOND // 2)
@@ -279,9 +330,9 @@ def test_a_log_gets_the_rows_of_an_instant_at_once_and_the_same_bytes():
         simulation.prepare(tick * MILLISECOND, 16)
         assert simulation.send_ready(tick * MILLISECOND)
     assert len(calls) == 1001, 'an instant is one call'
-    assert all(size == sum(len(data) for _, _, data in rows) for rows, size in calls)
-    assert [(chosen[index].topic, stamp, data)
-            for rows, _ in calls for index, stamp, data in rows] == expected
+    assert all(size == sum(map(len, messages)) for _, _, messages, size in calls)
+    assert [(chosen[index].topic, stamp, data) for indices, stamp, messages, _ in calls
+            for index, data in zip(indices, messages, strict=True)] == expected
     simulation.log_to(calls.append, ())
     simulation.advance(2 * SECOND)
     assert len(calls) == 1001
@@ -292,7 +343,7 @@ def test_late_samples_go_to_the_log_all_the_same():
     simulation = simulate()
     calls = []
     pose = stream(simulation, 'pose')
-    simulation.log_to(lambda rows, size: calls.extend(rows), [pose])
+    simulation.log_to(lambda *call: calls.append(call), [pose])
     published = listen(simulation, 'pose', 'joint_states', sink='publish')
     simulation.advance(0)
     simulation.prepare(SECOND, 1)

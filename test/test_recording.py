@@ -547,9 +547,14 @@ def test_few_and_many_keep_their_order_in_the_file(tmp_path):
     file = create_file(tmp_path / 'run.mcap', TOPICS, METADATA, compression='none')
     stamps = iter(range(1000))
     for count in (3, 100, 1, 2, 50, 7):
-        file.append_all([(topic, stamp, pose_cdr(stamp)) for stamp in
-                         (next(stamps) for _ in range(count)) for topic in (0, 2)])
-        file.append_all([(1, count, b'odd')])
+        poses = [(stamp, pose_cdr(stamp)) for stamp in
+                 (next(stamps) for _ in range(count))]
+        # Together, and one by one; both in between, and messages of another length.
+        file.append_all([((0, 2), stamp, (pose, pose), 2 * len(pose)) for stamp, pose in poses]
+                        if count != 50 else
+                        [((topic,), stamp, (pose,), len(pose)) for stamp, pose in poses
+                         for topic in (0, 2)])
+        file.append_all([((1,), count, (b'odd',), 3)])
     file.append_all([])
     file.finish()
     found = {}

@@ -38,12 +38,14 @@ EPOCH_GRID_NS = 10_000_000
 OPENING_NS = 60_000_000
 # How often subscriptions are counted; a new subscriber waits at most this long.
 LISTENERS_PERIOD_NS = 50_000_000
-# Instants computed at once, ahead of their time: what fills this share of the time between two
-# ticks, so that the next tick finds the processor free; as columns, or at ONE_NS each.
-BUSY_SHARE = 0.5
-COLUMNS_NS, ROW_NS = 150_000, 5_000
-ONE_NS = 30_000
-SWITCH_INTERVAL_S = 1e-4
+# Instants computed together, ahead of their time: many as columns, where they cost little more
+# than one, and fewer one by one.
+COLUMNS_AHEAD, ONES_AHEAD = 128, 16
+# In pieces that fill this share of the time between two ticks, so that the next one finds the
+# processor free; begun so many ticks before they are needed.
+BUSY_SHARE = 0.3
+TICKS_AHEAD = 16
+SWITCH_INTERVAL_S = 5e-6
 # One tick works at most this long before services and signals get their turn.
 TICK_BUDGET_S = 0.05
 # One ~/step works at most this long.
@@ -254,7 +256,7 @@ class Simulator(Node):
             # Most ticks have nothing more to do than this, and touch little.
             if (due_ns < self._plain_until_ns and now <= late_from
                     and self._simulation.send_ready(due_ns)):
-                return False
+                return self._computing
             if not (self._begun or self._begin()):
                 return False
             if self._paused or self._failure or self._ended:
@@ -274,22 +276,24 @@ class Simulator(Node):
             self._finish()
             return False
         self._foresee()
-        return simulation.now_ns >= due_ns >= self._plain_until_ns
+        return simulation.now_ns >= due_ns and (
+            self._computing or due_ns >= simulation.ready_ns - self._ahead_ns)
 
     def _prepare(self) -> None:
-        """Compute what comes next, while nobody waits for anything."""
+        """Compute some of what comes next, while nobody waits for anything."""
         with self._lock:
             simulation = self._simulation
-            simulation.prepare(simulation.now_ns + self._ahead_ns,
-                               self._rows_ahead if simulation.in_columns else self._ones_ahead)
+            self._computing = not simulation.prepare(
+                simulation.now_ns + self._ahead_ns,
+                COLUMNS_AHEAD if simulation.in_columns else ONES_AHEAD, self._busy_ns)
             self._foresee()
 
     def _foresee(self) -> None:
         """Say until when ticks are plain."""
         simulation = self._simulation
-        self._plain_until_ns = min(simulation.now_ns + self._listeners_period_ns,
-                                   simulation.ready_ns - self._ahead_ns,
-                                   self._duration_ns or NEVER_NS)
+        self._plain_until_ns = min(
+            simulation.now_ns + self._listeners_period_ns, self._duration_ns or NEVER_NS,
+            NEVER_NS if self._computing else simulation.ready_ns - self._ahead_ns)
 
     def _take_pace(self, values: dict[str, Any]) -> None:
         """Hold in nanoseconds what every tick asks for."""
@@ -299,12 +303,11 @@ class Simulator(Node):
         self._late_from = NEVER_NS
         # Simulated time before which a tick in time has only to send what is ready.
         self._plain_until_ns = -1
-        busy_ns = BUSY_SHARE * self._tick_period_ns
-        self._rows_ahead = max(32, min(64, int((busy_ns - COLUMNS_NS) / ROW_NS)))
-        self._ones_ahead = max(8, min(16, int(busy_ns / ONE_NS)))
+        self._computing = False
+        self._busy_ns = int(BUSY_SHARE * self._tick_period_ns)
         self._listeners_period_ns = round(LISTENERS_PERIOD_NS * values['time_scale'])
-        # In simulated time: up to the next tick, should it be late by half a period.
-        self._ahead_ns = round(1.5 * self._tick_period_ns * values['time_scale'])
+        # In simulated time.
+        self._ahead_ns = round(TICKS_AHEAD * self._tick_period_ns * values['time_scale'])
         self._latest_ns = int(LATEST_NS * values['time_scale'])
 
     def _due(self) -> int:

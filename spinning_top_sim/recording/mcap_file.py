@@ -21,6 +21,8 @@ import sys
 import zlib
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -379,26 +381,29 @@ class McapFile(IndexedFile):
         return self.add_message(
             topic_index + 1, sequence & 0xFFFFFFFF, log_time_ns, log_time_ns, data)
 
-    def append_all(self, messages: Sequence[tuple[int, int, bytes]]) -> None:
+    def append_all(self, taken: Sequence[tuple[Sequence[int], int, Sequence[bytes], int]],
+                   ) -> None:
         """
-        Write many messages: topic index, log time [ns], CDR.
+        Write many messages, those of one stamp together: topic indices, log time [ns], CDR, size.
 
         Those of a topic that are of one length go into their chunk as rows, for a tenth of the
         work.  Nothing is left in memory, so that the messages of a topic keep their order in the
         file.
         """
-        if not messages:
+        if not taken:
             return
-        size = sum(len(data) for _, _, data in messages)
-        count = max(1, len(messages) * CHUNK_BYTES // (size + MESSAGE.size * len(messages)))
-        for first in range(0, len(messages), count):
+        size = sum(size + MESSAGE.size * len(messages) for _, _, messages, size in taken)
+        count = max(1, len(taken) * CHUNK_BYTES // size)
+        for first in range(0, len(taken), count):
             times: dict[int, list[int]] = {}
             rows: dict[int, list[bytes]] = {}
-            for topic_index, time_ns, data in messages[first:first + count]:
-                if topic_index not in times:
-                    times[topic_index], rows[topic_index] = [], []
-                times[topic_index].append(time_ns)
-                rows[topic_index].append(data)
+            # One after the other they are mostly of the same topics.
+            for topic_indices, alike in groupby(taken[first:first + count], itemgetter(0)):
+                _, alike_times, alike_messages, _ = zip(*alike, strict=True)
+                for topic_index, data in zip(topic_indices, zip(*alike_messages, strict=True),
+                                             strict=True):
+                    times.setdefault(topic_index, []).extend(alike_times)
+                    rows.setdefault(topic_index, []).extend(data)
             self._append_by_topic(times, rows)
 
     def _append_by_topic(self, times: dict[int, list[int]], rows: dict[int, list[bytes]]) -> None:

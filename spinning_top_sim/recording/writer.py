@@ -33,7 +33,8 @@ METADATA_NAME = 'spinning_top_sim'
 _ENTRY_BYTES = 128  # what a queued message costs besides its data, about
 _CLOSE_AT_EXIT_S = 10.0
 
-Message = tuple[int, int, bytes]  # topic index, stamp [ns], CDR
+# Messages of one stamp: indices of their topics, stamp [ns], CDR of each, size of all [bytes].
+Messages = tuple[Sequence[int], int, Sequence[bytes], int]
 
 
 @dataclass(frozen=True)
@@ -95,13 +96,12 @@ class McapRecorder:
         self._queue_bytes, self._half_full = queue_bytes, queue_bytes // 2
 
         # Appending to a deque and taking from its other end need no lock between threads.
-        self._queue: deque[Message] = deque()
+        self._queue: deque[Messages] = deque()
         self._bytes_in = self._bytes_out = 0    # of the queue, ever
-        self._taken_count = 0          # messages that have left the queue, ever
+        self._offered = 0              # messages handed over, ever
         # Held for a few instructions, never during I/O; reentrant, because a signal handler may
         # close the recording while its thread is inside write().
         self._lock = threading.RLock()
-        self._refused = 0              # messages handed over after the end
         self._accepting = True
         self._state: Literal['recording', 'closed', 'failed'] = 'recording'
         self._error: str | None = None
@@ -184,7 +184,7 @@ class McapRecorder:
         """Where the recording stands now."""
         with self._lock:
             messages = sum(self._file.counts)
-            missing = self._offered() - messages
+            missing = self._offered - messages
             running = self._state == 'recording'
             return RecorderCounters(
                 messages=messages, queued=missing if running else 0,
@@ -193,31 +193,26 @@ class McapRecorder:
 
     def write(self, topic_index: int, log_time_ns: int, data: bytes) -> None:
         """Hand over one message; see `write_all`."""
-        self.write_all(((topic_index, log_time_ns, data),), len(data))
+        self.write_all((topic_index,), log_time_ns, (data,), len(data))
 
-    def write_all(self, messages: Sequence[Message], size: int) -> None:
+    def write_all(self, topic_indices: Sequence[int], log_time_ns: int,
+                  messages: Sequence[bytes], size: int) -> None:
         """
-        Hand over messages, from one thread at a time; they keep their order.
+        Hand over messages of one stamp, from one thread at a time; they keep their order.
 
-        messages: of each, its topic's index in the `topics` of `open`; its stamp [ns], >= 0, log
-            and publish time alike; CDR with its four bytes of header
-        size: of the CDR of all together [bytes]
+        topic_indices: of the topic of each, in the `topics` of `open`
+        log_time_ns: their stamp [ns], >= 0, log and publish time alike
+        messages: CDR, each with its four bytes of header;  size: of all together [bytes]
 
         Never waits for the disk, never raises for its sake.  After the recording stopped the
         messages are only counted, as lost.
         """
-        if not self._accepting:
-            with self._lock:
-                self._refused += len(messages)
-            return
-        self._queue.extend(messages)
-        self._bytes_in += size + _ENTRY_BYTES * len(messages)
-        if self._bytes_in - self._bytes_out >= self._half_full and not self._wake.is_set():
-            self._wake.set()
-
-    def _offered(self) -> int:
-        """Return how many messages have been handed over."""
-        return self._taken_count + len(self._queue) + self._refused
+        self._offered += len(messages)
+        if self._accepting:
+            self._queue.append((topic_indices, log_time_ns, messages, size))
+            self._bytes_in += size + _ENTRY_BYTES * len(messages)
+            if self._bytes_in - self._bytes_out >= self._half_full and not self._wake.is_set():
+                self._wake.set()
 
     def wait_for_room(self, timeout: float) -> bool:
         """Wait until there is room, at most `timeout` [s]; return whether there is."""
@@ -249,7 +244,7 @@ class McapRecorder:
                             strict=True))
         return RecordingSummary(
             path=self._path, bytes=self._file.size, counts=messages,
-            lost=self._offered() - sum(messages.values()), error=error, indexed=self._indexed)
+            lost=self._offered - sum(messages.values()), error=error, indexed=self._indexed)
 
     def __enter__(self) -> McapRecorder:
         return self
@@ -280,15 +275,14 @@ class McapRecorder:
                 return
             self._wake.wait(max(0.0, self._next_flush - time.monotonic()))
 
-    def _take(self) -> list[Message]:
+    def _take(self) -> list[Messages]:
         """Return what is queued, and take it out of the queue."""
-        count, take = len(self._queue), self._queue.popleft
-        self._taken_count += count      # before they leave, so that `counters` never misses any
-        messages = [take() for _ in range(count)]
-        self._bytes_out += (sum(len(data) for _, _, data in messages)
-                            + _ENTRY_BYTES * len(messages))
+        take = self._queue.popleft
+        taken = [take() for _ in range(len(self._queue))]
+        self._bytes_out += sum(size + _ENTRY_BYTES * len(messages)
+                               for _, _, messages, size in taken)
         self._taken.set()
-        return messages
+        return taken
 
     def _flush_if_due(self) -> None:
         """Close the chunk and bring it to the disk when it is time; mind the space left."""

@@ -42,8 +42,8 @@ class Propagator(Protocol):
     def reach_ns(self, ns: int, max_steps: int | None = None) -> bool:
         """Compute what the state at `ns` nanoseconds needs; False if max_steps did not do."""
 
-    def reach_ahead_ns(self, ns: int, now_ns: int) -> bool:
-        """Compute that only as far as the state at now_ns can still be read; False if not all."""
+    def step_ahead(self, now_ns: int) -> bool:
+        """Take one more step, if the state at now_ns can still be read then; return whether."""
 
     def at_ns(self, ns: int) -> OneState:
         """Return the state at `ns` nanoseconds."""
@@ -108,9 +108,9 @@ class ExactPropagator:
         """Nothing needs computing."""
         return True
 
-    def reach_ahead_ns(self, ns: int, now_ns: int) -> bool:
-        """Nothing needs computing."""
-        return True
+    def step_ahead(self, now_ns: int) -> bool:
+        """There are no steps."""
+        return False
 
     def columns_ns(self, instants: range) -> Columns:
         """Those of `grid` differ in their last bits."""

@@ -8,7 +8,7 @@ import math
 from abc import ABC, abstractmethod
 from bisect import bisect_left
 from collections import deque
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.kinematics import AxisState, Columns, OneState
@@ -31,6 +31,9 @@ from spinning_top_sim.solvers.phases import (
     windings,
 )
 from spinning_top_sim.solvers.transport import TransportForm
+
+if TYPE_CHECKING:
+    from spinning_top_sim.solvers.step_columns import Samples
 
 NANOSECONDS = 1_000_000_000
 # Later than any time: 292 years.
@@ -145,9 +148,9 @@ class SteppedOrClosed(ABC):
         """See `Propagator`."""
         return self.reach(ns / NANOSECONDS, max_steps)
 
-    def reach_ahead_ns(self, ns: int, now_ns: int) -> bool:
+    def step_ahead(self, now_ns: int) -> bool:
         """See `Propagator`."""
-        return True
+        return False
 
     def columns_ns(self, instants: range) -> Columns:
         """See `Propagator`."""
@@ -208,14 +211,13 @@ class _Stepped(SteppedOrClosed):
                     "use method = 'exact'")
         return True
 
-    def reach_ahead_ns(self, ns: int, now_ns: int) -> bool:
+    def step_ahead(self, now_ns: int) -> bool:
         """See `Propagator`."""
-        t, now = ns / NANOSECONDS, now_ns / NANOSECONDS
-        while self._newest[0].t1 < t:
-            # The oldest one would go, and the second has to hold that time then.
-            if len(self._kept) == STEPS_KEPT and self._kept[1][0].t0 >= now:
-                return False
-            self._step()
+        # The oldest one would go, and the second has to hold that time then.
+        if len(self._kept) == STEPS_KEPT and self._kept[1][0].t0 >= now_ns / NANOSECONDS:
+            return False
+        self._step()
+        _ = self._newest[0].coefficients        # who steps ahead reads each step: its share now
         return True
 
     def _step(self) -> None:
@@ -302,12 +304,20 @@ class TransportMotion(_Stepped):
         kept = [(step, phases) for step, phases in self._kept if phases is not None]
         first, last = (bisect_left(kept, time, key=_end) for time in (t[0], t[-1]))
         samples = step_columns.read(kept[first:last + 1], t)
+        return step_columns.StepColumns(self._top, self._start, samples, self._on_invariants)
+
+    def _on_invariants(self, samples: Samples) -> tuple[Pairs, Pairs, Pairs]:
+        """Return alpha, beta and the momentum as `at` has them."""
+        from spinning_top_sim.solvers.step_columns import rotations  # noqa: PLC0415
+
         alpha, beta, m = self._form.project_columns(*samples.unknowns)
-        spin = step_columns.rotations(self._half_spin_rate * samples.t)
-        turn = self._momentum_unit.imag
-        return step_columns.StepColumns(
-            self._top, self._start, alpha * spin, beta * spin.conjugate(),
-            Pairs(-turn * m.imag, turn * m.real), samples, self.at)
+        spin, turn = rotations(self._half_spin_rate * samples.t), self._momentum_unit.imag
+        columns = alpha * spin, beta * spin.conjugate(), Pairs(-turn * m.imag, turn * m.real)
+        for i in samples.ended:         # what is known there is not read from the polynomial
+            state = self.at(float(samples.t[i]))
+            for column, z in zip(columns, (state.alpha, state.beta, state.momentum), strict=True):
+                column.real[i], column.imag[i] = z.real, z.imag
+        return columns
 
     def _phases_onward(self) -> StepPhases:
         step, phases = self._newest

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import cmath
 import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -15,7 +14,7 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.kinematics import Columns, lazy
 from spinning_top_sim.physics.pairs import Pairs
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.phases import MomentumState, StepPhases, Winding
+from spinning_top_sim.solvers.phases import StepPhases, Winding
 
 if TYPE_CHECKING:
     from spinning_top_sim.solvers.dormand_prince import DenseStep
@@ -68,8 +67,8 @@ def read(kept: Sequence[tuple[DenseStep, StepPhases]], times: Sequence[float]) -
 
 def rotations(angles: Column) -> Pairs:
     """Return exp(i angle): by the functions of the standard library, as for one."""
-    return Pairs(*np.array([(z.real, z.imag) for z in
-                            [cmath.rect(1.0, angle) for angle in angles.tolist()]]).T.copy())
+    each = angles.tolist()
+    return Pairs(np.array(list(map(math.cos, each))), np.array(list(map(math.sin, each))))
 
 
 def _arctan2(y: Column, x: Column) -> Column:
@@ -96,16 +95,31 @@ class StepColumns(Columns):
     For motions that pass no pole: where neither parameter crosses zero (`StepPhases.crosses`).
     """
 
-    def __init__(self, top: Top, start: State, alpha: Pairs, beta: Pairs, momentum: Pairs,
-                 samples: Samples, at: Callable[[float], MomentumState]) -> None:
-        """Take the columns, where they come from, and what tells single states."""
+    def __init__(self, top: Top, start: State, samples: Samples,
+                 on_invariants: Callable[[Samples], tuple[Pairs, Pairs, Pairs]]) -> None:
+        """Take where steps were read, and what makes alpha, beta and the momentum of that."""
         self.top, self.l3_start, self.lz_start, self.lz = top, start.l3, start.lz, start.lz
-        self.alpha, self.beta, self.momentum = alpha, beta, momentum
         self._samples, self._line = samples, samples.line_rate * samples.t
-        for i in samples.ended:         # what is known there is not read from the polynomial
-            one = at(float(samples.t[i]))
-            for column, z in ((alpha, one.alpha), (beta, one.beta), (momentum, one.momentum)):
-                column.real[i], column.imag[i] = z.real, z.imag
+        self._on_invariants = on_invariants
+
+    @lazy
+    def _unknowns(self) -> tuple[Pairs, Pairs, Pairs]:
+        return self._on_invariants(self._samples)
+
+    @lazy
+    def alpha(self) -> Pairs:
+        """cos(theta/2) exp(i (phi + psi)/2)."""
+        return self._unknowns[0]
+
+    @lazy
+    def beta(self) -> Pairs:
+        """sin(theta/2) exp(i (phi - psi)/2)."""
+        return self._unknowns[1]
+
+    @lazy
+    def momentum(self) -> Pairs:
+        """L_x + i L_y [kg m^2/s] in the world."""
+        return self._unknowns[2]
 
     @lazy
     def quaternion(self) -> tuple[Column, Column, Column, Column]:

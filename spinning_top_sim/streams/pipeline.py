@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import contextlib
 import math
+import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import repeat
 from typing import TYPE_CHECKING, Any
 
 from spinning_top_sim.physics import attitude
@@ -37,23 +39,39 @@ if TYPE_CHECKING:
 STEPS_AT_ONCE = 500
 # Instants that are computed at most in one go.
 MOST_AT_ONCE = 256
+# Nor is more computed ahead than this, for a command makes it useless.
+FARTHEST_AHEAD_NS = 300_000_000
 NEVER_NS = 2 ** 63 - 1
 
-# A sample on its way to a log: number of its stream there, stamp [ns], message.
-Row = tuple[int, int, bytes]
+# What takes the samples of an instant for a log: numbers of their streams there, stamp [ns],
+# messages, size of these together [bytes].
+Log = Callable[[Sequence[int], int, Sequence[bytes], int], Any]
 
 
-class Instant:
-    """The samples of one time, with all who take them; size: of the messages in `rows` [bytes]."""
+class Takers:
+    """
+    Who takes the messages of an instant, which has those of the same streams as others.
 
-    __slots__ = ('publications', 'records', 'rows', 'size', 't_ns')
+    log: numbers of its streams in the log;  logged: where their messages are among all, None for
+    in every place;  size: of these together [bytes]
+    records, publications: who else, each with the place of the message
+    """
 
-    def __init__(self, t_ns: int) -> None:
-        self.t_ns = t_ns
-        self.rows: list[Row] = []
-        self.size = 0
-        self.records: list[tuple[Callable[[int, bytes], Any], int, bytes]] = []
-        self.publications: list[tuple[Callable[[bytes], Any], bytes, Stream]] = []
+    __slots__ = ('log', 'logged', 'publications', 'records', 'size')
+
+    def __init__(self, streams: Sequence[Stream]) -> None:
+        logged = [k for k, stream in enumerate(streams) if stream.log_index is not None]
+        self.log = tuple(stream.log_index for stream in streams if stream.log_index is not None)
+        self.logged = None if len(logged) == len(streams) else logged
+        self.size = sum(len(streams[k].template) for k in logged)
+        self.records = [(stream.record, k) for k, stream in enumerate(streams)
+                        if stream.record is not None]
+        self.publications = [(stream.publish, k, stream) for k, stream in enumerate(streams)
+                             if stream.publish is not None]
+
+
+# Time [ns], who takes the messages, and these.
+Instant = tuple[int, Takers, Sequence[bytes]]
 
 
 class Simulation:
@@ -74,11 +92,14 @@ class Simulation:
         """
         self.epoch_ns = epoch_ns
         # What comes next: the instants that are computed already, and from when on there is more
-        # to compute; of each stream that anybody takes, its first sample from there on, and who.
+        # to compute; of each stream that anybody takes, its first sample from there on; what is
+        # being computed.
         self._ready: deque[Instant] = deque()
-        self._beyond_ns = -1
-        self._cursors: list[list[Any]] = []
-        self._log: Callable[[list[Row], int], Any] | None = None
+        self._beyond_ns, self._shortest_ns = -1, NEVER_NS
+        self._cursors: list[_Cursor] = []
+        self._takers: dict[tuple[int, ...], Takers] = {}        # by the numbers of cursors
+        self._work: Iterator[None] | None = None
+        self._log: Log | None = None
         self._steps_before = self._evaluations_before = 0
         self.streams: list[Stream] = []
         self._load(values)
@@ -110,7 +131,8 @@ class Simulation:
         self.streams = streams
         self._invariants = next(s for s in streams if isinstance(s, Invariants))
         self._past = _Past(top, round(values['markers.trace_length'] * NANOSECONDS))
-        next(s for s in streams if isinstance(s, Markers)).axis_at = self.axis_at
+        self._markers = next(s for s in streams if isinstance(s, Markers))
+        self._markers.axis_at = self.axis_at
         self._begin(solver, start, state, 0)
 
     def _begin(self, solver: Propagator, start: State, state: OneState, at_ns: int) -> None:
@@ -215,12 +237,11 @@ class Simulation:
         top, anchor = self.top, self._anchor
         return set_up
 
-    def log_to(self, write: Callable[[list[Row], int], Any], streams: Sequence[Stream]) -> None:
+    def log_to(self, write: Log, streams: Sequence[Stream]) -> None:
         """
         Have the samples of these streams taken by a log from now on, those of an instant at once.
 
-        write: gets the rows of an instant, in which a stream has the number that it has in
-            `streams`, and the size of their messages together [bytes].  No streams: no log.
+        write: see `Log`; a stream has the number that it has in `streams`.  No streams: no log.
         """
         self._log = write
         for stream in self.streams:
@@ -248,18 +269,16 @@ class Simulation:
                     break
                 if due_ns > self._known_ns and not self._reach(due_ns, give_way):
                     return False
-                self._compute(target_ns)
+                if self._work is None:
+                    self._work = self._computation(target_ns)
+                self._go_on()
             instant = ready[0]
-            if instant.t_ns > target_ns:
+            if instant[0] > target_ns:
                 break
             if sent and give_way():
                 return False
             ready.popleft()
-            if instant.t_ns < publish_from_ns:
-                for _, _, stream in instant.publications:
-                    stream.skipped += 1
-                instant.publications.clear()
-            self._send(instant)
+            self._send(instant, instant[0] >= publish_from_ns)
             sent = True
         if target_ns > self._known_ns and not self._reach(target_ns, give_way):
             return False
@@ -277,7 +296,7 @@ class Simulation:
         if target_ns >= self._beyond_ns or target_ns > self._known_ns:
             return False
         ready = self._ready
-        while ready and ready[0].t_ns <= target_ns:
+        while ready and ready[0][0] <= target_ns:
             self._send(ready.popleft())
         if target_ns > self.now_ns:     # noqa: PLR1730 - max() takes twice the time
             self.now_ns = target_ns
@@ -288,20 +307,22 @@ class Simulation:
         """Before this time everything due is sent or computed [ns]."""
         return self._beyond_ns
 
-    def prepare(self, until_ns: int, instants: int) -> None:
+    def prepare(self, until_ns: int, instants: int, budget_ns: int | None = None) -> bool:
         """
         Compute now what is due up to `until_ns`, if it is not yet: many at once are cheap.
 
-        instants: compute so many at least, where any are to be computed
-        What is sent does not depend on it, a command finds the state that it would have found;
-        what then no longer holds is forgotten.  Gives up where the motion takes many steps, or
-        cannot go on: `advance` deals with that in its time.
+        instants: compute so many, or FARTHEST_AHEAD_NS, where any are to be computed
+        budget_ns: stop after about this time, and go on with the next call
+        Return whether all that is done.  What is sent does not depend on it, a command finds the
+        state that it would have found; what then no longer holds is forgotten.
         """
-        due_ns = self._next_due()
-        if due_ns > until_ns:
-            return
-        shortest_ns = min(cursor[1].period_ns for cursor in self._cursors)
-        self._compute(max(until_ns, due_ns + (instants - 1) * shortest_ns))
+        if self._work is None:
+            due_ns = self._next_due()
+            if due_ns > until_ns:
+                return True
+            self._work = self._computation(max(until_ns, due_ns + min(
+                (instants - 1) * self._shortest_ns, FARTHEST_AHEAD_NS)))
+        return self._go_on(None if budget_ns is None else time.monotonic_ns() + budget_ns)
 
     @property
     def in_columns(self) -> bool:
@@ -354,6 +375,7 @@ class Simulation:
     def _forget(self) -> None:
         """Drop what is computed ahead: it is not what comes next any more."""
         self._ready.clear()
+        self._work = None
         self._beyond_ns = -1
 
     def _next_due(self) -> int:
@@ -365,8 +387,9 @@ class Simulation:
                 if stream.next_ns <= now_ns:
                     stream.resume(now_ns)
                 due_ns = min(due_ns, stream.next_ns)
-            self._cursors = [[stream.next_ns, stream, stream.log_index, stream.record,
-                              stream.publish] for stream in streams]
+            self._cursors = [_Cursor(stream) for stream in streams]
+            self._shortest_ns = min((stream.period_ns for stream in streams), default=NEVER_NS)
+            self._takers.clear()
             self._ready.clear()
             self._beyond_ns = due_ns
         return self._beyond_ns
@@ -382,61 +405,97 @@ class Simulation:
                 stream.resume(until_ns - 1)
                 stream.skipped += (stream.next_ns - first_ns) // stream.period_ns
 
-    def _compute(self, until_ns: int) -> None:
-        """Compute the messages of what is due next, up to a time or as far as the steps allow."""
-        until_ns = min(until_ns, self._beyond_ns + (MOST_AT_ONCE - 1) * min(
-            cursor[1].period_ns for cursor in self._cursors))
-        if until_ns > self._known_ns:
-            # What cannot go on may not concern anybody; `advance` meets it in its time.
-            with contextlib.suppress(IntegrationError):
-                self.solver.reach_ahead_ns(until_ns - self.anchor_ns,
-                                           self.now_ns - self.anchor_ns)
-            self._known_ns = max(self._known_ns, self.anchor_ns + self.solver.latest_ns)
-            until_ns = min(until_ns, self._known_ns)
-        instants: dict[int, Instant] = {}
-        states = _States(self.solver, self.anchor_ns)
-        next_ns = NEVER_NS
-        for cursor in self._cursors:
-            due_ns, stream, log_index, record, publish = cursor
-            times = range(due_ns, until_ns + 1, stream.period_ns)
-            if times:
-                size = len(stream.template)
-                for t_ns, data in zip(times, self._messages(stream, times, states), strict=True):
-                    stamp_ns = self.epoch_ns + t_ns
-                    instant = instants.get(t_ns)
-                    if instant is None:
-                        instant = instants[t_ns] = Instant(t_ns)
-                    if log_index is not None:
-                        instant.rows.append((log_index, stamp_ns, data))
-                        instant.size += size
-                    if record is not None:
-                        instant.records.append((record, stamp_ns, data))
-                    if publish is not None:
-                        instant.publications.append((publish, data, stream))
-                cursor[0] = due_ns = times[-1] + stream.period_ns
-            next_ns = min(next_ns, due_ns)
-        self._ready.extend(instants[t_ns] for t_ns in sorted(instants))
-        self._beyond_ns = next_ns
+    def _go_on(self, end_ns: int | None = None) -> bool:
+        """Go on with the computation under way, at most to that time; return whether it ended."""
+        assert self._work is not None
+        try:
+            for _ in self._work:
+                if end_ns is not None and time.monotonic_ns() >= end_ns:
+                    return False
+        except BaseException:
+            self._forget()
+            raise
+        self._work = None
+        return True
 
-    def _messages(self, stream: Stream, times: range, states: _States) -> Sequence[bytes]:
-        """Return the messages of a stream at these times [ns]."""
+    def _computation(self, until_ns: int) -> Iterator[None]:
+        """
+        Compute the messages of what is due next, up to a time or as far as the steps allow.
+
+        In pieces, of which the longest take 0.1 ms.
+        """
+        until_ns = min(until_ns, self._beyond_ns + (MOST_AT_ONCE - 1) * self._shortest_ns)
+        solver, anchor_ns = self.solver, self.anchor_ns
+        # What cannot go on may not concern anybody; `advance` meets it in its time.
+        with contextlib.suppress(IntegrationError):
+            while anchor_ns + solver.latest_ns < until_ns and solver.step_ahead(
+                    self.now_ns - anchor_ns):
+                yield
+        self._known_ns = max(self._known_ns, anchor_ns + solver.latest_ns)
+        until_ns = min(until_ns, self._known_ns)
+        states = _States(solver, anchor_ns)
+        found = []
+        for number, cursor in enumerate(self._cursors):
+            if times := cursor.take(until_ns):
+                messages: list[bytes] = []
+                found.append((number, times, messages))
+                for some in self._messages(cursor.stream, times, states):
+                    messages += some
+                    yield
+        if found and all(times == found[0][1] for _, times, _ in found):
+            takers = self._takers_of(tuple(number for number, _, _ in found))
+            self._ready.extend(zip(found[0][1], repeat(takers),
+                                   zip(*(messages for _, _, messages in found), strict=True),
+                                   strict=False))
+        else:
+            instants: dict[int, tuple[list[int], list[bytes]]] = {}
+            for number, times, messages in found:
+                for t_ns, data in zip(times, messages, strict=True):
+                    numbers, all_data = instants.setdefault(t_ns, ([], []))
+                    numbers.append(number)
+                    all_data.append(data)
+            self._ready.extend((t_ns, self._takers_of(tuple(numbers)), all_data)
+                               for t_ns, (numbers, all_data) in sorted(instants.items()))
+        self._beyond_ns = min(cursor.due_ns for cursor in self._cursors)
+
+    def _takers_of(self, numbers: tuple[int, ...]) -> Takers:
+        """Return who takes the messages of the streams of these cursors."""
+        takers = self._takers.get(numbers)
+        if takers is None:
+            takers = self._takers[numbers] = Takers([self._cursors[k].stream for k in numbers])
+        return takers
+
+    def _messages(self, stream: Stream, times: range, states: _States,
+                  ) -> Iterator[Sequence[bytes]]:
+        """Yield the messages of a stream at these times [ns], in order, as many as are made."""
         if stream.one_by_one or not self.solver.in_columns:
-            return [stream.encode(states.at(t_ns), self.epoch_ns + t_ns, t_ns) for t_ns in times]
-        return stream.encode_columns(states.columns(times), self.epoch_ns, times)
+            for t_ns in times:
+                yield (stream.encode(states.at(t_ns), self.epoch_ns + t_ns, t_ns),)
+        else:
+            columns = states.columns(times)
+            yield ()
+            yield from stream.encode_columns(columns, self.epoch_ns, times)
 
-    def _send(self, instant: Instant) -> None:
-        """Hand out the samples of an instant."""
-        if instant.rows:
+    def _send(self, instant: Instant, publishes: bool = True) -> None:
+        """Hand out the samples of an instant; count those that are too late to be published."""
+        t_ns, takers, messages = instant
+        stamp_ns = self.epoch_ns + t_ns
+        if takers.log:
             assert self._log is not None
-            self._log(instant.rows, instant.size)
-        for record, stamp_ns, data in instant.records:
-            record(stamp_ns, data)
+            logged = takers.logged
+            self._log(takers.log, stamp_ns, messages if logged is None
+                      else [messages[k] for k in logged], takers.size)
+        for record, k in takers.records:
+            record(stamp_ns, messages[k])
         # After all is recorded: where it fails, as the node ends, the log has the instant whole.
         # One right after the other: each finds the middleware still awake from the one before.
-        self.now_ns = instant.t_ns
-        for publish, data, stream in instant.publications:
-            publish(data)
-            stream.sent += 1
+        self.now_ns = t_ns
+        for publish, k, stream in takers.publications:
+            if publishes:
+                publish(messages[k])
+                stream.sent += 1
+            else:
+                stream.skipped += 1
 
     def command(self, l3: float, lz: float) -> None:
         """
@@ -465,7 +524,21 @@ class Simulation:
         self._steps_before, self._evaluations_before = self.steps, self.evaluations
         self._past.end(self.anchor_ns, self._anchor, at_ns)
         self._begin(solver, start, state_after, at_ns)
+        self._markers.forget_after(at_ns)
         self.history.append((at_ns, l3, lz))
+
+
+class _Cursor:
+    """Where a stream that somebody takes will go on: due_ns, its first sample not computed."""
+
+    def __init__(self, stream: Stream) -> None:
+        self.stream, self.due_ns = stream, stream.next_ns
+
+    def take(self, until_ns: int) -> range:
+        """Go on behind a time; return when samples are due up to there."""
+        times = range(self.due_ns, until_ns + 1, self.stream.period_ns)
+        self.due_ns += len(times) * self.stream.period_ns
+        return times
 
 
 class _States:

@@ -9,7 +9,7 @@ parameters.STREAM_DEFAULTS.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from spinning_top_sim.physics.kinematics import Columns, OneState
@@ -109,16 +109,22 @@ class Stream:
         return self.template.encode_many(
             stamps_ns, *self.runs(states, range(first, first + len(stamps_ns))))
 
-    def encode_columns(self, states: Columns, epoch_ns: int, times: range) -> list[bytes]:
-        """Return the messages at these times [ns] after the stamp epoch_ns, each by itself."""
+    def encode_columns(self, states: Columns, epoch_ns: int, times: range,
+                       ) -> Iterator[list[bytes]]:
+        """
+        Yield the messages at these times [ns] after the stamp epoch_ns, each by itself.
+
+        In pieces, of which some are empty: so that long work can be interrupted.
+        """
         import numpy  # noqa: PLC0415 - where it is there already
 
-        stamps_ns = numpy.arange(epoch_ns + times.start, epoch_ns + times.stop, times.step)
         first = times.start // self.period_ns
-        data = self.template.encode_many(
-            stamps_ns, *self.runs(states, range(first, first + len(times)))).tobytes()
+        runs = self.runs(states, range(first, first + len(times)))
+        yield []
+        stamps_ns = numpy.arange(epoch_ns + times.start, epoch_ns + times.stop, times.step)
+        data = self.template.encode_many(stamps_ns, *runs).tobytes()
         size = len(self.template)
-        return [data[at:at + size] for at in range(0, len(data), size)]
+        yield [data[at:at + size] for at in range(0, len(data), size)]
 
     def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
         """
@@ -319,6 +325,11 @@ class Markers(Stream):
             return (*body, [number for point in (*self._trace(index * self.period_ns), tip)
                             for number in point])
         return (*body, self._traces(len(index), tip))
+
+    def forget_after(self, t_ns: int) -> None:
+        """Drop what was computed ahead of a time, at which another motion begins."""
+        self._points = {m: point for m, point in self._points.items()
+                        if m * self._spacing_ns <= t_ns}
 
     def _trace(self, t_ns: int) -> list[tuple[float, float, float]]:
         """Return where the tip was at the times of the grid before t."""
