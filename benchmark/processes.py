@@ -21,6 +21,8 @@ ROOT = Path(__file__).resolve().parent.parent
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ.setdefault('ROS_DOMAIN_ID', '46')
 os.environ.setdefault('ROS_LOG_DIR', tempfile.gettempdir())
+# Modules stay compiled after their first import, as those of an installed package are.
+os.environ.pop('PYTHONDONTWRITEBYTECODE', None)
 
 
 def ros_arguments(namespace: str, parameters: Mapping[str, Any]) -> list[str]:

@@ -182,9 +182,11 @@ class Simulator(Node):
 
     def _begin(self) -> bool:
         """Fix the stamp of t = 0; False as long as the /clock that we follow says nothing."""
-        now = self._date.now().nanoseconds
-        if now == 0:
+        if self._date.now().nanoseconds == 0:
             return False
+        if self._values['max_error'] > 0.0:
+            self._know_exact()          # within a report its import would keep ticks waiting
+        now = self._date.now().nanoseconds
         records = self._values['record.enabled']
         # The log's head tells the epoch, and takes a while to reach the disk.
         epoch = _ceil_to(now + (OPENING_NS if records and not self._follows else 0), EPOCH_GRID_NS)
