@@ -20,6 +20,7 @@ a topic is from the period.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import itertools
 import json
 import shutil
@@ -166,20 +167,28 @@ def measured(arguments: argparse.Namespace) -> dict:
 
 
 def idle(rounds: int, seconds: float) -> str:
-    """Return the table of what streams cost that nobody listens to."""
+    """
+    Return the table of what streams cost that nobody listens to.
+
+    Both nodes of a pair run side by side and are measured over the same seconds, for what this
+    machine does to one it then does to the other; who is started first takes turns.
+    """
     switches = [f'{name}.enabled' for name in (*STREAMS, 'imu_data', *OTHERS, 'clock')]
-    nodes = {(pacing, what): {'pacing': pacing, 'tick_rate': 1000.0, 'status_period': 0.0,
-                              **dict.fromkeys(switches, what == 'all')}
-             for pacing in ('timer', 'thread') for what in ('all', 'none')}
-    shares: dict[tuple[str, str], list[float]] = {key: [] for key in nodes}
-    for _ in range(rounds):
-        for key, parameters in nodes.items():
-            with Process((*SIM_NODE, *ros_arguments(f'/n{next(_namespaces)}',
-                                                    parameters))) as node:
-                time.sleep(3.0)
-                cpu, begin = node.cpu_ns(), time.monotonic_ns()
-                time.sleep(seconds)
-                shares[key].append((node.cpu_ns() - cpu) / (time.monotonic_ns() - begin))
+    shares: dict[tuple[str, str], list[float]] = {
+        (pacing, what): [] for pacing in ('timer', 'thread') for what in ('all', 'none')}
+    for number_, pacing in itertools.product(range(rounds), ('timer', 'thread')):
+        with contextlib.ExitStack() as nodes:
+            pair = {what: nodes.enter_context(Process((*SIM_NODE, *ros_arguments(
+                f'/n{next(_namespaces)}', {
+                    'pacing': pacing, 'tick_rate': 1000.0, 'status_period': 0.0,
+                    **dict.fromkeys(switches, what == 'all')}))))
+                for what in (('all', 'none'), ('none', 'all'))[number_ % 2]}
+            time.sleep(4.0)
+            begin = {what: (node.cpu_ns(), time.monotonic_ns()) for what, node in pair.items()}
+            time.sleep(seconds)
+            for what, node in pair.items():
+                cpu, at = begin[what]
+                shares[pacing, what].append((node.cpu_ns() - cpu) / (time.monotonic_ns() - at))
     rows = []
     for pacing in ('timer', 'thread'):
         every, none = shares[pacing, 'all'], shares[pacing, 'none']
@@ -277,7 +286,7 @@ def main() -> None:
     parser.add_argument('--rounds', type=int, default=3)
     parser.add_argument('--seconds', type=float, default=2.0, help='measured, each run')
     parser.add_argument('--warm-up', type=float, default=1.5, help='before that')
-    parser.add_argument('--idle-rounds', type=int, default=3,
+    parser.add_argument('--idle-rounds', type=int, default=6,
                         help='of the table of streams that nobody listens to')
     parser.add_argument('--no-report', action='store_true', help='print the tables only')
     arguments = parser.parse_args()
@@ -294,7 +303,8 @@ def main() -> None:
         '## Ratios of processor time for each sample that arrived\n',
         ratio_table(found, per_sample=True),
         '## Streams that nobody listens to\n',
-        'Processor time at 1000 ticks a second, default rates, no subscriber.\n', unheard,
+        'Processor time at 1000 ticks a second, default rates, no subscriber; both nodes of a '
+        f'pair side by side, {arguments.idle_rounds} rounds.\n', unheard,
         '## Arrivals\n', arrival_table(found)))
     print(text)
     if not arguments.no_report:

@@ -43,9 +43,9 @@ LISTENERS_PERIOD_NS = 50_000_000
 COLUMNS_AHEAD, ONES_AHEAD = 128, 16
 # In pieces that fill this share of the time between two ticks, so that the next one finds the
 # processor free; begun so many ticks before they are needed.
-BUSY_SHARE = 0.3
-TICKS_AHEAD = 16
-SWITCH_INTERVAL_S = 5e-6
+BUSY_SHARE = 0.15
+TICKS_AHEAD = 24
+SWITCH_INTERVAL_S = 1e-4
 # One tick works at most this long before services and signals get their turn.
 TICK_BUDGET_S = 0.05
 # One ~/step works at most this long.
