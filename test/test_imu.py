@@ -259,7 +259,8 @@ def test_noise_that_was_read_is_not_kept():
         after, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert after - before < 5000
+    # Six numbers of each block in between would be this; Python and numpy keep some at hand.
+    assert after - before < 400 * 6 * 8
 
 
 def test_noise_is_the_same_read_forwards_backwards_and_at_random():

@@ -42,9 +42,9 @@ LISTENERS_PERIOD_NS = 50_000_000
 # than one, and fewer one by one.
 COLUMNS_AHEAD, ONES_AHEAD = 128, 16
 # In pieces that fill this share of the time between two ticks, so that the next one finds the
-# processor free; begun so many ticks before they are needed.
+# processor free; begun so many ticks, or so much time, before they are needed.
 BUSY_SHARE = 0.15
-TICKS_AHEAD = 24
+TICKS_AHEAD, AHEAD_NS = 24, 50_000_000
 SWITCH_INTERVAL_S = 1e-4
 # One tick works at most this long before services and signals get their turn.
 TICK_BUDGET_S = 0.05
@@ -309,7 +309,8 @@ class Simulator(Node):
         self._busy_ns = int(BUSY_SHARE * self._tick_period_ns)
         self._listeners_period_ns = round(LISTENERS_PERIOD_NS * values['time_scale'])
         # In simulated time.
-        self._ahead_ns = round(TICKS_AHEAD * self._tick_period_ns * values['time_scale'])
+        self._ahead_ns = round(values['time_scale'] * max(
+            1.5 * self._tick_period_ns, min(TICKS_AHEAD * self._tick_period_ns, AHEAD_NS)))
         self._latest_ns = int(LATEST_NS * values['time_scale'])
 
     def _due(self) -> int:

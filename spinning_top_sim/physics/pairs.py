@@ -12,7 +12,9 @@ class Pairs:
 
     numpy multiplies its complex columns with fused instructions where the processor has them, and
     rounds otherwise than Python.  Real columns are added and multiplied alike everywhere, so what
-    comes out does not depend on how many numbers there are, nor on where one of them stands.
+    comes out does not depend on how many numbers there are, nor on where one of them stands.  (A
+    Python that was compiled to fuse its own complex products, as compilers for ARM do unasked, has
+    other last bits than these.)
 
     real, imag: (n,) columns;  operands are `Pairs`, real columns and real numbers
     """

@@ -391,7 +391,7 @@ class Simulation:
             self._shortest_ns = min((stream.period_ns for stream in streams), default=NEVER_NS)
             self._takers.clear()
             self._ready.clear()
-            self._beyond_ns = due_ns
+            self._work, self._beyond_ns = None, due_ns
         return self._beyond_ns
 
     def _skip(self, until_ns: int) -> None:
@@ -422,7 +422,7 @@ class Simulation:
         """
         Compute the messages of what is due next, up to a time or as far as the steps allow.
 
-        In pieces, of which the longest take 0.1 ms.
+        In pieces of some 0.1 ms.
         """
         until_ns = min(until_ns, self._beyond_ns + (MOST_AT_ONCE - 1) * self._shortest_ns)
         solver, anchor_ns = self.solver, self.anchor_ns
