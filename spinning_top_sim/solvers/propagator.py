@@ -42,8 +42,13 @@ class Propagator(Protocol):
     def reach_ns(self, ns: int, max_steps: int | None = None) -> bool:
         """Compute what the state at `ns` nanoseconds needs; False if max_steps did not do."""
 
-    def step_ahead(self, now_ns: int) -> bool:
-        """Take one more step, if the state at now_ns can still be read then; return whether."""
+    def step_ahead(self, until_ns: int, now_ns: int, period_ns: int) -> bool:
+        """
+        Take one more step towards until_ns; return whether that was done.
+
+        Not if it is reached, nor if the state at now_ns could not be read any more.  period_ns: of
+        the samples that will be asked for
+        """
 
     def at_ns(self, ns: int) -> OneState:
         """Return the state at `ns` nanoseconds."""
@@ -108,7 +113,7 @@ class ExactPropagator:
         """Nothing needs computing."""
         return True
 
-    def step_ahead(self, now_ns: int) -> bool:
+    def step_ahead(self, until_ns: int, now_ns: int, period_ns: int) -> bool:
         """There are no steps."""
         return False
 

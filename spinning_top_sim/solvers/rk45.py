@@ -50,7 +50,7 @@ REST_ULPS = 2.0
 # And how far the axis may swing all the same, in cos(theta) over sin^2(theta).
 REST_SWING = 1e-12
 # So many of the newest steps can still be read, for who computes ahead of the time that it is.
-STEPS_KEPT = 64
+STEPS_KEPT = 128
 
 
 def rk45(top: Top, start: State, *, equations: str = 'transport', rtol: float = 1e-11,
@@ -148,7 +148,7 @@ class SteppedOrClosed(ABC):
         """See `Propagator`."""
         return self.reach(ns / NANOSECONDS, max_steps)
 
-    def step_ahead(self, now_ns: int) -> bool:
+    def step_ahead(self, until_ns: int, now_ns: int, period_ns: int) -> bool:
         """See `Propagator`."""
         return False
 
@@ -211,13 +211,16 @@ class _Stepped(SteppedOrClosed):
                     "use method = 'exact'")
         return True
 
-    def step_ahead(self, now_ns: int) -> bool:
+    def step_ahead(self, until_ns: int, now_ns: int, period_ns: int) -> bool:
         """See `Propagator`."""
         # The oldest one would go, and the second has to hold that time then.
-        if len(self._kept) == STEPS_KEPT and self._kept[1][0].t0 >= now_ns / NANOSECONDS:
+        if self._newest[0].t1 >= until_ns / NANOSECONDS or (
+                len(self._kept) == STEPS_KEPT and self._kept[1][0].t0 >= now_ns / NANOSECONDS):
             return False
         self._step()
-        _ = self._newest[0].coefficients        # who steps ahead reads each step: its share now
+        newest = self._newest[0]
+        if newest.t1 - newest.t0 >= period_ns / NANOSECONDS:
+            _ = newest.coefficients             # a part of the work that can be done now
         return True
 
     def _step(self) -> None:

@@ -47,19 +47,20 @@ def read(kept: Sequence[tuple[DenseStep, StepPhases]], times: Sequence[float]) -
 
     A time at which two meet is that of the earlier one.
     """
-    steps, phases = zip(*kept, strict=True)
     t = np.array(times)
+    used, number = np.unique(np.array([step.t1 for step, _ in kept]).searchsorted(t),
+                             return_inverse=True)
+    kept = [kept[k] for k in used.tolist()]
     begins = np.array([(step.t1, step.t0, step.t1 - step.t0 or 1.0, begin.half_theta,
                         begin.alpha.phase, begin.beta.phase)
                        for step, begin in kept]).T
-    number = begins[0].searchsorted(t)
     ends, starts, lengths, half_theta, alpha_phase, beta_phase = begins.take(number, 1)
-    polynomials = np.array([step.coefficients for step in steps])   # (steps, 3, 6), complex
+    polynomials = np.array([step.coefficients for step, _ in kept])     # (steps, 3, 6), complex
     # By power, then by unknown, real and imaginary part apart.
     c = polynomials.view(np.float64).reshape(-1, 3, 6, 2).transpose(2, 1, 3, 0).take(number, 3)
     s = (t - starts) / lengths
     y = ((((c[5] * s + c[4]) * s + c[3]) * s + c[2]) * s + c[1]) * s + c[0]
-    newest = phases[-1]
+    _, newest = kept[-1]
     return Samples(t, (Pairs(*y[0]), Pairs(*y[1]), Pairs(*y[2])), half_theta,
                    (alpha_phase, beta_phase), (newest.alpha, newest.beta), newest.line_rate,
                    (t >= ends).nonzero()[0].tolist())

@@ -43,8 +43,9 @@ MOST_AT_ONCE = 256
 FARTHEST_AHEAD_NS = 300_000_000
 NEVER_NS = 2 ** 63 - 1
 
-# What takes the samples of an instant for a log: numbers of their streams there, stamp [ns],
-# messages, size of these together [bytes].
+# The samples of an instant for a log: numbers of their streams there, stamp [ns], messages, size
+# of these together [bytes]; and what takes them.
+Messages = tuple[Sequence[int], int, Sequence[bytes], int]
 Log = Callable[[Sequence[int], int, Sequence[bytes], int], Any]
 
 
@@ -428,8 +429,8 @@ class Simulation:
         solver, anchor_ns = self.solver, self.anchor_ns
         # What cannot go on may not concern anybody; `advance` meets it in its time.
         with contextlib.suppress(IntegrationError):
-            while anchor_ns + solver.latest_ns < until_ns and solver.step_ahead(
-                    self.now_ns - anchor_ns):
+            while solver.step_ahead(until_ns - anchor_ns, self.now_ns - anchor_ns,
+                                    self._shortest_ns):
                 yield
         self._known_ns = max(self._known_ns, anchor_ns + solver.latest_ns)
         until_ns = min(until_ns, self._known_ns)

@@ -3,8 +3,8 @@
 The executable `simulate`: the node's pipeline offline, as fast as the machine goes.
 
 The same parameters, seed and commands give the same messages as a live run, the offset of the
-stamps aside.  rk45 goes state by state, as live; the exact solution is evaluated and written in
-whole columns.
+stamps aside.  rk45 has the bytes of a live run; the exact solution is evaluated and written in
+whole columns of its own.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +19,7 @@ from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.rk45 import NANOSECONDS
 from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.pipeline import Messages, Simulation
 from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
 
 if TYPE_CHECKING:
@@ -174,16 +173,26 @@ def write_log(path: Path, values: Mapping[str, Any], duration_ns: int,
                           'columns' if columns else 'one state at a time')
     file = create_file(path, topics, metadata, compression=values['record.compression'])
 
-    behind = _Behind(file.put_plain_chunk)
+    behind = _Behind(file.put_plain_chunk if columns else file.append_all)
+    taken: list[Messages] = []
 
     def write(topic_index: int, stamp_ns: int, data: bytes) -> None:
         behind.wait()
         if file.append(topic_index, stamp_ns, data):
             file.write_chunk()
 
+    def flush() -> None:
+        nonlocal taken
+        if taken:
+            behind.wait()
+            behind.start(taken)
+            taken = []
+
     def advance(target_ns: int) -> None:
         if not columns:
             simulation.advance(target_ns)
+            if sum(size for *_, size in taken) >= CHUNK_BYTES:
+                flush()
             return
         parts: list[tuple[int, Any, Any]] = []
         simulation.advance_in_columns(target_ns, lambda stream, stamps, rows: parts.append(
@@ -194,8 +203,7 @@ def write_log(path: Path, values: Mapping[str, Any], duration_ns: int,
             file.write_chunk()
             behind.start(chunk)
 
-    for index, stream in enumerate(streams):
-        stream.record = partial(write, index)
+    simulation.log_to(lambda *messages: taken.append(messages), streams)
     write(events_topic, epoch_ns, journal.event('start', 0, -1))
     try:
         for target_ns, command in stretches(duration_ns, commands,
@@ -209,9 +217,11 @@ def write_log(path: Path, values: Mapping[str, Any], duration_ns: int,
                       journal.event('command', at_ns, simulation.now_ns, l3=l3, lz=lz))
                 write(commands_topic, epoch_ns + at_ns, journal.command(l3, lz))
             show(target_ns)
+        flush()
         behind.wait()
     finally:
         behind.close()
+        file.append_all(taken)          # of a motion that could not go on
         file.write_chunk()
         file.finish()
     return f'{sum(file.counts)} messages, {file.size / 1e6:.1f} MB'
