@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import cmath
 import math
-from typing import Protocol
+from typing import Any, Protocol
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.kinematics import OneState, lazy
+from spinning_top_sim.physics.kinematics import Columns, OneState, lazy
 from spinning_top_sim.physics.top import State, Top
 
 # Modulus (signed) and phase [rad] of alpha and of beta.
@@ -135,26 +135,32 @@ def spin_excess(top: Top, l3: float) -> float:
     return l3 * (1.0 / top.lambda3 - 1.0 / top.lambda1)
 
 
-class MomentumState(OneState):
-    """One state known by alpha, beta and the momentum L_x + i L_y [kg m^2/s] in the world."""
+class ByMomentum(Columns):
+    """What follows from alpha, beta and the momentum L_x + i L_y [kg m^2/s] in the world."""
+
+    momentum: Any
+
+    @lazy
+    def l3(self) -> Any:
+        """L . e3 [kg m^2/s], as the state has it."""
+        axis, height = self.axis
+        return (self.momentum * axis.conjugate()).real + self.lz * height
+
+    @lazy
+    def transverse_rate(self) -> Any:
+        """omega_1 + i omega_2 [rad/s] from the momentum: regular at the poles."""
+        return attitude.transverse_in_body(
+            self.alpha, self.beta, self.momentum, self.lz) / self.top.lambda1
+
+
+class MomentumState(ByMomentum, OneState):
+    """One state known by alpha, beta and the momentum."""
 
     def __init__(self, top: Top, start: State, alpha: complex, beta: complex,
                  momentum: complex, t: float, phases: Phases) -> None:
         self.top, self.l3_start, self.lz_start, self.lz = top, start.l3, start.lz, start.lz
         self.alpha, self.beta, self.momentum = alpha, beta, momentum
         self._t, self._phases = t, phases
-
-    @lazy
-    def l3(self) -> float:
-        """L . e3 [kg m^2/s], as this state has it."""
-        axis, height = self.axis
-        return (self.momentum * axis.conjugate()).real + self.lz * height
-
-    @lazy
-    def transverse_rate(self) -> complex:
-        """omega_1 + i omega_2 [rad/s] from the momentum: regular at the poles."""
-        return attitude.transverse_in_body(
-            self.alpha, self.beta, self.momentum, self.lz) / self.top.lambda1
 
     @lazy
     def _polar(self) -> Polar:

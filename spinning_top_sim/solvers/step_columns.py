@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.kinematics import Columns, lazy
+from spinning_top_sim.physics.kinematics import lazy
 from spinning_top_sim.physics.pairs import Pairs
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.phases import StepPhases, Winding
+from spinning_top_sim.solvers.phases import ByMomentum, StepPhases, Winding
 
 if TYPE_CHECKING:
     from spinning_top_sim.solvers.dormand_prince import DenseStep
@@ -89,7 +89,7 @@ def _onward(winding: Winding, z: Pairs, before: Column) -> Column:
     return phase + math.tau * turns
 
 
-class StepColumns(Columns):
+class StepColumns(ByMomentum):
     """
     States known by alpha, beta and the momentum L_x + i L_y [kg m^2/s] in the world.
 
@@ -126,18 +126,6 @@ class StepColumns(Columns):
     def quaternion(self) -> tuple[Column, Column, Column, Column]:
         """Attitude q(world <- body): columns x, y, z, w."""
         return attitude.quaternion(self.alpha, self.beta)
-
-    @lazy
-    def transverse_rate(self) -> Pairs:
-        """omega_1 + i omega_2 [rad/s] from the momentum."""
-        return attitude.transverse_in_body(
-            self.alpha, self.beta, self.momentum, self.lz) / self.top.lambda1
-
-    @lazy
-    def l3(self) -> Column:
-        """L . e3 [kg m^2/s], as these states have it."""
-        axis, height = self.axis
-        return (self.momentum * axis.conjugate()).real + self.lz * height
 
     @lazy
     def norm_error(self) -> Column:
