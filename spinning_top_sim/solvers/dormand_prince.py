@@ -12,6 +12,7 @@ curvatures come from the equations themselves and only where a step is sampled a
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from fractions import Fraction
@@ -78,6 +79,7 @@ class Form(Protocol):
 StepFunction = Callable[..., tuple[Vector, Vector, Vector]]
 
 
+@functools.cache
 def unrolled_step(size: int, number: type) -> StepFunction:
     """
     Return step(f, h, y, k1) -> (y_new, k7, error estimate) for vectors of `size` numbers.
