@@ -400,3 +400,20 @@ def test_columns_do_not_reach_behind_the_steps_that_are_kept():
     assert motion.earliest_ns > SECOND
     with pytest.raises(ValueError, match='oldest'):
         motion.columns_ns(range(SECOND, 2 * SECOND, SECOND))
+
+
+@pytest.mark.parametrize('name', ['loop-a', 'cusp-headline-a', 'nearpole-thmin~1e-6',
+                                  'fast-10000-cusp', 'cross-top-a'])
+def test_a_solution_is_its_single_states_to_the_last_bit(name):
+    """Over many times the steps that are kept, at odd times, some of them twice."""
+    t = np.sort(np.random.default_rng(3).uniform(0.0, 20.0, 2000))
+    t[1000:1003] = t[1000]
+    t[0] = 0.0
+    top, start = top_of(CASES[name]), start_of(CASES[name])
+    solution = solve(top, start, t, method='rk45', rtol=1e-9)
+    single = rk45(top, start, rtol=1e-9, atol=1e-10)
+    states = [single.at(instant) for instant in t.tolist()]
+    assert solution.steps == single.steps > 500
+    for part in ('alpha', 'beta', 'theta', 'theta_dot', 'phi', 'psi', 'l3', 'transverse_rate'):
+        expected = np.array([getattr(state, part) for state in states])
+        assert getattr(solution, part).tobytes() == expected.tobytes(), part

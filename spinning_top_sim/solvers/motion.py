@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,9 +11,10 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.kinematics import Columns, lazy
+from spinning_top_sim.physics.pairs import Pairs
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.solvers.rk45 import SteppedOrClosed
+from spinning_top_sim.solvers.rk45 import SteppedOrClosed, TransportMotion
 
 if TYPE_CHECKING:
     from spinning_top_sim.solvers.propagator import Branch
@@ -90,20 +92,64 @@ class Motion(Columns):
 
 
 class SteppedMotion(Motion):
-    """Samples of steps, taken one by one."""
+    """Samples of steps: of many at once where the motion has them so, else one by one."""
 
     PARTS = ('alpha', 'beta', 'theta', 'theta_dot', 'phi', 'psi', 'l3', 'transverse_rate')
 
     def __init__(self, top: Top, start: State, t: Column, stepped: SteppedOrClosed) -> None:
         super().__init__(top, start, t)
-        columns: dict[str, list[Any]] = {name: [] for name in self.PARTS}
-        for instant in t.tolist():
-            state = stepped.at(instant)
-            for name, column in columns.items():
-                column.append(getattr(state, name))
-        for name, column in columns.items():
-            setattr(self, name, np.array(column))
+        times = t.tolist()
+        self._blocks: list[Any]
+        if isinstance(stepped, TransportMotion) and stepped.in_columns and times:
+            self._blocks = list(stepped.blocks(times))
+        else:
+            states = [stepped.at(instant) for instant in times]
+            self._blocks = [SimpleNamespace(**{
+                name: np.array([getattr(state, name) for state in states])
+                for name in self.PARTS})]
         self.steps, self.evaluations = stepped.steps, stepped.evaluations
+
+    def _joined(self, name: str) -> Column:
+        """Return a column of all blocks."""
+        columns = [getattr(block, name) for block in self._blocks]
+        if not isinstance(columns[0], Pairs):
+            return np.concatenate(columns)
+        joined = np.empty(len(self.t), complex)
+        joined.real = np.concatenate([column.real for column in columns])
+        joined.imag = np.concatenate([column.imag for column in columns])
+        return joined
+
+    @lazy
+    def alpha(self) -> Column:
+        return self._joined('alpha')
+
+    @lazy
+    def beta(self) -> Column:
+        return self._joined('beta')
+
+    @lazy
+    def theta(self) -> Column:
+        return self._joined('theta')
+
+    @lazy
+    def theta_dot(self) -> Column:
+        return self._joined('theta_dot')
+
+    @lazy
+    def phi(self) -> Column:
+        return self._joined('phi')
+
+    @lazy
+    def psi(self) -> Column:
+        return self._joined('psi')
+
+    @lazy
+    def l3(self) -> Column:
+        return self._joined('l3')
+
+    @lazy
+    def transverse_rate(self) -> Column:
+        return self._joined('transverse_rate')
 
 
 class ExactMotion(Motion):

@@ -6,8 +6,10 @@ from __future__ import annotations
 import cmath
 import math
 from abc import ABC, abstractmethod
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections import deque
+from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from spinning_top_sim.physics import attitude
@@ -33,7 +35,7 @@ from spinning_top_sim.solvers.phases import (
 from spinning_top_sim.solvers.transport import TransportForm
 
 if TYPE_CHECKING:
-    from spinning_top_sim.solvers.step_columns import Samples
+    from spinning_top_sim.solvers.step_columns import Samples, StepColumns
 
 NANOSECONDS = 1_000_000_000
 # Later than any time: 292 years.
@@ -297,29 +299,49 @@ class TransportMotion(_Stepped):
         return MomentumState(self._top, self._start, alpha * spin, beta * spin.conjugate(),
                              self._momentum_unit * m, t, phases)
 
-    def columns_ns(self, instants: range) -> Columns:
+    def columns_ns(self, instants: range) -> StepColumns:
         """See `Propagator`."""
+        return self._columns([ns / NANOSECONDS for ns in instants])
+
+    def blocks(self, t: Sequence[float]) -> Iterator[StepColumns]:
+        """Yield the states at ascending times [s], those of many steps each, if `in_columns`."""
+        begin = 0
+        while begin < len(t):
+            self.reach(t[begin])
+            # The step that holds that time has to stay.
+            for _ in range(STEPS_KEPT - 2):
+                if self._newest[0].t1 >= t[-1]:
+                    break
+                self._step()
+            end = bisect_right(t, self._newest[0].t1, begin)
+            yield self._columns(t[begin:end])
+            begin = end
+
+    def _columns(self, t: Sequence[float]) -> StepColumns:
+        """Return the states at ascending times [s] within the steps that are kept."""
         from spinning_top_sim.solvers import step_columns  # noqa: PLC0415 - for its numpy
 
-        t = [ns / NANOSECONDS for ns in instants]
         self._step_at(t[0])
         assert t[-1] <= self._newest[0].t1
         kept = [(step, phases) for step, phases in self._kept if phases is not None]
         first, last = (bisect_left(kept, time, key=_end) for time in (t[0], t[-1]))
         samples = step_columns.read(kept[first:last + 1], t)
-        return step_columns.StepColumns(self._top, self._start, samples, self._on_invariants)
+        # What is known there is not read from the polynomial.
+        ended = [(k, self.at(t[k])) for k in samples.ended]
+        return step_columns.StepColumns(self._top, self._start, samples,
+                                        partial(self._on_invariants, ended))
 
-    def _on_invariants(self, samples: Samples) -> tuple[Pairs, Pairs, Pairs]:
-        """Return alpha, beta and the momentum as `at` has them."""
+    def _on_invariants(self, ended: Sequence[tuple[int, MomentumState]], samples: Samples,
+                       ) -> tuple[Pairs, Pairs, Pairs]:
+        """Return alpha, beta and the momentum as `at` has them; it has said some already."""
         from spinning_top_sim.solvers.step_columns import rotations  # noqa: PLC0415
 
         alpha, beta, m = self._form.project_columns(*samples.unknowns)
         spin, turn = rotations(self._half_spin_rate * samples.t), self._momentum_unit.imag
         columns = alpha * spin, beta * spin.conjugate(), Pairs(-turn * m.imag, turn * m.real)
-        for i in samples.ended:         # what is known there is not read from the polynomial
-            state = self.at(float(samples.t[i]))
+        for k, state in ended:
             for column, z in zip(columns, (state.alpha, state.beta, state.momentum), strict=True):
-                column.real[i], column.imag[i] = z.real, z.imag
+                column.real[k], column.imag[k] = z.real, z.imag
         return columns
 
     def _phases_onward(self) -> StepPhases:
