@@ -795,3 +795,29 @@ def test_a_message_that_cannot_be_packed_is_no_exception_for_the_simulation(tmp_
     assert recorder.state == 'failed'
     assert 'stopped: error:' in (summary.error or '')
     assert (summary.indexed, summary.lost) == (True, 1)
+
+
+def test_recordings_that_follow_one_another_share_a_compressor(tmp_path, monkeypatch):
+    """Two at a time do not; and the bytes are those of a new one."""
+    monkeypatch.setattr(mcap_file, '_spare_compressors', [])
+
+    def compressor(recorder):
+        return recorder._file._compress.__self__
+
+    def chunks(path):
+        with path.open('rb') as file:
+            return [record.data for record in StreamReader(file, emit_chunks=True).records
+                    if isinstance(record, Chunk)]
+
+    options = {'min_free_bytes': 0, 'max_loss': 60.0}
+    used = []
+    for name in ('a', 'b'):
+        with McapRecorder.open(tmp_path / name, TOPICS, METADATA, **options) as recorder:
+            used.append(compressor(recorder))
+            for message in some_messages(300):
+                recorder.write(*message)
+            if name == 'b':
+                with McapRecorder.open(tmp_path / 'c', TOPICS, METADATA, **options) as other:
+                    assert compressor(other) is not compressor(recorder)
+    assert used[0] is used[1]
+    assert chunks(tmp_path / 'a') == chunks(tmp_path / 'b') != []

@@ -83,13 +83,31 @@ class PlainChunk(NamedTuple):
     span: tuple[int, int]
 
 
+# The compressor of a file that was closed, for the next one: it holds 4 MB, which a node that
+# records again and again would give back and take anew.
+_spare_compressors: list[zstandard.ZstdCompressor] = []
+
+
 def _compressor(compression: str) -> Callable[[bytes | memoryview], bytes]:
     """Return what compresses a chunk."""
     if compression == 'zstd':
+        with contextlib.suppress(IndexError):
+            return _spare_compressors.pop().compress
         return zstandard.ZstdCompressor().compress
     if compression == 'lz4':
         return lambda plain: bytes(lz4.frame.compress(plain))
     return bytes
+
+
+def _spare(compress: Callable[[bytes | memoryview], bytes]) -> None:
+    """Keep a compressor that is not used any more."""
+    compressor = getattr(compress, '__self__', None)
+    if isinstance(compressor, zstandard.ZstdCompressor) and not _spare_compressors:
+        _spare_compressors.append(compressor)
+
+
+def _refuse(plain: bytes | memoryview) -> bytes:
+    raise ValueError('a chunk for a file that is closed')
 
 
 class IndexedFile:
@@ -252,6 +270,8 @@ class IndexedFile:
             sync_directory(self._path.parent)
         finally:
             self._file.close()
+            _spare(self._compress)
+            self._compress = _refuse
 
     def _tail(self, last_metadata: Metadata | None) -> bytes:
         """Return everything behind the last chunk: the last record, summary, footer."""
