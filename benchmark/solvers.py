@@ -25,6 +25,7 @@ from peers import FailedError, Peer, Runner, angles_between, peer
 from report import number, preamble, table, write_section
 from timing import TimeUpError, interleaved, one_thread, seconds_of, time_limit
 
+from spinning_top_sim import solve
 from spinning_top_sim.solvers.exact import ExactSolution
 
 COUNTS = (2, 100, 100_000)
@@ -61,9 +62,19 @@ class _PreparedGrid(_Prepared):
         return self.solution.quaternion_grid(0, int(ns[1]), len(ns))
 
 
+class _SteppedArray(Runner):
+    """`solve`, whose columns read many samples of the steps at once."""
+
+    def attitudes(self, ns):
+        return solve(self.case.top, self.case.start, ns / 1e9, method='rk45',
+                     rtol=self.setting).quaternion
+
+
 PREPARED = (Peer('exact, prepared, state by state', 'ours', _PreparedOne, (0.0,)),
             Peer('exact, prepared, any times', 'ours', _PreparedArray, (0.0,)),
             Peer('exact, prepared, grid', 'ours', _PreparedGrid, (0.0,)))
+
+STEPPED = Peer('rk45 transport, array', 'ours', _SteppedArray, (1e-11,))
 
 
 def absent() -> list[str]:
@@ -89,7 +100,8 @@ def measure(case: Case, count: int, rounds: int) -> dict[str, tuple[float, float
     found: dict[str, tuple[float, float] | str] = {}
     runs: dict[object, Callable[[], object]] = {}
     errors = {}
-    for one, setting in [*((p, 0.0) for p in PREPARED), *((peer(n), s) for n, s in CHOSEN)]:
+    for one, setting in [*((p, 0.0) for p in PREPARED), (STEPPED, 1e-11),
+                         *((peer(n), s) for n, s in CHOSEN)]:
         name = f'{one.name} {one.setting_text(setting)}'.strip()
         if one.missing():
             found[name] = 'absent'
