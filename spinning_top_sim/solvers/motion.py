@@ -91,6 +91,10 @@ class Motion(Columns):
         return np.linalg.norm(self.quaternion, axis=1) - 1.0
 
 
+def _joined(name: str) -> Any:
+    return lazy(lambda motion: motion.join(name))
+
+
 class SteppedMotion(Motion):
     """Samples of steps: of many at once where the motion has them so, else one by one."""
 
@@ -109,7 +113,7 @@ class SteppedMotion(Motion):
                 for name in self.PARTS})]
         self.steps, self.evaluations = stepped.steps, stepped.evaluations
 
-    def _joined(self, name: str) -> Column:
+    def join(self, name: str) -> Column:
         """Return a column of all blocks."""
         columns = [getattr(block, name) for block in self._blocks]
         if not isinstance(columns[0], Pairs):
@@ -119,37 +123,7 @@ class SteppedMotion(Motion):
         joined.imag = np.concatenate([column.imag for column in columns])
         return joined
 
-    @lazy
-    def alpha(self) -> Column:
-        return self._joined('alpha')
-
-    @lazy
-    def beta(self) -> Column:
-        return self._joined('beta')
-
-    @lazy
-    def theta(self) -> Column:
-        return self._joined('theta')
-
-    @lazy
-    def theta_dot(self) -> Column:
-        return self._joined('theta_dot')
-
-    @lazy
-    def phi(self) -> Column:
-        return self._joined('phi')
-
-    @lazy
-    def psi(self) -> Column:
-        return self._joined('psi')
-
-    @lazy
-    def l3(self) -> Column:
-        return self._joined('l3')
-
-    @lazy
-    def transverse_rate(self) -> Column:
-        return self._joined('transverse_rate')
+    alpha, beta, theta, theta_dot, phi, psi, l3, transverse_rate = map(_joined, PARTS)
 
 
 class ExactMotion(Motion):

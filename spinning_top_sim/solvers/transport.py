@@ -135,8 +135,7 @@ class TransportForm:
         """Return what `project` does, to the last bit, of columns."""
         import numpy as np  # noqa: PLC0415 - who reads one state at a time does without
 
-        cos2 = alpha.real * alpha.real + alpha.imag * alpha.imag
-        sin2 = beta.real * beta.real + beta.imag * beta.imag
+        cos2, sin2 = attitude.squared_modulus(alpha), attitude.squared_modulus(beta)
         shrink = 1.0 / np.sqrt(cos2 + sin2)
         alpha, beta = alpha * shrink, beta * shrink
         cos_theta = (cos2 - sin2) * shrink * shrink
