@@ -89,6 +89,7 @@ benchmark:
 	.venv-benchmark/bin/python benchmark/solvers.py
 	.venv-benchmark/bin/python benchmark/offline.py --hour
 	.venv-benchmark/bin/python benchmark/offline_scaling.py --long
+	.venv-benchmark/bin/python benchmark/compression.py
 	.venv-benchmark/bin/python benchmark/startup.py
 	.venv-benchmark/bin/python benchmark/node_cpu.py
 	.venv-benchmark/bin/python benchmark/soak.py

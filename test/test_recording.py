@@ -17,11 +17,14 @@ import sys
 import textwrap
 import threading
 import time
+import tracemalloc
 import zlib
 from pathlib import Path
 
+import lz4.frame  # type: ignore[import-untyped]
 import pytest
 import yaml  # type: ignore[import-untyped]
+import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -35,7 +38,7 @@ from rosbags.interfaces import Qos, QosHistory, QosReliability
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from spinning_top_sim.recording import mcap_file
+from spinning_top_sim.recording import mcap_file, scratch
 from spinning_top_sim.recording.errors import DefinitionNotFoundError, RecordingError
 from spinning_top_sim.recording.mcap_file import CHUNK_BYTES, McapFile
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic
@@ -797,12 +800,9 @@ def test_a_message_that_cannot_be_packed_is_no_exception_for_the_simulation(tmp_
     assert (summary.indexed, summary.lost) == (True, 1)
 
 
-def test_recordings_that_follow_one_another_share_a_compressor(tmp_path, monkeypatch):
+def test_recordings_that_follow_one_another_share_what_makes_chunks(tmp_path, monkeypatch):
     """Two at a time do not; and the bytes are those of a new one."""
-    monkeypatch.setattr(mcap_file, '_spare_compressors', [])
-
-    def compressor(recorder):
-        return recorder._file._compress.__self__
+    monkeypatch.setattr(scratch, '_kept', [])
 
     def chunks(path):
         with path.open('rb') as file:
@@ -813,11 +813,56 @@ def test_recordings_that_follow_one_another_share_a_compressor(tmp_path, monkeyp
     used = []
     for name in ('a', 'b'):
         with McapRecorder.open(tmp_path / name, TOPICS, METADATA, **options) as recorder:
-            used.append(compressor(recorder))
+            used.append(recorder._file._scratch)
             for message in some_messages(300):
                 recorder.write(*message)
             if name == 'b':
                 with McapRecorder.open(tmp_path / 'c', TOPICS, METADATA, **options) as other:
-                    assert compressor(other) is not compressor(recorder)
+                    assert other._file._scratch is not recorder._file._scratch
     assert used[0] is used[1]
     assert chunks(tmp_path / 'a') == chunks(tmp_path / 'b') != []
+
+
+def test_a_file_that_is_closed_twice_leaves_the_next_one_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(scratch, '_kept', [])
+    first = create_file(tmp_path / 'a', TOPICS, METADATA, compression='zstd')
+    first.finish()
+    second = create_file(tmp_path / 'b', TOPICS, METADATA, compression='zstd')
+    with pytest.raises(ValueError, match='closed file'):
+        first.finish()
+    assert scratch._kept == []
+    assert first._scratch is not second._scratch
+    second.finish()
+
+
+def test_chunks_are_made_in_memory_that_is_there(tmp_path):
+    """What is taken beside it is a fraction of a chunk: else a heap grows and shrinks by it."""
+    file = create_file(tmp_path / 'run.mcap', TOPICS, METADATA, compression='zstd')
+    taken = [((0, 1), time_ns, (bytes(340), bytes(500)), 840) for time_ns in range(1000)]
+    file.append_all(taken)
+    tracemalloc.start()
+    try:
+        file.append_all(taken)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    file.finish()
+    assert file.chunk_count == 2
+    assert peak < 0.5 * 1000 * (840 + 2 * 31)
+
+
+@pytest.mark.parametrize('compression', COMPRESSIONS)
+@pytest.mark.parametrize('size', [1, scratch.ROOM_BYTES // 2, scratch.ROOM_BYTES // 2 + 1,
+                                  scratch.ROOM_BYTES, scratch.ROOM_BYTES + 1])
+def test_a_chunk_of_noise_survives_whatever_its_size(compression, size):
+    """It becomes longer by being compressed."""
+    plain = random.Random(size).randbytes(size)
+    some = scratch.Scratch(compression)
+    for _ in range(2):
+        room = some.room(size)
+        room[:] = plain
+        packed = some.compress(room)
+        some.give_back(room)
+        assert {'zstd': zstandard.decompress, 'lz4': lz4.frame.decompress,
+                'none': bytes}[compression](packed) == plain
+    assert len(some._rooms) == (size <= scratch.ROOM_BYTES)

@@ -20,14 +20,13 @@ import struct
 import sys
 import zlib
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import lz4.frame  # type: ignore[import-untyped]
-import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
@@ -54,6 +53,7 @@ from spinning_top_sim.recording.rosbag2 import (
     offered_qos_yaml,
 )
 from spinning_top_sim.recording.schemas import MessageDefinition
+from spinning_top_sim.recording.scratch import Scratch, keep, scratch_for
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -61,6 +61,7 @@ if TYPE_CHECKING:
 CHUNK_BYTES = 1 << 20  # uncompressed; a single larger message still makes a chunk of its own
 
 FEW = 8                 # messages, of a topic: as quick one by one
+JOINED_BYTES = 1 << 16  # of a topic's messages at a time, to be copied from there: it stays warm
 
 # What a chunk holds, by channel: log time, offset in the uncompressed chunk, log time, offset, ..
 # (uint64).
@@ -68,6 +69,9 @@ Entries = Mapping[int, 'array[int]']
 
 MESSAGE = struct.Struct('<BQHIQQ')  # opcode, length, channel, sequence, log and publish time
 MESSAGE_FIELDS = 2 + 4 + 8 + 8      # what `length` counts besides the data
+_MESSAGE_HEAD = [('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
+                 ('log_time', '<u8'), ('publish_time', '<u8')]
+_CHUNK = struct.Struct('<BQQQQI')   # opcode, length, span, size and crc of the plain data
 _INDEX = struct.Struct('<BQHI')      # opcode, length, channel, length of the entries
 
 
@@ -75,39 +79,13 @@ class PlainChunk(NamedTuple):
     """
     Messages that are to become a chunk.
 
-    data: their records;  span: earliest and latest stamp [ns]
+    data: their records, which the file takes back once they are written
+    span: earliest and latest stamp [ns]
     """
 
     data: bytes | memoryview
     entries: Entries
     span: tuple[int, int]
-
-
-# The compressor of a file that was closed, for the next one: it holds 4 MB, which a node that
-# records again and again would give back and take anew.
-_spare_compressors: list[zstandard.ZstdCompressor] = []
-
-
-def _compressor(compression: str) -> Callable[[bytes | memoryview], bytes]:
-    """Return what compresses a chunk."""
-    if compression == 'zstd':
-        with contextlib.suppress(IndexError):
-            return _spare_compressors.pop().compress
-        return zstandard.ZstdCompressor().compress
-    if compression == 'lz4':
-        return lambda plain: bytes(lz4.frame.compress(plain))
-    return bytes
-
-
-def _spare(compress: Callable[[bytes | memoryview], bytes]) -> None:
-    """Keep a compressor that is not used any more."""
-    compressor = getattr(compress, '__self__', None)
-    if isinstance(compressor, zstandard.ZstdCompressor) and not _spare_compressors:
-        _spare_compressors.append(compressor)
-
-
-def _refuse(plain: bytes | memoryview) -> bytes:
-    raise ValueError('a chunk for a file that is closed')
 
 
 class IndexedFile:
@@ -127,7 +105,7 @@ class IndexedFile:
         """
         self._path = path
         self._compression = '' if compression == 'none' else compression
-        self._compress = _compressor(compression)
+        self._scratch = scratch_for(compression)
 
         self.message_counts: dict[int, int] = {}  # messages in the file, by channel
         self.chunk_count = 0
@@ -214,9 +192,11 @@ class IndexedFile:
         """Compress and write a chunk, which holds something."""
         start_ns, end_ns = plain.span
         self.put_chunk(Chunk(
-            compression=self._compression, data=self._compress(plain.data),
+            compression=self._compression, data=self._scratch.compress(plain.data),
             uncompressed_size=len(plain.data), uncompressed_crc=zlib.crc32(plain.data),
             message_start_time=start_ns, message_end_time=end_ns), plain.entries, plain.span)
+        if isinstance(plain.data, memoryview):
+            self._scratch.give_back(plain.data)
 
     def put_chunk(self, chunk: Chunk, entries: Entries, span: tuple[int, int] | None = None,
                   ) -> None:
@@ -225,22 +205,23 @@ class IndexedFile:
 
         span: the earliest and the latest stamp in `entries`, where they are known
         """
-        record = record_bytes(chunk)
+        head = _chunk_head(chunk)
+        chunk_length = len(head) + len(chunk.data)
         indexes = message_indexes(entries)
-        index_start = self.size + len(record)
+        index_start = self.size + chunk_length
         index_offsets = {}
         for channel_id, index in indexes.items():
             index_offsets[channel_id] = index_start
             index_start += len(index)
         chunk_index = ChunkIndex(
-            chunk_start_offset=self.size, chunk_length=len(record),
+            chunk_start_offset=self.size, chunk_length=chunk_length,
             message_index_offsets=index_offsets,
-            message_index_length=index_start - self.size - len(record),
+            message_index_length=index_start - self.size - chunk_length,
             compression=chunk.compression, compressed_size=len(chunk.data),
             uncompressed_size=chunk.uncompressed_size,
             message_start_time=chunk.message_start_time, message_end_time=chunk.message_end_time)
 
-        self._put(b''.join((record, *indexes.values())))
+        self._put_blocks((head, chunk.data, b''.join(indexes.values())))
         self._chunk_indexes += record_bytes(chunk_index)
         self.chunk_count += 1
         if not indexes:
@@ -269,9 +250,10 @@ class IndexedFile:
             self.sync()
             sync_directory(self._path.parent)
         finally:
+            if not self._file.closed:
+                keep(self._scratch)
+                self._scratch = Scratch('none')     # the other belongs to the next file
             self._file.close()
-            _spare(self._compress)
-            self._compress = _refuse
 
     def _tail(self, last_metadata: Metadata | None) -> bytes:
         """Return everything behind the last chunk: the last record, summary, footer."""
@@ -419,7 +401,7 @@ class McapFile(IndexedFile):
             rows: dict[int, list[bytes]] = {}
             # One after the other they are mostly of the same topics.
             for topic_indices, alike in groupby(taken[first:first + count], itemgetter(0)):
-                _, alike_times, alike_messages, _ = zip(*alike, strict=True)
+                _, alike_times, alike_messages, _ = zip(*list(alike), strict=True)
                 for topic_index, data in zip(topic_indices, zip(*alike_messages, strict=True),
                                              strict=True):
                     times.setdefault(topic_index, []).extend(alike_times)
@@ -429,13 +411,14 @@ class McapFile(IndexedFile):
     def _append_by_topic(self, times: dict[int, list[int]], rows: dict[int, list[bytes]]) -> None:
         import numpy  # noqa: PLC0415 - rclpy's messages have imported it
 
-        parts = []
+        parts: list[tuple[int, NDArray[Any], list[bytes]]] = []
+        stamps, newest = numpy.empty(0, numpy.int64), None
         for topic_index, data in rows.items():
-            lengths = set(map(len, data))
-            length = lengths.pop()
-            if len(data) >= FEW and length and not lengths:
-                parts.append((topic_index, numpy.array(times[topic_index], numpy.int64),
-                              numpy.frombuffer(b''.join(data), 'u1').reshape(-1, length)))
+            if len(data) >= FEW and data[0] and len(set(map(len, data))) == 1:
+                if times[topic_index] != newest:        # those of many topics are the same
+                    newest = times[topic_index]
+                    stamps = numpy.array(newest, numpy.int64)
+                parts.append((topic_index, stamps, data))
                 continue
             for time_ns, one in zip(times[topic_index], data, strict=True):
                 if self.append(topic_index, time_ns, one):
@@ -443,48 +426,59 @@ class McapFile(IndexedFile):
         if parts:
             rest = self._chunk_parts, self._chunk_entries
             self._clear_chunk()
-            self.put_plain_chunk(_with_rest(self.chunk_of_rows(parts), *rest))
+            self.put_plain_chunk(self.chunk_of_rows(parts, *rest))
         else:
             self.write_chunk()
 
-    def chunk_of_rows(self, parts: Sequence[tuple[int, NDArray[Any], NDArray[Any]]]) -> PlainChunk:
+    def chunk_of_rows(
+        self, parts: Sequence[tuple[int, NDArray[Any], NDArray[Any] | list[bytes]]],
+        rest: Sequence[bytes] = (), rest_entries: Entries = MappingProxyType({}),
+    ) -> PlainChunk:
         """
         Return a chunk of messages of equal length a topic, made in a few numpy calls.
 
-        parts: (topic index, log times (n,) int64 [ns], rows of CDR bytes (n, size)
-            uint8), each topic at most once and not empty.  The messages of a chunk need no order
-            of time: its message indexes have it (MCAP specification, "Message Index").
+        parts: (topic index, log times (n,) int64 [ns], CDR of each message, or rows of these
+            (n, size) uint8), each topic at most once and not empty.  The messages of a chunk need
+            no order of time: its message indexes have it (MCAP specification, "Message Index").
+        rest: records of other topics, to stand behind these;  rest_entries: theirs, by themselves
         """
         import numpy  # noqa: PLC0415 - recovery needs none
 
-        head = numpy.dtype([
-            ('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
-            ('log_time', '<u8'), ('publish_time', '<u8')])
-        data = numpy.empty(sum(len(times) * (head.itemsize + rows.shape[1])
-                               for _, times, rows in parts), 'u1')
+        sizes = [len(rows[0]) for _, _, rows in parts]
+        rest_at = sum(len(times) * (MESSAGE.size + size)
+                      for (_, times, _), size in zip(parts, sizes, strict=True))
+        room = self._scratch.room(rest_at + sum(map(len, rest)))
+        data = numpy.frombuffer(room, 'u1')
+        head = numpy.dtype(_MESSAGE_HEAD)
         at = 0
         entries = {}
-        for topic_index, times, rows in parts:
-            count, size = rows.shape
-            length = head.itemsize + size
+        for (topic_index, times, rows), size in zip(parts, sizes, strict=True):
+            count, length = len(times), MESSAGE.size + size
             records = data[at:at + count * length].reshape(count, length)
-            heads = records[:, :head.itemsize].view(head)[:, 0]
+            heads = records[:, :MESSAGE.size].view(head)[:, 0]
             heads['opcode'] = Opcode.MESSAGE
             heads['length'] = MESSAGE_FIELDS + size
             heads['channel'] = topic_index + 1
             sequence = self._sequences[topic_index]
             heads['sequence'] = numpy.arange(sequence, sequence + count) & 0xFFFFFFFF
             heads['log_time'] = heads['publish_time'] = times
-            records[:, head.itemsize:] = rows
+            _copy_rows(rows, records[:, MESSAGE.size:])
             self._sequences[topic_index] = sequence + count
             index = numpy.empty((count, 2), 'u8')
             index[:, 0] = times
             index[:, 1] = at + length * numpy.arange(count)
             entries[topic_index + 1] = array('Q', index.tobytes())
             at += count * length
-        span = (min(int(times.min()) for _, times, _ in parts),
-                max(int(times.max()) for _, times, _ in parts))
-        return PlainChunk(data.data, entries, span)
+        spans = [(int(times.min()), int(times.max())) for _, times, _ in parts]
+        if rest:
+            room[rest_at:] = b''.join(rest)
+            for channel_id, numbers in rest_entries.items():
+                entries[channel_id] = array('Q', numbers)
+                for i in range(1, len(numbers), 2):
+                    entries[channel_id][i] += rest_at
+            spans.append(time_span(rest_entries))
+        return PlainChunk(room, entries, (min(start for start, _ in spans),
+                                          max(end for _, end in spans)))
 
     def finish(self) -> None:
         """Write the summary of the chunks that are in the file, bring it to disk and close it."""
@@ -509,17 +503,27 @@ def _joined(records: Iterable[McapRecord]) -> bytes:
     return b''.join(map(record_bytes, records))
 
 
-def _with_rest(chunk: PlainChunk, records: list[bytes], entries: Entries) -> PlainChunk:
-    """Return a chunk and, behind it, records of other topics with their entries."""
-    if not records:
-        return chunk
-    size = len(chunk.data)
-    for numbers in entries.values():
-        for i in range(1, len(numbers), 2):
-            numbers[i] += size
-    spans = chunk.span, time_span(entries)
-    return PlainChunk(b''.join((chunk.data, *records)), {**chunk.entries, **entries},
-                      (min(start for start, _ in spans), max(end for _, end in spans)))
+def _chunk_head(chunk: Chunk) -> bytes:
+    """Return what stands before the data in the record of a chunk."""
+    compression = chunk.compression.encode()
+    tail = struct.pack(f'<I{len(compression)}sQ', len(compression), compression, len(chunk.data))
+    return _CHUNK.pack(
+        Opcode.CHUNK, _CHUNK.size - 9 + len(tail) + len(chunk.data), chunk.message_start_time,
+        chunk.message_end_time, chunk.uncompressed_size, chunk.uncompressed_crc) + tail
+
+
+def _copy_rows(rows: NDArray[Any] | list[bytes], to: NDArray[Any]) -> None:
+    """Copy messages of equal length into the rows of an array."""
+    import numpy  # noqa: PLC0415
+
+    if not isinstance(rows, list):
+        to[:] = rows
+        return
+    size = to.shape[1]
+    step = max(1, JOINED_BYTES // size)
+    for first in range(0, len(rows), step):
+        joined = b''.join(rows[first:first + step])
+        to[first:first + step] = numpy.frombuffer(joined, 'u1').reshape(-1, size)
 
 
 def message_indexes(entries: Entries) -> dict[int, bytes]:

@@ -1,0 +1,122 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""
+How small the chunks of a live log become, and what that costs: zstd's levels beside lz4.
+
+    python benchmark/compression.py
+    python benchmark/compression.py --no-report
+
+Chunks are those of a node that records three streams (pose, joint_states, imu/data_raw, whose
+gyroscope is noisy) with the default max_loss: four a second.  Each compressor gets every chunk
+cold, with the processor's caches full of something else, as it finds them in a node after a
+quarter of a second; and once more at once, warm.  All take turns.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import lz4.frame
+import numpy
+import zstandard
+from processes import median
+from report import preamble, table, write_section
+
+from spinning_top_sim.recording.rosbag2 import RecordedTopic
+from spinning_top_sim.recording.scratch import ZSTD_LEVEL
+from spinning_top_sim.recording.writer import create_file
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.pipeline import Simulation
+
+STREAMS = ('pose', 'joint_states', 'imu')
+TOPICS = ('pose', 'joint_states', 'imu/data_raw')
+RATES = (200, 1000, 2000)
+LEVELS = (-3, -1, 1, 2, 3)
+CHUNK_NS = 250_000_000
+
+
+def chunks_at(rate: float, count: int) -> list[bytes]:
+    """Return the plain chunks of a recording at this rate [Hz]."""
+    simulation = Simulation(parameters.checked({
+        'imu.gyroscope_noise_density': 1e-3, **{f'{name}.rate': rate for name in STREAMS}}))
+    streams = [stream for stream in simulation.streams if stream.topic in TOPICS]
+    found: list[bytes] = []
+    with tempfile.TemporaryDirectory() as folder:
+        file = create_file(Path(folder) / 'run.mcap', [
+            RecordedTopic(f'/{stream.topic}', stream.type_name) for stream in streams], {},
+            compression='none')
+        put = file.put_plain_chunk
+        file.put_plain_chunk = lambda plain: (found.append(bytes(plain.data)), put(plain))
+        taken: list = []
+        simulation.log_to(lambda *messages: taken.append(messages), streams)
+        for k in range(1, count + 1):
+            simulation.advance(k * CHUNK_NS)
+            file.append_all(taken)
+            taken.clear()
+        file.finish()
+    return found
+
+
+def compressors() -> dict[str, Callable[[bytes], bytes]]:
+    return {**{f'zstd {level}': zstandard.ZstdCompressor(level=level).compress
+               for level in LEVELS}, 'lz4': lz4.frame.compress}
+
+
+def microseconds(compress: Callable[[bytes], bytes], chunk: bytes) -> float:
+    """Return the processor time of this thread."""
+    start = time.thread_time_ns()
+    compress(chunk)
+    return (time.thread_time_ns() - start) / 1e3
+
+
+def memory_mb(compress: Callable[[bytes], bytes]) -> float:
+    """Return what a compressor of zstd holds."""
+    return compress.__self__.memory_size() / 1e6
+
+
+def rows_at(rate: float, count: int) -> list[tuple[str, ...]]:
+    chunks = chunks_at(rate, count)
+    cold: dict[str, list[float]] = {name: [] for name in compressors()}
+    warm: dict[str, list[float]] = {name: [] for name in cold}
+    used = compressors()
+    elsewhere = numpy.zeros(8_000_000)
+    for chunk in chunks:
+        for name, compress in used.items():
+            elsewhere += 1.0
+            cold[name].append(microseconds(compress, chunk))
+            warm[name].append(microseconds(compress, chunk))
+    plain = sum(map(len, chunks))
+    size = {name: sum(len(compress(chunk)) for chunk in chunks) for name, compress in used.items()}
+    standard = f'zstd {LEVELS[-1]}'
+    return [(f'{rate:g}', f'{plain / len(chunks) / 1e3:.0f}',
+             name + (' (ours)' if name == f'zstd {ZSTD_LEVEL}' else ''),
+             f'{size[name] / plain:.3f}', f'{size[name] / size[standard]:.2f}',
+             f'{median(cold[name]):.0f}', f'{median(warm[name]):.0f}',
+             f'{memory_mb(compress):.2f}' if name.startswith('zstd') else '–')
+            for name, compress in used.items()]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--chunks', type=int, default=60, help='at each rate')
+    parser.add_argument('--no-report', action='store_true', help='print only')
+    arguments = parser.parse_args()
+    head = preamble('Compression of the log', ('numpy', 'zstandard', 'lz4'))
+    rows = [row for rate in RATES for row in rows_at(rate, arguments.chunks)]
+    text = table(('Hz', 'chunk [kB]', 'compressor', 'of the plain size',
+                  f'of that of zstd {LEVELS[-1]}', 'cold [us a chunk]', 'warm [us a chunk]',
+                  'memory [MB]'), rows)
+    print(text)
+    if not arguments.no_report:
+        write_section('compression', '\n'.join((
+            head, __doc__.strip().split('\n\n')[-1] + '\n', text)))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
