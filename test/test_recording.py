@@ -835,6 +835,23 @@ def test_a_file_that_is_closed_twice_leaves_the_next_one_alone(tmp_path, monkeyp
     second.finish()
 
 
+def test_processes_that_fork_make_their_chunks_apart():
+    script = textwrap.dedent("""
+        import os
+        from spinning_top_sim.recording import scratch
+        room = scratch.Scratch('zstd').room(3)
+        room[:] = b'one'
+        if os.fork() == 0:
+            room[:] = b'two'
+            os._exit(0)
+        os.wait()
+        print(bytes(room))
+        """)
+    run = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True,
+                         timeout=PATIENCE_S, check=True)
+    assert run.stdout == "b'one'\n"
+
+
 def test_chunks_are_made_in_memory_that_is_there(tmp_path):
     """What is taken beside it is a fraction of a chunk: else a heap grows and shrinks by it."""
     file = create_file(tmp_path / 'run.mcap', TOPICS, METADATA, compression='zstd')

@@ -71,7 +71,10 @@ def _lz4(plain: bytes | memoryview) -> bytes:
 
 
 def _room() -> memoryview:
-    return memoryview(mmap.mmap(-1, ROOM_BYTES))
+    # Private: a process that forks would have it together with its children.
+    private = ({'flags': mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS}
+               if hasattr(mmap, 'MAP_PRIVATE') else {})
+    return memoryview(mmap.mmap(-1, ROOM_BYTES, **private))
 
 
 _kept: list[Scratch] = []
