@@ -13,7 +13,7 @@ MAKEFLAGS += --no-builtin-rules
 .SUFFIXES:
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help run test stress benchmark docs dependencies lint build clean check-scene FORCE
+.PHONY: help run test stress benchmark performance docs dependencies lint build clean check-scene FORCE
 
 # DDS stays on this machine: by default it would ask the whole network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
@@ -44,7 +44,9 @@ help:
 	@echo 'make test    run the tests;  TESTS=... picks some, ARGS=... is for pytest'
 	@echo 'make stress  200 recording nodes killed (KILLS=...), then 100 000 random tops (STRESS=...)'
 	@echo '             through both solvers: an hour'
-	@echo 'make benchmark  accuracy, stability and cost beside other programs, and the noise of the'
+	@echo 'make performance  docs/performance.md: node, start, a long run, solvers, simulate (an hour'
+	@echo '             and a half, in an environment of its own, .venv-benchmark)'
+	@echo 'make benchmark  that, and accuracy, stability and cost beside other programs, and the noise of the'
 	@echo '             IMU, into docs/ (three hours, in an environment of its own, .venv-benchmark)'
 	@echo 'make docs    write the interface page, the plain URDF and the pictures anew'
 	@echo 'make lint    ruff and mypy'
@@ -79,20 +81,22 @@ stress: dependencies
 	'$(VENV)/bin/python' test/stress.py $(STRESS)
 
 # Peers need hundreds of megabytes that the package does not: they have their own environment.
-benchmark: export OMP_NUM_THREADS ?= 1
-benchmark: export OPENBLAS_NUM_THREADS ?= 1
-benchmark:
+benchmark performance: export OMP_NUM_THREADS ?= 1
+benchmark performance: export OPENBLAS_NUM_THREADS ?= 1
+performance:
 	@$(MAKE) --no-print-directory VENV=.venv-benchmark .venv-benchmark/.package \
 	    .venv-benchmark/.peers
-	.venv-benchmark/bin/python benchmark/heavy_top.py
-	.venv-benchmark/bin/python benchmark/exact_cost.py
+	.venv-benchmark/bin/python benchmark/node_cpu.py
+	.venv-benchmark/bin/python benchmark/startup.py
 	.venv-benchmark/bin/python benchmark/solvers.py
 	.venv-benchmark/bin/python benchmark/offline.py --hour
 	.venv-benchmark/bin/python benchmark/offline_scaling.py --long
 	.venv-benchmark/bin/python benchmark/compression.py
-	.venv-benchmark/bin/python benchmark/startup.py
-	.venv-benchmark/bin/python benchmark/node_cpu.py
 	.venv-benchmark/bin/python benchmark/soak.py
+
+benchmark: performance
+	.venv-benchmark/bin/python benchmark/heavy_top.py
+	.venv-benchmark/bin/python benchmark/exact_cost.py
 	.venv-benchmark/bin/python benchmark/gauge.py
 	.venv-benchmark/bin/python benchmark/stability.py
 	.venv-benchmark/bin/python benchmark/work_precision.py

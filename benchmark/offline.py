@@ -14,18 +14,17 @@ All take turns in one process; what is reported are medians, and ratios within a
 from __future__ import annotations
 
 import argparse
-import platform
 import resource
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from importlib.metadata import version
 from pathlib import Path
 
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
+from report import preamble, table, write_section
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_typestore
@@ -88,8 +87,8 @@ def timed(function, *arguments) -> float:
     return time.perf_counter() - start
 
 
-def rounds(folder: Path, seconds: float, count: int) -> None:
-    """Let all take turns; print medians and ratios."""
+def rounds(folder: Path, seconds: float, count: int) -> str:
+    """Let all take turns; return messages a second, and ratios."""
     first = folder / 'first.mcap'
     run_ours(first, seconds)
     messages = ready_made(first)
@@ -99,46 +98,54 @@ def rounds(folder: Path, seconds: float, count: int) -> None:
         times['mcap add_message'].append(
             timed(write_with_mcap, folder / f'mcap{turn}.mcap', messages))
         times['rosbags'].append(timed(write_with_rosbags, folder / f'bag{turn}', messages))
-    print(f'{len(messages)} messages a run, {count} rounds in turns')
-    print(f'{"":18}{"messages/s":>12}{"ratio to ours":>16}')
+    rows = []
     for name, taken in times.items():
-        ratio = statistics.median(other / ours for other, ours in
-                                  zip(taken, times['simulate'], strict=True))
-        print(f'{name:18}{len(messages) / statistics.median(taken):12,.0f}{ratio:16.2f}')
+        ratios = [other / ours for other, ours in zip(taken, times['simulate'], strict=True)]
+        rows.append((name, f'{len(messages) / statistics.median(taken):,.0f}',
+                     f'{statistics.median(ratios):.2f}'))
+    return (f'{len(messages)} messages a run, {count} rounds.\n\n'
+            + table(('', 'messages/s', 'time, in that of ours'), rows))
 
 
-def one_hour(folder: Path, seconds: float) -> None:
-    """Run it in a process of its own; print rate and peak memory."""
+def in_a_process(folder: Path, seconds: float) -> tuple[str, ...]:
+    """Run it in a process of its own; return what it took, with its start and its exit."""
+    path = folder / 'long.mcap'
     start = time.perf_counter()
-    subprocess.run([sys.executable, '-m', 'spinning_top_sim.tools.simulate', '-o',
-                    str(folder / 'hour.mcap'), '--duration', str(seconds), '--quiet',
-                    *PARAMETERS], check=True, timeout=3600)
+    subprocess.run([sys.executable, '-m', 'spinning_top_sim.tools.simulate', '-o', str(path),
+                    '--duration', str(seconds), '--quiet', *PARAMETERS], check=True, timeout=3600)
     taken = time.perf_counter() - start
-    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e3
-    with open(folder / 'hour.mcap', 'rb') as file:
-        statistics_record = make_reader(file).get_summary().statistics
-    count = statistics_record.message_count
-    size = (folder / 'hour.mcap').stat().st_size
-    print(f'{seconds:g} s simulated: {count} messages in {taken:.1f} s from start to exit: '
-          f'{count / taken:,.0f} messages/s, {size / 1e6:.0f} MB, peak memory {peak:.0f} MB')
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e3     # of the largest yet
+    with path.open('rb') as file:
+        count = make_reader(file).get_summary().statistics.message_count
+    size = path.stat().st_size
+    path.unlink()
+    return (f'{seconds / 60.0:g}', f'{count}', f'{taken:.1f}', f'{count / taken:,.0f}',
+            f'{size / 1e6:.0f}', f'{peak:.0f}')
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--seconds', type=float, default=60.0, help='simulated, a round')
     parser.add_argument('--rounds', type=int, default=5)
     parser.add_argument('--hour', action='store_true', help='also an hour, and its memory')
+    parser.add_argument('--no-report', action='store_true', help='print only')
     arguments = parser.parse_args()
-    print(f'{platform.machine()}, Python {platform.python_version()}, numpy '
-          f'{version("numpy")}, mcap {version("mcap")}, rosbags {version("rosbags")}')
+    head = preamble('`simulate` beside writers that only write',
+                    ('numpy', 'mcap', 'zstandard', 'rosbags'))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        rounds(folder, arguments.seconds, arguments.rounds)
+        text = rounds(folder, arguments.seconds, arguments.rounds)
         if arguments.hour:
-            for seconds in (60.0, 600.0, 3600.0):
-                one_hour(folder, seconds)
-                (folder / 'hour.mcap').unlink()
+            text += '\n' + table(
+                ('simulated [min]', 'messages', 'time from start to exit [s]', 'messages/s',
+                 'file [MB]', 'peak memory [MB]'),
+                [in_a_process(folder, seconds) for seconds in (60.0, 600.0, 3600.0)])
+    print(text)
+    if not arguments.no_report:
+        write_section('offline', '\n'.join((
+            head, __doc__.strip().split('\n\n')[-1] + '\n', text)))
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(main())

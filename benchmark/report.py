@@ -57,7 +57,7 @@ def write(name: str, text: str) -> None:
 
 
 # What docs/performance.md holds, in this order; each benchmark writes its own section.
-SECTIONS = ('node_cpu', 'startup', 'solvers', 'soak', 'offline_scaling', 'compression')
+SECTIONS = ('node_cpu', 'startup', 'solvers', 'offline', 'offline_scaling', 'compression', 'soak')
 
 
 def write_section(name: str, page: str) -> None:

@@ -185,8 +185,8 @@ def write_log(path: Path, values: Mapping[str, Any], duration_ns: int,
         nonlocal taken
         if taken:
             behind.wait()
-            behind.start(taken)
-            taken = []
+            batch, taken = taken, []        # before: interrupted, a log is shorter, not doubled
+            behind.start(batch)
 
     def advance(target_ns: int) -> None:
         if not columns:
