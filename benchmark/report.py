@@ -72,9 +72,16 @@ def write_section(name: str, page: str) -> None:
 
 
 def _commit() -> str:
-    run = subprocess.run(['git', 'describe', '--always', '--dirty'], cwd=ROOT,
-                         capture_output=True, text=True, check=False)
-    return run.stdout.strip() or 'unknown'
+    """Return the commit, and whether anything but the pages that benchmarks write has changed."""
+    commit = _git('describe', '--always')
+    changed = _git('status', '--porcelain', '--untracked-files=no', '--', '.', ':!docs')
+    return (commit + ('-dirty' if changed else '')) or 'unknown'
+
+
+def _git(*arguments: str) -> str:
+    run = subprocess.run(['git', *arguments], cwd=ROOT, capture_output=True, text=True,
+                         check=False)
+    return run.stdout.strip()
 
 
 def _processor() -> str:
