@@ -55,7 +55,8 @@ def euler(start, l3, lz, span):
         bend = sine / LAMBDA1 * (LAMBDA1 * phi_dot * phi_dot * cosine - l3 * phi_dot + TORQUE)
         return np.array([phi_dot, theta_dot, l3 / LAMBDA3 - phi_dot * cosine, bend])
 
-    steps = max(1, math.ceil(span / 1e-4))
+    fastest = max(abs(rates(start)[0]), 100.0)
+    steps = min(1000, max(1, math.ceil(span * fastest / 0.01)))
     h, y = span / steps, start
     for _ in range(steps):
         k1 = rates(y)
@@ -102,10 +103,15 @@ def l3_of(topic):
 
 
 @pytest.mark.parametrize(('command', 'l3', 'lz'), [
-    (by_topic_command, 1.25, 0.75), (by_parameters, 2.0, -0.5), (by_parameters, 1, 1),
+    (by_topic_command, 1.25, 0.75), (by_parameters, 2.0, -0.5), (by_parameters, 1, 0),
     (by_topic_command, 1.6, 1.3856)])
 def test_a_command_sets_the_momenta_and_nothing_jumps(peer, motion, command, l3, lz):
-    """An impulsive torque: attitude and nutation rate go on, L3 and Lz are the commanded ones."""
+    """
+    An impulsive torque: attitude and nutation rate go on, L3 and Lz are the commanded ones.
+
+    No motion here has L3 = +-Lz, which leads over a pole: next to it, the angles of the one that
+    follows turn too fast to be told from two samples.
+    """
     topics = motion.topics
     command(peer, motion.node, l3, lz)
     wait_for('the new momentum', lambda: abs(l3_of(topics['ground_truth/odom'])[-1] - l3) < 1e-9)
