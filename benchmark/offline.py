@@ -14,14 +14,13 @@ All take turns in one process; what is reported are medians, and ratios within a
 from __future__ import annotations
 
 import argparse
-import resource
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
+import processes
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from report import preamble, table, write_section
@@ -110,17 +109,14 @@ def rounds(folder: Path, seconds: float, count: int) -> str:
 def in_a_process(folder: Path, seconds: float) -> tuple[str, ...]:
     """Run it in a process of its own; return what it took, with its start and its exit."""
     path = folder / 'long.mcap'
-    start = time.perf_counter()
-    subprocess.run([sys.executable, '-m', 'spinning_top_sim.tools.simulate', '-o', str(path),
-                    '--duration', str(seconds), '--quiet', *PARAMETERS], check=True, timeout=3600)
-    taken = time.perf_counter() - start
-    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e3     # of the largest yet
+    taken, peak = processes.simulate(
+        ('-o', str(path), '--duration', str(seconds), *PARAMETERS))
     with path.open('rb') as file:
         count = make_reader(file).get_summary().statistics.message_count
     size = path.stat().st_size
     path.unlink()
     return (f'{seconds / 60.0:g}', f'{count}', f'{taken:.1f}', f'{count / taken:,.0f}',
-            f'{size / 1e6:.0f}', f'{peak:.0f}')
+            f'{size / 1e6:.0f}', f'{peak / 1e6:.0f}')
 
 
 def main() -> None:

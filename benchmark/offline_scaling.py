@@ -12,15 +12,12 @@ Each run is a process of its own, from start to exit, with streams at 100 Hz int
 from __future__ import annotations
 
 import argparse
-import os
-import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 from mcap.reader import make_reader
-from processes import ROOT, load
+from processes import load, simulate
 from report import preamble, table, write_section
 
 STREAMS = ('pose', 'joint_states', 'imu', 'ground_truth_imu', 'ground_truth_odom', 'invariants')
@@ -34,21 +31,13 @@ def run(method: str, streams: tuple[str, ...], seconds: float, path: Path) -> li
                   **{f'{name}.enabled': str(name in streams).lower() for name in STREAMS},
                   **{f'{name}.rate': RATE for name in streams}}
     arguments = [item for name, value in parameters.items() for item in ('-p', f'{name}:={value}')]
-    begin = time.monotonic()
-    process = subprocess.Popen(
-        [sys.executable, '-m', 'spinning_top_sim.tools.simulate', '-o', str(path), '--duration',
-         str(seconds), '--quiet', *arguments], env={**os.environ, 'PYTHONPATH': str(ROOT)})
-    _, status, usage = os.wait4(process.pid, 0)
-    taken = time.monotonic() - begin
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise SystemExit(f'simulate ended with exit code {process.returncode}')
+    taken, peak = simulate(('-o', str(path), '--duration', str(seconds), *arguments))
     with path.open('rb') as file:
         summary = make_reader(file).get_summary()
     assert summary and summary.statistics
     count = summary.statistics.message_count
     path.unlink()
-    return [f'{count}', f'{taken:.2f}', f'{count / taken:,.0f}', f'{usage.ru_maxrss / 1e3:.0f}']
+    return [f'{count}', f'{taken:.2f}', f'{count / taken:,.0f}', f'{peak / 1e6:.0f}']
 
 
 def main() -> None:

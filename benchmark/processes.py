@@ -105,6 +105,33 @@ class Process:
             return self._process.wait()
 
 
+# Runs `simulate` and says what it has held at most.  The rusage of a child counts what its parent
+# held when it was started, too.
+_SIMULATE = """
+import sys
+from spinning_top_sim.tools.simulate import main
+code = main(sys.argv[1:])
+print(next(line for line in open('/proc/self/status') if line.startswith('VmHWM:')).split()[1])
+sys.exit(code)
+"""
+
+
+def simulate(arguments: Sequence[str]) -> tuple[float, int]:
+    """
+    Run `simulate` in a process of its own.
+
+    Return its time from start to exit [s] and its peak memory [bytes].  Raises SystemExit.
+    """
+    begin = time.monotonic()
+    run = subprocess.run(
+        [sys.executable, '-c', _SIMULATE, *arguments, '--quiet'], stdout=subprocess.PIPE,
+        text=True, env={**os.environ, 'PYTHONPATH': str(ROOT)}, timeout=3600.0, check=False)
+    taken = time.monotonic() - begin
+    if run.returncode:
+        raise SystemExit(f'simulate ended with exit code {run.returncode}')
+    return taken, 1024 * int(run.stdout.split()[-1])
+
+
 def load() -> float:
     """Return how many processes have wanted to run in the last minute, of late."""
     return os.getloadavg()[0]
