@@ -106,6 +106,8 @@ benchmark: performance
 $(VENV)/.peers: benchmark/requirements.txt $(VENV)/.deps-test
 	@echo 'Installing into $(VENV) what the benchmarks compare with'
 	@$(PIP) -r benchmark/requirements.txt
+	@$(PIP) 'numbalsoda>=0.3.4,<0.4' || \
+	    echo 'numbalsoda is not compared: its source needs CMake and a Fortran compiler'
 	@touch '$@'
 
 docs: $(VENV)/.deps-plot $(VENV)/.deps-test $(VENV)/.package

@@ -382,6 +382,42 @@ class _Diffrax(_Quadratic):
         return np.asarray(states)
 
 
+class _Numbalsoda(_Quadratic):
+    """A method of numbalsoda, its right-hand side compiled by numba."""
+
+    def __init__(self, case: Case, setting: float, method: str) -> None:
+        super().__init__(case, setting)
+        import numbalsoda
+        self._solve, self._rates = getattr(numbalsoda, method), _compiled_rates()
+        self._constants = np.array((0.5 / case.top.lambda1, case.top.gravity_torque,
+                                    case.start.lz))
+
+    def compile(self, ns):
+        self.states(ns[:2])
+
+    def states(self, ns):
+        states, succeeded = self._solve(
+            self._rates, np.array(quadratic_start(self.case)), ns / 1e9, data=self._constants,
+            rtol=self.setting, atol=0.1 * self.setting)
+        if not succeeded:
+            raise FailedError('not successful')
+        return states
+
+
+@functools.cache
+def _compiled_rates() -> int:
+    """Return the address of `quadratic_rates` as numbalsoda calls it."""
+    import numba
+    from numbalsoda import lsoda_sig
+    rates = numba.njit(quadratic_rates)
+
+    @numba.cfunc(lsoda_sig)
+    def called(t, y, y_dot, constants):
+        y_dot[0], y_dot[1], y_dot[2], y_dot[3], y_dot[4], y_dot[5] = rates(
+            (y[0], y[1], y[2], y[3], y[4], y[5]), constants[0], constants[1], constants[2])
+    return called.address
+
+
 # ---------------------------------------------------------------------------------------- MuJoCo
 
 class _MuJoCo(Runner):
@@ -439,6 +475,10 @@ def _scipy(method: str) -> Callable[[Case, float], Runner]:
     return lambda case, setting: _SciPy(case, setting, method)
 
 
+def _numbalsoda(method: str) -> Callable[[Case, float], Runner]:
+    return lambda case, setting: _Numbalsoda(case, setting, method)
+
+
 def _mujoco(integrator: str) -> Callable[[Case, float], Runner]:
     return lambda case, setting: _MuJoCo(case, setting, integrator)
 
@@ -457,6 +497,10 @@ PEERS = (
     Peer('heyoka quadratic', 'heyoka', _HeyokaQuadratic, TAYLOR, unit='steps', needs='heyoka'),
     Peer('diffrax Dopri8 quadratic', 'diffrax', _Diffrax, (1e-6, 1e-9, 1e-12), unit='steps',
          needs='diffrax'),
+    Peer('numbalsoda LSODA quadratic', 'numbalsoda', _numbalsoda('lsoda'), (1e-6, 1e-9, 1e-12),
+         unit='', needs='numbalsoda'),
+    Peer('numbalsoda DOP853 quadratic', 'numbalsoda', _numbalsoda('dop853'),
+         (1e-6, 1e-9, 1e-12), unit='', needs='numbalsoda'),
     Peer('MuJoCo RK4', 'MuJoCo', _mujoco('RK4'), (512.0, 2048.0, 8192.0), unit='steps',
          knob='rate', needs='mujoco'),
     Peer('MuJoCo implicit', 'MuJoCo', _mujoco('implicit'), (512.0, 2048.0, 8192.0),

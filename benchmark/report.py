@@ -15,7 +15,7 @@ from pathlib import Path
 
 from cases import ROOT
 
-PACKAGES = ('numpy', 'scipy', 'heyoka', 'mujoco', 'jax', 'diffrax', 'matplotlib')
+PACKAGES = ('numpy', 'scipy', 'heyoka', 'mujoco', 'jax', 'diffrax', 'numbalsoda', 'matplotlib')
 
 
 def preamble(title: str, packages: Sequence[str] = PACKAGES) -> str:

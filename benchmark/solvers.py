@@ -32,6 +32,7 @@ COUNTS = (2, 100, 100_000)
 CHOSEN = (('exact, state by state', 0.0), ('exact, array', 0.0), ('exact, grid', 0.0),
           ('rk45 transport', 1e-9), ('rk45 transport', 1e-11), ('SciPy RK45', 1e-9),
           ('SciPy DOP853', 1e-12), ('heyoka quadratic', 1e-12), ('heyoka quadratic', 2.0 ** -52),
+          ('numbalsoda LSODA quadratic', 1e-12), ('numbalsoda DOP853 quadratic', 1e-12),
           ('diffrax Dopri8 quadratic', 1e-12), ('MuJoCo RK4', 2048.0))
 LONGEST_S = 20.0
 
@@ -85,11 +86,6 @@ def absent() -> list[str]:
         reason = one.missing()
         if reason:
             found[one.family] = reason
-    try:
-        __import__('numbalsoda')
-        found['numbalsoda'] = 'is installed, but nothing here drives it'
-    except Exception as error:      # whatever a foreign package raises is the reason
-        found['numbalsoda'] = f'{type(error).__name__}: {error}'
     return [f'- {name}: {reason}' for name, reason in found.items()]
 
 
