@@ -13,7 +13,8 @@ MAKEFLAGS += --no-builtin-rules
 .SUFFIXES:
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help run test stress benchmark performance docs dependencies lint build clean check-scene FORCE
+.PHONY: help run test stress performance benchmark docs dependencies lint build clean check-scene \
+    FORCE
 
 # DDS stays on this machine: by default it would ask the whole network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
@@ -46,8 +47,8 @@ help:
 	@echo '             through both solvers: an hour'
 	@echo 'make performance  docs/performance.md: node, start, a long run, solvers, simulate (an hour'
 	@echo '             and a half, in an environment of its own, .venv-benchmark)'
-	@echo 'make benchmark  that, and accuracy, stability and cost beside other programs, and the noise of the'
-	@echo '             IMU, into docs/ (three hours, in an environment of its own, .venv-benchmark)'
+	@echo 'make benchmark  that, and accuracy, stability and cost beside other programs, and the'
+	@echo '             noise of the IMU, into docs/ (three hours)'
 	@echo 'make docs    write the interface page, the plain URDF and the pictures anew'
 	@echo 'make lint    ruff and mypy'
 	@echo 'make build   build with colcon in a temporary workspace, run and test what was installed'
@@ -103,10 +104,10 @@ benchmark: performance
 	.venv-benchmark/bin/python benchmark/allan.py
 	.venv-benchmark/bin/python benchmark/attitude_filter.py
 
-$(VENV)/.peers: benchmark/requirements.txt $(VENV)/.deps-test
+$(VENV)/.peers: $(wildcard benchmark/requirements*.txt) $(VENV)/.deps-test
 	@echo 'Installing into $(VENV) what the benchmarks compare with'
 	@$(PIP) -r benchmark/requirements.txt
-	@$(PIP) 'numbalsoda>=0.3.4,<0.4' || \
+	@$(PIP) -r benchmark/requirements-built.txt || \
 	    echo 'numbalsoda is not compared: its source needs CMake and a Fortran compiler'
 	@touch '$@'
 

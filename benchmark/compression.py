@@ -24,6 +24,8 @@ from pathlib import Path
 import lz4.frame
 import numpy
 import zstandard
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader
 from processes import median
 from report import preamble, table, write_section
 
@@ -45,13 +47,11 @@ def chunks_at(rate: float, count: int) -> list[bytes]:
     simulation = Simulation(parameters.checked({
         'imu.gyroscope_noise_density': 1e-3, **{f'{name}.rate': rate for name in STREAMS}}))
     streams = [stream for stream in simulation.streams if stream.topic in TOPICS]
-    found: list[bytes] = []
     with tempfile.TemporaryDirectory() as folder:
-        file = create_file(Path(folder) / 'run.mcap', [
+        path = Path(folder) / 'run.mcap'
+        file = create_file(path, [
             RecordedTopic(f'/{stream.topic}', stream.type_name) for stream in streams], {},
             compression='none')
-        put = file.put_plain_chunk
-        file.put_plain_chunk = lambda plain: (found.append(bytes(plain.data)), put(plain))
         taken: list = []
         simulation.log_to(lambda *messages: taken.append(messages), streams)
         for k in range(1, count + 1):
@@ -59,7 +59,9 @@ def chunks_at(rate: float, count: int) -> list[bytes]:
             file.append_all(taken)
             taken.clear()
         file.finish()
-    return found
+        with path.open('rb') as log:
+            return [record.data for record in StreamReader(log, emit_chunks=True).records
+                    if isinstance(record, Chunk)]
 
 
 def compressors() -> dict[str, Callable[[bytes], bytes]]:
@@ -81,9 +83,9 @@ def memory_mb(compress: Callable[[bytes], bytes]) -> float:
 
 def rows_at(rate: float, count: int) -> list[tuple[str, ...]]:
     chunks = chunks_at(rate, count)
-    cold: dict[str, list[float]] = {name: [] for name in compressors()}
-    warm: dict[str, list[float]] = {name: [] for name in cold}
     used = compressors()
+    cold: dict[str, list[float]] = {name: [] for name in used}
+    warm: dict[str, list[float]] = {name: [] for name in used}
     elsewhere = numpy.zeros(8_000_000)
     for chunk in chunks:
         for name, compress in used.items():
@@ -114,8 +116,7 @@ def main() -> None:
                   'memory [MB]'), rows)
     print(text)
     if not arguments.no_report:
-        write_section('compression', '\n'.join((
-            head, __doc__.strip().split('\n\n')[-1] + '\n', text)))
+        write_section('compression', head, __doc__, text)
 
 
 if __name__ == '__main__':

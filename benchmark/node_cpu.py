@@ -310,9 +310,8 @@ def main() -> None:
     if not arguments.no_report:
         docs = Path(__file__).resolve().parent.parent / 'docs'
         figure(found, docs / 'node_cpu.png')
-        write_section('node_cpu', '\n'.join((
-            head, __doc__.strip().split('\n\n')[-1] + '\n',
-            '![Processor time over rate](node_cpu.png)\n', text)))
+        write_section('node_cpu', head, __doc__, '![Processor time over rate](node_cpu.png)\n',
+                      text)
 
 
 if __name__ == '__main__':

@@ -139,8 +139,7 @@ def main() -> None:
                 [in_a_process(folder, seconds) for seconds in (60.0, 600.0, 3600.0)])
     print(text)
     if not arguments.no_report:
-        write_section('offline', '\n'.join((
-            head, __doc__.strip().split('\n\n')[-1] + '\n', text)))
+        write_section('offline', head, __doc__, text)
 
 
 if __name__ == '__main__':

@@ -63,8 +63,7 @@ def main() -> None:
                       table(('streams', *heads), stream_rows)))
     print(text)
     if not arguments.no_report:
-        write_section('offline_scaling', '\n'.join((
-            head, __doc__.strip().split('\n\n')[-1] + '\n', text)))
+        write_section('offline_scaling', head, __doc__, text)
 
 
 if __name__ == '__main__':

@@ -60,8 +60,13 @@ def write(name: str, text: str) -> None:
 SECTIONS = ('node_cpu', 'startup', 'solvers', 'offline', 'offline_scaling', 'compression', 'soak')
 
 
-def write_section(name: str, page: str) -> None:
-    """Put a page into docs/performance.md as one of its SECTIONS, in place of what it was."""
+def write_section(name: str, head: str, description: str, *texts: str) -> None:
+    """
+    Put a page into docs/performance.md as one of its SECTIONS, in place of what it was.
+
+    description: a docstring, whose last paragraph stands below the head
+    """
+    page = '\n'.join((head, description.strip().split('\n\n')[-1] + '\n', *texts))
     path = ROOT / 'docs' / 'performance.md'
     before = path.read_text() if path.exists() else ''
     sections = dict(re.findall(r'<!-- (\w+) -->\n(.*?)<!-- end -->\n', before, re.DOTALL))

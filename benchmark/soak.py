@@ -184,8 +184,7 @@ def main() -> int:
                       table(('', ''), rows)))
     print(text)
     if not arguments.no_report:
-        write_section('soak', '\n'.join((head,
-                                    __doc__.strip().split('\n\n')[-1] + '\n', text)))
+        write_section('soak', head, __doc__, text)
     return 0 if fine else 1
 
 

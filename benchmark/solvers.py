@@ -145,8 +145,7 @@ def main() -> None:
         'Not compared:\n' if missing else 'Nothing is missing.', *missing, ''))
     print(text)
     if not arguments.no_report:
-        write_section('solvers', '\n'.join((head,
-                                       __doc__.strip().split('\n\n')[-1] + '\n', text)))
+        write_section('solvers', head, __doc__, text)
 
 
 if __name__ == '__main__':

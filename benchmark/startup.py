@@ -159,8 +159,7 @@ def main() -> None:
         import_times(arguments.imports)))
     print(text)
     if not arguments.no_report:
-        write_section('startup', '\n'.join((head,
-                                       __doc__.strip().split('\n\n')[-1] + '\n', text)))
+        write_section('startup', head, __doc__, text)
 
 
 if __name__ == '__main__':

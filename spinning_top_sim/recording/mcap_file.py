@@ -105,7 +105,6 @@ class IndexedFile:
         """
         self._path = path
         self._compression = '' if compression == 'none' else compression
-        self._scratch = scratch_for(compression)
 
         self.message_counts: dict[int, int] = {}  # messages in the file, by channel
         self.chunk_count = 0
@@ -122,6 +121,7 @@ class IndexedFile:
 
         self._file = open(path, 'xb', buffering=0)  # noqa: SIM115
         with self.discarded_on_failure():
+            self._scratch = scratch_for(compression)
             self._put(MCAP0_MAGIC + record_bytes(Header(profile=profile, library=library)))
 
     @contextlib.contextmanager
