@@ -88,6 +88,7 @@ performance:
 	@$(MAKE) --no-print-directory VENV=.venv-benchmark .venv-benchmark/.package \
 	    .venv-benchmark/.peers
 	.venv-benchmark/bin/python benchmark/node_cpu.py
+	.venv-benchmark/bin/python benchmark/wake_up.py
 	.venv-benchmark/bin/python benchmark/startup.py
 	.venv-benchmark/bin/python benchmark/solvers.py
 	.venv-benchmark/bin/python benchmark/offline.py --hour

@@ -32,7 +32,7 @@ def ros_arguments(namespace: str, parameters: Mapping[str, Any]) -> list[str]:
                 '-p', f'{name}:={value if isinstance(value, str) else json.dumps(value)}'))]
 
 
-SIM_NODE = ('-m', 'spinning_top_sim.nodes.sim_node')
+SIM_NODE = ('-P', '-m', 'spinning_top_sim.nodes.sim_node')
 
 
 def script(name: str) -> tuple[str]:

@@ -57,7 +57,8 @@ def write(name: str, text: str) -> None:
 
 
 # What docs/performance.md holds, in this order; each benchmark writes its own section.
-SECTIONS = ('node_cpu', 'startup', 'solvers', 'offline', 'offline_scaling', 'compression', 'soak')
+SECTIONS = ('node_cpu', 'wake_up', 'startup', 'solvers', 'offline', 'offline_scaling',
+            'compression', 'soak')
 
 
 def write_section(name: str, head: str, description: str, *texts: str) -> None:

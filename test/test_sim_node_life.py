@@ -158,8 +158,8 @@ def test_the_default_scene_imports_just_what_it_uses(finished):
             if name.startswith('spinning_top_sim.') and name.count('.') == 2}
     assert ours == {
         *(f'nodes.{name}' for name in (
-            'executable', 'message_types', 'occasional', 'pacing', 'reports', 'ros_parameters',
-            'simulator')),
+            'executable', 'message_types', 'occasional', 'pacing', 'prompt', 'reports',
+            'ros_parameters', 'simulator')),
         *(f'physics.{name}' for name in (
             'attitude', 'kinematics', 'pairs', 'regimes', 'shape', 'top')),
         *(f'solvers.{name}' for name in (

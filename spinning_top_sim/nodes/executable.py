@@ -95,7 +95,9 @@ def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode],
          interrupt: _InterruptOnce) -> int:
     import rclpy  # noqa: PLC0415 - so that Ctrl-C while rclpy is imported ends quietly too
     from rclpy.exceptions import ParameterException  # noqa: PLC0415
-    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor  # noqa: PLC0415
+    from rclpy.executors import ExternalShutdownException  # noqa: PLC0415
+
+    from spinning_top_sim.nodes.prompt import PromptExecutor  # noqa: PLC0415
 
     try:
         rclpy.init(args=argv)
@@ -107,7 +109,7 @@ def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode],
             node = make_node()
         except (ValueError, RuntimeError, OSError, ParameterException) as error:
             return _cannot_start(name, error) if rclpy.ok() else 0
-        executor = SingleThreadedExecutor()
+        executor = PromptExecutor()
         executor.add_node(node)
         gc.collect()
         gc.freeze()             # what there is now stays: no full collection in the middle of it
@@ -117,10 +119,7 @@ def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode],
         node.start()
         # rclpy ends the spin at any signal; an exception in the midst of its code only does harm.
         interrupt.told = True
-        # rclpy's spin_until_future_complete leaves a callback at the future at each wake-up.
-        node.finished.add_done_callback(lambda _: executor.create_task(lambda: None))
-        while rclpy.ok() and not node.finished.done():
-            executor.spin_once()
+        executor.run_until(node.finished)
         if node.finished.done():
             return node.finished.result() or 0
     except (KeyboardInterrupt, ExternalShutdownException):

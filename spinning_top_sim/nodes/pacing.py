@@ -83,9 +83,10 @@ class DeadlineThread(threading.Thread):
 
     tick: returns whether `spare` shall be called before the next one
 
-    A sleeping thread wakes for 30 us of CPU where a wait set with services and subscriptions
-    takes 200: worth it from 500 Hz on.  Who comes late ticks at once, and deadlines that have
-    passed meanwhile are skipped, not made up for; the grid of deadlines stays.
+    A sleeping thread wakes up at half the processor time of a wait set with services and
+    subscriptions (`python benchmark/wake_up.py`): worth it from 500 Hz on.  Who comes late ticks
+    at once, and deadlines that have passed meanwhile are skipped, not made up for; the grid of
+    deadlines stays.
     """
 
     # Looked at this often while waiting for a far deadline, so that `stop` is quick.

@@ -25,6 +25,7 @@ from spinning_top_sim.nodes import reports
 from spinning_top_sim.nodes.message_types import message_type
 from spinning_top_sim.nodes.occasional import OccasionalGroup
 from spinning_top_sim.nodes.pacing import DeadlineThread, Onward, SimulatedClock
+from spinning_top_sim.nodes.prompt import PromptGroup
 from spinning_top_sim.nodes.ros_parameters import SPIN, ParameterChanges, declare, start_values
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal
@@ -178,7 +179,7 @@ class Simulator(Node):
             self._pacer.start()
         else:
             self._tick_timer = self.create_timer(1.0 / tick_rate, self._tick_by_timer,
-                                                 clock=self._steady)
+                                                 clock=self._steady, callback_group=PromptGroup())
 
     def _begin(self) -> bool:
         """Fix the stamp of t = 0; False as long as the /clock that we follow says nothing."""
