@@ -12,7 +12,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from rclpy.task import Future
 
@@ -39,8 +39,9 @@ class PromptExecutor(SingleThreadedExecutor):
 
     For one call of a timer rclpy goes through every entity and makes a new wait set, and once more
     because each callback wakes the executor.  Here one wait set is kept, and all else that becomes
-    ready is left to rclpy, which finds it still ready.  What a wake-up costs is measured by
-    `python benchmark/wake_up.py`.
+    ready is left to rclpy, which finds it still ready.  Events of publishers and subscriptions
+    wake nobody up: rclpy finds them together with what does, such as a timer once a second.
+    What a wake-up costs is measured by `python benchmark/wake_up.py`.
     """
 
     def run_until(self, future: Future) -> None:
@@ -55,10 +56,12 @@ class PromptExecutor(SingleThreadedExecutor):
         # Once: rclpy's spin_until_future_complete leaves a callback there at each wake-up.
         future.add_done_callback(lambda _: self.wake())
         while goes_on():
-            # Without prompt timers, rclpy has to wait until there is something.
-            timeout = 0.0 if self._attend() else None
-            if goes_on():
-                self.spin_once(timeout)
+            # Twice: the last callback of a round wakes us once more, rclpy first finds that the
+            # round is over, and only then looks anew for what that callback has made ready.
+            # Without prompt timers it is rclpy that waits.
+            for timeout in (0.0, 0.0) if self._attend() else (None,):
+                if goes_on():
+                    self.spin_once(timeout)
 
     def _attend(self) -> bool:
         """Call prompt timers until something else is ready; return whether there are any."""
@@ -81,7 +84,8 @@ class PromptExecutor(SingleThreadedExecutor):
 
     def _call_until_something_else(self, prompt: list, others: list, held: ExitStack) -> None:
         """Call the prompt timers whenever they are due, until anything else is ready."""
-        def hold(handles: list) -> list:
+        def hold(entities: Iterable) -> list:
+            handles = [entity.handle for entity in entities]
             for handle in handles:
                 held.enter_context(handle)
             return handles
@@ -90,37 +94,31 @@ class PromptExecutor(SingleThreadedExecutor):
             return [entity for node in self.get_nodes() for entity in getattr(node, kind)
                     if self.can_execute(entity)]
 
-        hold([self._context.handle])
-        prompt_timers = hold([timer.handle for timer in prompt])
-        timers = hold([timer.handle for timer in others])
-        subscriptions = hold([entity.handle for entity in of_nodes('subscriptions')])
-        services = hold([entity.handle for entity in of_nodes('services')])
-        guards = hold([self._guard.handle, self._sigint_gc.handle])
-        events = hold(of_nodes('waitables'))
+        context, = hold([self._context])
+        timers = hold([*prompt, *others])
+        subscriptions, services = hold(of_nodes('subscriptions')), hold(of_nodes('services'))
+        guards = hold([self._guard, self._sigint_gc])
         wait_set = rclpy_implementation.WaitSet(
-            len(subscriptions), len(guards), len(prompt_timers) + len(timers), 0, len(services),
-            len(events), self._context.handle)
+            len(subscriptions), len(guards), len(timers), 0, len(services), 0, context)
         additions: list[tuple[Callable, Any]] = [
-            *((wait_set.add_timer, handle) for handle in (*prompt_timers, *timers)),
+            *((wait_set.add_timer, handle) for handle in timers),
             *((wait_set.add_subscription, handle) for handle in subscriptions),
             *((wait_set.add_service, handle) for handle in services),
-            *((wait_set.add_guard_condition, handle) for handle in guards),
-            *((event.add_to_wait_set, wait_set) for event in events)]
+            *((wait_set.add_guard_condition, handle) for handle in guards)]
         calls = {timer.handle.pointer: (timer.handle, timer.callback) for timer in prompt}
         ready, something_else = wait_set.get_ready_entities, False
         while not something_else:
             wait_set.clear_entities()
-            for add, what in additions:
-                add(what)
+            for add, handle in additions:
+                add(handle)
             wait_set.wait(-1)
             something_else = bool(
-                ready('guard_condition') or ready('subscription') or ready('service')
-                or any(event.is_ready(wait_set) for event in events))
+                ready('guard_condition') or ready('subscription') or ready('service'))
             for pointer in ready('timer'):
                 if pointer in calls:
-                    handle, callback = calls[pointer]
-                    if handle.is_timer_ready():         # not so after `cancel`
-                        handle.call_timer()
+                    timer, callback = calls[pointer]
+                    if timer.is_timer_ready():          # not so after `cancel`
+                        timer.call_timer()
                         callback()
                 else:
                     something_else = True
