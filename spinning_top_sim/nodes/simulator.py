@@ -41,10 +41,10 @@ OPENING_NS = 60_000_000
 LISTENERS_PERIOD_NS = 50_000_000
 # Instants computed together, ahead of their time: many as columns, where they cost little more
 # than one, and fewer one by one.
-COLUMNS_AHEAD, ONES_AHEAD = 128, 16
+COLUMNS_AHEAD, ONES_AHEAD = 256, 16
 # In pieces that fill this share of the time between two ticks, so that the next one finds the
 # processor free; begun so many ticks, or so much time, before they are needed.
-BUSY_SHARE = 0.15
+BUSY_SHARE = 0.35
 TICKS_AHEAD, AHEAD_NS = 24, 50_000_000
 SWITCH_INTERVAL_S = 1e-4
 # One tick works at most this long before services and signals get their turn.

@@ -39,8 +39,12 @@ if TYPE_CHECKING:
 STEPS_AT_ONCE = 500
 # Instants that are computed at most in one go.
 MOST_AT_ONCE = 256
-# Nor is more computed ahead than this, for a command makes it useless.
+# Nor is more computed ahead than this, for a command makes it useless; who has just commanded may
+# do so again soon, so it begins with few instants, and goes on with twice as many each time.
 FARTHEST_AHEAD_NS = 300_000_000
+FEWEST_AHEAD = 16
+# Columns of fewer instants cost more than the instants one by one.
+FEWEST_IN_COLUMNS = 12
 NEVER_NS = 2 ** 63 - 1
 
 # The samples of an instant for a log: numbers of their streams there, stamp [ns], messages, size
@@ -97,6 +101,7 @@ class Simulation:
         # being computed.
         self._ready: deque[Instant] = deque()
         self._beyond_ns, self._shortest_ns = -1, NEVER_NS
+        self._most_ahead = FEWEST_AHEAD
         self._cursors: list[_Cursor] = []
         self._takers: dict[tuple[int, ...], Takers] = {}        # by the numbers of cursors
         self._work: Iterator[None] | None = None
@@ -312,7 +317,8 @@ class Simulation:
         """
         Compute now what is due up to `until_ns`, if it is not yet: many at once are cheap.
 
-        instants: compute so many, or FARTHEST_AHEAD_NS, where any are to be computed
+        instants: compute so many, or FARTHEST_AHEAD_NS, where any are to be computed; fewer at
+            first, and after a command
         budget_ns: stop after about this time, and go on with the next call
         Return whether all that is done.  What is sent does not depend on it, a command finds the
         state that it would have found; what then no longer holds is forgotten.
@@ -321,6 +327,8 @@ class Simulation:
             due_ns = self._next_due()
             if due_ns > until_ns:
                 return True
+            instants = min(instants, self._most_ahead)
+            self._most_ahead = min(2 * self._most_ahead, MOST_AT_ONCE)
             self._work = self._computation(max(until_ns, due_ns + min(
                 (instants - 1) * self._shortest_ns, FARTHEST_AHEAD_NS)))
         return self._go_on(None if budget_ns is None else time.monotonic_ns() + budget_ns)
@@ -378,6 +386,7 @@ class Simulation:
         self._ready.clear()
         self._work = None
         self._beyond_ns = -1
+        self._most_ahead = FEWEST_AHEAD
 
     def _next_due(self) -> int:
         """Return when there is more to compute than what is ready [ns]."""
@@ -469,7 +478,7 @@ class Simulation:
     def _messages(self, stream: Stream, times: range, states: _States,
                   ) -> Iterator[Sequence[bytes]]:
         """Yield the messages of a stream at these times [ns], in order, as many as are made."""
-        if stream.one_by_one or not self.solver.in_columns:
+        if stream.one_by_one or len(times) < FEWEST_IN_COLUMNS or not self.solver.in_columns:
             for t_ns in times:
                 yield (stream.encode(states.at(t_ns), self.epoch_ns + t_ns, t_ns),)
         else:
