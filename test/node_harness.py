@@ -263,14 +263,21 @@ class Peer:
 
     def call(self, kind, name, request, timeout=PATIENCE_S):
         """Call a service and return its answer."""
-        client = self._clients.get(name)
-        if client is None:
-            client = self._clients[name] = self.node.create_client(kind, name)
+        new = name not in self._clients
+        if new:
+            self._clients[name] = self.node.create_client(kind, name)
+        client = self._clients[name]
         assert client.wait_for_service(timeout), f'no service {name}'
-        done = threading.Event()
-        future = client.call_async(request)
-        future.add_done_callback(lambda _: done.set())
-        assert done.wait(timeout), f'no answer from {name}'
+        # A server that has not heard of a new client yet gives up its answer after 0.1 s, with
+        # "client will not receive response" (rmw_fastrtps); such a client asks once more.
+        for patience in (timeout / 10, timeout) if new else (timeout,):
+            done = threading.Event()
+            future = client.call_async(request)
+            future.add_done_callback(lambda _, done=done: done.set())
+            if done.wait(patience):
+                break
+        else:
+            raise AssertionError(f'no answer from {name}')
         return future.result()
 
     def trigger(self, node, name):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The executor that attends to ticks itself and leaves all else to rclpy."""
+"""The executor that attends to ticks and messages itself and leaves all else to rclpy."""
 
 import contextlib
 
@@ -8,17 +8,18 @@ import pytest
 pytest.importorskip('rclpy')
 
 import rclpy
-from node_harness import SimNode
+from node_harness import SimNode, wait_for
 from node_logs import QUIET, assert_clean_end
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.task import Future
+from std_msgs.msg import Int32
 from std_srvs.srv import Trigger
 
 from spinning_top_sim.nodes.prompt import PromptExecutor, PromptGroup
 
-# How often rclpy's executor was asked for what is ready, in so many ticks.
+# How often rclpy looked for what is ready, in so many ticks.
 WAITS = """
 import sys
 from rclpy.executors import SingleThreadedExecutor
@@ -27,12 +28,12 @@ from spinning_top_sim.nodes.simulator import Simulator
 counts = {'ticks': 0, 'waits': 0}
 def counted(kind, name, count):
     original = getattr(kind, name)
-    def call(self, *arguments):
+    def call(self, *arguments, **keywords):
         counts[count] += 1
-        return original(self, *arguments)
+        return original(self, *arguments, **keywords)
     setattr(kind, name, call)
 counted(Simulator, '_tick', 'ticks')
-counted(SingleThreadedExecutor, 'spin_once', 'waits')
+counted(SingleThreadedExecutor, '_wait_for_ready_callbacks', 'waits')
 code = main()
 print('counts', counts['ticks'], counts['waits'])
 sys.exit(code)
@@ -158,6 +159,34 @@ def test_services_and_clients_of_the_node_itself_work(spun):
     spun.at[10] = ask
     assert spun.run() == 'as meant'
     assert spun.seen[0].endswith(' calls')
+
+
+def test_subscriptions_get_every_message_without_rclpys_search(spun, monkeypatch):
+    looks, told = [], []
+    original = spun.executor._wait_for_ready_callbacks
+
+    def look(*arguments, **keywords):
+        looks.append(spun.calls)
+        return original(*arguments, **keywords)
+
+    def received(message):
+        spun.seen.append(message.data)
+        if len(spun.seen) == 100:
+            spun.end()
+
+    monkeypatch.setattr(spun.executor, '_wait_for_ready_callbacks', look)
+    spun.node.create_subscription(Int32, 'numbers', received, 10)
+    spun.node.create_subscription(Int32, 'numbers', told.append, 10, raw=True)
+    spun.node.create_subscription(Int32, 'numbers', lambda _, info: told.append(info), 10)
+    publisher = spun.node.create_publisher(Int32, 'numbers', 10)
+    wait_for('itself', lambda: publisher.get_subscription_count() == 3)
+    for number in range(1, 101):
+        spun.at[number] = lambda number=number: publisher.publish(Int32(data=number))
+    assert spun.run() == 'as meant'
+    assert spun.seen == list(range(1, 101))
+    assert {type(one) for one in told} == {bytes, dict}
+    assert len(told) >= 190
+    assert len(looks) < 20
 
 
 def test_tasks_and_the_exceptions_of_callbacks_come_through(spun):

@@ -1,28 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An executor that attends to some timers without rclpy's search for what is to be done."""
+"""An executor that calls ticks and subscriptions without rclpy's search for what is to be done."""
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import EventHandler
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import ShutdownException, SingleThreadedExecutor, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.subscription import Subscription
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from rclpy.task import Future
+    from rclpy.timer import Timer
 
 
 class PromptGroup(ReentrantCallbackGroup):
-    """
-    A callback group for timers that a `PromptExecutor` calls itself; others treat it as any group.
-
-    Their callbacks are functions, not coroutines.
-    """
+    """For timers that a `PromptExecutor` calls itself; others treat it as any callback group."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -35,12 +33,13 @@ class PromptGroup(ReentrantCallbackGroup):
 
 class PromptExecutor(SingleThreadedExecutor):
     """
-    rclpy's executor, with a shorter way from a timer of a `PromptGroup` to its callback.
+    rclpy's executor, with a shorter way to timers of a `PromptGroup` and to subscriptions.
 
     For one call of a timer rclpy goes through every entity and makes a new wait set, and once more
     because each callback wakes the executor.  Here one wait set is kept, and all else that becomes
-    ready is left to rclpy, which finds it still ready.  Events of publishers and subscriptions
-    wake nobody up: rclpy finds them together with what does, such as a timer once a second.
+    ready is left to rclpy, which finds it still ready.  Callbacks of those timers and of all
+    subscriptions are functions, not coroutines.  Events of publishers and subscriptions wake
+    nobody up: rclpy finds them together with what does, such as a timer once a second.
     What a wake-up costs is measured by `python benchmark/wake_up.py`.
     """
 
@@ -56,34 +55,41 @@ class PromptExecutor(SingleThreadedExecutor):
         # Once: rclpy's spin_until_future_complete leaves a callback there at each wake-up.
         future.add_done_callback(lambda _: self.wake())
         while goes_on():
-            # Twice: the last callback of a round wakes us once more, rclpy first finds that the
-            # round is over, and only then looks anew for what that callback has made ready.
-            # Without prompt timers it is rclpy that waits.
-            for timeout in (0.0, 0.0) if self._attend() else (None,):
-                if goes_on():
-                    self.spin_once(timeout)
+            if not self._attend():
+                self.spin_once()
+            elif goes_on():
+                self._execute_what_is_ready()
+
+    def _execute_what_is_ready(self) -> None:
+        """Have rclpy look once, and execute all that it finds; each callback wakes us again."""
+        with suppress(TimeoutException, ShutdownException):
+            while True:
+                task, _, _ = self.wait_for_ready_callbacks(timeout_sec=0.0)
+                task()
+                if task.exception() is not None:
+                    raise task.exception()
 
     def _attend(self) -> bool:
-        """Call prompt timers until something else is ready; return whether there are any."""
+        """Do the prompt things until something else is ready; return whether this is possible."""
         nodes = self.get_nodes()
-        timers = [timer for node in nodes for timer in node.timers]
-        prompt = [timer for timer in timers if isinstance(timer.callback_group, PromptGroup)]
         # What rclpy would not find ready any more, or is none of the entities that we know.
         strange = [entity for node in nodes for entity in (
             *node.clients, *node.guards,
             *(waitable for waitable in node.waitables if not isinstance(waitable, EventHandler)))]
-        attended = bool(prompt) and not strange
+        timers = [timer for node in nodes for timer in node.timers]
+        prompt = [timer for timer in timers if isinstance(timer.callback_group, PromptGroup)]
         for timer in prompt:
-            timer.callback_group.attended = attended
-        if attended:
-            others = [timer for timer in timers if self.can_execute(timer)]
-            # Who makes or destroys an entity wakes the executor; until then handles are held.
-            with ExitStack() as held:
-                self._call_until_something_else(prompt, others, held)
-        return attended
+            timer.callback_group.attended = not strange
+        if strange:
+            return False
+        others = [timer for timer in timers if self.can_execute(timer)]
+        # Who makes or destroys an entity wakes the executor; until then handles are held.
+        with ExitStack() as held:
+            self._call_until_something_else(prompt, others, held)
+        return True
 
     def _call_until_something_else(self, prompt: list, others: list, held: ExitStack) -> None:
-        """Call the prompt timers whenever they are due, until anything else is ready."""
+        """Call prompt timers and subscriptions as they become ready, until anything else is."""
         def hold(entities: Iterable) -> list:
             handles = [entity.handle for entity in entities]
             for handle in handles:
@@ -95,8 +101,8 @@ class PromptExecutor(SingleThreadedExecutor):
                     if self.can_execute(entity)]
 
         context, = hold([self._context])
-        timers = hold([*prompt, *others])
-        subscriptions, services = hold(of_nodes('subscriptions')), hold(of_nodes('services'))
+        timers, services = hold([*prompt, *others]), hold(of_nodes('services'))
+        subscriptions = hold(of_nodes('subscriptions'))
         guards = hold([self._guard, self._sigint_gc])
         wait_set = rclpy_implementation.WaitSet(
             len(subscriptions), len(guards), len(timers), 0, len(services), 0, context)
@@ -105,20 +111,33 @@ class PromptExecutor(SingleThreadedExecutor):
             *((wait_set.add_subscription, handle) for handle in subscriptions),
             *((wait_set.add_service, handle) for handle in services),
             *((wait_set.add_guard_condition, handle) for handle in guards)]
-        calls = {timer.handle.pointer: (timer.handle, timer.callback) for timer in prompt}
+        calls = {timer.handle.pointer: timer for timer in prompt}
+        receivers = {one.handle.pointer: one for one in of_nodes('subscriptions')}
         ready, something_else = wait_set.get_ready_entities, False
         while not something_else:
             wait_set.clear_entities()
             for add, handle in additions:
                 add(handle)
             wait_set.wait(-1)
-            something_else = bool(
-                ready('guard_condition') or ready('subscription') or ready('service'))
+            something_else = bool(ready('guard_condition') or ready('service'))
+            received = ready('subscription')
             for pointer in ready('timer'):
                 if pointer in calls:
-                    timer, callback = calls[pointer]
-                    if timer.is_timer_ready():          # not so after `cancel`
-                        timer.call_timer()
-                        callback()
+                    _call(calls[pointer])
                 else:
                     something_else = True
+            for pointer in received:
+                _receive(receivers[pointer])
+
+
+def _call(timer: Timer) -> None:
+    if timer.handle.is_timer_ready():       # not so after `cancel`
+        timer.handle.call_timer()
+        timer.callback()
+
+
+def _receive(subscription: Subscription) -> None:
+    taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+    if taken is not None:
+        message_only = subscription._callback_type is Subscription.CallbackType.MessageOnly
+        subscription.callback(*taken[:1 if message_only else 2])
