@@ -65,7 +65,8 @@ class Waits:
         if kind is PromptExecutor:
             executor.run_until(done)
         else:
-            executor.spin_until_future_complete(done)
+            while not done.done():
+                executor.spin_once()
         taken = time.thread_time() - begin
         self._node.destroy_timer(timer)
         executor.remove_node(self._node)
