@@ -27,7 +27,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -43,7 +43,7 @@ KINDS = {
     'ours, thread, recording': ('thread', True), 'ours, thread': ('thread', False),
     'straightforward': None, 'floor, timer': None, 'floor, thread': None,
 }
-STRAIGHT = 'straightforward'
+STRAIGHT, FLOOR = 'straightforward', 'floor, thread'
 
 
 @dataclass
@@ -166,35 +166,67 @@ def measured(arguments: argparse.Namespace) -> dict:
     return found
 
 
-def idle(rounds: int, seconds: float) -> str:
+def together(programs: Mapping[str, Callable[[str], list[str]]], rounds: int, seconds: float,
+             subscribers: int = 0) -> dict[str, list[float]]:
     """
-    Return the table of what streams cost that nobody listens to.
+    Return the processor seconds a second of nodes that run side by side, of each in every round.
 
-    Both nodes of a pair run side by side and are measured over the same seconds, for what this
-    machine does to one it then does to the other; who is started first takes turns.
+    What this machine does to one it then does to the other; who is started first takes turns.
+    programs: what python is given to run a node, for a namespace;  subscribers: of each node
     """
-    switches = [f'{name}.enabled' for name in (*STREAMS, 'imu_data', *OTHERS, 'clock')]
-    shares: dict[tuple[str, str], list[float]] = {
-        (pacing, what): [] for pacing in ('timer', 'thread') for what in ('all', 'none')}
-    for number_, pacing in itertools.product(range(rounds), ('timer', 'thread')):
-        with contextlib.ExitStack() as nodes:
-            pair = {what: nodes.enter_context(Process((*SIM_NODE, *ros_arguments(
-                f'/n{next(_namespaces)}', {
-                    'pacing': pacing, 'tick_rate': 1000.0, 'status_period': 0.0,
-                    **dict.fromkeys(switches, what == 'all')}))))
-                for what in (('all', 'none'), ('none', 'all'))[number_ % 2]}
+    shares: dict[str, list[float]] = {name: [] for name in programs}
+    for number_ in range(rounds):
+        with contextlib.ExitStack() as running:
+            nodes = {}
+            for name in list(programs)[::-1 if number_ % 2 else 1]:
+                namespace = f'/n{next(_namespaces)}'
+                for _ in range(subscribers):
+                    running.enter_context(
+                        Process((*script('listener.py'), namespace), talks=True)).line()
+                nodes[name] = running.enter_context(Process(programs[name](namespace)))
             time.sleep(4.0)
-            begin = {what: (node.cpu_ns(), time.monotonic_ns()) for what, node in pair.items()}
+            begin = {name: (node.cpu_ns(), time.monotonic_ns()) for name, node in nodes.items()}
             time.sleep(seconds)
-            for what, node in pair.items():
-                cpu, at = begin[what]
-                shares[pacing, what].append((node.cpu_ns() - cpu) / (time.monotonic_ns() - at))
-    rows = []
-    for pacing in ('timer', 'thread'):
-        every, none = shares[pacing, 'all'], shares[pacing, 'none']
-        rows.append((pacing, f'{100 * median(every):.1f}', f'{100 * median(none):.1f}',
-                     number(median([a / b for a, b in zip(every, none, strict=True)]), 3)))
-    return table(('pacing', 'all streams enabled [%]', 'none enabled [%]', 'ratio'), rows)
+            for name, node in nodes.items():
+                cpu, at = begin[name]
+                shares[name].append((node.cpu_ns() - cpu) / (time.monotonic_ns() - at))
+    return shares
+
+
+def pair_row(shares: dict[str, list[float]]) -> tuple[str, ...]:
+    """Return the processor time of two nodes, and the median of their ratios with its range."""
+    one, other = shares.values()
+    ratios = [a / b for a, b in zip(one, other, strict=True)]
+    return (f'{100 * median(one):.1f}', f'{100 * median(other):.1f}',
+            *(number(value, 3) for value in (median(ratios), min(ratios), max(ratios))))
+
+
+def idle(rounds: int, seconds: float) -> str:
+    """Return the table of what streams cost that nobody listens to."""
+    switches = [f'{name}.enabled' for name in (*STREAMS, 'imu_data', *OTHERS, 'clock')]
+
+    def node(pacing: str, enabled: bool) -> Callable[[str], list[str]]:
+        return lambda namespace: [*SIM_NODE, *ros_arguments(namespace, {
+            'pacing': pacing, 'tick_rate': 1000.0, 'status_period': 0.0,
+            **dict.fromkeys(switches, enabled)})]
+
+    return table(
+        ('pacing', 'all streams enabled [%]', 'none enabled [%]', 'ratio', 'lowest', 'highest'),
+        [(pacing, *pair_row(together({'all': node(pacing, True), 'none': node(pacing, False)},
+                                     rounds, seconds))) for pacing in ('timer', 'thread')])
+
+
+def beside_the_floor(rounds: int, seconds: float) -> str:
+    """Return the table of what `pacing: thread` costs beside the floor, at 1 kHz."""
+    with tempfile.TemporaryDirectory() as name:
+        def node(kind: str) -> Callable[[str], list[str]]:
+            return lambda namespace: program(kind, 1000, namespace, Path(name))
+
+        return table(
+            ('node', 'it [%]', 'the floor [%]', 'ratio', 'lowest', 'highest'),
+            [(kind, *pair_row(together({kind: node(kind), FLOOR: node(FLOOR)}, rounds, seconds,
+                                       subscribers=1)))
+             for kind in ('ours, thread, recording', 'ours, thread')])
 
 
 def mean_rate(one: Result) -> float:
@@ -221,7 +253,7 @@ def share_table(found: dict) -> str:
 COMPARED = (('ours, thread, recording', STRAIGHT), ('ours, thread', STRAIGHT),
             ('ours, timer, recording', STRAIGHT), ('ours, timer', STRAIGHT),
             ('floor, timer', STRAIGHT),
-            ('ours, thread, recording', 'floor, thread'), ('ours, thread', 'floor, thread'),
+            ('ours, thread, recording', FLOOR), ('ours, thread', FLOOR),
             ('ours, timer', 'floor, timer'))
 
 
@@ -286,14 +318,16 @@ def main() -> None:
     parser.add_argument('--rounds', type=int, default=3)
     parser.add_argument('--seconds', type=float, default=2.0, help='measured, each run')
     parser.add_argument('--warm-up', type=float, default=1.5, help='before that')
-    parser.add_argument('--idle-rounds', type=int, default=6,
-                        help='of the table of streams that nobody listens to')
+    parser.add_argument('--pair-rounds', type=int, default=6,
+                        help='of the tables of nodes side by side')
     parser.add_argument('--no-report', action='store_true', help='print the tables only')
     arguments = parser.parse_args()
     head = preamble('Processor time of the node')        # with the commit that is there now
     at_first = load()
-    unheard = idle(arguments.idle_rounds, 2.0 * arguments.seconds)
+    unheard = idle(arguments.pair_rounds, 2.0 * arguments.seconds)
     print(unheard, flush=True)
+    floor = beside_the_floor(arguments.pair_rounds, 2.0 * arguments.seconds)
+    print(floor, flush=True)
     found = measured(arguments)
     text = '\n'.join((
         f'Load average at the begin {at_first:.1f}, at the end {load():.1f} (the benchmark '
@@ -302,9 +336,12 @@ def main() -> None:
         '## Ratios of processor time\n', ratio_table(found),
         '## Ratios of processor time for each sample that arrived\n',
         ratio_table(found, per_sample=True),
+        '## Beside the floor\n',
+        'Processor time at 1 kHz with a subscriber each; both nodes of a pair side by side, '
+        f'{arguments.pair_rounds} rounds.\n', floor,
         '## Streams that nobody listens to\n',
         'Processor time at 1000 ticks a second, default rates, no subscriber; both nodes of a '
-        f'pair side by side, {arguments.idle_rounds} rounds.\n', unheard,
+        f'pair side by side, {arguments.pair_rounds} rounds.\n', unheard,
         '## Arrivals\n', arrival_table(found)))
     print(text)
     if not arguments.no_report:
