@@ -32,6 +32,7 @@ def ros_arguments(namespace: str, parameters: Mapping[str, Any]) -> list[str]:
                 '-p', f'{name}:={value if isinstance(value, str) else json.dumps(value)}'))]
 
 
+# -P: of this checkout, by PYTHONPATH, and not of whatever lies in the working directory.
 SIM_NODE = ('-P', '-m', 'spinning_top_sim.nodes.sim_node')
 
 
@@ -124,7 +125,7 @@ def simulate(arguments: Sequence[str]) -> tuple[float, int]:
     """
     begin = time.monotonic()
     run = subprocess.run(
-        [sys.executable, '-c', _SIMULATE, *arguments, '--quiet'], stdout=subprocess.PIPE,
+        [sys.executable, '-P', '-c', _SIMULATE, *arguments, '--quiet'], stdout=subprocess.PIPE,
         text=True, env={**os.environ, 'PYTHONPATH': str(ROOT)}, timeout=3600.0, check=False)
     taken = time.monotonic() - begin
     if run.returncode:

@@ -100,7 +100,7 @@ def import_times(count: int) -> str:
     """Return the slowest imports of `sim_node` by their own time, from -X importtime."""
     program_ = ('import sys; from spinning_top_sim.nodes import sim_node; '
                 'import spinning_top_sim.nodes.simulator')
-    run = subprocess.run([sys.executable, '-X', 'importtime', '-c', program_], check=True,
+    run = subprocess.run([sys.executable, '-P', '-X', 'importtime', '-c', program_], check=True,
                          capture_output=True, text=True, timeout=60,
                          env={**os.environ, 'PYTHONPATH': str(ROOT)})
     own: dict[str, int] = {}

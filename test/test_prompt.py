@@ -101,7 +101,7 @@ def test_other_executors_call_a_prompt_timer_too():
         assert spun.done.result() == 'as meant'
 
 
-def test_without_prompt_timers_it_is_rclpys_executor():
+def test_other_timers_are_called_where_none_is_prompt():
     with Spun() as spun:
         spun.at[5] = spun.end
         assert spun.run() == 'as meant'

@@ -100,10 +100,10 @@ class PromptExecutor(SingleThreadedExecutor):
             return [entity for node in self.get_nodes() for entity in getattr(node, kind)
                     if self.can_execute(entity)]
 
+        receivers = {one.handle.pointer: one for one in of_nodes('subscriptions')}
         context, = hold([self._context])
-        timers, services = hold([*prompt, *others]), hold(of_nodes('services'))
-        subscriptions = hold(of_nodes('subscriptions'))
-        guards = hold([self._guard, self._sigint_gc])
+        timers, subscriptions = hold([*prompt, *others]), hold(receivers.values())
+        services, guards = hold(of_nodes('services')), hold([self._guard, self._sigint_gc])
         wait_set = rclpy_implementation.WaitSet(
             len(subscriptions), len(guards), len(timers), 0, len(services), 0, context)
         additions: list[tuple[Callable, Any]] = [
@@ -112,7 +112,6 @@ class PromptExecutor(SingleThreadedExecutor):
             *((wait_set.add_service, handle) for handle in services),
             *((wait_set.add_guard_condition, handle) for handle in guards)]
         calls = {timer.handle.pointer: timer for timer in prompt}
-        receivers = {one.handle.pointer: one for one in of_nodes('subscriptions')}
         ready, something_else = wait_set.get_ready_entities, False
         while not something_else:
             wait_set.clear_entities()
