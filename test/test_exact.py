@@ -7,12 +7,15 @@ data/reference_cases.json holds 32 motions at four times each, computed with 70 
 promises: 5e-15, relative for what is larger than 1.
 """
 
+import gc
 import itertools
 import json
 import math
 import random
+import re
 import subprocess
 import sys
+import weakref
 from dataclasses import replace
 from decimal import Context, Decimal, Inexact, localcontext
 from fractions import Fraction
@@ -588,6 +591,23 @@ def test_the_caller_s_decimal_context_does_not_matter():
         assert solution.full_state_at(10 ** 15) == expected.full_state_at(10 ** 15)
         grid = solution.quaternion_grid(10 ** 15, 10 ** 6, 5)
     assert (grid == expected.quaternion_grid(10 ** 15, 10 ** 6, 5)).all()
+
+
+@pytest.mark.parametrize('name', sorted(REGIMES))
+def test_a_solution_leaves_nothing_for_the_garbage_collector(name):
+    """A node makes one at each command."""
+    solution = ExactSolution(*REGIMES[name])
+    solution.quaternion_at(5)
+    solution.full_state_at(5)
+    with pytest.raises(ValueError, match=re.escape(f'within {solution.time_limit:.6g} s')):
+        solution.quaternion_at(solution.ns_limit + 1)
+    there = weakref.ref(solution)
+    gc.disable()
+    try:
+        del solution
+        assert there() is None
+    finally:
+        gc.enable()
 
 
 # ------------------------------------------------------------------------------ long decimals

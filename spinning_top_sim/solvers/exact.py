@@ -22,7 +22,12 @@ from math import cos, sin, sinh, sqrt
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.exact_attitude import HALF_TURN, Quaternion, attitude_by_waves
+from spinning_top_sim.solvers.exact_attitude import (
+    HALF_TURN,
+    Quaternion,
+    attitude_by_waves,
+    too_late,
+)
 from spinning_top_sim.solvers.long_decimals import (
     FIXED_BITS,
     FIXED_HALF,
@@ -63,9 +68,6 @@ class ExactSolution:
     smoothly through a pole that is passed exactly (and out of [0, pi]), phi and psi are unwrapped.
     On every motion each of them, over max(1, |value|), is within 5e-15.
 
-    quaternion_at: takes a time after the start, a Python int of nanoseconds, and returns the
-    attitude (x, y, z, w) there.  Raises ValueError for a time too far away.
-
     Attributes: nutation_period [s], None if the nutation rests; mean_precession_rate and
     mean_spin_rate [rad/s]; theta_min and theta_max [rad], of theta folded into [0, pi];
     m and m1 = 1 - m, the parameter of the elliptic functions: m1 -> 0 on the separatrix;
@@ -80,9 +82,11 @@ class ExactSolution:
         self.theta_motion = motion = set_up(top, start)
         with precision(motion.digits):
             self._take_over(motion, top, start)
-            self.quaternion_at: Callable[[int], Quaternion] = (
-                attitude_by_waves(motion, self.ns_limit, self.too_late)
-                or self._quaternion_by_quarters)
+            by_waves = attitude_by_waves(motion, self.ns_limit, self.time_limit)
+        # No reference to self in it: a solution goes when its motion ends, not when Python next
+        # looks for cycles.
+        if by_waves is not None:
+            self.quaternion_at = by_waves       # type: ignore[assignment, method-assign]
         self._check_start()
         self._arrays: ArrayEvaluator | None = None
 
@@ -139,11 +143,13 @@ class ExactSolution:
 
     # ------------------------------------------------------------------------------ one state
 
-    def _quaternion_by_quarters(self, ns: int) -> Quaternion:
+    def quaternion_at(self, ns: int) -> Quaternion:
         """
-        Return what `quaternion_at` does, near the separatrix too.
+        Return the attitude (x, y, z, w) at `ns`, a Python int of nanoseconds after the start.
 
-        The formulas of `nutation_at`, with alpha and beta as complex numbers: no angles.
+        The formulas of `nutation_at`, with alpha and beta as complex numbers: no angles.  Most
+        motions have a faster function in its place, see `exact_attitude`.
+        Raises ValueError for a time too far away.
         """
         if not -self.ns_limit <= ns <= self.ns_limit:
             raise self.too_late(f'{ns} ns')
@@ -255,8 +261,7 @@ class ExactSolution:
 
     def too_late(self, time: str) -> ValueError:
         """Return the refusal of a time at which nothing is left of a phase."""
-        return ValueError(f't = {time}: must be finite and within {self.time_limit:.6g} s, '
-                          f'where a phase of this motion reaches 2^52 turns')
+        return too_late(time, self.time_limit)
 
     # ---------------------------------------------------------------------------- many states
 

@@ -99,8 +99,14 @@ def _chebyshev(amplitudes: dict[int, float], polynomials: tuple[tuple[int, ...],
     return tuple(total)
 
 
-def attitude_by_waves(motion: ThetaMotion, ns_limit: int,
-                      too_late: Callable[[str], ValueError]) -> Callable[[int], Quaternion] | None:
+def too_late(time: str, time_limit: float) -> ValueError:
+    """Return the refusal of a time at which nothing is left of a phase."""
+    return ValueError(f't = {time}: must be finite and within {time_limit:.6g} s, '
+                      f'where a phase of this motion reaches 2^52 turns')
+
+
+def attitude_by_waves(motion: ThetaMotion, ns_limit: int, time_limit: float
+                      ) -> Callable[[int], Quaternion] | None:
     """
     Return a function of nanoseconds after the start to (x, y, z, w); see `ExactSolution`.
 
@@ -118,14 +124,14 @@ def attitude_by_waves(motion: ThetaMotion, ns_limit: int,
                    *beta.p[FEW_WAVES + 1:], *beta.r[FEW_WAVES:],
                    *denominator[FEW_WAVES + 1:]))
     return (_few_waves if few else _many_waves)(
-        alpha, beta, denominator, phase, ns_limit, too_late)
+        alpha, beta, denominator, phase, ns_limit, time_limit)
 
 
 # The two below differ in the length of the polynomials only: each operation counts.
 
 
 def _few_waves(alpha: _Waves, beta: _Waves, denominator: tuple[float, ...], phase: FixedRate,
-               ns_limit: int, too_late: Callable[[str], ValueError]
+               ns_limit: int, time_limit: float
                ) -> Callable[[int], Quaternion]:
     (alpha_rate, alpha_start), (a0, a1, a2, *_), (b0, b1, *_) = alpha
     (beta_rate, beta_start), (c0, c1, c2, *_), (d0, d1, *_) = beta
@@ -135,7 +141,7 @@ def _few_waves(alpha: _Waves, beta: _Waves, denominator: tuple[float, ...], phas
 
     def quaternion_at(ns: int) -> Quaternion:
         if not -ns_limit <= ns <= ns_limit:
-            raise too_late(f'{ns} ns')
+            raise too_late(f'{ns} ns', time_limit)
         angle = ((ns * rate + start & mask) - half) * unit
         s, c = sin(angle), cos(angle)
         alpha_real, alpha_imag = (a2 * c + a1) * c + a0, s * (b1 * c + b0)
@@ -152,7 +158,7 @@ def _few_waves(alpha: _Waves, beta: _Waves, denominator: tuple[float, ...], phas
 
 
 def _many_waves(alpha: _Waves, beta: _Waves, denominator: tuple[float, ...], phase: FixedRate,
-                ns_limit: int, too_late: Callable[[str], ValueError]
+                ns_limit: int, time_limit: float
                ) -> Callable[[int], Quaternion]:
     (alpha_rate, alpha_start), (a0, a1, a2, a3, a4), (b0, b1, b2, b3) = alpha
     (beta_rate, beta_start), (c0, c1, c2, c3, c4), (d0, d1, d2, d3) = beta
@@ -162,7 +168,7 @@ def _many_waves(alpha: _Waves, beta: _Waves, denominator: tuple[float, ...], pha
 
     def quaternion_at(ns: int) -> Quaternion:
         if not -ns_limit <= ns <= ns_limit:
-            raise too_late(f'{ns} ns')
+            raise too_late(f'{ns} ns', time_limit)
         angle = ((ns * rate + start & mask) - half) * unit
         s, c = sin(angle), cos(angle)
         alpha_real = (((a4 * c + a3) * c + a2) * c + a1) * c + a0
