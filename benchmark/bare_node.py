@@ -111,6 +111,9 @@ def main() -> None:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except Exception:       # rclpy found the context gone down in the midst of a wait
+        if rclpy.ok():
+            raise
     finally:
         node.stopped = True
         if hasattr(node, 'thread'):
