@@ -90,11 +90,12 @@ class Process:
 
     def wait(self, seconds: float) -> int:
         """Wait for its end; return its exit code.  Raises subprocess.TimeoutExpired."""
-        ended = os.pidfd_open(self.pid)     # subprocess would look every 50 ms
-        try:
-            select.select([ended], [], [], seconds)
-        finally:
-            os.close(ended)
+        if self.alive:
+            ended = os.pidfd_open(self.pid)     # subprocess would look every 50 ms
+            try:
+                select.select([ended], [], [], seconds)
+            finally:
+                os.close(ended)
         return self._process.wait(0.0)
 
     def end(self) -> int:

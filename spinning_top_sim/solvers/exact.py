@@ -152,7 +152,7 @@ class ExactSolution:
         Raises ValueError for a time too far away.
         """
         if not -self.ns_limit <= ns <= self.ns_limit:
-            raise self.too_late(f'{ns} ns')
+            raise too_late(f'{ns} ns', self.time_limit)
         # As in _nutation_phase, without the call.
         phase = ns * self._quarter_rate + self._offset0
         whole = phase + FIXED_HALF >> FIXED_BITS
@@ -214,7 +214,7 @@ class ExactSolution:
             float, float, float, float, float, float, float, float, float, float, float]:
         """Return what `state_at` does, and the body's angular velocity in its frame [rad/s]."""
         if not -self.ns_limit <= ns <= self.ns_limit:
-            raise self.too_late(f'{ns} ns')
+            raise too_late(f'{ns} ns', self.time_limit)
         quarters, y = self._nutation_phase(ns)
         point = nutation_at(self.branches[quarters & 1], y, -1.0 if quarters & 2 else 1.0, SCALAR)
         alpha, beta, alpha_argument, beta_argument, theta_dot = point
@@ -258,10 +258,6 @@ class ExactSolution:
         if self.top_rate:
             precession = precession + self.top_rate * (alpha / beta)
         return precession
-
-    def too_late(self, time: str) -> ValueError:
-        """Return the refusal of a time at which nothing is left of a phase."""
-        return too_late(time, self.time_limit)
 
     # ---------------------------------------------------------------------------- many states
 

@@ -26,7 +26,7 @@ from spinning_top_sim.solvers.exact import (
     nutation_at,
     transverse_rates,
 )
-from spinning_top_sim.solvers.exact_attitude import modes
+from spinning_top_sim.solvers.exact_attitude import modes, too_late
 from spinning_top_sim.solvers.long_decimals import (
     FIXED_BITS,
     FIXED_ONE,
@@ -241,12 +241,12 @@ class ArrayEvaluator:
         if t.size:
             latest = max(float(t.max()), -float(t.min()))
             if not latest <= self.solution.time_limit:      # catches NaN too
-                raise self.solution.too_late(f'{latest!r} s')
+                raise too_late(f'{latest!r} s', self.solution.time_limit)
         return t
 
     def _check_ns(self, ns: int) -> None:
         if abs(ns) > self.solution.ns_limit:
-            raise self.solution.too_late(f'{ns} ns')
+            raise too_late(f'{ns} ns', self.solution.time_limit)
 
 
 def _blocks(n: int) -> Iterator[slice]:
