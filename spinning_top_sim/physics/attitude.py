@@ -1,104 +1,125 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Attitude mathematics of the top in Cayley-Klein parameters, valid at every attitude.
+Attitude mathematics of the top in unit quaternions, regular at every attitude.
 
-The attitude q(world <- body) = Rz(phi) Ry(theta) Rz(psi) is held as two complex numbers (Klein &
-Sommerfeld, *Theorie des Kreisels*, ch. I),
+The attitude of the body in the world is the ZYZ rotation Rz(phi) Ry(theta) Rz(psi).  Its unit
+quaternion (x, y, z, w) holds the Cayley-Klein parameters of Klein & Sommerfeld, *Theorie des
+Kreisels*, ch. I:
 
     alpha = w + i z = cos(theta/2) exp(i (phi + psi)/2),
-    beta  = y - i x = sin(theta/2) exp(i (phi - psi)/2),
+    beta  = y - i x = sin(theta/2) exp(i (phi - psi)/2).
 
-and a vector as v_x + i v_y with v_z apart.  Only + - * / and `conjugate` are used, so every
-function takes one state (floats, complex) or many (numpy arrays) alike.
+Functions take and return columns: arrays of shape (n,), and tuples of such arrays for vectors and
+quaternions.  They use elementwise real arithmetic only, so that a value does not depend on the
+other values in its column.
 """
 
 from __future__ import annotations
 
-import math
-from typing import Any
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from spinning_top_sim.physics.top import Top
 
-# One number or an array of them; complex where the text says so.
-Scalar = Any
+Column = NDArray[np.float64]
+# Components x, y, z of a vector; an entry that is the same for all samples may be a float.
+Vector = tuple[Column | float, Column | float, Column | float]
+# Components x, y, z, w, the order of ROS and SciPy.
+Quaternion = tuple[Column, Column, Column, Column]
+Number = TypeVar('Number', float, Column)
 
 
-def quaternion(alpha: Scalar, beta: Scalar) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    """Return (x, y, z, w), the order of ROS and SciPy, of q(world <- body)."""
-    return -beta.imag, beta.real, alpha.imag, alpha.real
+def quaternion_of_angles(phi: Column, theta: Column, psi: Column) -> Quaternion:
+    """Return q(world <- body) of ZYZ Euler angles [rad]."""
+    half_sum, half_difference = 0.5 * (phi + psi), 0.5 * (phi - psi)
+    cosine, sine = np.cos(0.5 * theta), np.sin(0.5 * theta)
+    return (-sine * np.sin(half_difference), sine * np.cos(half_difference),
+            cosine * np.sin(half_sum), cosine * np.cos(half_sum))
 
 
-def axis_in_world(alpha: Scalar, beta: Scalar) -> tuple[Scalar, Scalar]:
-    """Return the symmetry axis e3 in the world: (e3_x + i e3_y, e3_z)."""
-    return 2.0 * alpha * beta, squared_modulus(alpha) - squared_modulus(beta)
+def product(p: Quaternion, q: Quaternion) -> Quaternion:
+    """Return the quaternion product p q: first the rotation q, then p."""
+    (a, b, c, d), (x, y, z, w) = p, q
+    return (d * x + a * w + b * z - c * y, d * y - a * z + b * w + c * x,
+            d * z + a * y - b * x + c * w, d * w - a * x - b * y - c * z)
 
 
-def vertical_in_body(alpha: Scalar, beta: Scalar) -> tuple[Scalar, Scalar]:
-    """Return the upward vertical in the body frame: (z_1 + i z_2, z_3)."""
-    return -2.0 * alpha.conjugate() * beta, squared_modulus(alpha) - squared_modulus(beta)
+def half_angle_squares(q: Quaternion) -> tuple[Column, Column]:
+    """Return cos^2 and sin^2 of theta/2."""
+    x, y, z, w = q
+    return w * w + z * z, x * x + y * y
 
 
-def transverse_in_body(alpha: Scalar, beta: Scalar, v_xy: Scalar, v_z: Scalar) -> Scalar:
-    """Return v_1 + i v_2 in the body frame of a vector given in the world."""
-    conjugate = alpha.conjugate()
-    return (conjugate * conjugate * v_xy - beta * beta * v_xy.conjugate()
-            - 2.0 * conjugate * beta * v_z)
+def axis_in_world(q: Quaternion) -> tuple[Column, Column, Column]:
+    """Return the symmetry axis e3 in the world frame."""
+    x, y, z, w = q
+    return (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), (w * w + z * z) - (x * x + y * y))
 
 
-def squared_modulus(z: Scalar) -> Scalar:
-    """Return |z|^2 without a square root."""
-    return z.real * z.real + z.imag * z.imag
+def vertical_in_body(q: Quaternion) -> tuple[Column, Column, Column]:
+    """Return the upward vertical in the body frame."""
+    x, y, z, w = q
+    return (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), (w * w + z * z) - (x * x + y * y))
 
 
-def momentum_in_world(top: Top, theta_dot: Scalar, phi_dot: Scalar, sin_theta: Scalar,
-                      cos_theta: Scalar, l3: float, cis_phi: Scalar) -> Scalar:
-    """
-    Return L_x + i L_y [kg m^2/s].
+def transverse_in_body(q: Quaternion, v: Vector) -> tuple[Column, Column]:
+    """Return the first two components in the body frame of a vector given in the world frame."""
+    x, y, z, w = q
+    vx, vy, vz = v
+    return ((w * w + x * x - y * y - z * z) * vx + 2.0 * (x * y + w * z) * vy
+            + 2.0 * (x * z - w * y) * vz,
+            2.0 * (x * y - w * z) * vx + (w * w - x * x + y * y - z * z) * vy
+            + 2.0 * (y * z + w * x) * vz)
 
-    Eq. (6) of "Analysis of Symmetric Spinning Top" turned into the world by exp(i phi).
-    """
-    return cis_phi * (sin_theta * (l3 - top.lambda1 * phi_dot * cos_theta)
-                      + 1j * (top.lambda1 * theta_dot))
 
-
-def precession_rate(top: Top, l3: float, lz: float, cos2_half: Scalar,
-                    sin2_half: Scalar) -> Scalar:
+def precession_rate(top: Top, l3: float, lz: float, cos2_half: Number,
+                    sin2_half: Number) -> Number:
     """
     Return phi' [rad/s] from cos^2 and sin^2 of theta/2.
 
-    Eq. (31), (Lz - L3 cos theta)/(lambda1 sin^2 theta), split so that each part has one pole and
-    nothing cancels; a part whose momentum vanishes is 0 at its pole too.
+    Eq. (31) of "Analysis of Symmetric Spinning Top" (2023), (Lz - L3 cos theta)/(lambda1
+    sin^2 theta), split into two terms with one pole each, so that nothing cancels.  A term whose
+    momentum vanishes is 0 at its pole too.
     """
-    return 0.25 / top.lambda1 * (_over(lz + l3, cos2_half) + _over(lz - l3, sin2_half))
+    bottom = (lz + l3) / cos2_half if lz + l3 else 0.0 * cos2_half
+    upright = (lz - l3) / sin2_half if lz - l3 else 0.0 * sin2_half
+    return 0.25 / top.lambda1 * (bottom + upright)
 
 
-def angular_acceleration(top: Top, omega: tuple[Scalar, Scalar, Scalar],
-                         vertical: Scalar) -> tuple[Scalar, Scalar]:
+def angular_acceleration(top: Top, omega: Vector, vertical: Vector) -> tuple[Column, Column]:
     """
-    Return omega_1' and omega_2' [rad/s^2] in the body frame (omega_3' = 0): Euler's equations.
+    Return omega_1' and omega_2' [rad/s^2] in the body frame by Euler's equations; omega_3' = 0.
 
-    omega: body rates [rad/s]; vertical: z_1 + i z_2 of `vertical_in_body`.
+    Parameters
+    ----------
+    omega : angular velocity in the body frame [rad/s]
+    vertical : upward vertical in the body frame
     """
     gyroscopic = (top.lambda1 - top.lambda3) * omega[2]
     torque = top.gravity_torque
-    return ((gyroscopic * omega[1] + torque * vertical.imag) / top.lambda1,
-            -(gyroscopic * omega[0] + torque * vertical.real) / top.lambda1)
+    return ((gyroscopic * omega[1] + torque * vertical[1]) / top.lambda1,
+            -(gyroscopic * omega[0] + torque * vertical[0]) / top.lambda1)
 
 
-def specific_force(gravity: float, point: tuple[float, float, float],
-                   omega: tuple[Scalar, Scalar, Scalar],
-                   alpha: tuple[Scalar, Scalar, Scalar],
-                   vertical: tuple[Scalar, Scalar, Scalar],
-                   ) -> tuple[Scalar, Scalar, Scalar]:
+def specific_force(gravity: float, point: tuple[float, float, float], omega: Vector,
+                   acceleration: Vector, vertical: Vector) -> Vector:
     """
-    Return what an ideal accelerometer at a body point measures [m/s^2], in the body frame.
+    Return what an ideal accelerometer at a point of the body measures, in the body frame [m/s^2].
 
-    f = alpha x r + omega x (omega x r) + g z: +g upwards at rest (REP-145).
-    point: r [m];  omega, alpha: angular velocity and acceleration;  vertical: upward unit vector.
+    f = omega' x r + omega x (omega x r) + g z: at rest +g upwards, as REP-145 has it.
+
+    Parameters
+    ----------
+    gravity : [m/s^2]
+    point : r in the body frame [m]
+    omega, acceleration : angular velocity [rad/s] and acceleration [rad/s^2], body frame
+    vertical : upward vertical in the body frame
     """
     r1, r2, r3 = point
     w1, w2, w3 = omega
-    a1, a2, a3 = alpha
+    a1, a2, a3 = acceleration
     along = w1 * r1 + w2 * r2 + w3 * r3
     square = w1 * w1 + w2 * w2 + w3 * w3
     return (a2 * r3 - a3 * r2 + w1 * along - r1 * square + gravity * vertical[0],
@@ -106,13 +127,9 @@ def specific_force(gravity: float, point: tuple[float, float, float],
             a1 * r2 - a2 * r1 + w3 * along - r3 * square + gravity * vertical[2])
 
 
-def angle_between(p: tuple[float, float, float, float],
-                  q: tuple[float, float, float, float]) -> float:
+def angle_between(p: Quaternion, q: Quaternion) -> Column:
     """Return the angle [rad] of the rotation from one attitude to another, accurate near 0."""
-    apart = math.dist(p, q)
-    opposite = math.hypot(*[a + b for a, b in zip(p, q, strict=True)])
-    return 4.0 * math.atan2(min(apart, opposite), max(apart, opposite))
-
-
-def _over(momentum: float, square: Scalar) -> Scalar:
-    return momentum / square if momentum != 0.0 else 0.0 * square
+    apart = sum((a - b) * (a - b) for a, b in zip(p, q, strict=True))
+    opposite = sum((a + b) * (a + b) for a, b in zip(p, q, strict=True))
+    return 4.0 * np.arctan2(np.sqrt(np.minimum(apart, opposite)),
+                            np.sqrt(np.maximum(apart, opposite)))

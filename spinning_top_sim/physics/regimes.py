@@ -118,6 +118,39 @@ def precession_extremes(top: Top, state: State, theta_min: float,
     return min(rates), max(rates)
 
 
+# How many units in the last place count as rounding.
+REST_ULPS = 2.0
+# And how far the axis may swing all the same, in cos(theta) over sin^2(theta).
+REST_SWING = 1e-12
+
+
+def nutation_rests(top: Top, start: State) -> bool:
+    """
+    Whether theta stays as it is: sleeping, hanging at a pole, or steady precession.
+
+    Steady means theta'' = 0, eq. (30), as nearly as its terms and the given L3 and Lz, doubles
+    all, can say.  Next to a pole they say so little that the axis may swing far; then it is not.
+    """
+    if start.theta_dot != 0.0:
+        return False
+    sine, cosine = math.sin(start.theta), math.cos(start.theta)
+    half_cosine, half_sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
+    phi_dot = attitude.precession_rate(top, start.l3, start.lz, half_cosine ** 2, half_sine ** 2)
+    gyroscopic = start.l3 / top.lambda1
+    terms = (phi_dot * phi_dot * sine * cosine, -gyroscopic * phi_dot * sine,
+             top.gravity_torque / top.lambda1 * sine)
+    doubt = sum(map(abs, terms))
+    if start.lz - start.l3 * cosine:
+        rounded_rate = (abs(start.lz) + abs(start.l3)) / (top.lambda1 * sine * sine)
+        doubt += abs((2.0 * phi_dot * cosine - gyroscopic) * sine) * rounded_rate
+    if abs(math.fsum(terms)) > REST_ULPS * math.ulp(1.0) * doubt:
+        return False
+    # From theta' = 0 cos(theta) swings by f1/f2, where that is small.
+    s0, c0 = half_sine ** 2, half_cosine ** 2
+    _, f1, f2, _ = cubic(top, start, s0, c0)
+    return abs(f1) <= REST_SWING * 4.0 * s0 * c0 * abs(f2)
+
+
 # Relative distance below which two roots, or a root and Lz/L3, are said to coincide.
 COINCIDE = 1e-12
 

@@ -5,21 +5,24 @@ Adaptive Dormand-Prince 5(4) steps in plain Python numbers: the method of MATLAB
 Tableau: Dormand & Prince, "A family of embedded Runge-Kutta formulae", J. Comp. Appl. Math. 6
 (1980) 19-26, table 2 (RK5(4)7M).  Step control: Hairer, Norsett & Wanner, *Solving Ordinary
 Differential Equations I*, 2nd ed., sect. II.4.  Between steps the solution is the quintic
-Hermite polynomial through value, slope and curvature at both ends: its error is O(h^6) like that
-of a step, where the usual 4th-order continuous extension would spoil the step's accuracy; the
-curvatures come from the equations themselves and only where a step is sampled at all.
+Hermite polynomial through the value and two derivatives at both ends: its error is O(h^6) like
+that of a step, where the usual 4th-order continuous extension would spoil the step's accuracy.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 # One state: a tuple of n floats or complex numbers.
 Vector = tuple[Any, ...]
+Rows = NDArray[np.float64]
 
 STAGES: tuple[tuple[Fraction, ...], ...] = (
     (Fraction(1, 5),),
@@ -49,7 +52,7 @@ class IntegrationError(RuntimeError):
     """The integration cannot go on; the message says where, why and what to do instead."""
 
 
-class Form(Protocol):
+class Equations(Protocol):
     """Equations of motion y' = f(y) in some chart, with what the step control needs to know."""
 
     @property
@@ -60,11 +63,19 @@ class Form(Protocol):
     def number(self) -> type:
         """Of the unknowns: float or complex."""
 
-    def rates(self, *y: Any) -> Vector:
+    @property
+    def start(self) -> Vector:
+        """The unknowns at t = 0."""
+
+    @property
+    def first_step(self) -> float:
+        """A careful first step [s]: the control finds the right one within a few."""
+
+    def derivative(self, *y: Any) -> Vector:
         """Return y'."""
 
-    def curvatures(self, y: Vector, rates: Vector) -> Vector:
-        """Return y'' from y and y'."""
+    def second_derivative(self, y: Rows, derivative: Rows) -> Rows:
+        """Return y'' from y and y': rows of components (k, n), real and imaginary parts apart."""
 
     def project(self, y: Vector) -> Vector:
         """Return y moved back onto the motion's invariants, or as it is."""
@@ -110,51 +121,19 @@ def unrolled_step(size: int, number: type) -> StepFunction:
     return scope['step']
 
 
-class DenseStep:
+class Step(NamedTuple):
     """
-    One accepted step, to be read anywhere between its ends.
+    One accepted step.
 
-    t0, t1: the ends [s];  y0, y1: the states there;  slope0, slope1: their derivatives
+    t0, t1: the ends [s];  y0, y1: the unknowns there;  derivative0, derivative1: their derivatives
     """
 
-    __slots__ = ('_form', '_polynomial', 'slope0', 'slope1', 't0', 't1', 'y0', 'y1')
-
-    def __init__(self, form: Form, t0: float, y0: Vector, slope0: Vector,
-                 t1: float, y1: Vector, slope1: Vector) -> None:
-        self._form = form
-        self.t0, self.y0, self.slope0 = t0, y0, slope0
-        self.t1, self.y1, self.slope1 = t1, y1, slope1
-        self._polynomial: list[tuple[Any, ...]] | None = None
-
-    def interpolate(self, t: float) -> Vector:
-        """Return y at t in [t0, t1] [s]; the ends exactly."""
-        if t >= self.t1:
-            return self.y1
-        s = (t - self.t0) / (self.t1 - self.t0)
-        return tuple([((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0
-                      for c0, c1, c2, c3, c4, c5 in self._polynomial or self.coefficients])
-
-    @property
-    def coefficients(self) -> list[tuple[Any, ...]]:
-        """Of the quintic in s = (t - t0)/h, one tuple a component."""
-        if self._polynomial is None:
-            self._polynomial = self._hermite()
-        return self._polynomial
-
-    def _hermite(self) -> list[tuple[Any, ...]]:
-        h = self.t1 - self.t0
-        bend0 = self._form.curvatures(self.y0, self.slope0)
-        bend1 = self._form.curvatures(self.y1, self.slope1)
-        rows = []
-        for a, b, k0, k1, c0, c1 in zip(self.y0, self.y1, self.slope0, self.slope1, bend0, bend1,
-                                        strict=True):
-            rise, p, q = b - a, h * k0, h * k1
-            u, v = 0.5 * h * h * c0, 0.5 * h * h * c1
-            rows.append((a, p, u,
-                         10.0 * rise - 6.0 * p - 4.0 * q - 3.0 * u + v,
-                         -15.0 * rise + 8.0 * p + 7.0 * q + 3.0 * u - 2.0 * v,
-                         6.0 * rise - 3.0 * p - 3.0 * q - u + v))
-        return rows
+    t0: float
+    y0: Vector
+    derivative0: Vector
+    t1: float
+    y1: Vector
+    derivative1: Vector
 
 
 class Integrator:
@@ -165,20 +144,20 @@ class Integrator:
     counts
     """
 
-    def __init__(self, form: Form, start: Vector, first_step: float) -> None:
-        self.form = form
-        self._step = unrolled_step(len(start), form.number)
-        start = form.project(start)
-        slope = form.rates(*start)
-        self.newest = DenseStep(form, 0.0, start, slope, 0.0, start, slope)
-        self._next_step = first_step
+    def __init__(self, equations: Equations) -> None:
+        self.equations = equations
+        start = equations.project(equations.start)
+        self._step = unrolled_step(len(start), equations.number)
+        derivative = equations.derivative(*start)
+        self.newest = Step(0.0, start, derivative, 0.0, start, derivative)
+        self._next_step = equations.first_step
         self.steps = self.rejected = 0
         self.evaluations = 1
 
-    def step(self) -> DenseStep:
+    def step(self) -> Step:
         """Take one accepted step.  Raises IntegrationError where none can be taken."""
-        form, newest = self.form, self.newest
-        t, y, slope = newest.t1, newest.y1, newest.slope1
+        equations, newest = self.equations, self.newest
+        t, y, derivative = newest.t1, newest.y1, newest.derivative1
         grow = GROW
         while True:
             end = t + self._next_step
@@ -186,10 +165,10 @@ class Integrator:
             if not h > SMALLEST_STEP_ULPS * math.ulp(t) or not math.isfinite(end):
                 raise IntegrationError(
                     f'the step size collapsed to {self._next_step:.3g} s at t = {t:.9g} s '
-                    f'({form.name} equations)')
-            y_new, slope_new, difference = self._step(form.rates, h, y, slope)
+                    f'({equations.name} equations)')
+            y_new, derivative_new, difference = self._step(equations.derivative, h, y, derivative)
             self.evaluations += 6
-            error = form.error(y, y_new, difference)
+            error = equations.error(y, y_new, difference)
             if error <= 1.0:
                 break
             # A NaN compares false everywhere: it lands here and shrinks the step until collapse.
@@ -197,11 +176,53 @@ class Integrator:
             grow = 1.0
             shrink = SAFETY * error ** -0.2 if error < math.inf else SHRINK
             self._next_step = h * max(SHRINK, shrink)
-        form.check_step(y, y_new)
+        equations.check_step(y, y_new)
         factor = SAFETY * error ** -0.2 if error > 0.0 else grow
         self._next_step = h * min(grow, max(SHRINK, factor))
         self.steps += 1
         # First same as last: the projection moves y by less than the step's own error, so the
-        # slope at the unprojected end serves the next step too.
-        self.newest = DenseStep(form, t, y, slope, end, form.project(y_new), slope_new)
+        # derivative at the unprojected end serves the next step too.
+        self.newest = Step(t, y, derivative, end, equations.project(y_new), derivative_new)
         return self.newest
+
+
+class Interpolants(NamedTuple):
+    """
+    The quintic Hermite polynomials of n steps in s = (t - begin)/length.
+
+    begin, length: (n,) [s];  coefficients: (6, k, n) by power and component, real and imaginary
+    parts apart
+    """
+
+    begin: Rows
+    length: Rows
+    coefficients: Rows
+
+    @classmethod
+    def of(cls, steps: Sequence[Step], equations: Equations) -> Interpolants:
+        """Return the interpolants of steps of these equations."""
+        begin = np.array([step.t0 for step in steps])
+        h = np.array([step.t1 - step.t0 for step in steps])
+        y0, y1 = _rows([step.y0 for step in steps]), _rows([step.y1 for step in steps])
+        first0 = _rows([step.derivative0 for step in steps])
+        first1 = _rows([step.derivative1 for step in steps])
+        rise, p, q = y1 - y0, h * first0, h * first1
+        u = 0.5 * h * h * equations.second_derivative(y0, first0)
+        v = 0.5 * h * h * equations.second_derivative(y1, first1)
+        return cls(begin, np.where(h > 0.0, h, 1.0), np.array((
+            y0, p, u,
+            10.0 * rise - 6.0 * p - 4.0 * q - 3.0 * u + v,
+            -15.0 * rise + 8.0 * p + 7.0 * q + 3.0 * u - 2.0 * v,
+            6.0 * rise - 3.0 * p - 3.0 * q - u + v)))
+
+    def at(self, numbers: NDArray[np.int64], t: Rows) -> Rows:
+        """Return the unknowns (k, m) at m times [s] in the steps of these numbers."""
+        s = (t - self.begin[numbers]) / self.length[numbers]
+        c0, c1, c2, c3, c4, c5 = self.coefficients.take(numbers, axis=2)
+        return ((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0
+
+
+def _rows(vectors: Sequence[Vector]) -> Rows:
+    """Return rows (k, n) of n vectors; a complex component makes two rows."""
+    columns = np.array(vectors)
+    return np.ascontiguousarray(columns.view(np.float64).T)

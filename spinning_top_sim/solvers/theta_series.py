@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from decimal import Decimal, getcontext
 
-from spinning_top_sim.solvers.long_decimals import (
+from spinning_top_sim.solvers.decimal_math import (
     ONE,
     ZERO,
     complete_integral,

@@ -29,7 +29,7 @@ from dataclasses import dataclass, replace
 from decimal import Decimal, DecimalException, getcontext, localcontext
 
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.long_decimals import (
+from spinning_top_sim.solvers.decimal_math import (
     ONE,
     ZERO,
     atan2,
@@ -256,7 +256,10 @@ def _cubic_roots(f0: Decimal, f1: Decimal, f2: Decimal, f3: Decimal) -> _Roots:
         return _Roots(low, ZERO, high, -low, high)
     y, side = _isolated_root(a2, a1, a0)
     product = -a0 / y
-    low, high, gap = _quadratic_roots((a1 - product) / y, product)  # near a pole -a2 - y cancels
+    # The sum of the others, without cancellation: near a pole -a2 - y would, with a small y the
+    # other.
+    total = -a2 - y if 2 * abs(y) < abs(a2) else (a1 - product) / y
+    low, high, gap = _quadratic_roots(total, product)
     if side < 0:
         return _Roots(y, low, high, low - y, gap)
     return _Roots(low, high, y, gap, y - high)

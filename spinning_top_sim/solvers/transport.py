@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The form of the equations that the simulator steps by default: regular at every attitude.
+The equations that the simulator steps by default: regular at every attitude.
 
 Unknowns are the Cayley-Klein parameters and the horizontal angular momentum in the world,
 m = i (L_x + i L_y)/(2 lambda1).  From q' = (1/2) omega q and L' = torque,
@@ -23,11 +23,13 @@ from __future__ import annotations
 
 import cmath
 import math
+from typing import NamedTuple, Protocol
 
-from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.pairs import Pairs
+import numpy as np
+
+from spinning_top_sim.physics.attitude import Column, precession_rate
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.dormand_prince import Vector
+from spinning_top_sim.solvers.dormand_prince import Rows, Vector
 
 # The energy error is taken out of the nutation rate where its square is this share of the
 # largest |m|^2 or more: at a turning point the energy does not tell the rate.
@@ -36,8 +38,47 @@ NUTATION_SHARE = 1e-6
 POLE_SHARE = 1e-4
 
 
-class TransportForm:
-    """The equations above for one top and one motion; see `dormand_prince.Form`."""
+class Unknowns(NamedTuple):
+    """Real and imaginary parts of alpha, beta and m: numbers, or columns of shape (n,)."""
+
+    alpha_real: Column
+    alpha_imag: Column
+    beta_real: Column
+    beta_imag: Column
+    m_real: Column
+    m_imag: Column
+
+
+class _Functions(Protocol):
+    """What the projection takes from numpy for columns, from `math` for one state."""
+
+    def sqrt(self, x, /): ...  # type: ignore[no-untyped-def]
+    def copysign(self, x, y, /): ...  # type: ignore[no-untyped-def]
+    def where(self, condition, x, y, /): ...  # type: ignore[no-untyped-def]
+
+
+class _OneState:
+    """The functions of one state, which numpy would take ten times as long for."""
+
+    sqrt = staticmethod(math.sqrt)
+    copysign = staticmethod(math.copysign)
+
+    @staticmethod
+    def where(condition: bool, x: float, y: float) -> float:
+        return x if condition else y
+
+
+class TransportEquations:
+    """
+    The equations above for one top and one motion; see `dormand_prince.Equations`.
+
+    Parameters
+    ----------
+    top : Top
+    start : State
+    rtol, atol : tolerated error of a step; the unknowns are scaled to 1, so the two add up
+    spin_carried_share : c/L3
+    """
 
     name = 'transport'
     number = complex
@@ -53,7 +94,8 @@ class TransportForm:
         self.spin_rate = l3 / top.lambda3 - (l3 - self.spin_carried) / lambda1   # chi
         self.start = self._vector(start)
         # What 2 lambda1 |m|^2 + P cos(theta) must stay; the rest of the energy is constant.
-        self._energy = self._axis_energy(*self.start)
+        alpha, beta, m = self.start
+        self._energy = 2.0 * lambda1 * abs(m) ** 2 + torque * (abs(alpha) ** 2 - abs(beta) ** 2)
         # |m| never exceeds this: the scale of its error, as 1 is that of alpha and beta.  Close to
         # hanging the sum is what its rounding leaves.
         above_lowest = max(self._energy + abs(torque), 4.0 * math.ulp(1.0) * abs(torque))
@@ -62,15 +104,17 @@ class TransportForm:
         self._large_enough = NUTATION_SHARE * self._scale ** 2
 
     def _vector(self, start: State) -> Vector:
-        top = self.top
+        """Return alpha, beta and m of a state; L_x + i L_y by eq. (6), turned by exp(i phi)."""
+        lambda1 = self.top.lambda1
         cosine, sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
-        phi_dot = attitude.precession_rate(top, self.l3, self.lz, cosine * cosine, sine * sine)
-        momentum = attitude.momentum_in_world(
-            top, start.theta_dot, phi_dot, 2.0 * sine * cosine, cosine * cosine - sine * sine,
-            self.l3, cmath.rect(1.0, start.phi))
+        phi_dot = precession_rate(self.top, self.l3, self.lz, cosine * cosine, sine * sine)
+        momentum = cmath.rect(1.0, start.phi) * complex(
+            2.0 * sine * cosine * (self.l3 - lambda1 * phi_dot
+                                   * (cosine * cosine - sine * sine)),
+            lambda1 * start.theta_dot)
         return (cosine * cmath.rect(1.0, 0.5 * (start.phi + start.psi)),
                 sine * cmath.rect(1.0, 0.5 * (start.phi - start.psi)),
-                0.5j * momentum / top.lambda1)
+                0.5j * momentum / lambda1)
 
     @property
     def first_step(self) -> float:
@@ -80,18 +124,24 @@ class TransportForm:
                 + math.sqrt(abs(top.gravity_torque) / top.lambda1))
         return 0.1 * self._tolerance ** 0.2 / rate
 
-    def rates(self, alpha: complex, beta: complex, m: complex) -> Vector:
+    def derivative(self, alpha: complex, beta: complex, m: complex) -> Vector:
         """Return (alpha', beta', m')."""
         return (self._turn_a * alpha + m * beta.conjugate(),
                 self._turn_b * beta - m * alpha.conjugate(),
                 self._fall * (alpha * beta))
 
-    def curvatures(self, y: Vector, rates: Vector) -> Vector:
-        """Return (alpha'', beta'', m''): the equations differentiated once."""
-        (a, b, m), (da, db, dm) = y, rates
-        return (self._turn_a * da + dm * b.conjugate() + m * db.conjugate(),
-                self._turn_b * db - dm * a.conjugate() - m * da.conjugate(),
-                self._fall * (da * b + a * db))
+    def second_derivative(self, y: Rows, derivative: Rows) -> Rows:
+        """Return alpha'', beta'' and m'', the equations differentiated once, as six rows."""
+        a, a_imag, b, b_imag, m, m_imag = y
+        da, da_imag, db, db_imag, dm, dm_imag = derivative
+        turn_a, turn_b, fall = self._turn_a.imag, self._turn_b.imag, self._fall.real
+        return np.array((
+            dm * b + dm_imag * b_imag + m * db + m_imag * db_imag - turn_a * da_imag,
+            dm_imag * b - dm * b_imag + m_imag * db - m * db_imag + turn_a * da,
+            -(dm * a + dm_imag * a_imag + m * da + m_imag * da_imag) - turn_b * db_imag,
+            -(dm_imag * a - dm * a_imag + m_imag * da - m * da_imag) + turn_b * db,
+            fall * (da * b - da_imag * b_imag + a * db - a_imag * db_imag),
+            fall * (da * b_imag + da_imag * b + a * db_imag + a_imag * db)))
 
     def error(self, y: Vector, y_new: Vector, difference: Vector) -> float:
         """Return the largest of the three errors, each over its scale and the tolerance."""
@@ -99,90 +149,83 @@ class TransportForm:
         return max(abs(da), abs(db), abs(dm) / self._scale) / self._tolerance
 
     def check_step(self, y: Vector, y_new: Vector) -> None:
-        """Nothing can go wrong silently in this form."""
-
-    def _axis_energy(self, alpha: complex, beta: complex, m: complex) -> float:
-        return (2.0 * self.top.lambda1 * attitude.squared_modulus(m) + self.top.gravity_torque
-                * (attitude.squared_modulus(alpha) - attitude.squared_modulus(beta)))
+        """Nothing can go wrong silently in these equations."""
 
     def project(self, y: Vector) -> Vector:
-        """Return y with |q| = 1, then L.e3 = L3, then the energy restored along theta'."""
+        """Return y moved back onto the invariants; see `project_columns`."""
         alpha, beta, m = y
-        cos2 = alpha.real * alpha.real + alpha.imag * alpha.imag
-        sin2 = beta.real * beta.real + beta.imag * beta.imag
-        shrink = 1.0 / math.sqrt(cos2 + sin2)
-        alpha *= shrink
-        beta *= shrink
-        cos_theta = (cos2 - sin2) * shrink * shrink
-        half_axis = alpha * beta                # (e3_x + i e3_y)/2
-        share = shrink * shrink
-        square = cos2 * sin2 * (share * share)
-        if square <= POLE_SHARE:
-            return alpha, beta, m
-        lambda1 = self.top.lambda1
-        # m conj(half_axis) = (u + i v): v carries L.e3, u the nutation rate.
-        along = m * half_axis.conjugate()
-        v = 0.25 * (self.l3 - self.lz * cos_theta) / lambda1
-        u = along.real
-        wanted = (self._energy - self.top.gravity_torque * cos_theta) / (2.0 * lambda1) * square
-        if u * u > self._large_enough * square:
-            root = wanted - v * v
-            if root > 0.0:
-                u = math.copysign(math.sqrt(root), u)
-        return alpha, beta, complex(u, v) * half_axis / square
+        projected = self._project(Unknowns(alpha.real, alpha.imag, beta.real, beta.imag,
+                                           m.real, m.imag), _OneState)
+        return complex(*projected[:2]), complex(*projected[2:4]), complex(*projected[4:])
 
-    def project_columns(self, alpha: Pairs, beta: Pairs, m: Pairs) -> tuple[Pairs, Pairs, Pairs]:
-        """Return what `project` does, to the last bit, of columns."""
-        import numpy as np  # noqa: PLC0415 - who reads one state at a time does without
+    def project_columns(self, y: Unknowns) -> Unknowns:
+        """Return y with |q| = 1, then L.e3 = L3, then the energy restored along theta'."""
+        return self._project(y, np)
 
-        cos2, sin2 = attitude.squared_modulus(alpha), attitude.squared_modulus(beta)
-        shrink = 1.0 / np.sqrt(cos2 + sin2)
-        alpha, beta = alpha * shrink, beta * shrink
-        cos_theta = (cos2 - sin2) * shrink * shrink
-        half_axis = alpha * beta
+    def _project(self, y: Unknowns, functions: _Functions) -> Unknowns:
+        alpha_real, alpha_imag, beta_real, beta_imag, m_real, m_imag = y
+        where = functions.where
+        cos2 = alpha_real * alpha_real + alpha_imag * alpha_imag
+        sin2 = beta_real * beta_real + beta_imag * beta_imag
+        shrink = 1.0 / functions.sqrt(cos2 + sin2)
+        alpha_real, alpha_imag = alpha_real * shrink, alpha_imag * shrink
+        beta_real, beta_imag = beta_real * shrink, beta_imag * shrink
         share = shrink * shrink
+        cos_theta = (cos2 - sin2) * share
         square = cos2 * sin2 * (share * share)
+        # (e3_x + i e3_y)/2 = alpha beta; m conj(alpha beta) = u + i v: v carries L.e3, u theta'.
+        axis_real = alpha_real * beta_real - alpha_imag * beta_imag
+        axis_imag = alpha_real * beta_imag + alpha_imag * beta_real
         lambda1 = self.top.lambda1
         v = 0.25 * (self.l3 - self.lz * cos_theta) / lambda1
-        u = (m * half_axis.conjugate()).real
+        u = m_real * axis_real + m_imag * axis_imag
         wanted = (self._energy - self.top.gravity_torque * cos_theta) / (2.0 * lambda1) * square
         root = wanted - v * v
         mended = (u * u > self._large_enough * square) & (root > 0.0)
-        u = np.where(mended, np.copysign(np.sqrt(np.where(mended, root, 0.0)), u), u)
+        u = where(mended, functions.copysign(
+            functions.sqrt(where(root > 0.0, root, 0.0)), u), u)
         at_pole = square <= POLE_SHARE
-        if not at_pole.any():
-            return alpha, beta, Pairs(u, v) * half_axis / square
-        elsewhere = Pairs(u, v) * half_axis / np.where(at_pole, 1.0, square)
-        return alpha, beta, Pairs(np.where(at_pole, m.real, elsewhere.real),
-                                  np.where(at_pole, m.imag, elsewhere.imag))
+        divisor = where(at_pole, 1.0, square)
+        return Unknowns(
+            alpha_real, alpha_imag, beta_real, beta_imag,
+            where(at_pole, m_real, (u * axis_real - v * axis_imag) / divisor),
+            where(at_pole, m_imag, (u * axis_imag + v * axis_real) / divisor))
 
-    def project_on_lines(self, y: Vector, alpha: tuple[float, float],
-                         beta: tuple[float, float]) -> Vector:
+    def project_on_lines(self, y: Unknowns, cosine: Column, sine: Column, alpha_phase: Column,
+                         beta_phase: Column) -> Unknowns:
         """
-        Return what `project` does, for a top that passes a pole: Lz = L3 or Lz = -L3.
+        Return what `project_columns` does, for a top that passes a pole: Lz = L3 or Lz = -L3.
 
-        alpha, beta: of y, as signed moduli and phases; of one that can vanish the phase is known
-        without the steps.  Then the meridian of the axis is, at a pole too, and m has its place.
+        Parameters
+        ----------
+        y : Unknowns
+        cosine, sine : signed moduli of alpha and beta
+        alpha_phase, beta_phase : their phases [rad].  That of a parameter which can vanish is
+            known without the steps; so the meridian of the axis is known at a pole too.
         """
-        (cosine, phase_a), (sine, phase_b) = alpha, beta
-        shrink = 1.0 / math.hypot(cosine, sine)
-        cosine *= shrink
-        sine *= shrink
+        shrink = 1.0 / np.hypot(cosine, sine)
+        cosine, sine = cosine * shrink, sine * shrink
         lambda1 = self.top.lambda1
         # As above, with L3 -+ Lz cos(theta) = 2 L3 sin^2(theta/2) or 2 L3 cos^2(theta/2).
-        v = 0.0
+        v = np.zeros(len(cosine))
         if self.l3:
-            v = 0.5 * self.l3 / lambda1 * (sine / cosine if self.lz == self.l3 else cosine / sine)
-        meridian = cmath.rect(1.0, phase_a + phase_b)
+            v = 0.5 * self.l3 / lambda1 * (
+                sine / cosine if self.lz == self.l3 else cosine / sine)
+        meridian = alpha_phase + beta_phase
+        meridian_cos, meridian_sin = np.cos(meridian), np.sin(meridian)
         half_axis = cosine * sine
-        if half_axis * half_axis > POLE_SHARE:      # the steps' own meridian goes with their m
-            u = (y[2] * (y[0] * y[1]).conjugate()).real / half_axis
-        else:
-            u = (y[2] * meridian.conjugate()).real
-        if u * u > self._large_enough:
-            root = (self._energy - self.top.gravity_torque * (cosine - sine) * (cosine + sine)
-                    ) / (2.0 * lambda1) - v * v
-            if root > 0.0:
-                u = math.copysign(math.sqrt(root), u)
-        return (cmath.rect(cosine, phase_a), cmath.rect(sine, phase_b),
-                complex(u, v) * meridian)
+        # Away from the pole the steps' own meridian goes with their m.
+        axis_real = y.alpha_real * y.beta_real - y.alpha_imag * y.beta_imag
+        axis_imag = y.alpha_real * y.beta_imag + y.alpha_imag * y.beta_real
+        away = half_axis * half_axis > POLE_SHARE
+        u = np.where(away, (y.m_real * axis_real + y.m_imag * axis_imag)
+                     / np.where(away, half_axis, 1.0),
+                     y.m_real * meridian_cos + y.m_imag * meridian_sin)
+        root = (self._energy - self.top.gravity_torque * (cosine - sine) * (cosine + sine)
+                ) / (2.0 * lambda1) - v * v
+        mended = (u * u > self._large_enough) & (root > 0.0)
+        u = np.where(mended, np.copysign(np.sqrt(np.where(root > 0.0, root, 0.0)), u), u)
+        return Unknowns(
+            cosine * np.cos(alpha_phase), cosine * np.sin(alpha_phase),
+            sine * np.cos(beta_phase), sine * np.sin(beta_phase),
+            u * meridian_cos - v * meridian_sin, u * meridian_sin + v * meridian_cos)

@@ -11,11 +11,16 @@ equal messages are equal bytes.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
 
 ENCAPSULATION = b'\x00\x01\x00\x00'
 NANOSECONDS = 1_000_000_000
+
+# The numbers of a field in n messages: an array (n, count), or `count` columns or numbers.
+Field = NDArray[np.float64] | Sequence[NDArray[np.float64] | float]
 
 
 class CdrWriter:
@@ -92,119 +97,96 @@ class CdrWriter:
 
 class Template:
     """
-    A serialized message whose stamp and numbers are replaced.
+    A serialized message whose stamp and numbers are replaced, many messages at a time.
 
-    encode(stamp_ns, *runs): return the message with this stamp [ns] and one sequence of numbers a
-    run, as bytes.
+    Parameters
+    ----------
+    writer : CdrWriter
+        The message.
+    stamps_at : offsets of its stamps: none, one, or one of each part of an array
+    fields : (offset, count) of each run of doubles that is replaced
+
+    Bytes outside of stamps and fields stay as they are.
     """
-
-    encode: Callable[..., bytes]
 
     def __init__(self, writer: CdrWriter, stamps_at: Sequence[int],
                  fields: Sequence[tuple[int, int]]) -> None:
-        """
-        Take the bytes, the offsets of the stamp (none, one, or one of each part of an array),
-        and (offset, count) of each run of doubles to patch.
-
-        What lies between the runs keeps its bytes.
-        """
         self._buffer = writer.buffer
         self._stamps_at = tuple(stamps_at)
         self._fields = tuple(fields)
-        self._rows: Any = None
-        self.encode = self._written_out()
+        self._row_type = self._make_row_type()
+        self._rows: NDArray[np.void] = np.empty(0, self._row_type)
 
     def __len__(self) -> int:
         """Return the size of every message [bytes]."""
         return len(self._buffer)
 
-    def with_fixed(self, *runs: Sequence[float]) -> Template:
-        """Return the message with these numbers for good: `encode` takes no runs then."""
+    def with_fixed(self, *values: Field) -> Template:
+        """Return the message with these numbers for good: `encode` takes no fields then."""
         writer = CdrWriter()
-        writer.buffer[:] = self.encode(0, *runs)
+        writer.buffer[:] = self.encode_one(0, *values)
         template = Template(writer, self._stamps_at, ())
-        template._fields = self._fields
+        template._fields, template._row_type = self._fields, self._row_type
+        template._rows = np.empty(0, self._row_type)
         return template
 
-    def _written_out(self) -> Callable[..., bytes]:
+    def encode(self, stamps_ns: NDArray[np.int64], *values: Field) -> NDArray[np.uint8]:
         """
-        Return `encode`: one call that packs what varies between what does not.
+        Return n messages of equal length as rows of bytes (n, size).
 
-        Written out as source text once, because a loop over the runs takes twice the time.
+        Parameters
+        ----------
+        stamps_ns : (n,) [ns]
+        values : one for each field: an array (n, count), or `count` columns (n,) or numbers
+
+        The rows are valid until the next call.
         """
-        pieces = [(at, 8 * count, f'{count}d', f'*run{i}')
-                  for i, (at, count) in enumerate(self._fields)]
-        pieces += [(at, 8, 'iI', f'*divmod(stamp_ns, {NANOSECONDS})') for at in self._stamps_at]
-        scope: dict[str, Any] = {}
-        formats, arguments, end = ['<'], [], 0
-        for at, size, code, argument in [*sorted(pieces), (len(self._buffer), 0, '', '')]:
-            if at > end:
-                scope[f'fixed{end}'] = bytes(self._buffer[end:at])
-                formats.append(f'{at - end}s')
-                arguments.append(f'fixed{end}')
-            if size:
-                formats.append(code)
-                arguments.append(argument)
-            end = at + size
-        scope['pack'] = struct.Struct(''.join(formats)).pack
-        names = ', '.join(['stamp_ns', *(f'run{i}' for i in range(len(self._fields)))])
-        function: Callable[..., bytes] = eval(
-            f'lambda {names}: pack({", ".join(arguments)})', scope)
-        return function
-
-    def encode_many(self, stamps_ns: Any, *runs: Any) -> Any:
-        """
-        Return n messages of equal length as rows of bytes, (n, size) uint8.
-
-        stamps_ns: (n,) int64 [ns];  runs: (n, count) arrays, or tuples of `count` columns or
-        numbers.  The rows are valid until the next call.
-        """
-        import numpy  # noqa: PLC0415 - offline only
-
         count = len(stamps_ns)
-        if self._rows is None or len(self._rows) < count:
-            self._rows = numpy.empty(count, self._row_type())
-            self._rows.view('u1').reshape(count, -1)[:] = numpy.frombuffer(self._buffer, 'u1')
+        if len(self._rows) < count:
+            self._rows = np.empty(count, self._row_type)
+            self._rows.view(np.uint8).reshape(count, -1)[:] = np.frombuffer(
+                self._buffer, np.uint8)
         rows = self._rows[:count]
         for at in self._stamps_at:
-            rows[f'sec{at}'], rows[f'nanosec{at}'] = numpy.divmod(stamps_ns, NANOSECONDS)
-        for i, run in enumerate(runs):
-            field = rows[f'run{i}']
-            if isinstance(run, numpy.ndarray):
-                field[:] = run
+            rows[f'sec{at}'], rows[f'nanosec{at}'] = np.divmod(stamps_ns, NANOSECONDS)
+        for i, value in enumerate(values):
+            field = rows[f'field{i}']
+            if isinstance(value, np.ndarray):
+                field[:] = value
             else:
-                for column, values in enumerate(run):
-                    field[:, column] = values
-        return rows.view('u1').reshape(count, -1)
+                for column, numbers in enumerate(value):
+                    field[:, column] = numbers
+        return rows.view(np.uint8).reshape(count, -1)
 
-    def decode_many(self, data: bytes) -> tuple[Any, ...]:
-        """Return the runs, (n, count) arrays each, of n messages one after the other."""
-        import numpy  # noqa: PLC0415
+    def encode_one(self, stamp_ns: int, *values: Field) -> bytes:
+        """Return one message; see `encode`."""
+        return self.encode(np.array([stamp_ns]), *values).tobytes()
 
-        rows = numpy.frombuffer(data, self._row_type())
-        return tuple(rows[f'run{i}'] for i in range(len(self._fields)))
+    def decode(self, data: bytes) -> tuple[NDArray[np.float64], ...]:
+        """Return the fields, (n, count) each, of n messages one after the other."""
+        rows = np.frombuffer(data, self._row_type)
+        return tuple(rows[f'field{i}'] for i in range(len(self._fields)))
 
-    def _row_type(self) -> Any:
-        """Return a message as a numpy type: the runs, and the stamps if there are any."""
-        import numpy  # noqa: PLC0415
-
-        names = [f'run{i}' for i in range(len(self._fields))]
-        formats: list[Any] = [('<f8', (number,)) for _, number in self._fields]
+    def _make_row_type(self) -> np.dtype[np.void]:
+        """Return a message as a numpy type: the fields, and the stamps if there are any."""
+        names = [f'field{i}' for i in range(len(self._fields))]
+        formats: list[str | tuple[str, tuple[int]]] = [
+            ('<f8', (number,)) for _, number in self._fields]
         offsets = [at for at, _ in self._fields]
         for at in self._stamps_at:
             names += [f'sec{at}', f'nanosec{at}']
             formats += ['<i4', '<u4']
             offsets += [at, at + 4]
-        return numpy.dtype({'names': names, 'formats': formats, 'offsets': offsets,
-                            'itemsize': len(self._buffer)})
+        return np.dtype({'names': names, 'formats': formats, 'offsets': offsets,
+                         'itemsize': len(self._buffer)})
 
     def field_at(self, at: int) -> tuple[int, int, int] | None:
-        """Return run, element and offset of what holds a byte: run -1 is the stamp."""
+        """Return field, element and offset of what holds a byte: field -1 is the stamp."""
         for stamp_at in self._stamps_at:
             if 0 <= at - stamp_at < 8:
                 return -1, 0, stamp_at
-        for run, (begin, count) in enumerate(self._fields):
+        for field, (begin, count) in enumerate(self._fields):
             if 0 <= at - begin < 8 * count:
                 element = (at - begin) // 8
-                return run, element, begin + 8 * element
+                return field, element, begin + 8 * element
         return None

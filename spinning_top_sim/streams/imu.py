@@ -10,52 +10,70 @@ kalibr's model, with its names and units.  Conventions: REP-145
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.kinematics import Columns
+from spinning_top_sim.physics.attitude import Quaternion, Vector
+from spinning_top_sim.physics.states import States
 
-# Three, or four, numbers or columns of numbers.
-Vector = tuple[Any, Any, Any]
-Quaternion = tuple[Any, Any, Any, Any]
 Matrix = tuple[Vector, Vector, Vector]
-ZERO: Vector = (0.0, 0.0, 0.0)
-NO_NOISE = 12 * (0.0,)
+Rows = NDArray[np.float64]
+ZERO = (0.0, 0.0, 0.0)
+NO_NOISE = np.zeros((12, 1))
+# At rates that are changed often, old ones are forgotten.
+SENSORS_KEPT = 4
 
 
 class Imu:
     """
-    Where the IMU sits: at `imu.lever_arm` [m] and `imu.rpy` [rad] of the body frame.
+    One IMU: at `imu.lever_arm` [m] and `imu.rpy` [rad] of the body frame.
 
-    What it measures there is `true`; what it reads, `Sensor.read`.
+    What it measures there is `true`; what it reads, `sensor(period_ns).read`.
+
+    Parameters
+    ----------
+    values : checked parameters, see `parameters.checked`
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        self._lever_arm: Vector = values['imu.lever_arm']
+        self._values = values
+        self._lever_arm: tuple[float, float, float] = values['imu.lever_arm']
         self._turned = values['imu.rpy'] != ZERO
         self._to_sensor = _transposed(_rotation(*values['imu.rpy']))
         self._mounting = _quaternion(*values['imu.rpy'])
+        self._sensors: dict[int, Sensor] = {}
 
-    def orientation(self, state: Columns) -> Any:
-        """Return q(world <- IMU) as x, y, z, w: four numbers or columns, or (n, 4)."""
+    def sensor(self, period_ns: int) -> Sensor:
+        """Return the sensor at a sampling period [ns]: one for all streams of that rate."""
+        if period_ns not in self._sensors:
+            while len(self._sensors) >= SENSORS_KEPT:
+                del self._sensors[next(iter(self._sensors))]
+            self._sensors[period_ns] = Sensor(self._values, period_ns)
+        return self._sensors[period_ns]
+
+    def orientation(self, states: States) -> Quaternion:
+        """Return q(world <- IMU): columns x, y, z, w."""
         if not self._turned:
-            return state.quaternion
-        return _product(attitude.quaternion(state.alpha, state.beta), self._mounting)
+            return states.rows_quaternion
+        return attitude.product(states.rows_quaternion, self._mounting)
 
     def in_body(self, orientation: Quaternion, rates: Vector) -> tuple[Quaternion, Vector]:
         """Return attitude and rates of the body from those of the IMU."""
         if not self._turned:
             return orientation, rates
         x, y, z, w = self._mounting
-        return (_product(orientation, (-x, -y, -z, w)),
+        return (attitude.product(orientation, (-x, -y, -z, w)),
                 _apply(_transposed(self._to_sensor), rates))
 
-    def true(self, state: Columns) -> tuple[Vector, Vector]:
+    def true(self, states: States) -> tuple[Vector, Vector]:
         """Return angular velocity [rad/s] and specific force [m/s^2] in the IMU's frame."""
-        rates = state.body_rates
-        force = state.specific_force(self._lever_arm)
+        rates = states.rows_angular_velocity
+        force = states.specific_force(self._lever_arm)
         if self._turned:
             return _apply(self._to_sensor, rates), _apply(self._to_sensor, force)
         return rates, force
@@ -99,26 +117,16 @@ class Axes:
         """Of what is added to a sample besides the bias: white noise and rounding."""
         return self.white ** 2 + self.resolution ** 2 / 12.0
 
-    def read(self, exact: Vector, white: Sequence[Any], bias: Sequence[Any],
-             functions: Functions) -> Vector:
+    def read(self, exact: Vector, white: Rows, bias: Rows) -> Vector:
         """Return the readings: noise and bias added, cut at the range, rounded."""
-        x, y, z = (functions.clip(value + noise + offset, -self.limit, self.limit)
+        x, y, z = (np.clip(value + noise + offset, -self.limit, self.limit)
                    for value, noise, offset in zip(exact, white, bias, strict=True))
         step = self.resolution
-        if step:
-            nearest = functions.round
-            return nearest(x / step) * step, nearest(y / step) * step, nearest(z / step) * step
+        if step:        # + 0.0: no reading is -0
+            return tuple((np.rint(one / step) + 0.0) * step for one in (x, y, z))
         return x, y, z
 
 
-class Functions(NamedTuple):
-    """What `Axes.read` takes from Python for one sample, from numpy for many."""
-
-    clip: Callable[[Any, float, float], Any]
-    round: Callable[[Any], Any]
-
-
-ONE = Functions(lambda x, low, high: max(low, min(high, x)), round)
 PERFECT = Axes(white=0.0, walk=0.0, turn_on=0.0, limit=math.inf, resolution=0.0)
 
 
@@ -139,29 +147,28 @@ class Sensor:
         if self.is_random:
             self._noise = Noise(values['seed'], self.gyroscope, self.accelerometer)
 
-    def read(self, exact: tuple[Vector, Vector], index: int | range) -> tuple[Vector, Vector]:
-        """Return the readings of rates [rad/s] and force [m/s^2] in sample `index`, or in many."""
+    def read(self, exact: tuple[Vector, Vector], indices: range) -> tuple[Vector, Vector]:
+        """
+        Return the readings of rates [rad/s] and force [m/s^2] in consecutive samples.
+
+        Parameters
+        ----------
+        exact : what an ideal sensor reads there
+        indices : numbers k of the samples
+        """
         if self._perfect:
             return exact
-        row, functions = self._drawn(index), ONE
-        if isinstance(index, range):
-            import numpy  # noqa: PLC0415
-            # Nothing is -0 then, as with whole numbers.
-            functions = Functions(numpy.clip, lambda x: numpy.rint(x) + 0.0)
-        return (self.gyroscope.read(exact[0], row[0:3], row[6:9], functions),
-                self.accelerometer.read(exact[1], row[3:6], row[9:12], functions))
+        drawn = self._drawn(indices)
+        return (self.gyroscope.read(exact[0], drawn[0:3], drawn[6:9]),
+                self.accelerometer.read(exact[1], drawn[3:6], drawn[9:12]))
 
-    def bias(self, index: int | range) -> tuple[Sequence[Any], Sequence[Any]]:
-        """Return the bias in sample `index`, or in many: [rad/s], [m/s^2]."""
-        row = self._drawn(index)
-        return tuple(row[6:9]), tuple(row[9:12])
+    def bias(self, indices: range) -> tuple[Vector, Vector]:
+        """Return the bias in consecutive samples: [rad/s], [m/s^2]."""
+        drawn = self._drawn(indices)
+        return (drawn[6], drawn[7], drawn[8]), (drawn[9], drawn[10], drawn[11])
 
-    def _drawn(self, index: int | range) -> Sequence[Any]:
-        if self._noise is None:
-            return NO_NOISE
-        if isinstance(index, range):
-            return self._noise.samples(index)
-        return self._noise.sample(index)
+    def _drawn(self, indices: range) -> Rows:
+        return NO_NOISE if self._noise is None else self._noise.samples(indices)
 
 
 class Noise:
@@ -170,48 +177,43 @@ class Noise:
 
     Block b of 512 samples is drawn from a generator keyed by seed and b (Philox, counter-based:
     Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC11), so that samples can be
-    read from anywhere; the bias at the start of a block is the sum over the blocks before, at hand
-    for the newest few: who goes further back begins from the start.
+    read from anywhere.  The bias at the start of a block is the sum over the blocks before it; it is
+    kept for the newest few blocks, and older blocks are summed again from 0.
     """
 
     BLOCK = 512
     STARTS_KEPT = 4
+    BLOCKS_KEPT = 2
 
     def __init__(self, seed: int, gyroscope: Axes, accelerometer: Axes) -> None:
-        # 80 ms of numpy for those who want noise only.
-        import numpy  # noqa: PLC0415
-
-        self._numpy, self._seed = numpy, seed
+        self._seed = seed
         kinds = (gyroscope, accelerometer)
-        self._white = numpy.repeat([kind.white for kind in kinds], 3)
-        self._walk = numpy.repeat([kind.walk for kind in kinds], 3)
+        self._white = np.repeat([kind.white for kind in kinds], 3)
+        self._walk = np.repeat([kind.walk for kind in kinds], 3)
         # Where the bias of block b begins; that of block 0 is the turn-on bias.
-        self._bias_starts = {0: numpy.repeat([kind.turn_on for kind in kinds], 3)
-                                * self._normal(0, 6, turn_on=True)[0]}
-        self._block = -1
-        self._rows: list[list[float]] = []
+        self._bias_starts = {0: np.repeat([kind.turn_on for kind in kinds], 3)
+                             * self._normal(0, 6, turn_on=True)[0]}
+        self._blocks: dict[int, Rows] = {}
+        self._newest: tuple[range, Rows] = range(0), np.empty((12, 0))
 
-    def sample(self, index: int) -> Sequence[float]:
-        """Return white noise (rates, force) and bias (rates, force): 12 numbers."""
-        block, row = divmod(index, self.BLOCK)
-        if block != self._block:
-            self._load(block)
-        return self._rows[row]
+    def samples(self, indices: range) -> Rows:
+        """Return white noise (rates, force) and bias (rates, force) of samples, (12, n)."""
+        if self._newest[0] != indices:      # streams of one rate ask for the same ones
+            first, last = indices[0] // self.BLOCK, indices[-1] // self.BLOCK
+            drawn = np.vstack([self._of_block(block) for block in range(first, last + 1)])
+            begin = indices[0] - first * self.BLOCK
+            self._newest = indices, np.ascontiguousarray(drawn[begin:begin + len(indices)].T)
+        return self._newest[1]
 
-    def samples(self, indices: range) -> Any:
-        """Return the same of consecutive samples, (12, n)."""
-        numpy = self._numpy
-        first, last = indices[0] // self.BLOCK, indices[-1] // self.BLOCK
-        drawn = numpy.vstack([numpy.hstack(self._drawn(block))
-                              for block in range(first, last + 1)])
-        begin = indices[0] - first * self.BLOCK
-        return drawn[begin:begin + len(indices)].T
+    def _of_block(self, block: int) -> Rows:
+        """Return white noise and bias of a block, (512, 12)."""
+        if block not in self._blocks:
+            while len(self._blocks) >= self.BLOCKS_KEPT:
+                del self._blocks[next(iter(self._blocks))]
+            self._blocks[block] = np.hstack(self._drawn(block))
+        return self._blocks[block]
 
-    def _load(self, block: int) -> None:
-        self._rows = self._numpy.hstack(self._drawn(block)).tolist()
-        self._block = block
-
-    def _drawn(self, block: int) -> tuple[Any, Any]:
+    def _drawn(self, block: int) -> tuple[Rows, Rows]:
         """Return white noise and bias of a block, (512, 6) each, by way of those before it."""
         starts = self._bias_starts
         at = max(b for b in starts if b <= block)
@@ -221,7 +223,7 @@ class Noise:
             steps = normal[:, 6:] * self._walk
             if at == 0:
                 steps[0] = 0.0          # sample 0 has the turn-on bias itself
-            bias = start + self._numpy.cumsum(steps, axis=0)
+            bias = start + np.cumsum(steps, axis=0)
             at, start = at + 1, bias[-1].copy()         # not a view that keeps all
             if at > block:
                 break
@@ -230,8 +232,8 @@ class Noise:
             del starts[list(starts)[1]]                 # the oldest; that of block 0 stays
         return normal[:, :6] * self._white, bias
 
-    def _normal(self, block: int, columns: int, turn_on: bool = False) -> Any:
-        generator = self._numpy.random.Generator(self._numpy.random.Philox(
+    def _normal(self, block: int, columns: int, turn_on: bool = False) -> Rows:
+        generator = np.random.Generator(np.random.Philox(
             key=self._seed, counter=[0, 0, int(turn_on), block]))
         return generator.standard_normal((1 if turn_on else self.BLOCK, columns))
 
@@ -248,15 +250,11 @@ def _rotation(roll: float, pitch: float, yaw: float) -> Matrix:
 
 def _quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
     """Return the same rotation as x, y, z, w."""
-    turns = [(math.sin(0.5 * angle), math.cos(0.5 * angle)) for angle in (roll, pitch, yaw)]
-    (xr, wr), (yp, wp), (zy, wy) = turns
-    return _product(_product((0.0, 0.0, zy, wy), (0.0, yp, 0.0, wp)), (xr, 0.0, 0.0, wr))
-
-
-def _product(p: Quaternion, q: Quaternion) -> Quaternion:
-    (a, b, c, d), (x, y, z, w) = p, q
-    return (d * x + a * w + b * z - c * y, d * y - a * z + b * w + c * x,
-            d * z + a * y - b * x + c * w, d * w - a * x - b * y - c * z)
+    none = np.zeros(1)
+    (xr, wr), (yp, wp), (zy, wy) = ((np.sin(half), np.cos(half))
+                                    for half in 0.5 * np.array([[roll], [pitch], [yaw]]))
+    return attitude.product(attitude.product((none, none, zy, wy), (none, yp, none, wp)),
+                            (xr, none, none, wr))
 
 
 def _transposed(m: Matrix) -> Matrix:

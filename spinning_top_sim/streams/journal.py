@@ -35,7 +35,7 @@ def is_enabled(parameter: str, values: Mapping[str, Any]) -> bool:
 
 def command(l3: float, lz: float) -> bytes:
     """Return an applied command as it is logged: std_msgs/Float64MultiArray [L3, Lz]."""
-    return messages.float64_multi_array(('l3', 'lz')).encode(0, (l3, lz))
+    return messages.float64_multi_array(('l3', 'lz')).encode_one(0, (l3, lz))
 
 
 def event(name: str, t_ns: int, sent_ns: int, **details: Any) -> bytes:

@@ -34,51 +34,51 @@ def _header(frame_id: str) -> tuple[CdrWriter, int]:
 
 
 def pose_stamped(frame_id: str) -> Template:
-    """geometry_msgs/PoseStamped at the origin; runs: orientation x, y, z, w."""
+    """geometry_msgs/PoseStamped at the origin; fields: orientation x, y, z, w."""
     writer, stamp_at = _header(frame_id)
     writer.doubles((0.0, 0.0, 0.0))
     return Template(writer, [stamp_at], [(writer.doubles((0.0, 0.0, 0.0, 1.0)), 4)])
 
 
 def joint_state(names: Sequence[str]) -> Template:
-    """sensor_msgs/JointState without effort; runs: positions, velocities."""
+    """sensor_msgs/JointState without effort; fields: positions, velocities."""
     writer, stamp_at = _header('')
     writer.strings(names)
     zeros = len(names) * (0.0,)
-    runs = [(writer.double_sequence(zeros), len(names)) for _ in ('position', 'velocity')]
+    fields = [(writer.double_sequence(zeros), len(names)) for _ in ('position', 'velocity')]
     writer.double_sequence(())
-    return Template(writer, [stamp_at], runs)
+    return Template(writer, [stamp_at], fields)
 
 
 def imu(frame_id: str, orientation_covariance: Sequence[float],
         angular_velocity_covariance: Sequence[float],
         linear_acceleration_covariance: Sequence[float]) -> Template:
-    """sensor_msgs/Imu; runs: orientation x, y, z, w, angular velocity, linear acceleration."""
+    """sensor_msgs/Imu; fields: orientation x, y, z, w, angular velocity, linear acceleration."""
     writer, stamp_at = _header(frame_id)
-    runs = [(writer.doubles((0.0, 0.0, 0.0, 1.0)), 4)]
+    fields = [(writer.doubles((0.0, 0.0, 0.0, 1.0)), 4)]
     writer.doubles(orientation_covariance)
-    runs.append((writer.doubles(3 * (0.0,)), 3))
+    fields.append((writer.doubles(3 * (0.0,)), 3))
     writer.doubles(angular_velocity_covariance)
-    runs.append((writer.doubles(3 * (0.0,)), 3))
+    fields.append((writer.doubles(3 * (0.0,)), 3))
     writer.doubles(linear_acceleration_covariance)
-    return Template(writer, [stamp_at], runs)
+    return Template(writer, [stamp_at], fields)
 
 
 def odometry(frame_id: str, child_frame_id: str) -> Template:
-    """nav_msgs/Odometry of a fixed point, covariances zero; runs: orientation, body rates."""
+    """nav_msgs/Odometry of a fixed point, covariances zero; fields: orientation, body rates."""
     writer, stamp_at = _header(frame_id)
     writer.string(child_frame_id)
     writer.doubles(3 * (0.0,))
-    runs = [(writer.doubles((0.0, 0.0, 0.0, 1.0)), 4)]
+    fields = [(writer.doubles((0.0, 0.0, 0.0, 1.0)), 4)]
     writer.doubles(36 * (0.0,))
     writer.doubles(3 * (0.0,))                              # linear velocity: the pivot is fixed
-    runs.append((writer.doubles(3 * (0.0,)), 3))
+    fields.append((writer.doubles(3 * (0.0,)), 3))
     writer.doubles(36 * (0.0,))
-    return Template(writer, [stamp_at], runs)
+    return Template(writer, [stamp_at], fields)
 
 
 def float64_multi_array(labels: Sequence[str]) -> Template:
-    """std_msgs/Float64MultiArray, one dimension labelled with its columns; runs: the data."""
+    """std_msgs/Float64MultiArray, one dimension labelled with its columns; fields: the data."""
     writer = CdrWriter()
     writer.uint32(1)
     writer.string(','.join(labels))
@@ -90,7 +90,7 @@ def float64_multi_array(labels: Sequence[str]) -> Template:
 
 
 def clock() -> Template:
-    """rosgraph_msgs/Clock; no runs."""
+    """rosgraph_msgs/Clock; no fields."""
     writer = CdrWriter()
     return Template(writer, [writer.stamp()], [])
 
@@ -102,22 +102,22 @@ def markers(frame_id: str, size: Sequence[float], lines: Sequence[float], line_w
 
     size: of the cylinder, diameters and height [m];  lines: x, y, z of begin and end of each, in
     the body frame [m];  trace_points: how many
-    runs: position and orientation of the cylinder, orientation of the lines, the trace's points
+    fields: position and orientation of the cylinder, orientation of the lines, the trace's points
     """
     writer = CdrWriter()
     writer.uint32(3 if trace_points else 2)
     body = _marker(writer, frame_id, 'body', CYLINDER, size, BODY_COLOR)
     axis = _marker(writer, frame_id, 'axis', LINE_LIST, (line_width, 0.0, 0.0), AXIS_COLOR, lines)
     placed = [body, axis]
-    runs = [(body.position_at, 3), (body.orientation_at, 4), (axis.orientation_at, 4)]
+    fields = [(body.position_at, 3), (body.orientation_at, 4), (axis.orientation_at, 4)]
     if trace_points:
         numbers = 3 * trace_points
         trace = _marker(writer, frame_id, 'trace', LINE_STRIP, (0.5 * line_width, 0.0, 0.0),
                         TRACE_COLOR, numbers * (0.0,))
         placed.append(trace)
-        runs.append((trace.points_at, numbers))
+        fields.append((trace.points_at, numbers))
     writer.end()
-    return Template(writer, [marker.stamp_at for marker in placed], runs)
+    return Template(writer, [marker.stamp_at for marker in placed], fields)
 
 
 class _Marker(NamedTuple):

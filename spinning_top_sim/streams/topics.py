@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The streams: for each a topic, a message type, a rate, and how a state becomes bytes.
+The streams: for each a topic, a message type, a rate, and how states become bytes.
 
 A new stream is a subclass of `Stream` here, a template in messages.py and a line in
 parameters.STREAM_DEFAULTS.
@@ -9,130 +9,114 @@ parameters.STREAM_DEFAULTS.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from spinning_top_sim.physics.kinematics import Columns, OneState
-from spinning_top_sim.physics.shape import shape_of
-from spinning_top_sim.streams import messages, parameters
-from spinning_top_sim.streams.cdr import NANOSECONDS, Template
-from spinning_top_sim.streams.imu import Imu, Sensor
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.physics.states import States
+from spinning_top_sim.streams import messages
+from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
+from spinning_top_sim.streams.imu import Imu
 
 JOINTS = ('precession_joint', 'nutation_joint', 'spin_joint')
 INVARIANTS = ('energy', 'l3', 'lz', 'energy_drift', 'l3_drift', 'lz_drift',
               'quaternion_norm_error', 'orientation_error')
-NAN = math.nan
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
 
 
 class Stream:
     """
-    One topic: samples at t = k x period, k = 0, 1, 2.., whoever listens and however ticks fall.
+    One topic: samples at t = k * period, k = 0, 1, 2.., whoever listens and however ticks fall.
 
-    sent, skipped: counts of samples published, and of those that came too late to be published
-    log_index: its number in a log that takes the samples of all streams, None for none; see
-    `Simulation.log_to`
-    next_ns: when the next sample is due, if anybody takes it
-    one_by_one: whether live samples are computed so: few, each with an exact solution of its own
-    changed: called when what comes next is not what it would have been
+    Parameters
+    ----------
+    values : checked parameters, see `parameters.checked`
+
+    Attributes
+    ----------
+    parameter : prefix of its parameters
+    topic, type_name : of its messages
+    template : Template
+    period_ns : of its samples [ns]
+    log_index : its number in the log that records it, None for no log; see `Simulation.log_to`
+    sent, skipped : counts of samples published, and of those that came too late for that
+    on_change : called when it is published, recorded or sampled otherwise than before
     """
 
     parameter: str
     topic: str
     type_name: str
     template: Template
-    one_by_one = False
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        self._publish: Callable[[bytes], Any] | None = None
-        self._record: Callable[[int, bytes], Any] | None = None
+        self._publish: Callable[[bytes], object] | None = None
         self.log_index: int | None = None
-        self.changed: Callable[[], None] = lambda: None
+        self.on_change: Callable[[], None] = lambda: None
         self.sent = self.skipped = 0
-        self.next_ns = 0
+        self._skipped_until_ns = 0
         self.period_ns = 1
         self.set_rate(values[f'{self.parameter}.rate'])
 
     @property
-    def publish(self) -> Callable[[bytes], Any] | None:
-        """What a sample is handed to in time; None while nobody listens."""
+    def publish(self) -> Callable[[bytes], object] | None:
+        """What a sample is handed to in time; None while there are no subscribers."""
         return self._publish
 
     @publish.setter
-    def publish(self, sink: Callable[[bytes], Any] | None) -> None:
+    def publish(self, sink: Callable[[bytes], object] | None) -> None:
         if sink != self._publish:
             self._publish = sink
-            self.changed()
-
-    @property
-    def record(self) -> Callable[[int, bytes], Any] | None:
-        """What every sample is handed to, with its stamp [ns]; None for nothing."""
-        return self._record
-
-    @record.setter
-    def record(self, sink: Callable[[int, bytes], Any] | None) -> None:
-        if sink != self._record:
-            self._record = sink
-            self.changed()
+            self.on_change()
 
     def set_rate(self, rate: float) -> None:
-        """Put the samples on the grid of another rate [Hz]; call `resume` after."""
+        """Put the samples on the grid of another rate [Hz]."""
         self.period_ns = max(1, round(NANOSECONDS / rate))
-
-    def resume(self, after_ns: int) -> None:
-        """Make the first grid point later than `after_ns` the next sample."""
-        self.next_ns = (after_ns // self.period_ns + 1) * self.period_ns
-        self.changed()
+        self.on_change()
 
     @property
-    def wanted(self) -> bool:
-        """Whether anybody takes the samples: else nothing is computed."""
-        return self._publish is not None or self.recorded
+    def has_sinks(self) -> bool:
+        """Whether it has subscribers or is recorded: else nothing is computed."""
+        return self._publish is not None or self.log_index is not None
 
-    @property
-    def recorded(self) -> bool:
-        """Whether somebody takes every sample, however late."""
-        return self._record is not None or self.log_index is not None
+    def first_after(self, t_ns: int) -> int:
+        """Return the time of the first sample later than `t_ns` that is not skipped [ns]."""
+        return (max(t_ns, self._skipped_until_ns - 1) // self.period_ns + 1) * self.period_ns
 
-    @property
-    def index(self) -> int:
-        """Number k of the next sample."""
-        return self.next_ns // self.period_ns
+    def times(self, after_ns: int, until_ns: int) -> range:
+        """Return the times of the samples after `after_ns` and up to `until_ns` [ns]."""
+        return range(self.first_after(after_ns), until_ns + 1, self.period_ns)
 
-    def encode(self, state: OneState, stamp_ns: int, t_ns: int) -> bytes:
-        """Return the serialized message of a state, its stamp, and its time [ns]."""
-        return self.template.encode(stamp_ns, *self.runs(state, t_ns // self.period_ns))
+    def skip(self, after_ns: int, before_ns: int) -> None:
+        """Leave out and count the samples after `after_ns` and before `before_ns` [ns]."""
+        count = len(self.times(after_ns, before_ns - 1))
+        if count:
+            self.skipped += count
+            self._skipped_until_ns = before_ns
+            self.on_change()
 
-    def encode_many(self, states: Columns, stamps_ns: Any) -> Any:
-        """Return the messages of the next n samples as rows of bytes, (n, size) uint8."""
-        first = self.index
-        return self.template.encode_many(
-            stamps_ns, *self.runs(states, range(first, first + len(stamps_ns))))
-
-    def encode_columns(self, states: Columns, epoch_ns: int, times: range,
-                       ) -> Iterator[list[bytes]]:
+    def encode(self, states: States, epoch_ns: int, times: range) -> NDArray[np.uint8]:
         """
-        Yield the messages at these times [ns] after the stamp epoch_ns, each by itself.
+        Return the messages at sample times as rows of bytes (n, size), valid until the next call.
 
-        In pieces, of which some are empty: so that long work can be interrupted.
+        Parameters
+        ----------
+        states : the states at `times`
+        epoch_ns : stamp of t = 0 [ns]
+        times : of samples [ns]; see `times`
         """
-        import numpy  # noqa: PLC0415 - where it is there already
+        stamps_ns = np.arange(epoch_ns + times.start, epoch_ns + times.stop, times.step)
+        return self.template.encode(stamps_ns, *self.fields(states, times))
 
-        first = times.start // self.period_ns
-        runs = self.runs(states, range(first, first + len(times)))
-        yield []
-        stamps_ns = numpy.arange(epoch_ns + times.start, epoch_ns + times.stop, times.step)
-        data = self.template.encode_many(stamps_ns, *runs).tobytes()
-        size = len(self.template)
-        yield [data[at:at + size] for at in range(0, len(data), size)]
-
-    def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
-        """
-        Return the numbers that go into `template`, for one state or for many.
-
-        index: number k of the sample, or the range of many
-        """
+    def fields(self, states: States, times: range) -> Sequence[Field]:
+        """Return the numbers that go into the fields of `template`."""
         raise NotImplementedError
+
+    def indices(self, times: range) -> range:
+        """Return the numbers k of the samples at these times."""
+        first = times.start // self.period_ns
+        return range(first, first + len(times))
 
 
 class Pose(Stream):
@@ -144,8 +128,8 @@ class Pose(Stream):
         super().__init__(values)
         self.template = messages.pose_stamped(values['world_frame'])
 
-    def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
-        return (state.quaternion,)
+    def fields(self, states: States, times: range) -> Sequence[Field]:
+        return (states.rows_quaternion,)
 
 
 class JointStates(Stream):
@@ -157,8 +141,9 @@ class JointStates(Stream):
         super().__init__(values)
         self.template = messages.joint_state(JOINTS)
 
-    def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
-        return state.euler_angles, state.euler_rates
+    def fields(self, states: States, times: range) -> Sequence[Field]:
+        return ((states.phi, states.theta, states.psi),
+                (states.phi_dot, states.theta_dot, states.psi_dot))
 
 
 class GroundTruthOdometry(Stream):
@@ -171,28 +156,29 @@ class GroundTruthOdometry(Stream):
         super().__init__(values)
         self.template = messages.odometry(values['world_frame'], values['body_frame'])
 
-    def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
-        return state.quaternion, state.body_rates
+    def fields(self, states: States, times: range) -> Sequence[Field]:
+        return states.rows_quaternion, states.rows_angular_velocity
 
 
 class ImuStream(Stream):
     """What all IMU topics share: the mounting, and the sensor at the stream's rate."""
 
     type_name = 'sensor_msgs/msg/Imu'
-    oriented = True
+    has_orientation = True
 
     def __init__(self, values: Mapping[str, Any], imu: Imu) -> None:
-        self._values, self._imu = values, imu
+        self._frame_id: str = values['imu.frame_id']
+        self._imu = imu
         super().__init__(values)
 
     def set_rate(self, rate: float) -> None:
         super().set_rate(rate)
         # A density says how much noise a sample has at a rate.
-        self._sensor = Sensor(self._values, self.period_ns)
+        self._sensor = self._imu.sensor(self.period_ns)
         gyroscope, accelerometer = self._variances()
         self.template = messages.imu(
-            self._values['imu.frame_id'],
-            messages.EXACT if self.oriented else messages.UNKNOWN_ORIENTATION,
+            self._frame_id,
+            messages.EXACT if self.has_orientation else messages.UNKNOWN_ORIENTATION,
             messages.diagonal(gyroscope), messages.diagonal(accelerometer))
 
     def _variances(self) -> tuple[float, float]:
@@ -203,39 +189,36 @@ class ImuStream(Stream):
 class ImuRaw(ImuStream):
     """What the sensor reads, without an orientation (REP-145)."""
 
-    parameter, topic, oriented = 'imu', 'imu/data_raw', False
+    parameter, topic, has_orientation = 'imu', 'imu/data_raw', False
 
     def _variances(self) -> tuple[float, float]:
         return self._sensor.gyroscope.variance, self._sensor.accelerometer.variance
 
-    def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
-        return (self._orientation(state), *self._sensor.read(self._imu.true(state), index))
-
-    def _orientation(self, state: Columns) -> Any:
-        return IDENTITY
+    def fields(self, states: States, times: range) -> Sequence[Field]:
+        orientation = self._imu.orientation(states) if self.has_orientation else IDENTITY
+        return (orientation, *self._sensor.read(self._imu.true(states), self.indices(times)))
 
 
 class ImuData(ImuRaw):
     """What the sensor reads, with the exact orientation of its frame."""
 
-    parameter, topic, oriented = 'imu_data', 'imu/data', True
-
-    def _orientation(self, state: Columns) -> Any:
-        return self._imu.orientation(state)
+    parameter, topic, has_orientation = 'imu_data', 'imu/data', True
 
 
 class ImuBias(ImuStream):
     """The bias that `ImuRaw` carries."""
 
-    parameter, topic, oriented = 'imu', 'ground_truth/imu_bias', False
+    parameter, topic, has_orientation = 'imu', 'ground_truth/imu_bias', False
 
     def set_rate(self, rate: float) -> None:
         super().set_rate(rate)
         if not self._sensor.is_random:
-            self.template = self.template.with_fixed(IDENTITY, *self._sensor.bias(0))
+            self.template = self.template.with_fixed(IDENTITY, *self._sensor.bias(range(1)))
 
-    def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
-        return (IDENTITY, *self._sensor.bias(index)) if self._sensor.is_random else ()
+    def fields(self, states: States, times: range) -> Sequence[Field]:
+        if not self._sensor.is_random:
+            return ()
+        return (IDENTITY, *self._sensor.bias(self.indices(times)))
 
 
 class GroundTruthImu(ImuStream):
@@ -243,8 +226,8 @@ class GroundTruthImu(ImuStream):
 
     parameter, topic = 'ground_truth_imu', 'ground_truth/imu'
 
-    def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
-        return (self._imu.orientation(state), *self._imu.true(state))
+    def fields(self, states: States, times: range) -> Sequence[Field]:
+        return (self._imu.orientation(states), *self._imu.true(states))
 
 
 class Invariants(Stream):
@@ -253,107 +236,27 @@ class Invariants(Stream):
 
     A drift is relative to the value that the motion began with (absolute where that is 0); the
     orientation error [rad] is against the exact solution.
+
+    Attributes
+    ----------
+    start : energy, L3 and Lz that drifts are measured from
+    orientation_error : takes states and their times [ns]; returns the errors (n,) [rad]
     """
 
     parameter, topic, type_name = 'invariants', '~/invariants', 'std_msgs/msg/Float64MultiArray'
-    one_by_one = True
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         super().__init__(values)
         self.template = messages.float64_multi_array(INVARIANTS)
-        self._start = (0.0, 0.0, 0.0)
-        self.orientation_error: Callable[[Columns, int], Any] = lambda state, t_ns: NAN
+        self.start = (0.0, 0.0, 0.0)
+        self.orientation_error: Callable[[States, range], NDArray[np.float64]] = (
+            lambda states, times: np.full(len(times), math.nan))
 
-    def start_from(self, state: OneState) -> None:
-        """Measure drifts from this state on."""
-        self._start = (state.energy, state.l3_start, state.lz_start)
-
-    def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
-        first = index.start if isinstance(index, range) else index
-        now = (state.energy, state.l3, state.lz)
-        drifts = [(value - start) / (abs(start) or 1.0)
-                  for value, start in zip(now, self._start, strict=True)]
-        return ((*now, *drifts, state.norm_error,
-                 self.orientation_error(state, first * self.period_ns)),)
-
-
-class Markers(Stream):
-    """
-    The top and the trace of its tip for Foxglove and RViz, in the world frame: no TF is needed.
-
-    The body is the cylinder of `shape_of`; a line along the axis and down its side shows the spin.
-
-    Every message has the whole trace, so that a viewer who comes late, or moves about in a log,
-    sees it at once; yet it remembers no sample, for what is sent must not depend on who listened
-    when.  Its points are those of the exact solution at fixed times m x spacing before the sample,
-    and the tip of the body ends it: with a coarse `solver.rtol` one sees the body leave the path.
-    Before t = 0 it rests at the start.
-    """
-
-    parameter, topic, type_name = 'markers', 'markers', 'visualization_msgs/msg/MarkerArray'
-    one_by_one = True
-
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values)
-        shape = self._shape = shape_of(parameters.top_of(values))
-        length_ns = round(values['markers.trace_length'] * NANOSECONDS)
-        self._count = min(values['markers.trace_points'], length_ns)
-        self._spacing_ns = max(1, length_ns // max(self._count, 1))
-        self._points: dict[int, tuple[float, float, float]] = {}    # of the last trace, by m
-        self.axis_at: Callable[[int], tuple[float, float, float]] = lambda t_ns: (0.0, 0.0, 1.0)
-        side = math.copysign(0.5 * shape.height, shape.tip)
-        # Slightly outside, to be seen.
-        rim, far, near = (1.01 * shape.radius, shape.centre + 1.01 * side,
-                          shape.centre - 1.01 * side)
-        lines = (0.0, 0.0, 0.0, 0.0, 0.0, shape.tip,
-                 0.0, 0.0, far, rim, 0.0, far,
-                 rim, 0.0, far, rim, 0.0, near,
-                 rim, 0.0, near, 0.0, 0.0, near)
-        self.template = messages.markers(
-            values['world_frame'], (2.0 * shape.radius, 2.0 * shape.radius, shape.height), lines,
-            0.02 * abs(shape.tip), self._count + 1 if self._count else 0)
-
-    def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
-        across, along = state.axis
-        axis = across.real, across.imag, along
-        centre = tuple(self._shape.centre * part for part in axis)
-        body = centre, state.quaternion, state.quaternion
-        if not self._count:
-            return body
-        tip = tuple(self._shape.tip * part for part in axis)
-        if isinstance(index, int):
-            return (*body, [number for point in (*self._trace(index * self.period_ns), tip)
-                            for number in point])
-        return (*body, self._traces(len(index), tip))
-
-    def forget_after(self, t_ns: int) -> None:
-        """Drop what was computed ahead of a time, at which another motion begins."""
-        self._points = {m: point for m, point in self._points.items()
-                        if m * self._spacing_ns <= t_ns}
-
-    def _trace(self, t_ns: int) -> list[tuple[float, float, float]]:
-        """Return where the tip was at the times of the grid before t."""
-        newest = (t_ns - 1) // self._spacing_ns
-        known = self._points
-        self._points = {m: known.get(m) or self._tip_at(m * self._spacing_ns)
-                        for m in range(newest - self._count + 1, newest + 1)}
-        return list(self._points.values())
-
-    def _traces(self, count: int, tips: tuple[Any, ...]) -> Any:
-        """Return the points of the next `count` samples as rows of numbers."""
-        import numpy  # noqa: PLC0415 - offline only
-
-        rows = numpy.empty((count, self._count + 1, 3))
-        for k in range(count):
-            rows[k, :-1] = self._trace(self.next_ns + k * self.period_ns)
-        for axis, column in enumerate(tips):
-            rows[:, -1, axis] = column
-        return rows.reshape(count, -1)
-
-    def _tip_at(self, t_ns: int) -> tuple[float, float, float]:
-        x, y, z = self.axis_at(max(t_ns, 0))
-        tip = self._shape.tip
-        return tip * x, tip * y, tip * z
+    def fields(self, states: States, times: range) -> Sequence[Field]:
+        now = (states.energy, states.l3, states.lz)
+        drifts = [(values - start) / (abs(start) or 1.0)
+                  for values, start in zip(now, self.start, strict=True)]
+        return ((*now, *drifts, states.norm_error, self.orientation_error(states, times)),)
 
 
 class Clock(Stream):
@@ -365,12 +268,5 @@ class Clock(Stream):
         super().__init__(values)
         self.template = messages.clock()
 
-    def runs(self, state: Columns, index: int | range) -> tuple[Any, ...]:
+    def fields(self, states: States, times: range) -> Sequence[Field]:
         return ()
-
-
-def all_streams(values: Mapping[str, Any], imu: Imu) -> list[Stream]:
-    """Return every stream there is, in the order in which samples of one instant are sent."""
-    return [Clock(values), Pose(values), JointStates(values), ImuRaw(values, imu),
-            ImuData(values, imu), ImuBias(values, imu), GroundTruthImu(values, imu),
-            GroundTruthOdometry(values), Invariants(values), Markers(values)]

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Elementary and elliptic functions in long decimals.
+Elementary and elliptic functions of `decimal.Decimal` numbers.
 
 Every function works to the precision of the current `decimal` context, and is accurate relative to
 its result (small arguments included).  The standard library offers sqrt, exp and ln; the rest is
-here, with the forms in which long numbers leave: fixed point, and sums of two doubles.  DLMF is
-the Digital Library of Mathematical Functions, https://dlmf.nist.gov.
+here.  DLMF is the Digital Library of Mathematical Functions, https://dlmf.nist.gov.
 """
 
 from __future__ import annotations
@@ -15,34 +14,9 @@ from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from decimal import Context, Decimal, getcontext, localcontext
 from functools import lru_cache
-from typing import NamedTuple
 
 ZERO, ONE = Decimal(0), Decimal(1)
 HALVINGS = 8
-
-# Fixed point: turns, quarter periods and radians per nanosecond in units of 2^-128.
-FIXED_BITS = 128
-FIXED_ONE = 1 << FIXED_BITS
-FIXED_HALF = FIXED_ONE // 2
-FRACTION_MASK = FIXED_ONE - 1
-FIXED_UNIT = 2.0 ** -FIXED_BITS
-RADIANS_PER_UNIT = 2.0 * math.pi * FIXED_UNIT
-
-
-class FixedRate(NamedTuple):
-    """A rate per nanosecond and a start, in fixed point."""
-
-    rate: int
-    start: int
-
-    @classmethod
-    def of(cls, per_second: Decimal, start: Decimal) -> FixedRate:
-        """Round a rate per second and a start."""
-        return cls(int(per_second * FIXED_ONE / 10 ** 9), int(start * FIXED_ONE))
-
-    def at(self, ns: int) -> int:
-        """Return start + rate ns, in fixed point."""
-        return self.start + self.rate * ns
 
 
 def precision(digits: int) -> AbstractContextManager[Context]:

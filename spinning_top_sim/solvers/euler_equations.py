@@ -9,24 +9,25 @@ Equations (29)-(32) of "Analysis of Symmetric Spinning Top" (2023), to the lette
 
 They are singular where the axis is vertical, and near there wrong without a sign of it: cos(theta)
 rounds towards 1, Lz - L3 cos(theta) loses its digits, or a step leaps over the pole, and phi and
-psi drift off while every error estimate is small.  So this form stops with an error there.
+psi drift off while every error estimate is small.  So these equations stop with an error there.
 """
 
 from __future__ import annotations
 
 import math
 
-from spinning_top_sim.physics.kinematics import AxisState
+import numpy as np
+
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.dormand_prince import IntegrationError, Vector
+from spinning_top_sim.solvers.dormand_prince import IntegrationError, Rows, Vector
 
 # |sin(theta)| at which the rounding of cos(theta), 1.1e-16, costs phi' a millionth of L3/lambda1.
 SMALLEST_SINE = math.sqrt(2.0 ** -53 / 1e-6)
-ADVICE = "use the regular form (equations = 'transport') or method = 'exact'"
+ADVICE = "use the regular equations (equations = 'transport') or method = 'exact'"
 
 
-class EulerForm:
-    """The equations above for one top and one motion; see `dormand_prince.Form`."""
+class EulerEquations:
+    """The equations above for one top and one motion; see `dormand_prince.Equations`."""
 
     name = 'euler'
     number = float
@@ -44,7 +45,7 @@ class EulerForm:
                 + abs(self.l3) / top.lambda3 + math.sqrt(abs(top.gravity_torque) / top.lambda1))
         return 0.1 * (self._rtol + self._atol) ** 0.2 / (rate or 1.0)
 
-    def rates(self, theta: float, theta_dot: float, phi: float, psi: float) -> Vector:
+    def derivative(self, theta: float, theta_dot: float, phi: float, psi: float) -> Vector:
         """Return (theta', theta'', phi', psi').  Raises IntegrationError near a pole."""
         sine, cosine = math.sin(theta), math.cos(theta)
         if not abs(sine) > SMALLEST_SINE:
@@ -60,11 +61,11 @@ class EulerForm:
                 + top.gravity_torque / top.lambda1 * sine,
                 phi_dot, psi_dot)
 
-    def curvatures(self, y: Vector, rates: Vector) -> Vector:
-        """Return the equations differentiated once in time."""
+    def second_derivative(self, y: Rows, derivative: Rows) -> Rows:
+        """Return the equations differentiated once in time, as four rows."""
         theta = y[0]
-        theta_dot, theta_ddot, phi_dot, _ = rates
-        sine, cosine = math.sin(theta), math.cos(theta)
+        theta_dot, theta_ddot, phi_dot, _ = derivative
+        sine, cosine = np.sin(theta), np.cos(theta)
         lambda1 = self.top.lambda1
         phi_ddot = theta_dot * (self.l3 / lambda1 - 2.0 * phi_dot * cosine) / sine
         theta_dddot = (
@@ -72,7 +73,8 @@ class EulerForm:
             + theta_dot * phi_dot * phi_dot * (cosine * cosine - sine * sine)
             - self.l3 / lambda1 * (phi_ddot * sine + phi_dot * cosine * theta_dot)
             + self.top.gravity_torque / lambda1 * cosine * theta_dot)
-        return theta_ddot, theta_dddot, phi_ddot, phi_dot * sine * theta_dot - phi_ddot * cosine
+        return np.array((theta_ddot, theta_dddot, phi_ddot,
+                         phi_dot * sine * theta_dot - phi_ddot * cosine))
 
     def error(self, y: Vector, y_new: Vector, difference: Vector) -> float:
         """Return the largest error over atol + rtol |y|, component by component."""
@@ -87,11 +89,5 @@ class EulerForm:
                 f'{y_new[0]!r} rad, and lost phi and psi; {ADVICE}')
 
     def project(self, y: Vector) -> Vector:
-        """Return y as it is: L3 and Lz are exact in this form, and the rest is to the letter."""
+        """Return y as it is: L3 and Lz are exact here, and the rest is to the letter."""
         return y
-
-
-def euler_state(form: EulerForm, y: Vector) -> AxisState:
-    """Return the state with these Euler angles."""
-    theta, theta_dot, phi, psi = y
-    return AxisState(form.top, form.l3, form.lz, theta, theta_dot, phi, psi)

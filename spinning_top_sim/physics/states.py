@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""States of a top at many times, as columns that are computed when they are first asked for."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
+from spinning_top_sim.physics.top import Top
+
+PIVOT = (0.0, 0.0, 0.0)
+
+
+class Samples(Protocol):
+    """
+    What a solver evaluates itself at n times; every other column of `States` follows from it.
+
+    All arrays have shape (n,).  A property computes its values at each access: `States` keeps
+    what it has asked for.
+    """
+
+    @property
+    def quaternion(self) -> Quaternion:
+        """Attitude q(world <- body) as x, y, z, w, its sign continuous in time."""
+
+    @property
+    def half_angle_squares(self) -> tuple[Column, Column]:
+        """cos^2 and sin^2 of theta/2."""
+
+    @property
+    def angles(self) -> tuple[Column, Column, Column]:
+        """phi, theta and psi [rad], unwrapped and continued through the poles."""
+
+    @property
+    def theta_dot(self) -> Column:
+        """Nutation rate [rad/s]."""
+
+    @property
+    def transverse_velocity(self) -> tuple[Column, Column]:
+        """Angular velocity about the first two body axes [rad/s]."""
+
+    @property
+    def l3(self) -> Column:
+        """Angular momentum along the symmetry axis, as the samples have it [kg m^2/s]."""
+
+
+class States:
+    """
+    States of a top at n times.
+
+    Each column is computed when it is first asked for, so that a pose costs no angle and an angle
+    no angular velocity.  A value depends on its own time only, never on the other times.
+
+    Attributes
+    ----------
+    top : Top
+    t : (n,) times since the start of the motion [s]
+    theta, phi, psi : (n,) ZYZ Euler angles [rad], unwrapped and continued through the poles
+    theta_dot, phi_dot, psi_dot : (n,) [rad/s]
+    theta_folded : (n,) tilt from the upward vertical, in [0, pi] [rad]
+    quaternion : (n, 4) attitude q(world <- body) as x, y, z, w, its sign continuous in time
+    angular_velocity, angular_acceleration : (n, 3) in the body frame [rad/s], [rad/s^2]
+    energy : (n,) kinetic energy + P cos(theta) [J]
+    l3, lz : (n,) angular momentum along the axis and along the vertical [kg m^2/s]
+    norm_error : (n,) |q| - 1
+    rows_... : the same as tuples of (n,) components, which cost no copy
+    """
+
+    def __init__(self, top: Top, l3: float, lz: float, t: Column, samples: Samples) -> None:
+        self.top, self.t = top, t
+        self._l3, self._lz, self._samples = l3, lz, samples
+
+    def __len__(self) -> int:
+        """Return n."""
+        return len(self.t)
+
+    # ------------------------------------------------------------------------------ angles
+
+    @cached_property
+    def _angles(self) -> tuple[Column, Column, Column]:
+        return self._samples.angles
+
+    @property
+    def phi(self) -> Column:
+        """Precession angle (n,), unwrapped [rad]."""
+        return self._angles[0]
+
+    @property
+    def theta(self) -> Column:
+        """Tilt (n,), continued through the poles [rad]."""
+        return self._angles[1]
+
+    @property
+    def psi(self) -> Column:
+        """Spin angle (n,), unwrapped [rad]."""
+        return self._angles[2]
+
+    @cached_property
+    def theta_dot(self) -> Column:
+        """Nutation rate (n,) [rad/s]."""
+        return self._samples.theta_dot
+
+    @cached_property
+    def _half_angle_squares(self) -> tuple[Column, Column]:
+        return self._samples.half_angle_squares
+
+    @cached_property
+    def phi_dot(self) -> Column:
+        """Precession rate (n,) [rad/s], eq. (31) of "Analysis of Symmetric Spinning Top"."""
+        return attitude.precession_rate(self.top, self._l3, self._lz, *self._half_angle_squares)
+
+    @cached_property
+    def psi_dot(self) -> Column:
+        """Spin rate (n,) [rad/s], eq. (32)."""
+        cos2, sin2 = self._half_angle_squares
+        return self._l3 / self.top.lambda3 - self.phi_dot * (cos2 - sin2)
+
+    @cached_property
+    def theta_folded(self) -> Column:
+        """Tilt (n,) in [0, pi] [rad]."""
+        cos2, sin2 = self._half_angle_squares
+        return 2.0 * np.arctan2(np.sqrt(sin2), np.sqrt(cos2))
+
+    # ---------------------------------------------------------------------------- attitude
+
+    @cached_property
+    def rows_quaternion(self) -> Quaternion:
+        """Attitude q(world <- body): x, y, z, w."""
+        return self._samples.quaternion
+
+    @cached_property
+    def quaternion(self) -> NDArray[np.float64]:
+        """Attitude q(world <- body) (n, 4): x, y, z, w."""
+        return np.stack(self.rows_quaternion, axis=-1)
+
+    @cached_property
+    def norm_error(self) -> Column:
+        """|q| - 1 (n,)."""
+        x, y, z, w = self.rows_quaternion
+        return np.sqrt((x * x + y * y) + (z * z + w * w)) - 1.0
+
+    @cached_property
+    def rows_axis(self) -> tuple[Column, Column, Column]:
+        """Symmetry axis e3 in the world frame."""
+        return attitude.axis_in_world(self.rows_quaternion)
+
+    @cached_property
+    def rows_vertical(self) -> tuple[Column, Column, Column]:
+        """Upward vertical in the body frame."""
+        return attitude.vertical_in_body(self.rows_quaternion)
+
+    # ------------------------------------------------------------------------------ motion
+
+    @cached_property
+    def rows_angular_velocity(self) -> Vector:
+        """Angular velocity in the body frame [rad/s]; the third component is constant."""
+        return (*self._samples.transverse_velocity, self._l3 / self.top.lambda3)
+
+    @cached_property
+    def angular_velocity(self) -> NDArray[np.float64]:
+        """Angular velocity (n, 3) in the body frame [rad/s]."""
+        return _stacked(self.rows_angular_velocity, len(self))
+
+    @cached_property
+    def rows_angular_acceleration(self) -> Vector:
+        """Angular acceleration in the body frame [rad/s^2]."""
+        return (*attitude.angular_acceleration(self.top, self.rows_angular_velocity,
+                                               self.rows_vertical), 0.0)
+
+    @cached_property
+    def angular_acceleration(self) -> NDArray[np.float64]:
+        """Angular acceleration (n, 3) in the body frame [rad/s^2]."""
+        return _stacked(self.rows_angular_acceleration, len(self))
+
+    def specific_force(self, point: tuple[float, float, float]) -> Vector:
+        """Return the specific force at a point r of the body [m], in the body frame [m/s^2]."""
+        if point == PIVOT:          # at rest: no rate is needed
+            gravity = self.top.gravity
+            x, y, z = self.rows_vertical
+            return gravity * x, gravity * y, gravity * z
+        return attitude.specific_force(self.top.gravity, point, self.rows_angular_velocity,
+                                       self.rows_angular_acceleration, self.rows_vertical)
+
+    @cached_property
+    def energy(self) -> Column:
+        """Kinetic energy + P cos(theta) (n,) [J]."""
+        omega1, omega2, _ = self.rows_angular_velocity
+        return (0.5 * self.top.lambda1 * (omega1 * omega1 + omega2 * omega2)
+                + 0.5 * self._l3 * self._l3 / self.top.lambda3
+                + self.top.gravity_torque * self.rows_vertical[2])
+
+    @cached_property
+    def l3(self) -> Column:
+        """L . e3 (n,) [kg m^2/s]: a constant of the motion, as the samples have it."""
+        return self._samples.l3
+
+    @cached_property
+    def lz(self) -> Column:
+        """L . z (n,) [kg m^2/s]: a constant of the motion."""
+        return np.full(len(self), self._lz)
+
+
+def _stacked(rows: Vector, n: int) -> NDArray[np.float64]:
+    """Return (n, 3) of components, each a column or one number for all."""
+    result = np.empty((n, 3))
+    for k, row in enumerate(rows):
+        result[:, k] = row
+    return result

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The nutation of the exact motion, accurate relative to itself next to a pole.
+
+The phase of the nutation is counted from the nearest quarter period, where the theta functions are
+short polynomials; even and odd quarter periods have series of their own (`theta_setup`).
+"""
+
+from __future__ import annotations
+
+import math
+from decimal import Decimal
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.physics.attitude import Column
+from spinning_top_sim.solvers.decimal_math import ZERO, double_double
+from spinning_top_sim.solvers.theta_series import TERMS, Series
+from spinning_top_sim.solvers.theta_setup import ThetaMotion
+from spinning_top_sim.solvers.times import Rate, Times
+
+QUARTER_PERIOD_ANGLE = 0.5 * math.pi
+BLOCK = 4096                # times evaluated together: temporaries stay in the cache
+# Smaller amplitudes leave no room for their products in doubles.
+LEAST_AMPLITUDE = Decimal('1e-290')
+# Larger numbers leave none for splitting them.
+MOST = Decimal('1e290')
+
+
+class NutationColumns(NamedTuple):
+    """
+    Where the axis is at n times, (n,) each.
+
+    alpha, beta : cos(theta/2) D and sin(theta/2) D with a common D > 0, signed where a pole is
+        passed exactly
+    alpha_argument, beta_argument : what the nutation adds to the rotations of alpha and beta [rad]
+    theta_dot : [rad/s]
+    half_theta : theta/2, continued through the poles [rad]
+    """
+
+    alpha: Column
+    beta: Column
+    alpha_argument: Column
+    beta_argument: Column
+    theta_dot: Column
+    half_theta: Column
+
+
+class _Factor(NamedTuple):
+    """
+    Alpha or beta over even or odd quarter periods, in doubles.
+
+    real, imag : coefficients in xi, highest first; the prefactors are indices into (1, cos y,
+        sin y, sin y cos y), or the hyperbolic ones.  A real factor has sense 0.
+    """
+
+    real_prefactor: int
+    real: tuple[float, ...]
+    imag_prefactor: int
+    imag: tuple[float, ...]
+    sense: int
+    drift: float
+    crosses: bool
+    has_zero: bool
+
+    def at(self, y: Column, flip: Column, xi: Column, prefactors: tuple[Column | float, ...],
+           ) -> tuple[Column, Column, Column]:
+        """Return modulus (signed if real), argument, and the modulus less the factor sin y."""
+        polynomial = _horner(self.real, xi)
+        if not self.sense:
+            if self.crosses:
+                polynomial = flip * polynomial
+            real = prefactors[self.real_prefactor] * polynomial
+            return real, 0.0 * y, polynomial if self.has_zero else real
+        real = prefactors[self.real_prefactor] * polynomial
+        imag = prefactors[self.imag_prefactor] * _horner(self.imag, xi)
+        modulus = np.hypot(real, imag)          # its square may be too small for a double
+        return modulus, self.drift * y + self.sense * np.arctan2(imag, real), modulus
+
+
+class _Branch(NamedTuple):
+    """Both factors and cos(theta)' over even or odd quarter periods."""
+
+    alpha: _Factor
+    beta: _Factor
+    u_dot: float                    # times `magnifier`, a power of 2: near a pole all is small
+    magnifier: float
+    u_dot_series: tuple[float, ...]
+    imaginary: bool
+    stretch: float
+
+    def at(self, y: Column, flip: Column) -> tuple[Column, ...]:
+        """
+        Return alpha, beta, their arguments and theta' at the phase y, |y| <= pi/4.
+
+        flip : (-1)^floor(N/2) of the quarter period N
+        """
+        if self.imaginary:
+            s = np.sinh(y * self.stretch)
+            xi = -s * s
+        else:
+            s = np.sin(y)
+            xi = s * s
+        c = np.sqrt(1.0 - xi)           # cos y > 0, or cosh x
+        prefactors = (1.0, c, s, s * c)
+        alpha, alpha_argument, alpha_slope = self.alpha.at(y, flip, xi, prefactors)
+        beta, beta_argument, beta_slope = self.beta.at(y, flip, xi, prefactors)
+        if not self.u_dot:              # resting, perhaps at a pole
+            return alpha, beta, alpha_argument, beta_argument, 0.0 * y
+        # theta' = -u'/sin(theta), with the zero that u' shares with a factor at a pole divided
+        # out.
+        sin_2y = 2.0 * c if self.alpha.has_zero or self.beta.has_zero else 2.0 * s * c
+        theta1 = sin_2y * _horner(self.u_dot_series, 4.0 * xi * (1.0 - xi))
+        # In this order nothing overflows on the separatrix, where all grow like cosh x.
+        theta_dot = (-0.5 * self.u_dot * (theta1 / (alpha * alpha + beta * beta))
+                     / (self.magnifier * alpha_slope * beta_slope))
+        return alpha, beta, alpha_argument, beta_argument, theta_dot
+
+
+class Nutation:
+    """
+    The nutation of one motion.
+
+    Raises
+    ------
+    ValueError
+        If an amplitude or a rate is out of the range in which doubles hold the motion.
+    """
+
+    def __init__(self, motion: ThetaMotion, start_theta: float) -> None:
+        self._branches = _branch(motion, 0), _branch(motion, 1)
+        self._quarters = Rate(motion.quarter_rate)
+        self._quarter0 = motion.quarter0
+        self._offset, self._offset_rest = double_double(motion.offset0)
+        self._turning = motion.turning
+        self._turns0 = 0.0
+        if motion.turning:
+            start = np.array([QUARTER_PERIOD_ANGLE * float(motion.offset0)])
+            self._turns0 = round(float(self._turns(
+                np.array([float(motion.quarter0)]), start, np.array([0.5 * start_theta]))[0]))
+
+    def at(self, times: Times) -> NutationColumns:
+        """Return the nutation at n times."""
+        columns = np.empty((6, len(times)))
+        for first in range(0, len(times), BLOCK):
+            block = slice(first, first + BLOCK)
+            self._fill(columns[:, block], times[block])
+        return NutationColumns(*columns)
+
+    def _fill(self, out: NDArray[np.float64], times: Times) -> None:
+        quarters, y = self._phase(times)
+        place = quarters.astype(np.int64) & 3
+        flip = np.where(place < 2, 1.0, -1.0)
+        odd = (place & 1).astype(bool)
+        for branch, here in zip(self._branches, (~odd, odd), strict=True):
+            if here.all():
+                out[:5] = branch.at(y, flip)
+            elif here.any():
+                out[:5, here] = branch.at(y[here], flip[here])
+        half_theta = np.arctan2(out[1], out[0])
+        if self._turning:
+            half_theta += 2.0 * math.pi * np.rint(self._turns(quarters, y, half_theta))
+        out[5] = half_theta
+
+    def _phase(self, times: Times) -> tuple[Column, Column]:
+        """
+        Return the nearest whole number of quarter periods, and the angle y from there.
+
+        y is accurate relative to itself: a top races past a pole that it misses by little.
+        """
+        high, rest = self._quarters.product(times)
+        whole = np.rint(high)
+        part = high - whole
+        # Knuth's sum of part and offset: `nearest` with what it leaves out.
+        nearest = part + self._offset
+        taken = nearest - part
+        left_out = (part - (nearest - taken)) + (self._offset - taken)
+        shift = np.rint(nearest + rest)
+        # Exact where the result is small (Sterbenz), as shift is 0 or +-1.
+        y = (nearest - shift) + (left_out + (rest + self._offset_rest))
+        return whole + (self._quarter0 + shift), QUARTER_PERIOD_ANGLE * y
+
+    def _turns(self, quarters: Column, y: Column, half_theta: Column) -> Column:
+        """
+        Return how many turns theta/2, known up to a turn, lacks: near a whole number.
+
+        In a planar rotation, which passes both poles, theta/2 stays within a quarter turn of
+        (pi/2) (intercept + slope Z), Z in quarter periods.
+        """
+        assert self._turning is not None
+        intercept, slope = self._turning
+        steady = QUARTER_PERIOD_ANGLE * (intercept + slope * quarters) + slope * y
+        return (steady - half_theta) / (2.0 * math.pi) - self._turns0
+
+
+def in_range(name: str, value: Decimal) -> float:
+    """Return a number as a double.  Raises ValueError where its products would overflow."""
+    if abs(value) > MOST:
+        raise ValueError(f'{name} is {value:.3e}: must be at most {MOST} for doubles to hold '
+                         f'the motion; the constants of the top are too far apart in size')
+    return float(value)
+
+
+def _branch(motion: ThetaMotion, odd: int) -> _Branch:
+    """Round one branch to doubles."""
+    def factor(which: str) -> _Factor:
+        factor = motion.alpha if which == 'alpha' else motion.beta
+        branch = factor.odd if odd else factor.even
+        real = _coefficients(branch.real.scaled(Decimal(factor.sign)), which)
+        imag = branch.imag or Series('cos even', (ZERO,))
+        return _Factor(branch.real.prefactor, real, imag.prefactor, _coefficients(imag),
+                       factor.sense, float(factor.drift), factor.crosses, branch.has_zero)
+    alpha, beta = factor('alpha'), factor('beta')
+    smallest = min(max(map(abs, x.real + x.imag)) for x in (alpha, beta))
+    magnifier = 2.0 ** -math.frexp(smallest)[1] if smallest else 1.0
+    u_dot = in_range("cos(theta)'", motion.u_dot[odd] * Decimal(magnifier))
+    return _Branch(alpha, beta, u_dot, magnifier, _coefficients(motion.u_dot_series),
+                   motion.imaginary, float(motion.stretch))
+
+
+def _coefficients(series: Series, checked: str = '') -> tuple[float, ...]:
+    """Return the polynomial's coefficients as doubles, highest of TERMS first."""
+    exact = series.polynomial()
+    largest = max(abs(x) for x in exact)
+    if checked and 0 < largest < LEAST_AMPLITUDE:
+        raise ValueError(f'the amplitude of {checked} is {largest:.3e}: the start is too close to '
+                         f'a pole or to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
+    return (0.0,) * (TERMS - len(exact)) + tuple(float(x) for x in reversed(exact))
+
+
+def _horner(coefficients: tuple[float, ...], x: Column) -> Column:
+    """Return the polynomial with these coefficients, highest of four first, at x."""
+    c3, c2, c1, c0 = coefficients
+    return ((c3 * x + c2) * x + c1) * x + c0

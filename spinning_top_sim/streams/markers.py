@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The top and the trace of its tip as markers for Foxglove and RViz."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.physics.shape import shape_of
+from spinning_top_sim.physics.states import States
+from spinning_top_sim.streams import messages, parameters
+from spinning_top_sim.streams.cdr import NANOSECONDS, Field
+from spinning_top_sim.streams.segment import Axis, Reference
+from spinning_top_sim.streams.topics import Stream
+
+
+class PastAxis:
+    """
+    Where the symmetry axis was, over all segments of a run, by the exact solution.
+
+    Each segment is followed from its start to the command that ended it, that instant included.
+
+    Attributes
+    ----------
+    now : Reference
+        Of the present segment.
+    """
+
+    def __init__(self, length_ns: int) -> None:
+        self._length_ns = length_ns
+        self._past: deque[Reference] = deque()
+        self.now: Reference | None = None
+
+    def begin(self, reference: Reference) -> None:
+        """Begin a new segment; forget those that the trace does not reach any more."""
+        if self.now is not None:
+            self._past.append(self.now)
+        self.now = reference
+        oldest = reference.start_ns - self._length_ns
+        while len(self._past) > 1 and self._past[1].start_ns < oldest:
+            self._past.popleft()
+
+    def axis(self, times_ns: NDArray[np.int64]) -> Axis:
+        """Return the axis in the world at ascending simulated times (n,) [ns]."""
+        assert self.now is not None
+        segments = [*self._past, self.now]
+        # A segment ends with the command that begins the next one.
+        ends = np.searchsorted(times_ns, [one.start_ns for one in segments[1:]], 'right')
+        parts = [one.axis(times) for one, times in zip(
+            segments, np.split(times_ns, ends), strict=True) if len(times)]
+        x, y, z = (np.concatenate(rows) for rows in zip(*parts, strict=True))
+        return x, y, z
+
+
+class Markers(Stream):
+    """
+    The top and the trace of its tip, in the world frame: no TF is needed.
+
+    The body is the cylinder of `shape_of`; a line along the axis and down its side shows the spin.
+
+    Every message has the whole trace, so that a viewer who comes late, or moves about in a log,
+    sees it at once.  Its points are those of the exact solution at fixed times m * spacing before
+    the sample, so that a message does not depend on earlier ones; the tip of the body ends it:
+    with a coarse `solver.rtol` one sees the body leave the path.  Before t = 0 it rests at the
+    start.
+    """
+
+    parameter, topic, type_name = 'markers', 'markers', 'visualization_msgs/msg/MarkerArray'
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        super().__init__(values)
+        shape = self._shape = shape_of(parameters.top_of(values))
+        length_ns = round(values['markers.trace_length'] * NANOSECONDS)
+        self._count = min(values['markers.trace_points'], length_ns)
+        self._spacing_ns = max(1, length_ns // max(self._count, 1))
+        self.past = PastAxis(length_ns)
+        side = math.copysign(0.5 * shape.height, shape.tip)
+        # Slightly outside, to be seen.
+        rim, far, near = (1.01 * shape.radius, shape.centre + 1.01 * side,
+                          shape.centre - 1.01 * side)
+        lines = (0.0, 0.0, 0.0, 0.0, 0.0, shape.tip,
+                 0.0, 0.0, far, rim, 0.0, far,
+                 rim, 0.0, far, rim, 0.0, near,
+                 rim, 0.0, near, 0.0, 0.0, near)
+        self.template = messages.markers(
+            values['world_frame'], (2.0 * shape.radius, 2.0 * shape.radius, shape.height), lines,
+            0.02 * abs(shape.tip), self._count + 1 if self._count else 0)
+
+    def fields(self, states: States, times: range) -> Sequence[Field]:
+        axis = states.rows_axis
+        body = (tuple(self._shape.centre * part for part in axis), states.rows_quaternion,
+                states.rows_quaternion)
+        return (*body, self._traces(times, axis)) if self._count else body
+
+    def _traces(self, times: range, axis: Axis) -> NDArray[np.float64]:
+        """Return the points of the traces (n, 3 (count + 1)) that end at these times."""
+        newest = (np.arange(times.start, times.stop, times.step) - 1) // self._spacing_ns
+        first = int(newest[0]) - self._count + 1
+        grid = np.arange(first, int(newest[-1]) + 1)
+        points = np.stack(self.past.axis(np.maximum(grid * self._spacing_ns, 0)), axis=-1)
+        traces = np.empty((len(times), self._count + 1, 3))
+        for row, begin in zip(traces, (newest - self._count + 1 - first).tolist(), strict=True):
+            row[:-1] = points[begin:begin + self._count]
+        traces[:, -1] = np.stack(axis, axis=-1)
+        traces *= self._shape.tip
+        return traces.reshape(len(times), -1)

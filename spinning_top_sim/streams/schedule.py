@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which samples are due when; their messages are computed in blocks, ahead of their time."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+
+from spinning_top_sim.physics.states import States
+from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.streams.segment import Segment
+from spinning_top_sim.streams.topics import Stream
+
+# Instants of a block.  A command makes what is computed useless, and the next one may come soon:
+# after it, blocks begin small and double.
+LARGEST_BLOCK, SMALLEST_BLOCK = 256, 16
+# Nor does a block reach further ahead than this.
+LONGEST_BLOCK_NS = 300_000_000
+# Integration steps between two looks at the time, and in a block.
+STEPS_IN_A_PIECE, MOST_PIECES = 4, 64
+NEVER_NS = 2 ** 63 - 1
+
+
+class Delivery:
+    """
+    The sinks for one set of streams that are due together.
+
+    Attributes
+    ----------
+    log_indices : numbers of the recorded streams in the log
+    logged : places of their messages among all, None for every place
+    size : of their messages together [bytes]
+    published : streams with subscribers, and the places of their messages
+    """
+
+    __slots__ = ('log_indices', 'logged', 'published', 'size')
+
+    def __init__(self, streams: Sequence[Stream]) -> None:
+        logged = [k for k, stream in enumerate(streams) if stream.log_index is not None]
+        self.log_indices = tuple(stream.log_index for stream in streams
+                                 if stream.log_index is not None)
+        self.logged = None if len(logged) == len(streams) else logged
+        self.size = sum(len(streams[k].template) for k in logged)
+        self.published = [(stream.publish, k, stream) for k, stream in enumerate(streams)
+                          if stream.publish is not None]
+
+
+# Simulated time [ns], sinks, and a message for each stream of the sinks.
+Instant = tuple[int, Delivery, Sequence[bytes]]
+
+
+class Schedule:
+    """
+    The messages of the streams of one run, in order of time.
+
+    Blocks are computed where there is time: `prepare` in pieces after a tick, `compute` at once.
+    What is sent does not depend on it.
+
+    Attributes
+    ----------
+    ready : instants that are computed and not yet sent
+    computed_ns : every sample before this simulated time is sent or in `ready` [ns]
+    reached_ns : the solver needs no further steps up to this time [ns]
+    """
+
+    def __init__(self, streams: Sequence[Stream], segment: Segment, epoch_ns: int) -> None:
+        self._streams, self._epoch_ns = streams, epoch_ns
+        self.ready: deque[Instant] = deque()
+        # Streams with sinks, and the first sample of each that is not computed.
+        self._active: list[Stream] = []
+        self._next_ns: list[int] = []
+        self._deliveries: dict[tuple[int, ...], Delivery] = {}      # by places in `_active`
+        self._shortest_ns = NEVER_NS
+        self.follow(segment)
+        for stream in streams:
+            stream.on_change = self.invalidate
+
+    def follow(self, segment: Segment) -> None:
+        """Go on with another segment."""
+        self._segment = segment
+        self.reached_ns = segment.start_ns
+        self.invalidate()
+
+    @property
+    def epoch_ns(self) -> int:
+        """Stamp of t = 0 [ns]."""
+        return self._epoch_ns
+
+    @epoch_ns.setter
+    def epoch_ns(self, epoch_ns: int) -> None:
+        self._epoch_ns = epoch_ns
+        self.invalidate()
+
+    def invalidate(self) -> None:
+        """Drop what is computed ahead, as it does not come next any more."""
+        self.ready.clear()
+        self._work: Iterator[None] | None = None
+        self.computed_ns = -1
+        self._block = SMALLEST_BLOCK
+
+    def next_due(self, now_ns: int) -> int:
+        """Return the time of the first sample after `now_ns` that is not computed [ns]."""
+        if self.computed_ns <= now_ns:
+            self._active = [stream for stream in self._streams if stream.has_sinks]
+            self._next_ns = [stream.first_after(now_ns) for stream in self._active]
+            self._shortest_ns = min((stream.period_ns for stream in self._active),
+                                    default=NEVER_NS)
+            self._deliveries.clear()
+            self.ready.clear()
+            self._work = None
+            self.computed_ns = min(self._next_ns, default=NEVER_NS)
+        return self.computed_ns
+
+    def prepare(self, now_ns: int, until_ns: int, budget_ns: int | None = None) -> bool:
+        """
+        Compute a block if there are samples due up to `until_ns` that are not computed.
+
+        Parameters
+        ----------
+        now_ns : simulated time up to which everything is sent [ns]
+        until_ns : simulated time [ns]
+        budget_ns : processor time after which to stop; the next call goes on there
+
+        Returns
+        -------
+        bool
+            Whether nothing is left to do.
+        """
+        if self._work is None:
+            due_ns = self.next_due(now_ns)
+            if due_ns > until_ns:
+                return True
+            span_ns = min((self._block - 1) * self._shortest_ns, LONGEST_BLOCK_NS)
+            self._block = min(2 * self._block, LARGEST_BLOCK)
+            self._begin(now_ns, max(until_ns, due_ns + span_ns))
+        return self._go_on(None if budget_ns is None else time.monotonic_ns() + budget_ns)
+
+    def compute(self, now_ns: int, until_ns: int) -> None:
+        """Compute a block up to `until_ns` at the most, or finish the one under way."""
+        if self._work is None:
+            self._begin(now_ns, until_ns)
+        self._go_on(None)
+
+    def _begin(self, now_ns: int, until_ns: int) -> None:
+        farthest_ns = self.next_due(now_ns) + (LARGEST_BLOCK - 1) * self._shortest_ns
+        self._work = self._pieces(now_ns, min(until_ns, farthest_ns))
+
+    def _go_on(self, end_ns: int | None) -> bool:
+        """Compute pieces of the block under way until a time; return whether it is complete."""
+        assert self._work is not None
+        try:
+            for _ in self._work:
+                if end_ns is not None and time.monotonic_ns() >= end_ns:
+                    return False
+        except BaseException:
+            self.invalidate()
+            raise
+        self._work = None
+        return True
+
+    def _pieces(self, now_ns: int, until_ns: int) -> Iterator[None]:
+        """Compute a block, as far as the steps allow, in pieces of some 0.1 ms."""
+        segment = self._segment
+        solver, start_ns = segment.solver, segment.start_ns
+        solver.release(now_ns - start_ns)
+        # Deferred: `Simulation.advance` raises the error when it reaches that time.
+        with contextlib.suppress(IntegrationError):
+            for _ in range(MOST_PIECES):
+                if solver.reach(until_ns - start_ns, STEPS_IN_A_PIECE):
+                    break
+                yield
+        self.reached_ns = max(self.reached_ns, start_ns + solver.latest_ns)
+        until_ns = min(until_ns, self.reached_ns)
+        states: dict[range, States] = {}
+        instants: dict[int, tuple[list[int], list[bytes]]] = {}
+        next_ns = []
+        for place, (stream, first_ns) in enumerate(zip(self._active, self._next_ns, strict=True)):
+            times = range(first_ns, until_ns + 1, stream.period_ns)
+            next_ns.append(first_ns + len(times) * stream.period_ns)
+            if not times:
+                continue
+            if times not in states:
+                states[times] = segment.states(times)
+            yield
+            data = stream.encode(states[times], self._epoch_ns, times).tobytes()
+            size = len(stream.template)
+            for number, t_ns in enumerate(times):
+                places, messages = instants.setdefault(t_ns, ([], []))
+                places.append(place)
+                messages.append(data[number * size:(number + 1) * size])
+            yield
+        self.ready.extend((t_ns, self._delivery(tuple(places)), messages)
+                          for t_ns, (places, messages) in sorted(instants.items()))
+        self._next_ns = next_ns
+        self.computed_ns = min(next_ns, default=NEVER_NS)
+
+    def _delivery(self, places: tuple[int, ...]) -> Delivery:
+        delivery = self._deliveries.get(places)
+        if delivery is None:
+            delivery = self._deliveries[places] = Delivery([self._active[k] for k in places])
+        return delivery

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A motion between two commands, and the exact solution that it is compared with."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.solvers.propagator import Propagator
+
+Axis = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+
+
+class Reference:
+    """
+    The exact solution of a motion, set up when it is first asked for.
+
+    Setting it up takes milliseconds and may run in another thread than the simulation.
+
+    Attributes
+    ----------
+    top : Top
+    start : State
+        Of the motion.
+    start_ns : when it begins, in simulated time [ns]
+    """
+
+    def __init__(self, top: Top, start: State, start_ns: int,
+                 solution: ExactSolution | None = None) -> None:
+        self.top, self.start, self.start_ns = top, start, start_ns
+        self._solution = solution
+        self._is_known = solution is not None
+
+    @property
+    def solution(self) -> ExactSolution | None:
+        """The exact solution; None for a motion whose constants it cannot hold."""
+        if not self._is_known:
+            try:
+                self._solution = ExactSolution(self.top, self.start)
+            except ValueError:
+                self._solution = None
+            self._is_known = True
+        return self._solution
+
+    def states(self, times_ns: NDArray[np.int64]) -> States | None:
+        """Return the exact states at simulated times (n,) [ns], or None without a solution."""
+        solution = self.solution
+        return None if solution is None else solution.states(times_ns - self.start_ns)
+
+    def axis(self, times_ns: NDArray[np.int64]) -> Axis:
+        """
+        Return the symmetry axis in the world at simulated times (n,) [ns].
+
+        Without an exact solution it stands as it does at the start.
+        """
+        states = self.states(times_ns)
+        if states is not None:
+            return states.rows_axis
+        theta, phi, ones = self.start.theta, self.start.phi, np.ones(len(times_ns))
+        return (math.sin(theta) * math.cos(phi) * ones, math.sin(theta) * math.sin(phi) * ones,
+                math.cos(theta) * ones)
+
+
+class Segment:
+    """
+    A motion from its start, or from a command, until the next command.
+
+    Attributes
+    ----------
+    solver : Propagator
+        Its t = 0 is `start_ns`.
+    start_ns : simulated time at which it begins [ns]
+    energy, l3, lz : constants of the motion, as it began
+    reference : Reference
+    """
+
+    def __init__(self, solver: Propagator, start: State, start_ns: int) -> None:
+        self.solver, self.start_ns = solver, start_ns
+        first = solver.states(range(1))
+        self.energy, self.l3, self.lz = float(first.energy[0]), start.l3, start.lz
+        self.reference = Reference(solver.top, start, start_ns,
+                                   solver if isinstance(solver, ExactSolution) else None)
+
+    def states(self, times: range) -> States:
+        """Return the states at ascending simulated times [ns]."""
+        start = self.start_ns
+        return self.solver.states(range(times.start - start, times.stop - start, times.step))
+
+    def orientation_error(self, states: States, times: range) -> NDArray[np.float64]:
+        """
+        Return the angles (n,) between states at simulated times and the exact solution [rad].
+
+        0 for the exact solution itself; NaN for a motion that it cannot hold.
+        """
+        exact = self.reference.solution
+        if exact is None:
+            return np.full(len(times), math.nan)
+        if exact is self.solver:
+            return np.zeros(len(times))
+        start = self.start_ns
+        local = range(times.start - start, times.stop - start, times.step)
+        return attitude.angle_between(states.rows_quaternion, exact.states(local).rows_quaternion)
