@@ -161,7 +161,7 @@ def assert_close(found, expected):
         runs = (stream.template.decode_many(b''.join(data for _, data in rows))
                 for rows in (mine, other))
         for one, two in zip(*runs, strict=True):
-            assert one == pytest.approx(two, rel=1e-12, abs=2e-12), stream.topic
+            assert np.allclose(one, two, rtol=1e-12, atol=2e-12, equal_nan=True), stream.topic
 
 
 # ---------------------------------------------------------------------------------------- live
@@ -172,7 +172,7 @@ def test_any_division_of_a_run_gives_the_same_bytes(scene, method):
     whole = record(scene, method)
     counts = {topic: len(rows) for topic, rows in whole.rows.items()}
     assert counts['pose'] > 500 and counts['imu/data_raw'] > 700 and min(counts.values()) > 20
-    for seed, count in enumerate((5, 60, 600)):
+    for seed, count in enumerate((5, 300)):
         assert_same_bytes(record(scene, method, random_splits(seed, count)), whole)
 
 
@@ -328,7 +328,7 @@ def test_stepped_states_are_the_same_bits_however_many_follow(name):
     t = some_times(3, 0.0)
     whole = solve(top, start, t, method='rk45', rtol=1e-9)
     rng = np.random.default_rng(4)
-    for count in (1, *sorted(rng.integers(2, INSTANTS, 3)), INSTANTS - 1):
+    for count in (1, int(rng.integers(2, INSTANTS)), INSTANTS - 1):
         part = solve(top, start, t[:count], method='rk45', rtol=1e-9)
         for each in (*OF_ANGLES, *OF_ATTITUDE):
             assert_same_bits(column(part, each), column(whole, each)[:count], each)
