@@ -12,7 +12,6 @@ import itertools
 import json
 import math
 import random
-import re
 import subprocess
 import sys
 import weakref
@@ -24,7 +23,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim import State, Top, solve
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.long_decimals import (
     atan2,
@@ -520,6 +519,45 @@ def test_grids_of_many_steps_side_by_side():
             assert difference(grid[1], solution.quaternion_at(7 + step)) <= BOUND
 
 
+@pytest.mark.parametrize('theta, l3, lz', [
+    (0.0028, 1.0, 1.0 + 1e-7), (0.003, 0.5, 0.5), (0.003, 1.0, 1.0), (0.0032, 0.5, 0.5),
+    (0.0036, 0.9, 0.9 + 9e-8), (0.02, 1.5, 1.5)])
+def test_near_the_separatrix_a_grid_is_as_good_as_its_angles(theta, l3, lz):
+    """m1 from 2e-6 to 2e-4, where the series for a whole turn would cancel."""
+    state = start(theta, l3=l3, lz=lz)
+    motion = solve(UNIT, state, np.arange(-5_000, 10_000) * 1e-3)
+    assert 2e-6 < motion.solution.m1 < 2e-4
+    sine, cosine = np.sin(0.5 * motion.theta), np.cos(0.5 * motion.theta)
+    plus, minus = 0.5 * (motion.phi + motion.psi), 0.5 * (motion.phi - motion.psi)
+    of_angles = np.column_stack((-sine * np.sin(minus), sine * np.cos(minus),
+                                 cosine * np.sin(plus), cosine * np.cos(plus)))
+    assert np.abs(motion.quaternion - of_angles).max() <= BOUND
+    grid = ExactSolution(UNIT, state).quaternion_grid(-5 * 10 ** 9, 10 ** 6, 15_000)
+    assert np.abs(grid - of_angles).max() <= BOUND
+
+
+# The fastest phase in turns per second, by hand: (phi + psi)/2 of a sleeping top, and the
+# nutation of a free rotation, which takes two quarter periods a turn.
+FASTEST_TURNS = {
+    'sleeping': (replace(UNIT, lambda3=0.001), start(0.0, l3=3.0, lz=3.0),
+                 0.5 * 3.0 / 0.001 / (2.0 * math.pi)),
+    'free rotation': (replace(UNIT, gravity=0.0), start(0.4, 250.0, l3=0.0, lz=0.0),
+                      250.0 / math.pi),
+}
+
+
+@pytest.mark.parametrize('name', FASTEST_TURNS)
+def test_times_end_where_the_fastest_phase_has_made_2_to_the_52_turns(name):
+    top, state, turns_per_second = FASTEST_TURNS[name]
+    limit = 2.0 ** 52 / turns_per_second
+    assert ExactSolution(top, state).time_limit == pytest.approx(limit, rel=1e-12)
+    for sign in (1.0, -1.0):
+        inside = solve(top, state, [sign * limit * (1.0 - 1e-9)])
+        assert np.isfinite(inside.quaternion).all() and np.isfinite(inside.phi).all()
+        with pytest.raises(ValueError, match='must be finite and within'):
+            assert solve(top, state, [0.0, sign * limit * (1.0 + 1e-9)]).quaternion is None
+
+
 def test_bad_arrays_and_counts_are_refused():
     solution = ExactSolution(*REGIMES['looping'])
     with pytest.raises(ValueError, match='shape'):
@@ -571,6 +609,31 @@ def test_extreme_inputs_are_solved_or_refused(seed):
     assert solved > 5
 
 
+@pytest.mark.parametrize('top, state', [
+    (Top(lambda1=0.5, lambda3=1.0, mass=2e8, com_distance=1.0, gravity=G),
+     start(1.0, 4.838e-20, l3=55810.0, lz=55810.0)),
+    (Top(lambda1=0.196, lambda3=1.0, mass=67.69, com_distance=1.0, gravity=G),
+     start(math.pi - 8e-14, 3.5e-31, l3=1.07e-12, lz=1.07e-12)),
+    (Top(lambda1=15.463371957511931, lambda3=1.0, mass=35086630.49369044, com_distance=1.0,
+         gravity=G),
+     start(3.141590416121667, 3.199103207571675e-34, l3=0.29947830013747967,
+           lz=0.02329830159939593)),
+    (Top(lambda1=7.078571047581468e-18, lambda3=1.0, mass=12.19625939538337, com_distance=1.0,
+         gravity=G),
+     start(3.141592636054256, 1.2982985058408475e-22, l3=-5.702321402634462e-16,
+           lz=-5.702321402634462e-16)),
+])
+def test_a_rate_of_next_to_nothing_is_right_or_refused(top, state):
+    """What the constants of the motion lose of the start is not passed over in silence."""
+    try:
+        motion = solve(top, state, [0.0])
+        found = motion.theta[0], motion.theta_dot[0]
+    except ValueError as refusal:
+        assert 'too far apart' in str(refusal)
+        return
+    assert found == pytest.approx((state.theta, state.theta_dot), rel=1e-14, abs=1e-14)
+
+
 def test_huge_start_angles_keep_their_fraction_of_a_turn():
     top, state = REGIMES['looping']
     for phi, psi in ((1e300, 0.0), (1e20, -3.0), (-1e15, 1e15)):
@@ -595,12 +658,14 @@ def test_the_caller_s_decimal_context_does_not_matter():
 
 @pytest.mark.parametrize('name', sorted(REGIMES))
 def test_a_solution_leaves_nothing_for_the_garbage_collector(name):
-    """A node makes one at each command."""
-    solution = ExactSolution(*REGIMES[name])
-    solution.quaternion_at(5)
-    solution.full_state_at(5)
-    with pytest.raises(ValueError, match=re.escape(f'within {solution.time_limit:.6g} s')):
-        solution.quaternion_at(solution.ns_limit + 1)
+    """A node makes one at each command: after use, and after a refusal."""
+    top, state = REGIMES[name]
+    solution = ExactSolution(top, state)
+    attitude = solution.quaternion_at(0)
+    assert difference(attitude, zyz(state)) <= BOUND
+    assert difference(solution.full_state_at(0)[4:8], zyz(state)) <= BOUND
+    with pytest.raises(ValueError, match=r'2\^52 turns'):
+        solution.quaternion_at(10 ** 400)
     there = weakref.ref(solution)
     gc.disable()
     try:

@@ -23,6 +23,7 @@ from spinning_top_sim.streams.pipeline import Simulation
 # Central differences of order 8 (Fornberg, Math. Comp. 51 (1988) 699-706).
 FIRST = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
 SECOND = np.array([-1 / 560, 8 / 315, -1 / 5, 8 / 5, -205 / 72, 8 / 5, -1 / 5, 8 / 315, -1 / 560])
+SECOND_NS = 1_000_000_000
 NOISY = {'imu.gyroscope_noise_density': 1e-3, 'imu.gyroscope_random_walk': 2e-4,
          'imu.accelerometer_noise_density': 2e-2, 'imu.accelerometer_random_walk': 3e-3,
          'imu.gyroscope_turn_on_bias': 0.01, 'imu.accelerometer_turn_on_bias': 0.05}
@@ -159,6 +160,41 @@ def test_what_is_added_is_distributed_as_the_message_says(resolution):
     whitened = added / np.sqrt(covariances)
     lagged = np.mean(whitened[1:] * whitened[:-1], axis=0)
     assert np.abs(lagged).max() < 5.0 / math.sqrt(len(added))
+
+
+def errors(**noise):
+    """Return white noise and bias of one second of samples, (n, 6) each."""
+    values = {'imu.' + name: value for name, value in noise.items()}
+    found = messages({**values, 'solver.method': 'exact'}, SECOND_NS, 'imu/data_raw',
+                     'ground_truth/imu', 'ground_truth/imu_bias')
+    bias = found['ground_truth/imu_bias'][1]
+    return found['imu/data_raw'][1] - found['ground_truth/imu'][1] - bias, bias
+
+
+def test_without_a_turn_on_bias_the_walk_begins_at_zero():
+    _, bias = errors(gyroscope_random_walk=2e-4, accelerometer_random_walk=3e-3)
+    assert np.all(bias[0] == 0.0)
+    assert np.all(bias[1:] != 0.0)
+
+
+def test_the_first_bias_is_the_turn_on_bias():
+    turn_on = {'gyroscope_turn_on_bias': 0.01, 'accelerometer_turn_on_bias': 0.05}
+    _, constant = errors(**turn_on)
+    _, walking = errors(**turn_on, gyroscope_random_walk=2e-4, accelerometer_random_walk=3e-3)
+    assert np.all(constant == constant[0]) and np.all(constant[0] != 0.0)
+    assert np.array_equal(walking[0], constant[0])
+
+
+def test_the_turn_on_bias_is_a_draw_of_its_own():
+    """Over its deviation it is none of the numbers that noise and walk are made of."""
+    _, bias = errors(gyroscope_turn_on_bias=1.0, accelerometer_turn_on_bias=1.0)
+    # Deviations of 1 at the rate that the IMU has.
+    density = math.sqrt(1.0 / parameters.defaults()['imu.rate'])
+    white, _ = errors(gyroscope_noise_density=density, accelerometer_noise_density=density)
+    _, walk = errors(gyroscope_random_walk=1.0 / density, accelerometer_random_walk=1.0 / density)
+    numbers = np.concatenate((white.ravel(), walk.ravel(), np.diff(walk, axis=0).ravel()))
+    assert np.abs(numbers[:, None] - bias[0]).min() > 1e-9
+    assert 0.0 < np.abs(bias[0]).max() < 5.0 and np.ptp(bias[0]) > 0.1
 
 
 def test_bias_walks_with_its_own_variance():

@@ -200,6 +200,22 @@ def test_a_reset_begins_the_trace_anew():
 
 # ------------------------------------------------------------------------------------- as ROS
 
+@pytest.mark.parametrize('values', [{}, {'top.com_distance': -0.3, 'world_frame': 'map'}])
+def test_the_lines_are_drawn_to_the_scale_of_the_top(values):
+    """The axis is 2 % of the distance to the tip wide, the trace half of that."""
+    pytest.importorskip('rclpy')
+    from rclpy.serialization import deserialize_message
+    from visualization_msgs.msg import MarkerArray
+
+    run = markers_of(values, duration_ns=SECOND)
+    body, axis, trace = deserialize_message(run.sent[SECOND], MarkerArray).markers
+    shape = shape_of(run.simulation.top)
+    assert (body.scale.x, body.scale.y, body.scale.z) == (
+        2.0 * shape.radius, 2.0 * shape.radius, shape.height)
+    assert axis.scale.x == pytest.approx(0.02 * abs(shape.tip), rel=1e-12)
+    assert trace.scale.x == pytest.approx(0.01 * abs(shape.tip), rel=1e-12)
+    assert (axis.scale.y, axis.scale.z, trace.scale.y, trace.scale.z) == (0.0, 0.0, 0.0, 0.0)
+
 
 @pytest.mark.parametrize('frame', ['', 'world', 'a/map', 'x' * 7, 'θ'])
 @pytest.mark.parametrize('count', [0, 1, 2, 41])
@@ -240,4 +256,4 @@ def test_the_message_is_what_ros_serializes(frame, count):
         for marker in trace:
             assert marker.type == Marker.LINE_STRIP
             assert [c for p in marker.points for c in (p.x, p.y, p.z)] == dice[11:]
-            assert marker.scale.x > 0.0
+            assert marker.scale.x == 0.5 * axis.scale.x == 0.03125

@@ -8,11 +8,12 @@ import pytest
 from reference import CASES, SCENES, scene_parameters, start_of, top_of
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim import State, Top
+from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.kinematics import AxisState
 from spinning_top_sim.physics.regimes import regime, swing
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.pipeline import Simulation
 
 TOP = {'lambda1': 0.123, 'lambda3': 0.15, 'mass': 2.0, 'com_distance': 0.15, 'gravity': 9.80665}
 STATE = {'theta': 0.7, 'theta_dot': 0.4, 'phi': 0.3, 'psi': -1.2, 'l3': 1.6, 'lz': 1.1}
@@ -154,6 +155,64 @@ def test_every_scene_is_valid_and_is_the_motion_it_says():
 
 def test_the_default_parameters_are_the_cusp_scene():
     assert parameters.checked(scene_parameters('cusp')) == parameters.checked({})
+
+
+@pytest.mark.parametrize(('l3', 'name'), [
+    (math.nextafter(2.0, 3.0), 'sleeping'), (2.0, 'sleeping, unstable'),
+    (-2.0, 'sleeping, unstable'), (math.nextafter(2.0, 0.0), 'sleeping, unstable')])
+def test_an_upright_top_sleeps_above_the_critical_momentum(l3, name):
+    """L3^2 > 4 lambda1 P, with lambda1 = P = 1: here both sides are exact in doubles."""
+    top = Top(lambda1=1.0, lambda3=0.5, mass=1.0, com_distance=1.0, gravity=1.0)
+    assert regime(top, State(theta=0.0, l3=l3, lz=l3)) == name
+
+
+# ------------------------------------------------------------------- a motion in numbers
+
+def described(**values):
+    """Return the description of a motion, its top and its start state."""
+    simulation = Simulation(parameters.checked(
+        {name.replace('__', '.'): value for name, value in values.items()}))
+    start = parameters.start_state(simulation.values)
+    return simulation.describe(), simulation.top, start
+
+
+def test_the_gyroscopic_ratio_by_hand():
+    """L3^2/(4 lambda1 |P|) with lambda1 = 0.25 and P = 2 x 0.5 x 8 = 8: 3^2/(4 x 0.25 x 8)."""
+    top = {'top__lambda1': 0.25, 'top__mass': 2.0, 'top__gravity': 8.0, 'spin__l3': 3.0}
+    for distance in (0.5, -0.5):
+        assert described(**top, top__com_distance=distance)[0].gyroscopic_ratio == 1.125
+    assert described(**top, top__com_distance=0.0)[0].gyroscopic_ratio == math.inf
+
+
+def test_the_extremes_of_the_precession_by_hand():
+    """
+    It is least inside the swing, where L3 u^2 - 2 Lz u + L3 = 0 with u = cos(theta).
+
+    For L3 = 0.3 and Lz = 0.5 that is u = 1/3, and phi' = (0.5 - 0.1)/(lambda1 8/9).
+    """
+    description, top, _ = described(initial__theta=0.5 * math.pi, spin__l3=0.3, spin__lz=0.5,
+                                    top__com_distance=-0.15)
+    assert description.theta_max == pytest.approx(0.5 * math.pi, abs=1e-15)
+    assert description.theta_min < math.acos(1.0 / 3.0)
+    assert description.precession_min == pytest.approx(0.45 / top.lambda1, rel=1e-14)
+
+
+@pytest.mark.parametrize(('theta', 'theta_dot', 'l3', 'lz'), [
+    (0.6, 0.0, 1.6, 1.0), (1.2, 0.5, 0.3, 0.5), (1.2, 0.5, 0.3, -0.5), (1.2, 0.5, -0.3, 0.5),
+    (1.0, 2.0, -0.3, -0.6), (2.0, 1.0, 0.3, -0.5), (2.0, 0.0, 0.5, -0.7), (0.9, 0.0, 1.6, 1.6)])
+def test_the_extremes_are_those_of_the_motion(theta, theta_dot, l3, lz):
+    """Of phi' and theta, sampled over a nutation: inside the swing, at its ends, at a pole."""
+    description, top, start = described(initial__theta=theta, initial__theta_dot=theta_dot,
+                                        spin__l3=l3, spin__lz=lz)
+    motion = solve(top, start, np.linspace(0.0, description.nutation_period, 20_001))
+    for low, high, column in (
+            (description.precession_min, description.precession_max, motion.phi_dot),
+            (description.theta_min, description.theta_max, motion.theta_folded)):
+        width = column.max() - column.min()
+        assert low - 1e-12 * width <= column.min() <= low + 1e-5 * width
+        assert high - 1e-5 * width <= column.max() <= high + 1e-12 * width
+    assert (description.precession_min < description.mean_precession_rate
+            < description.precession_max)
 
 
 def test_swing_contains_every_reference_tilt():

@@ -336,6 +336,46 @@ def test_through_a_pole_the_invariants_hold(l3, theta):
     assert np.abs(motion.l3 - l3).max() <= 1e-14
 
 
+@pytest.mark.parametrize(('theta', 'theta_dot', 'l3', 'lz'), [
+    (0.1, 0.0, 1.6, 1.591), (0.1, 0.3, 1.6, 1.59), (0.1, 0.3, 3.0, 2.99),
+    (3.05, 0.2, 1.0, -0.99)])
+def test_close_to_a_pole_the_invariants_hold(theta, theta_dot, l3, lz):
+    """At tilts of 0.05 to 0.25 rad from the vertical, where rounding is magnified."""
+    top = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
+    start = State(theta=theta, theta_dot=theta_dot, phi=0.3, psi=-0.7, l3=l3, lz=lz)
+    t = np.linspace(0.0, 20.0, 4001)
+    motion, truth = (solve(top, start, t, method=method) for method in ('rk45', 'exact'))
+    tilts = np.minimum(truth.theta_folded, math.pi - truth.theta_folded)
+    assert tilts.min() > 0.05 and tilts.max() < 0.25
+    assert np.abs(motion.l3 - l3).max() <= 5e-15 * l3
+    assert np.abs(motion.energy - motion.energy[0]).max() <= 1e-12
+    x, y, z, w = motion.quaternion.T
+    omega1, omega2, omega3 = motion.angular_velocity.T
+    vertical = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
+    of_motion = (top.lambda1 * (omega1 * vertical[0] + omega2 * vertical[1])
+                 + top.lambda3 * omega3 * vertical[2])
+    assert np.abs(of_motion - lz).max() <= 5e-15 * abs(lz)
+    assert np.abs(motion.quaternion - truth.quaternion).max() <= 4e-10
+
+
+@pytest.mark.parametrize('method', ['rk45', 'exact'])
+@pytest.mark.parametrize('theta_dot', [2.5, -2.5])
+def test_a_free_planar_rotation_counts_its_turns(method, theta_dot):
+    """Without torque and momentum theta = theta0 + theta' t, either way round."""
+    top = Top(lambda1=1.0, lambda3=0.5, mass=1.0, com_distance=0.5, gravity=0.0)
+    start = State(theta=0.7, theta_dot=theta_dot, phi=0.3, psi=-0.4, l3=0.0, lz=0.0)
+    t = np.linspace(0.0, 50.0, 1001)
+    motion = solve(top, start, t, method=method)
+    assert motion.theta == pytest.approx(0.7 + theta_dot * t, abs=5e-14)
+    assert np.all(motion.theta_dot == pytest.approx(theta_dot, abs=1e-14))
+    assert motion.phi == pytest.approx(np.full(1001, 0.3), abs=1e-14)
+    assert motion.psi == pytest.approx(np.full(1001, -0.4), abs=1e-14)
+    half = 0.5 * motion.theta
+    expected = np.array([-np.sin(half) * math.sin(0.35), np.sin(half) * math.cos(0.35),
+                         np.cos(half) * math.sin(-0.05), np.cos(half) * math.cos(-0.05)]).T
+    assert np.abs(motion.quaternion - expected).max() <= 5e-14
+
+
 # ------------------------------------------------------------------------------- columns
 
 def bits(value):

@@ -197,19 +197,36 @@ def test_every_stream_sends_a_message_of_its_type_with_the_frames_of_the_paramet
     assert set(expected) <= seen
 
 
-def test_imu_covariances_follow_rep_145():
-    """No orientation estimate: first element -1; every other covariance 0 or positive."""
-    simulation = Simulation(parameters.checked({}))
+NOISE = {'imu.gyroscope_noise_density': 1e-3, 'imu.accelerometer_noise_density': 0.02,
+         'imu.gyroscope_resolution': 0.01, 'imu.accelerometer_resolution': 0.3, 'imu.rate': 200.0,
+         'imu_data.rate': 50.0}
+
+
+@pytest.mark.parametrize(('values', 'raw', 'data'), [
+    ({}, (0.0, 0.0), (0.0, 0.0)),
+    # density^2 x rate + resolution^2/12, of angular velocity and linear acceleration
+    (NOISE, (1e-6 * 200.0 + 1e-4 / 12.0, 4e-4 * 200.0 + 0.09 / 12.0),
+     (1e-6 * 50.0 + 1e-4 / 12.0, 4e-4 * 50.0 + 0.09 / 12.0))])
+def test_imu_covariances_follow_rep_145(values, raw, data):
+    """No orientation estimate: first element -1; all others are what is known, or 0."""
+    simulation = Simulation(parameters.checked(values))
     state = simulation.state()
     by_topic = {stream.topic: deserialize_message(stream.encode(state, 0, 0), Imu)
                 for stream in simulation.streams if stream.type_name == 'sensor_msgs/msg/Imu'}
     for topic in ('imu/data_raw', 'ground_truth/imu_bias'):
         assert by_topic[topic].orientation_covariance[0] == -1.0, topic
     for topic in ('imu/data', 'ground_truth/imu'):
-        assert by_topic[topic].orientation_covariance[0] >= 0.0, topic
+        assert by_topic[topic].orientation_covariance[0] == 0.0, topic
         orientation = by_topic[topic].orientation
         assert math.hypot(orientation.x, orientation.y, orientation.z,
                           orientation.w) == pytest.approx(1.0, abs=1e-15)
+    variances = {'imu/data_raw': raw, 'imu/data': data, 'ground_truth/imu': (0.0, 0.0),
+                 'ground_truth/imu_bias': (0.0, 0.0)}
+    assert set(by_topic) == set(variances)
     for topic, message in by_topic.items():
-        assert message.angular_velocity_covariance[0] >= 0.0, topic
-        assert message.linear_acceleration_covariance[0] >= 0.0, topic
+        assert not any(message.orientation_covariance[1:]), topic
+        for covariance, variance in zip((message.angular_velocity_covariance,
+                                         message.linear_acceleration_covariance),
+                                        variances[topic], strict=True):
+            assert covariance == pytest.approx(
+                [variance if k % 4 == 0 else 0.0 for k in range(9)], rel=1e-12, abs=0.0), topic
