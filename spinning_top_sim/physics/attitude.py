@@ -88,7 +88,8 @@ def precession_rate(top: Top, l3: float, lz: float, cos2_half: Number,
     return 0.25 / top.lambda1 * (bottom + upright)
 
 
-def angular_acceleration(top: Top, omega: Vector, vertical: Vector) -> tuple[Column, Column]:
+def angular_acceleration(top: Top, omega: Vector, vertical: Vector,
+                         ) -> tuple[Column | float, Column | float]:
     """
     Return omega_1' and omega_2' [rad/s^2] in the body frame by Euler's equations; omega_3' = 0.
 

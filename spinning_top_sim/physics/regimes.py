@@ -12,38 +12,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from decimal import Decimal
+from typing import TypeVar
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.top import State, Top
 
-
-class Averages(Protocol):
-    """What the closed form knows of a whole nutation (`solvers.exact.ExactSolution`)."""
-
-    @property
-    def nutation_period(self) -> float | None:
-        """[s], None where the nutation rests."""
-
-    @property
-    def mean_precession_rate(self) -> float:
-        """[rad/s]."""
-
-    @property
-    def mean_spin_rate(self) -> float:
-        """[rad/s]."""
-
-    @property
-    def theta_min(self) -> float:
-        """[rad]."""
-
-    @property
-    def theta_max(self) -> float:
-        """[rad]."""
-
-    @property
-    def m1(self) -> float:
-        """1 - m, complementary parameter of the elliptic functions."""
+Real = TypeVar('Real', float, Decimal)
 
 
 @dataclass(frozen=True)
@@ -79,19 +54,6 @@ class Description:
                 f'({self.precession_min:.4g} to {self.precession_max:.4g}), spin '
                 f'{self.mean_spin_rate:.6g} rad/s; L3^2/(4 lambda1 |P|) = '
                 f'{self.gyroscopic_ratio:.4g}, 1 - m = {self.separatrix_distance:.3g}')
-
-
-def describe(top: Top, state: State, averages: Averages) -> Description:
-    """Return the numbers of the motion through `state`, with those of the closed form."""
-    slowest, fastest = precession_extremes(top, state, averages.theta_min, averages.theta_max)
-    weight = 4.0 * top.lambda1 * abs(top.gravity_torque)
-    return Description(
-        name=regime(top, state), nutation_period=averages.nutation_period,
-        theta_min=averages.theta_min, theta_max=averages.theta_max,
-        mean_precession_rate=averages.mean_precession_rate,
-        precession_min=slowest, precession_max=fastest,
-        mean_spin_rate=averages.mean_spin_rate, separatrix_distance=averages.m1,
-        gyroscopic_ratio=state.l3 * state.l3 / weight if weight else math.inf)
 
 
 def precession_extremes(top: Top, state: State, theta_min: float,
@@ -147,7 +109,7 @@ def nutation_rests(top: Top, start: State) -> bool:
         return False
     # From theta' = 0 cos(theta) swings by f1/f2, where that is small.
     s0, c0 = half_sine ** 2, half_cosine ** 2
-    _, f1, f2, _ = cubic(top, start, s0, c0)
+    _, f1, f2, _ = _cubic_of(top, start)
     return abs(f1) <= REST_SWING * 4.0 * s0 * c0 * abs(f2)
 
 
@@ -167,9 +129,8 @@ class Swing:
 def swing(top: Top, state: State) -> Swing:
     """Return the roots of u'^2 = f(u) around the state, in doubles."""
     u0 = math.cos(state.theta)
-    half_cosine, half_sine = math.cos(0.5 * state.theta), math.sin(0.5 * state.theta)
-    s0, c0 = half_sine ** 2, half_cosine ** 2
-    f0, f1, f2, f3 = cubic(top, state, s0, c0)
+    s0, c0 = math.sin(0.5 * state.theta) ** 2, math.cos(0.5 * state.theta) ** 2
+    f0, f1, f2, f3 = _cubic_of(top, state)
     if f0 == 0.0 and f1 == 0.0:
         return Swing(u0, u0, math.inf if f3 == 0.0 else max(u0 - f2 / f3, u0))
     if f0 == 0.0:                       # theta' = 0: u0 is one end, the others from a quadratic
@@ -185,18 +146,33 @@ def swing(top: Top, state: State) -> Swing:
     return Swing(u0 + low, u0 + high, u0 + beyond)
 
 
-def cubic(top: Top, state: State, s0: float, c0: float) -> tuple[float, float, float, float]:
-    """Return f of u'^2 = f0 + f1 y + f2 y^2 + f3 y^3, y = u - u0; s0, c0: sin^2, cos^2 theta/2."""
-    torque, lambda1, l3, lz = top.gravity_torque, top.lambda1, state.l3, state.lz
-    u0 = c0 - s0
-    offset = (lz - l3) + 2.0 * l3 * s0 if s0 < c0 else (lz + l3) - 2.0 * l3 * c0
-    rate = attitude.precession_rate(top, l3, lz, c0, s0)
-    kinetic = 0.5 * lambda1 * (state.theta_dot ** 2 + 4.0 * s0 * c0 * rate ** 2)
-    return (4.0 * s0 * c0 * state.theta_dot ** 2,
-            (2.0 / lambda1 * (-2.0 * u0 * kinetic - 4.0 * torque * s0 * c0)
-             + 2.0 * offset * l3 / lambda1 ** 2),
-            2.0 / lambda1 * (2.0 * u0 * torque - kinetic) - (l3 / lambda1) ** 2,
-            2.0 * torque / lambda1)
+def nutation_cubic(lambda1: Real, torque: Real, l3: Real, lz: Real, theta_dot: Real,
+                   sin_half: Real, cos_half: Real) -> tuple[Real, Real, Real, Real]:
+    """
+    Return f0 .. f3 of u'^2 = f0 + f1 y + f2 y^2 + f3 y^3, y = u - u0, u = cos(theta).
+
+    Parameters
+    ----------
+    lambda1, torque, l3, lz, theta_dot : constants, and the nutation rate at the start
+    sin_half, cos_half : of theta/2 at the start; they stand for theta, so that nothing cancels at
+        either pole
+    """
+    s0, c0 = sin_half * sin_half, cos_half * cos_half
+    u0, sine = c0 - s0, 2 * sin_half * cos_half
+    # Lz - L3 u0, and phi' sin(theta).
+    momentum = (lz - l3) + 2 * l3 * s0 if s0 < c0 else (lz + l3) - 2 * l3 * c0
+    across = momentum / lambda1 / sine if sine else 0 * sine
+    kinetic = lambda1 * (theta_dot * theta_dot + across * across) / 2     # of the axis
+    return (sine * sine * theta_dot * theta_dot,
+            2 * momentum * l3 / lambda1 / lambda1
+            - 2 / lambda1 * (2 * u0 * kinetic + torque * sine * sine),
+            2 / lambda1 * (2 * u0 * torque - kinetic) - (l3 / lambda1) * (l3 / lambda1),
+            2 * torque / lambda1)
+
+
+def _cubic_of(top: Top, state: State) -> tuple[float, float, float, float]:
+    return nutation_cubic(top.lambda1, top.gravity_torque, state.l3, state.lz, state.theta_dot,
+                          math.sin(0.5 * state.theta), math.cos(0.5 * state.theta))
 
 
 def _quadratic_roots(a0: float, a1: float, a2: float) -> list[float]:

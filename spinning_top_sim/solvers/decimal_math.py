@@ -32,7 +32,7 @@ def pi() -> Decimal:
 @lru_cache
 def _pi(digits: int) -> Decimal:
     """Machin: pi = 16 arctan(1/5) - 4 arctan(1/239)."""
-    unit = 10 ** (digits + 10)
+    unit: int = 10 ** (digits + 10)
 
     def arctan_of_inverse(n: int) -> int:
         total = term = unit // n

@@ -20,8 +20,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-# One state: a tuple of n floats or complex numbers.
-Vector = tuple[Any, ...]
+# The unknowns of one state: complex numbers, of which floats are some.
+Vector = tuple[complex, ...]
 Rows = NDArray[np.float64]
 
 STAGES: tuple[tuple[Fraction, ...], ...] = (
@@ -60,8 +60,8 @@ class Equations(Protocol):
         """Of the equations."""
 
     @property
-    def number(self) -> type:
-        """Of the unknowns: float or complex."""
+    def is_complex(self) -> bool:
+        """Whether the unknowns are complex numbers."""
 
     @property
     def start(self) -> Vector:
@@ -71,8 +71,9 @@ class Equations(Protocol):
     def first_step(self) -> float:
         """A careful first step [s]: the control finds the right one within a few."""
 
-    def derivative(self, *y: Any) -> Vector:
-        """Return y'."""
+    @property
+    def derivative(self) -> Callable[..., Vector]:
+        """Takes the unknowns one by one; returns y'."""
 
     def second_derivative(self, y: Rows, derivative: Rows) -> Rows:
         """Return y'' from y and y': rows of components (k, n), real and imaginary parts apart."""
@@ -91,14 +92,14 @@ StepFunction = Callable[..., tuple[Vector, Vector, Vector]]
 
 
 @functools.cache
-def unrolled_step(size: int, number: type) -> StepFunction:
+def unrolled_step(size: int, is_complex: bool) -> StepFunction:
     """
     Return step(f, h, y, k1) -> (y_new, k7, error estimate) for vectors of `size` numbers.
 
     The loops over stages and components are written out once from the tableau, as source text:
     plain expressions on local names take a third of the time of loops over lists.
     """
-    literal = repr if number is float else (lambda x: f'({x!r}+0j)')
+    literal = (lambda x: f'({x!r}+0j)') if is_complex else repr
 
     def combination(coefficients: tuple[Fraction, ...], component: int) -> str:
         return ' + '.join(f'{literal(float(c))}*k{stage}_{component}'
@@ -108,7 +109,7 @@ def unrolled_step(size: int, number: type) -> StepFunction:
         return ''.join(f'{stem}_{i}, ' for i in range(size))
 
     lines = ['def step(f, h, y, k1):', f'    {names("y")}= y', f'    {names("k1")}= k1',
-             f'    h = {"h" if number is float else "complex(h)"}']
+             f'    h = {"complex(h)" if is_complex else "h"}']
     for stage, coefficients in enumerate(STAGES[:-1], start=2):
         arguments = ', '.join(f'y_{i} + h*({combination(coefficients, i)})' for i in range(size))
         lines.append(f'    {names(f"k{stage}")}= f({arguments})')
@@ -118,7 +119,8 @@ def unrolled_step(size: int, number: type) -> StepFunction:
     lines.append(f'    return ({names("z")}), k7, ({estimate},)')
     scope: dict[str, Any] = {}
     exec('\n'.join(lines), scope)
-    return scope['step']
+    step: StepFunction = scope['step']
+    return step
 
 
 class Step(NamedTuple):
@@ -147,7 +149,7 @@ class Integrator:
     def __init__(self, equations: Equations) -> None:
         self.equations = equations
         start = equations.project(equations.start)
-        self._step = unrolled_step(len(start), equations.number)
+        self._step = unrolled_step(len(start), equations.is_complex)
         derivative = equations.derivative(*start)
         self.newest = Step(0.0, start, derivative, 0.0, start, derivative)
         self._next_step = equations.first_step
@@ -219,10 +221,11 @@ class Interpolants(NamedTuple):
         """Return the unknowns (k, m) at m times [s] in the steps of these numbers."""
         s = (t - self.begin[numbers]) / self.length[numbers]
         c0, c1, c2, c3, c4, c5 = self.coefficients.take(numbers, axis=2)
-        return ((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0
+        unknowns: Rows = ((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0
+        return unknowns
 
 
 def _rows(vectors: Sequence[Vector]) -> Rows:
     """Return rows (k, n) of n vectors; a complex component makes two rows."""
-    columns = np.array(vectors)
+    columns: NDArray[np.generic] = np.array(vectors)
     return np.ascontiguousarray(columns.view(np.float64).T)

@@ -30,7 +30,7 @@ class EulerEquations:
     """The equations above for one top and one motion; see `dormand_prince.Equations`."""
 
     name = 'euler'
-    number = float
+    is_complex = False
 
     def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
         self.top, self.l3, self.lz = top, start.l3, start.lz
@@ -43,7 +43,7 @@ class EulerEquations:
         top = self.top
         rate = (abs(self.start[1]) + (abs(self.l3) + abs(self.lz)) / top.lambda1
                 + abs(self.l3) / top.lambda3 + math.sqrt(abs(top.gravity_torque) / top.lambda1))
-        return 0.1 * (self._rtol + self._atol) ** 0.2 / (rate or 1.0)
+        return 0.1 * math.pow(self._rtol + self._atol, 0.2) / (rate or 1.0)
 
     def derivative(self, theta: float, theta_dot: float, phi: float, psi: float) -> Vector:
         """Return (theta', theta'', phi', psi').  Raises IntegrationError near a pole."""
@@ -83,10 +83,11 @@ class EulerEquations:
 
     def check_step(self, y: Vector, y_new: Vector) -> None:
         """Raise IntegrationError if the step leapt over a pole: phi and psi would be lost."""
-        if math.floor(y[0] / math.pi) != math.floor(y_new[0] / math.pi):
+        before, after = y[0].real, y_new[0].real
+        if math.floor(before / math.pi) != math.floor(after / math.pi):
             raise IntegrationError(
-                f'euler equations: a step leapt over a pole, from theta = {y[0]!r} to '
-                f'{y_new[0]!r} rad, and lost phi and psi; {ADVICE}')
+                f'euler equations: a step leapt over a pole, from theta = {before!r} to '
+                f'{after!r} rad, and lost phi and psi; {ADVICE}')
 
     def project(self, y: Vector) -> Vector:
         """Return y as it is: L3 and Lz are exact here, and the rest is to the letter."""

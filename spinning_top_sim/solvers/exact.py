@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column, Quaternion
+from spinning_top_sim.physics.regimes import Description, precession_extremes, regime
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.decimal_math import pi, precision
@@ -135,6 +136,19 @@ class ExactSolution:
             if not abs(value - wanted) <= 1e-14 * max(1.0, abs(wanted)):
                 raise ValueError(f'{name} = {wanted!r} cannot be held in doubles: the constants '
                                  f'of {self.top} and {self.start} are too far apart in size')
+
+    def describe(self) -> Description:
+        """Return the motion in the numbers that a physicist asks for."""
+        top, start = self.top, self.start
+        slowest, fastest = precession_extremes(top, start, self.theta_min, self.theta_max)
+        weight = 4.0 * top.lambda1 * abs(top.gravity_torque)
+        return Description(
+            name=regime(top, start), nutation_period=self.nutation_period,
+            theta_min=self.theta_min, theta_max=self.theta_max,
+            mean_precession_rate=self.mean_precession_rate,
+            precession_min=slowest, precession_max=fastest,
+            mean_spin_rate=self.mean_spin_rate, separatrix_distance=self.m1,
+            gyroscopic_ratio=start.l3 * start.l3 / weight if weight else math.inf)
 
     # ------------------------------------------------------------------------- evaluation
 

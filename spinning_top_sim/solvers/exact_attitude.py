@@ -69,9 +69,9 @@ class AttitudeSeries:
             series += coefficient
             series *= square
         series += self._coefficients[0]
-        for row, prefactor in zip(series, self._prefactors, strict=True):
+        for k, prefactor in enumerate(self._prefactors):
             for factor in ((), (cos_v,), (sin_v,), (sin_v, cos_v))[prefactor]:
-                row *= factor
+                series[k] *= factor
         squares = series * series
         scale = (squares[0] + squares[1]) + (squares[2] + squares[3])
         series *= 1.0 / np.sqrt(scale)

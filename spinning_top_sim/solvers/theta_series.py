@@ -214,12 +214,14 @@ class ThetaForm:
         if self.imaginary:
             angle = pi() * a / (2 * self.K_prime)
             waves = [sin_cos(2 * k * angle) for k in range(self.with_all_terms().terms)]
-            slope = sum((-1) ** k * 2 * k * self._square(k) * s for k, (s, _) in enumerate(waves))
-            value = sum((-1) ** k * self._square(k) * c for k, (_, c) in enumerate(waves))
-            return (pi() / (2 * self.K_prime) * (a / self.K - slope / value))
+            slope = sum(((-1) ** k * 2 * k * self._square(k) * s
+                         for k, (s, _) in enumerate(waves)), ZERO)
+            value = sum(((-1) ** k * self._square(k) * c
+                         for k, (_, c) in enumerate(waves)), ZERO)
+            return pi() / (2 * self.K_prime) * (a / self.K - slope / value)
         minus, plus = self.with_all_terms()._growing_weights(a)
-        slope = sum((2 * k + 1) * x for k, x in enumerate(minus))
-        return pi() / (2 * self.K) * slope / sum(plus)
+        slope = sum(((2 * k + 1) * x for k, x in enumerate(minus)), ZERO)
+        return pi() / (2 * self.K) * slope / sum(plus, ZERO)
 
     def with_all_terms(self) -> ThetaForm:
         """Return the same form with every term that reaches the working precision."""

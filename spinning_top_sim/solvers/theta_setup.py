@@ -28,6 +28,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from decimal import Decimal, DecimalException, getcontext, localcontext
 
+from spinning_top_sim.physics.regimes import nutation_cubic
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.decimal_math import (
     ONE,
@@ -314,18 +315,8 @@ class _Orbit:
 
     def cubic(self) -> tuple[Decimal, Decimal, Decimal, Decimal]:
         """Coefficients of u'^2 in powers of u - u0."""
-        lambda1, P, l3, s0, c0 = self.lambda1, self.gravity_torque, self.l3, self.s0, self.c0
-        u0 = c0 - s0
-        # Lz - L3 u0
-        momentum = self.a_minus + 2 * l3 * s0 if s0 < c0 else self.a_plus - 2 * l3 * c0
-        sin_squared = 4 * s0 * c0
-        precession_squared = (momentum / lambda1) ** 2 / sin_squared if sin_squared else ZERO
-        energy = lambda1 * (self.theta_dot ** 2 + precession_squared) / 2   # of the axis' motion
-        return (sin_squared * self.theta_dot ** 2,
-                -2 / lambda1 * (2 * u0 * energy + P * sin_squared)
-                + 2 * momentum * l3 / lambda1 ** 2,
-                2 / lambda1 * (2 * u0 * P - energy) - (l3 / lambda1) ** 2,
-                2 * P / lambda1)
+        return nutation_cubic(self.lambda1, self.gravity_torque, self.l3, self.lz, self.theta_dot,
+                              self.sin_half, self.cos_half)
 
     def resting(self, alpha_turns: Decimal, beta_turns: Decimal) -> ThetaMotion:
         """

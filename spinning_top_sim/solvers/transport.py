@@ -23,7 +23,8 @@ from __future__ import annotations
 
 import cmath
 import math
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,7 +40,7 @@ POLE_SHARE = 1e-4
 
 
 class Unknowns(NamedTuple):
-    """Real and imaginary parts of alpha, beta and m: numbers, or columns of shape (n,)."""
+    """Real and imaginary parts of alpha, beta and m, columns of shape (n,)."""
 
     alpha_real: Column
     alpha_imag: Column
@@ -49,23 +50,17 @@ class Unknowns(NamedTuple):
     m_imag: Column
 
 
-class _Functions(Protocol):
+class _Functions(NamedTuple):
     """What the projection takes from numpy for columns, from `math` for one state."""
 
-    def sqrt(self, x, /): ...  # type: ignore[no-untyped-def]
-    def copysign(self, x, y, /): ...  # type: ignore[no-untyped-def]
-    def where(self, condition, x, y, /): ...  # type: ignore[no-untyped-def]
+    sqrt: Callable[[Any], Any]
+    copysign: Callable[[Any, Any], Any]
+    where: Callable[[Any, Any, Any], Any]
 
 
-class _OneState:
-    """The functions of one state, which numpy would take ten times as long for."""
-
-    sqrt = staticmethod(math.sqrt)
-    copysign = staticmethod(math.copysign)
-
-    @staticmethod
-    def where(condition: bool, x: float, y: float) -> float:
-        return x if condition else y
+COLUMNS = _Functions(np.sqrt, np.copysign, np.where)
+# numpy would take ten times as long for one state.
+ONE_STATE = _Functions(math.sqrt, math.copysign, lambda condition, x, y: x if condition else y)
 
 
 class TransportEquations:
@@ -81,7 +76,7 @@ class TransportEquations:
     """
 
     name = 'transport'
-    number = complex
+    is_complex = True
 
     def __init__(self, top: Top, start: State, rtol: float, atol: float,
                  spin_carried_share: float = 0.5) -> None:
@@ -122,7 +117,7 @@ class TransportEquations:
         top = self.top
         rate = (self._scale + (abs(self.l3) + abs(self.lz)) / top.lambda1
                 + math.sqrt(abs(top.gravity_torque) / top.lambda1))
-        return 0.1 * self._tolerance ** 0.2 / rate
+        return 0.1 * math.pow(self._tolerance, 0.2) / rate
 
     def derivative(self, alpha: complex, beta: complex, m: complex) -> Vector:
         """Return (alpha', beta', m')."""
@@ -154,15 +149,15 @@ class TransportEquations:
     def project(self, y: Vector) -> Vector:
         """Return y moved back onto the invariants; see `project_columns`."""
         alpha, beta, m = y
-        projected = self._project(Unknowns(alpha.real, alpha.imag, beta.real, beta.imag,
-                                           m.real, m.imag), _OneState)
+        projected = self._project((alpha.real, alpha.imag, beta.real, beta.imag, m.real, m.imag),
+                                  ONE_STATE)
         return complex(*projected[:2]), complex(*projected[2:4]), complex(*projected[4:])
 
     def project_columns(self, y: Unknowns) -> Unknowns:
         """Return y with |q| = 1, then L.e3 = L3, then the energy restored along theta'."""
-        return self._project(y, np)
+        return Unknowns(*self._project(y, COLUMNS))
 
-    def _project(self, y: Unknowns, functions: _Functions) -> Unknowns:
+    def _project(self, y: tuple[Any, ...], functions: _Functions) -> tuple[Any, ...]:
         alpha_real, alpha_imag, beta_real, beta_imag, m_real, m_imag = y
         where = functions.where
         cos2 = alpha_real * alpha_real + alpha_imag * alpha_imag
@@ -186,7 +181,7 @@ class TransportEquations:
             functions.sqrt(where(root > 0.0, root, 0.0)), u), u)
         at_pole = square <= POLE_SHARE
         divisor = where(at_pole, 1.0, square)
-        return Unknowns(
+        return (
             alpha_real, alpha_imag, beta_real, beta_imag,
             where(at_pole, m_real, (u * axis_real - v * axis_imag) / divisor),
             where(at_pole, m_imag, (u * axis_imag + v * axis_real) / divisor))

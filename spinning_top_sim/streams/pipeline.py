@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.regimes import Description, describe
+from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
@@ -147,7 +147,7 @@ class Simulation:
     def describe(self) -> Description | None:
         """Return the present motion in numbers; None where the closed form cannot hold it."""
         exact = self.segment.reference.solution
-        return None if exact is None else describe(self.top, exact.start, exact)
+        return None if exact is None else exact.describe()
 
     # ------------------------------------------------------------------------------ sending
 
