@@ -25,6 +25,10 @@ class Samples(Protocol):
     """
 
     @property
+    def t(self) -> Column:
+        """Times since the start of the motion [s]."""
+
+    @property
     def quaternion(self) -> Quaternion:
         """Attitude q(world <- body) as x, y, z, w, its sign continuous in time."""
 
@@ -71,13 +75,18 @@ class States:
     rows_... : the same as tuples of (n,) components, which cost no copy
     """
 
-    def __init__(self, top: Top, l3: float, lz: float, t: Column, samples: Samples) -> None:
-        self.top, self.t = top, t
+    def __init__(self, top: Top, l3: float, lz: float, n: int, samples: Samples) -> None:
+        self.top, self._n = top, n
         self._l3, self._lz, self._samples = l3, lz, samples
 
     def __len__(self) -> int:
         """Return n."""
-        return len(self.t)
+        return self._n
+
+    @cached_property
+    def t(self) -> Column:
+        """Times (n,) since the start of the motion [s]."""
+        return self._samples.t
 
     # ------------------------------------------------------------------------------ angles
 

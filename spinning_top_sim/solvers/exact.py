@@ -176,7 +176,7 @@ class ExactSolution:
         for ns in (int(min(times_ns)), int(max(times_ns))) if len(times_ns) else ():
             if not -self.ns_limit <= ns <= self.ns_limit:
                 raise self._too_far(f'{ns} ns')
-        return self.states_at(times)
+        return self._states(times)
 
     def states_at_seconds(self, t: Column) -> States:
         """
@@ -191,12 +191,12 @@ class ExactSolution:
             latest = max(float(t.max()), -float(t.min()))
             if not latest <= self.time_limit:       # catches NaN too
                 raise self._too_far(f'{latest!r} s')
-        return self.states_at(Times.from_seconds(t), t.copy())
+        return self._states(Times.from_seconds(t), t.copy())
 
-    def states_at(self, times: Times, seconds: Column | None = None) -> States:
+    def _states(self, times: Times, seconds: Column | None = None) -> States:
         """Return the states at times within the limits; `seconds` are the same times [s]."""
-        return States(self.top, self.start.l3, self.start.lz,
-                      times.seconds if seconds is None else seconds, _ExactSamples(self, times))
+        return States(self.top, self.start.l3, self.start.lz, len(times),
+                      _ExactSamples(self, times, seconds))
 
     def _too_far(self, time: str) -> ValueError:
         return ValueError(f't = {time}: must be finite and within {self.time_limit:.6g} s, '
@@ -270,8 +270,12 @@ class ExactSolution:
 class _ExactSamples:
     """What `States` asks for, of an exact solution at some times; see `physics.states.Samples`."""
 
-    def __init__(self, solution: ExactSolution, times: Times) -> None:
-        self._solution, self._times = solution, times
+    def __init__(self, solution: ExactSolution, times: Times, seconds: Column | None) -> None:
+        self._solution, self._times, self._seconds = solution, times, seconds
+
+    @property
+    def t(self) -> Column:
+        return self._times.seconds if self._seconds is None else self._seconds
 
     @cached_property
     def _nutation(self) -> NutationColumns:

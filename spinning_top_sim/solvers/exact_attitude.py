@@ -26,7 +26,7 @@ from spinning_top_sim.solvers.theta_setup import Factor, ThetaMotion
 from spinning_top_sim.solvers.times import Times
 
 NEGLIGIBLE = Decimal('1e-18')           # beside the largest coefficient
-BLOCK = 8192                            # times evaluated together: temporaries stay in the cache
+BLOCK = 16384           # times evaluated together: temporaries stay in the cache
 
 
 class AttitudeSeries:
@@ -54,14 +54,18 @@ class AttitudeSeries:
     def quaternion(self, times: Times) -> Quaternion:
         """Return x, y, z, w at n times."""
         out = np.empty((4, len(times)))
-        for first in range(0, len(times), BLOCK):
-            block = slice(first, first + BLOCK)
+        grid = times.grid
+        # Blocks of a grid consist of whole rows.
+        before = 0 if grid is None else grid.start // grid.step % BLOCK
+        for first in range(-before, len(times), BLOCK):
+            block = slice(max(first, 0), first + BLOCK)
             self._fill(out[:, block], times[block])
         x, y, z, w = out
         return x, y, z, w
 
     def _fill(self, out: NDArray[np.float64], times: Times) -> None:
-        cosines, sines = self._rotations.cosines_and_sines(times)
+        cosines, sines = (self._rotations.cosines_and_sines(times) if times.grid is None
+                          else self._rotations.on_grid(times.grid))
         cos_v, sin_v = cosines[2], sines[2]
         square = sin_v * sin_v
         series = self._coefficients[-1] * square

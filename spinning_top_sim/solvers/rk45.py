@@ -138,7 +138,8 @@ class SteppedMotion(ABC):
             if begin < len(t):
                 self._release(self._kept[-1].t1)
         rows = np.concatenate(parts, axis=1) if parts else self._rows(t[:0])
-        return States(self.top, self.start.l3, self.start.lz, t.copy(), self._samples(t, rows))
+        return States(self.top, self.start.l3, self.start.lz, len(t),
+                      self._samples(t.copy(), rows))
 
     def _rows(self, t: Column) -> Rows:
         """Return what `_samples` needs at times [s] within the steps that are kept."""
@@ -172,14 +173,14 @@ class EulerMotion(SteppedMotion):
         return interpolants.at(numbers, t)
 
     def _samples(self, t: Column, rows: Rows) -> Samples:
-        return _AngleSamples(self.top, self.start, rows)
+        return _AngleSamples(self.top, self.start, t, rows)
 
 
 class _AngleSamples:
     """Samples known by their Euler angles; see `physics.states.Samples`."""
 
-    def __init__(self, top: Top, start: State, rows: Rows) -> None:
-        self._top, self._l3, self._lz = top, start.l3, start.lz
+    def __init__(self, top: Top, start: State, t: Column, rows: Rows) -> None:
+        self._top, self._l3, self._lz, self.t = top, start.l3, start.lz, t
         self._theta, self.theta_dot, self._phi, self._psi = rows
 
     @property
@@ -250,7 +251,7 @@ class _TransportSamples:
 
     def __init__(self, equations: TransportEquations, phases: PhaseUnwrapper, top: Top,
                  start: State, t: Column, rows: Rows) -> None:
-        self._equations, self._top, self._lz, self._t = equations, top, start.lz, t
+        self._equations, self._top, self._lz, self.t = equations, top, start.lz, t
         self._alpha, self._beta, self._crosses = phases.alpha, phases.beta, phases.crosses
         self._stepped = Unknowns(*rows[:6])
         self._begins = rows[6:]
@@ -259,11 +260,11 @@ class _TransportSamples:
     @cached_property
     def _projected(self) -> Unknowns:
         """The unknowns on the invariants, in the frame that has all of the spin."""
-        spin = 0.5 * self._equations.spin_rate * self._t
+        spin = 0.5 * self._equations.spin_rate * self.t
         stepped = self._stepped
         if self._crosses:
             cosine, sine, alpha_phase, beta_phase = self._on_lines(
-                stepped, -0.5 * self._equations.spin_carried / self._top.lambda1 * self._t)
+                stepped, -0.5 * self._equations.spin_carried / self._top.lambda1 * self.t)
             projected = self._equations.project_on_lines(stepped, cosine, sine, alpha_phase,
                                                          beta_phase)
         else:

@@ -17,6 +17,8 @@ STEPS = 2048                # of a turn; within half a step the fifth power of t
 STEP_ANGLE = 2.0 * np.pi / STEPS
 # Within so many turns the first product of halves is exact to a small share of a step.
 SHORT_TURNS = 2.0 ** 22
+# Times of a row of a grid, and steps whose rows are kept.
+ROW, STEPS_KEPT = 512, 16
 # 1.5 * 2^52: doubles of its size are whole numbers, whose last bits are those of the mantissa.
 WHOLE = 1.5 * 2.0 ** 52
 
@@ -60,37 +62,81 @@ class Rotations:
         self._rates = [Rate(rate) for rate, _ in angles]
         fastest = max(abs(rate.high) for rate in self._rates)
         self._short_ns = SHORT_TURNS / fastest if fastest else np.inf
+        # By step [ns]: cos and sin of the angles within a row of a grid, without the starts.
+        self._within_row: dict[int, tuple[Rows, Rows]] = {}
 
     def cosines_and_sines(self, times: Times) -> tuple[Rows, Rows]:
         """Return cos and sin of the angles, (k, n) each."""
-        major, minor = self._in_steps(times)
+        return self._of_steps(*self._in_steps(times, self._start))
+
+    def on_grid(self, grid: range) -> tuple[Rows, Rows]:
+        """
+        Return cos and sin of the angles, (k, n) each, at uniform times [ns].
+
+        A third of the time of `cosines_and_sines`: by the addition theorem from the begin of a
+        row of ROW times and the angle within the row.  Rows begin at multiples of ROW steps,
+        wherever the grid begins, so a value depends on its own time and the step only.
+        """
+        step = grid.step
+        first, offset = divmod(grid.start, step)
+        rows = range(first // ROW, (first + len(grid) - 1) // ROW + 1)
+        begins = Times.from_ns(offset + step * ROW * np.arange(rows.start, rows.stop))
+        row_cosine, row_sine = (x[:, :, np.newaxis] for x in self.cosines_and_sines(begins))
+        if step not in self._within_row:
+            while len(self._within_row) >= STEPS_KEPT:
+                del self._within_row[next(iter(self._within_row))]
+            self._within_row[step] = self._of_steps(*self._in_steps(
+                Times.from_ns(range(0, ROW * step, step)), np.zeros_like(self._start)))
+        cosine, sine = (x[:, np.newaxis, :] for x in self._within_row[step])
+        count, begin = len(self._start), first - rows.start * ROW
+        part = slice(begin, begin + len(grid))
+        cosines = row_cosine * cosine
+        cosines -= row_sine * sine
+        sines = row_sine * cosine
+        sines += row_cosine * sine
+        return cosines.reshape(count, -1)[:, part], sines.reshape(count, -1)[:, part]
+
+    def _of_steps(self, major: Rows, minor: Rows) -> tuple[Rows, Rows]:
+        """Return cos and sin of angles in steps; in place, as memory costs as much as sums."""
         # Adding WHOLE rounds to whole steps; taking it away again is exact.
         whole = major + WHOLE
-        rest = (major - (whole - WHOLE)) + minor
-        more = rest + WHOLE
-        rest -= more - WHOLE
-        rest *= STEP_ANGLE
-        index = whole.view(np.int64) + more.view(np.int64)
+        major -= whole - WHOLE
+        major += minor
+        more = major + WHOLE
+        major -= more - WHOLE
+        major *= STEP_ANGLE
+        index = whole.view(np.int64)
+        index += more.view(np.int64)
         index &= STEPS - 1
         table_cosine, table_sine = COSINES.take(index), SINES.take(index)
-        square = rest * rest
-        cosine = (square * (1.0 / 24.0) - 0.5) * square + 1.0
-        sine = (square * (-1.0 / 6.0) + 1.0) * rest
-        return (table_cosine * cosine - table_sine * sine,
-                table_sine * cosine + table_cosine * sine)
+        square = np.multiply(major, major, out=minor)
+        cosine = np.multiply(square, 1.0 / 24.0, out=more)
+        cosine -= 0.5
+        cosine *= square
+        cosine += 1.0
+        sine = np.multiply(square, -1.0 / 6.0, out=square)
+        sine += 1.0
+        sine *= major
+        cosines = np.multiply(table_cosine, cosine, out=major)
+        cosines -= table_sine * sine
+        table_sine *= cosine
+        table_cosine *= sine
+        table_sine += table_cosine
+        return cosines, table_sine
 
-    def _in_steps(self, times: Times) -> tuple[Rows, Rows]:
+    def _in_steps(self, times: Times, start: Rows) -> tuple[Rows, Rows]:
         """Return the angles in steps, less whole turns perhaps: exact values and rests."""
         t1, t2 = halves(times.high)
         major = self._first * t1
-        minor = self._first * t2 + self._second * times.high
+        minor = self._first * t2
+        minor += self._second * times.high
         minor += (self._first + self._second) * times.low
-        minor += self._start
+        minor += start
         far = np.abs(times.high) > self._short_ns
         if far.any():
             distant = Times(times.high[far], times.low[far])
             for k, rate in enumerate(self._rates):
                 turns, rest = rate.fraction(distant)
                 major[k, far] = STEPS * turns
-                minor[k, far] = STEPS * rest + self._start[k]
+                minor[k, far] = STEPS * rest + start[k]
         return major, minor

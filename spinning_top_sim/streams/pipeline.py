@@ -285,13 +285,15 @@ class Simulation:
             except IntegrationError as error:
                 failure = error
             until_ns = min(target_ns, start_ns + solver.latest_ns)
-            states: dict[range, States] = {}
+            # By begin, end and period: ranges of one time are equal whatever their period.
+            states: dict[tuple[int, int, int], States] = {}
             for stream in self.streams:
                 times = stream.times(self.now_ns, until_ns)
                 if stream.log_index is not None and times:
-                    if times not in states:
-                        states[times] = self.segment.states(times)
-                    rows = stream.encode(states[times], self.epoch_ns, times)
+                    key = times.start, times.stop, times.step
+                    if key not in states:
+                        states[key] = self.segment.states(times)
+                    rows = stream.encode(states[key], self.epoch_ns, times)
                     send(stream, self.epoch_ns + np.arange(times.start, times.stop, times.step),
                          rows)
             self.now_ns = max(self.now_ns, until_ns)

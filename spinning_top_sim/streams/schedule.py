@@ -173,7 +173,8 @@ class Schedule:
                 yield
         self.reached_ns = max(self.reached_ns, start_ns + solver.latest_ns)
         until_ns = min(until_ns, self.reached_ns)
-        states: dict[range, States] = {}
+        # By begin, end and period: ranges of one time are equal whatever their period.
+        states: dict[tuple[int, int, int], States] = {}
         instants: dict[int, tuple[list[int], list[bytes]]] = {}
         next_ns = []
         for place, (stream, first_ns) in enumerate(zip(self._active, self._next_ns, strict=True)):
@@ -181,10 +182,11 @@ class Schedule:
             next_ns.append(first_ns + len(times) * stream.period_ns)
             if not times:
                 continue
-            if times not in states:
-                states[times] = segment.states(times)
+            key = times.start, times.stop, times.step
+            if key not in states:
+                states[key] = segment.states(times)
             yield
-            data = stream.encode(states[times], self._epoch_ns, times).tobytes()
+            data = stream.encode(states[key], self._epoch_ns, times).tobytes()
             size = len(stream.template)
             for number, t_ns in enumerate(times):
                 places, messages = instants.setdefault(t_ns, ([], []))
