@@ -25,11 +25,12 @@ BATCH_MESSAGES = 512
 BATCHES = 16
 
 
-def rounds(read: Callable[[], Iterable[Message]], length_ns: int, loop: bool) -> Iterator[Message]:
+def rounds(read: Callable[[], Iterable[Message]], span_ns: int, loop: bool) -> Iterator[Message]:
     """
     Yield the messages once, or again and again with times that go on.
 
-    read: returns the messages of one round;  length_ns: from the first round's begin to the next's
+    read: returns the messages of one round;  span_ns: from the begin of a round to its end, after
+    which ROUND_GAP_NS pass until the next one
     """
     shift = 0
     while True:
@@ -39,7 +40,7 @@ def rounds(read: Callable[[], Iterable[Message]], length_ns: int, loop: bool) ->
             yield at_ns + shift, index, data
         if empty or not loop:
             return
-        shift += length_ns
+        shift += span_ns + ROUND_GAP_NS
 
 
 class ReadAhead:
@@ -81,9 +82,10 @@ class ReadAhead:
             self._thread.join(1.0)
 
     def _read(self) -> None:
+        batch: list[Message] = []
+        size = 0
+        last: object = self._END
         try:
-            batch: list[Message] = []
-            size = 0
             for message in self._messages:
                 batch.append(message)
                 size += len(message[2])
@@ -92,10 +94,10 @@ class ReadAhead:
                     batch, size = [], 0
                 if self._stopped:
                     return
-            self._batches.put(batch)
-            self._batches.put(self._END)
         except Exception as error:
-            self._batches.put(error)
+            last = error
+        self._batches.put(batch)
+        self._batches.put(last)
 
 
 class Playback:

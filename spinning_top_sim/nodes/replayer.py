@@ -101,7 +101,7 @@ class Replayer(Node):
         if self._begin_ns > self._end_ns:
             raise ValueError(f'--start {options.start:g}: the log lasts '
                              f'{(self._end_ns - self._log_begin_ns) / NANOSECONDS:.3f} s')
-        self._length_ns = self._end_ns - self._begin_ns + ROUND_GAP_NS
+        self._span_ns = self._end_ns - self._begin_ns
         self._outputs: dict[int, Publisher] = {}        # by channel
         self._open_publishers()
         self._ahead: ReadAhead | None = None
@@ -207,7 +207,7 @@ class Replayer(Node):
         """Begin to play, after what the options say to wait for."""
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         self._ahead = ReadAhead(
-            rounds(self._messages, self._length_ns, self._options.loop))
+            rounds(self._messages, self._span_ns, self._options.loop))
         publish = {index: publisher.publish for index, publisher in self._outputs.items()}
         self._playback = Playback(self._ahead, self._begin_ns, self._rate,
                                   lambda index, data: publish[index](data),
@@ -309,9 +309,9 @@ class Replayer(Node):
 
     def _position(self) -> str:
         passed = self._playback.now() - self._begin_ns
-        number, within = divmod(passed, self._length_ns)
+        number, within = divmod(passed, self._span_ns + ROUND_GAP_NS)
         span = self._end_ns - self._log_begin_ns
-        at = min(within, self._end_ns - self._begin_ns) + self._begin_ns - self._log_begin_ns
+        at = min(within, self._span_ns) + self._begin_ns - self._log_begin_ns
         percent = 100.0 * at / span if span else 100.0
         which = f' of round {number + 1}' if self._options.loop else ''
         return (f'{at / NANOSECONDS:.2f} of {span / NANOSECONDS:.2f} s, {percent:.0f} %{which}')
