@@ -93,7 +93,7 @@ def test_the_manifest_names_every_ros_package_that_is_imported():
 def test_the_manifest_names_every_package_that_is_launched():
     declared = {dependency.name for dependency in
                 parse_package(str(ROOT / 'package.xml')).exec_depends} | {NAME}
-    sources = [*(ROOT / 'launch').glob('*.py'), ROOT / NAME / 'nodes/launching.py']
+    sources = [*(ROOT / 'launch').glob('*.py'), ROOT / NAME / 'nodes/launch_helpers.py']
     named = re.compile(r"(?:package=|STATE_PUBLISHER = )'(\w+)'")
     launched = {name for path in sources for name in named.findall(path.read_text())}
     assert launched == {NAME, 'robot_state_publisher', 'rviz2'}

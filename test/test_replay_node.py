@@ -8,6 +8,7 @@ is decided by how long something took, except that nothing may come before its t
 
 import contextlib
 import dataclasses
+import importlib
 import itertools
 import signal
 import threading
@@ -30,8 +31,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from spinning_top_sim.nodes import playback
-from spinning_top_sim.nodes.message_types import message_type
 from spinning_top_sim.nodes.playback import ROUND_GAP_NS, Playback, ReadAhead, rounds
+from spinning_top_sim.nodes.replayer import message_class
 from spinning_top_sim.recording import writer
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.schemas import find_definition
@@ -332,7 +333,7 @@ class Listening:
     def __init__(self, peer, topics):
         self.topics, self._matched = [], {}
         for name, kind in topics:
-            topic = Topic(message_type(kind))
+            topic = Topic(message_class(kind))
             matched = self._matched[name] = threading.Event()
             peer.node.create_subscription(
                 topic.kind, name, topic.receive,
@@ -440,6 +441,23 @@ def test_start_and_topics_choose_what_is_played(peer, tmp_path, strangers_log):
     assert_same(raw, [wanted[0][10:]])
     assert 'the log has no topic /nobody' in node.err
     assert 'on 1 topics' in node.out
+
+
+def test_only_message_classes_of_installed_ros_packages_are_found(monkeypatch):
+    assert message_class(TWIST) is message_class('geometry_msgs/Twist')
+    assert message_class(STRING).__name__ == 'String'
+    imported = []
+    monkeypatch.setattr(importlib, 'import_module', imported.append)
+    for name in ('antigravity/msg/X', 'os/msg/System', '/msg/String', 'std_msgs', 'std_msgs/msg/',
+                 'std_msgs/msg/string', 'std_msgs.msg/msg/String', '../std_msgs/msg/String',
+                 'std_msgs/msg/String\n', 'json/decoder/JSONDecoder', 'nowhere_msgs/msg/Thing'):
+        with pytest.raises(LookupError):
+            message_class(name)
+    assert imported == []
+    monkeypatch.undo()
+    for name in ('std_msgs/msg/Nothing', 'std_srvs/srv/Trigger', 'std_srvs/action/Trigger'):
+        with pytest.raises(LookupError):
+            message_class(name)
 
 
 def test_an_unknown_type_is_named_once_and_the_rest_plays(peer, tmp_path):

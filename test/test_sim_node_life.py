@@ -40,7 +40,7 @@ from spinning_top_sim.nodes.sim_node import main
 from spinning_top_sim.nodes.simulator import Simulator
 ordinary, counts = Simulator._tick, []
 def tick(self):
-    ordinary(self)
+    wanted = ordinary(self)
     counts.append(None)
     if len(counts) in (1000, 3000):
         gc.collect()
@@ -48,6 +48,7 @@ def tick(self):
     if len(counts) == 3000:
         open('objects.json', 'w').write(json.dumps([counts[999], counts[2999]]))
         self._finish()
+    return wanted
 Simulator._tick = tick
 sys.exit(main())
 """
@@ -142,9 +143,8 @@ def test_what_a_scene_does_not_need_is_not_imported(finished):
         assert ('spinning_top_sim.recording.writer' in modules) == records
 
 
-@pytest.mark.parametrize('pacing', ['timer', 'thread'])
-def test_wake_ups_leave_no_objects_behind(tmp_path, pacing):
-    with SimNode(tmp_path, {**QUIET, 'pacing': pacing, 'tick_rate': 1000.0},
+def test_wake_ups_leave_no_objects_behind(tmp_path):
+    with SimNode(tmp_path, {**QUIET, 'tick_rate': 1000.0},
                  program=('-c', OBJECTS)) as node:
         assert_clean_end(node, node.wait())
     early, late = json.loads((node.folder / 'objects.json').read_text())
@@ -158,8 +158,8 @@ def test_the_default_scene_imports_just_what_it_uses(finished):
             if name.startswith('spinning_top_sim.') and name.count('.') == 2}
     assert ours == {
         *(f'nodes.{name}' for name in (
-            'executable', 'message_types', 'occasional', 'pacing', 'prompt', 'reports',
-            'ros_parameters', 'simulator')),
+            'executable', 'pacing', 'recording_session', 'reports', 'ros_parameters',
+            'simulator', 'tick_loop')), 'recording.errors',
         *(f'physics.{name}' for name in (
             'attitude', 'kinematics', 'pairs', 'regimes', 'shape', 'top')),
         *(f'solvers.{name}' for name in (
@@ -180,14 +180,14 @@ def test_the_default_scene_imports_just_what_it_uses(finished):
 ENDS = {'sigint': (signal.SIGINT, 1, 0.0), 'sigterm': (signal.SIGTERM, 1, 0.0),
         'twice at once': (signal.SIGINT, 2, 0.0), 'twice, 50 ms': (signal.SIGINT, 2, 0.05),
         'twice, 200 ms': (signal.SIGINT, 2, 0.2), 'term twice': (signal.SIGTERM, 2, 0.02),
-        'five times': (signal.SIGINT, 5, 0.01)}
+        'five times': (signal.SIGINT, 5, 0.01), 'sighup': (signal.SIGHUP, 1, 0.0),
+        'sigquit': (signal.SIGQUIT, 1, 0.0), 'hup and hup': (signal.SIGHUP, 2, 0.05)}
 
 
 @pytest.mark.parametrize('case', ENDS)
 def test_however_it_is_ended_the_log_is_whole(peer, tmp_path, case):
     number, times, gap = ENDS[case]
-    pacing = 'thread' if 'twice' in case else 'timer'
-    with SimNode(tmp_path, {'record.enabled': True, 'pacing': pacing}) as node:
+    with SimNode(tmp_path, {'record.enabled': True}) as node:
         pose = peer.listen(node.topic('pose'), PoseStamped).wait(20)
         code = node.end(number, times, gap)
         peer.stop_listening(pose)

@@ -33,16 +33,14 @@ from rosbags.highlevel import AnyReader
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu
 
-from spinning_top_sim.nodes.occasional import OccasionalGroup
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.pipeline import Simulation
 
 
-@pytest.fixture(scope='module', params=['timer', 'thread'])
-def served(request, peer, tmp_path_factory):
+@pytest.fixture(scope='module')
+def served(peer, tmp_path_factory):
     folder = tmp_path_factory.mktemp('served')
-    with SimNode(folder, {**QUIET, 'pacing': request.param},
-                 namespace=f'/served_{request.param}') as node:
+    with SimNode(folder, QUIET, namespace='/served') as node:
         pose = peer.listen(node.topic('pose'), PoseStamped).wait(3)
         yield SimpleNamespace(node=node, pose=pose)
         assert_clean_end(node, node.end())
@@ -200,10 +198,8 @@ def test_remapping_and_qos_overrides_work(peer, tmp_path):
     assert offered['/ns/imu/data_raw'].depth == 3
 
 
-@pytest.mark.parametrize('pacing', ['timer', 'thread'])
-def test_a_subscription_with_another_qos_is_warned_about(peer, tmp_path, pacing):
-    """The publishers' events are looked at now and then only, but they are."""
-    with SimNode(tmp_path, {**QUIET, 'pacing': pacing}) as node:
+def test_a_subscription_with_another_qos_is_warned_about(peer, tmp_path):
+    with SimNode(tmp_path, QUIET) as node:
         topic = node.topic('pose')
         subscription = peer.node.create_subscription(
             PoseStamped, topic, lambda _: None, QoSProfile(
@@ -212,14 +208,6 @@ def test_a_subscription_with_another_qos_is_warned_about(peer, tmp_path, pacing)
         assert "on topic 'pose'" in node.err + node.out
         assert_clean_end(node, node.end())
         assert subscription.topic_name == topic
-
-
-def test_publishers_events_are_left_out_of_the_wait_set_but_for_a_moment():
-    group = OccasionalGroup()
-    assert not group.can_execute(None)
-    group.open()
-    assert group.can_execute(None)
-    wait_for('the end of the moment', lambda: not group.can_execute(None))
 
 
 def test_a_dump_of_the_parameters_makes_the_same_run(peer, tmp_path):

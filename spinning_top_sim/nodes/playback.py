@@ -158,7 +158,7 @@ class Playback:
     def set_rate(self, rate: float) -> None:
         """Go on at another rate."""
         with self._control():
-            self._clock.set_scale(rate)
+            self._clock.scale = rate
 
     def stop(self) -> None:
         """Make `run` return, soon."""

@@ -3,12 +3,16 @@
 
 from __future__ import annotations
 
+import importlib
 import math
+import os
+import re
 import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
@@ -28,11 +32,11 @@ from rclpy.qos import (
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.task import Future
 from rclpy.time import Time
+from rclpy.type_support import check_is_valid_msg_type
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes import reports
-from spinning_top_sim.nodes.message_types import message_type
 from spinning_top_sim.nodes.pacing import DeadlineThread
 from spinning_top_sim.nodes.playback import ROUND_GAP_NS, Message, Playback, ReadAhead, rounds
 from spinning_top_sim.recording.errors import DefinitionNotFoundError
@@ -41,6 +45,10 @@ from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
 from spinning_top_sim.recording.schemas import find_definition
 
 NANOSECONDS = 1_000_000_000
+# REP-144 and the ROS 2 interface names.
+TYPE_NAME = re.compile(
+    r'(?P<package>[a-z][a-z0-9_]*)/((?P<folder>msg|srv|action)/)?(?P<name>[A-Z][A-Za-z0-9_]*)')
+AMENT_INDEX = 'share/ament_index/resource_index/packages'
 SLOWEST, FASTEST = 1e-6, 1e9
 # Policies that tell nothing, and that no publisher can offer.
 UNKNOWN = {
@@ -170,7 +178,7 @@ class Replayer(Node):
             raise LookupError('--clock publishes another /clock')
         if topic.encoding != 'cdr':
             raise LookupError(f'its messages are encoded as {topic.encoding!r}, not as CDR')
-        kind = message_type(topic.type_name)
+        kind = message_class(topic.type_name)
         self._compare_types(topic)
         profiles = [profile for channel in channels for profile in channel.qos]
         return self.create_publisher(
@@ -329,6 +337,39 @@ class Replayer(Node):
         late = f', {playback.late} of them late' if playback.late else ''
         topics = len(set(self._outputs.values()))
         return f'played {playback.sent} messages on {topics} topics{late}'
+
+
+def message_class(type_name: str) -> type:
+    """
+    Return the class of a message type that a log names.
+
+    Parameters
+    ----------
+    type_name
+        Such as 'geometry_msgs/msg/Pose' ('msg' may be left out).
+
+    Raises
+    ------
+    LookupError
+        If it is no message type of an installed ROS package.  No other module is ever imported.
+
+    """
+    match = TYPE_NAME.fullmatch(type_name)
+    if match is None:
+        raise LookupError(f'{type_name!r} is not the name of a message type')
+    package, folder, name = match['package'], match['folder'] or 'msg', match['name']
+    prefixes = [*filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)),
+                sys.prefix]
+    if not any(Path(prefix, AMENT_INDEX, package).is_file() for prefix in prefixes):
+        raise LookupError(f'{type_name} is not installed')
+    try:
+        found: type = getattr(importlib.import_module(f'{package}.{folder}'), name)
+        check_is_valid_msg_type(found)
+    except (ImportError, AttributeError) as error:
+        raise LookupError(f'{type_name} is not installed') from error
+    except RuntimeError as error:
+        raise LookupError(f'{type_name} is no message type') from error
+    return found
 
 
 def _checked_rate(value: Any) -> float:
