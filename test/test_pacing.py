@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """When ticks come: the thread that paces them, on a clock of its own."""
 
+import threading
+import time
+
 import pytest
 
 from spinning_top_sim.nodes import pacing
@@ -90,6 +93,30 @@ def test_a_far_deadline_is_waited_for_in_pieces(monkeypatch):
     run = Run(monkeypatch, 2, at={0: lambda run: run.thread.set_rate(1.0)})
     assert max(run.time.naps) <= run.thread.LONGEST_SLEEP
     assert run.seen[1] * PERIOD == pytest.approx(1.0)
+
+
+def test_a_lock_is_left_to_who_waits_for_it():
+    lock, theirs, overtaken, done = pacing.FairLock(), [], [], threading.Event()
+
+    def busy():
+        turn = 0                                    # that another thread waits for
+        while not done.is_set():
+            with lock, lock:                        # reentrant
+                overtaken.append(len(theirs) < turn)
+                turn = len(theirs) + 1 if lock._queue.locked() else 0
+
+    thread = threading.Thread(target=busy, daemon=True)
+    thread.start()
+    for _ in range(50):
+        count = len(overtaken)
+        while len(overtaken) < count + 10:          # it is busy again
+            time.sleep(1e-5)
+        with lock:
+            theirs.append(None)
+    done.set()
+    thread.join(60.0)
+    assert not thread.is_alive()
+    assert not any(overtaken)
 
 
 def test_simulated_time_knows_when_it_will_be_what():

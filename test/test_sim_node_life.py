@@ -25,6 +25,7 @@ from node_logs import (
     by_parameters,
     decoded,
     log_of,
+    settled,
     the_log,
 )
 from sensor_msgs.msg import JointState
@@ -335,6 +336,63 @@ def test_the_euler_form_at_a_pole_stands_still_and_says_why(peer, diagnostics, t
         assert_clean_end(node, node.end())
         peer.stop_listening(joints)
     assert 'leapt over a pole' in node.err
+
+
+# A method that raises as long as there is a file `broken`.
+BREAKABLE = """
+import importlib, os, sys
+from spinning_top_sim.nodes.sim_node import main
+module, kind, name = {method!r}.rsplit('.', 2)
+kind = getattr(importlib.import_module('spinning_top_sim.nodes.' + module), kind)
+ordinary = getattr(kind, name)
+def method(*arguments):
+    if os.path.exists('broken'):
+        raise ZeroDivisionError('nobody expected this')
+    return ordinary(*arguments)
+setattr(kind, name, method)
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize('method', [
+    'tick_loop.TickLoop.tick', 'tick_loop.TickLoop.idle', 'reports.MotionReport.diagnostics',
+    'reports.MotionReport.status_line', 'tick_loop.TickLoop.pause', 'tick_loop.TickLoop.command',
+    'simulator.Simulator._put_into_effect'])
+def test_an_error_that_nobody_expects_stops_the_motion_loudly_until_a_reset(
+        peer, diagnostics, tmp_path, method):
+    """In a tick, in idle work, in a report, in a service, in a topic, in a parameter's change."""
+    with SimNode(tmp_path, {'record.enabled': True, 'status_period': 0.2},
+                 program=('-c', BREAKABLE.format(method=method))) as node:
+        pose = peer.listen(node.topic('pose'), PoseStamped).wait(20)
+        if method.endswith('command'):
+            peer.introduce(node, diagnostics)
+        (node.folder / 'broken').touch()
+        if method.endswith('pause'):
+            answer = peer.switch(node, 'set_pause', True)
+            assert not answer.success and 'nobody expected this' in answer.message
+        elif method.endswith('command'):
+            peer.send_command(node, 1.0, 1.0)
+        elif method.endswith('effect'):
+            answer = peer.set_together(node, pose__rate=50.0)
+            assert not answer.successful and 'nobody expected this' in answer.reason
+        wait_for('an error', lambda: 'the motion stands still until ~/reset' in node.err)
+        (node.folder / 'broken').unlink()
+        status = diagnostics.wait_for(node, 'an error', lambda s: s.level == b'\x02')
+        assert 'unexpected ZeroDivisionError: nobody expected this' in status.message
+        wait_for('the status line', lambda: ' FAILED |' in node.out.splitlines()[-1])
+        count = settled(pose)
+        logged = [data for _, data in log_of(the_log(node.folder))[0][node.topic('pose')]]
+        assert_received_from(pose.raw, logged)
+        assert peer.trigger(node, 'reset').success
+        pose.wait(count + 50)
+        diagnostics.wait_for(node, 'the recording that ended', lambda s: 'recording: unexpected'
+                             in s.message)
+        assert peer.set_together(node, record__uri='second.mcap').successful is True
+        assert peer.switch(node, 'record', True).success
+        diagnostics.wait_for(node, 'no error', lambda s: s.level == b'\x00')
+        assert node.end() == 0, node.err
+        peer.stop_listening(pose)
+    log_of(node.folder / 'second.mcap')
 
 
 SMALL_FILES = """

@@ -102,6 +102,35 @@ class MonotonicClock:
         return reading + self.stepped_back_ns
 
 
+class FairLock:
+    """
+    A reentrant lock that threads get in the order in which they ask for it.
+
+    With an ordinary lock, a thread that takes it again right after giving it back leaves no other
+    thread a turn.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._queue = threading.Lock()      # held by the thread that is next
+        self._owner: int | None = None
+        self._depth = 0
+
+    def __enter__(self) -> None:
+        this = threading.get_ident()
+        if self._owner != this:
+            with self._queue:
+                self._lock.acquire()
+            self._owner = this
+        self._depth += 1
+
+    def __exit__(self, *_: object) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            self._owner = None
+            self._lock.release()
+
+
 class DeadlineThread(threading.Thread):
     """
     Calls a function at absolute deadlines until it is stopped.

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 
-from spinning_top_sim.nodes.pacing import SimulatedClock
+from spinning_top_sim.nodes.pacing import FairLock, SimulatedClock
 
 Message = tuple[int, int, bytes]    # time [ns], which publisher, CDR
 
@@ -126,9 +126,7 @@ class Playback:
         self._known_until = begin_ns        # no message of before this is still to be sent
         self._wake = threading.Event()
         self._sleep = sleep or self._sleep_until_told
-        self._lock = threading.Lock()       # the clock, and sending
-        # Held while waiting for the lock, so that who plays without a rest leaves it to others.
-        self._turnstile = threading.Lock()
+        self._lock = FairLock()             # the clock, and sending
         self.paused = paused
         self.sent = self.late = 0
 
@@ -180,8 +178,6 @@ class Playback:
     def _send_when_due(self, at_ns: int, index: int, data: bytes) -> bool:
         """Send a message when its time has come; return False when stopped before."""
         while True:
-            with self._turnstile:
-                pass
             with self._lock:
                 if self._stopped:
                     return False
@@ -196,7 +192,7 @@ class Playback:
 
     @contextlib.contextmanager
     def _control(self) -> Iterator[None]:
-        with self._turnstile, self._lock:
+        with self._lock:
             yield
         self._wake.set()
 

@@ -8,13 +8,13 @@ import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
+from spinning_top_sim.nodes.pacing import FairLock
 from spinning_top_sim.nodes.reports import human_readable
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal
@@ -56,7 +56,7 @@ class RecordingSession:
 
     """
 
-    def __init__(self, simulation: Simulation, lock: AbstractContextManager,
+    def __init__(self, simulation: Simulation, lock: FairLock,
                  resolve: Callable[[str], str]) -> None:
         self.error: str | None = None
         self._simulation, self._lock, self._resolve = simulation, lock, resolve

@@ -24,18 +24,33 @@ OK, WARN, ERROR = 0, 1, 2
 
 
 class Speedometer:
-    """Real-time factor: simulated over real time since it was last read."""
+    """
+    Measures the real-time factor: simulated over real time between two readings.
+
+    Attributes
+    ----------
+    factor : float
+        The newest one.
+
+    """
+
+    # Reports that were held up come at once; time between them is too short to measure [s].
+    SHORTEST = 0.1
 
     def __init__(self) -> None:
-        self._real, self._simulated = time.monotonic(), 0
+        self.begin(0)
+
+    def begin(self, simulated_ns: int) -> None:
+        """Measure from here on, as after a reset."""
+        self._real, self._simulated = time.monotonic(), simulated_ns
         self.factor = 0.0
 
     def read(self, simulated_ns: int) -> float:
-        """Return the factor, and begin anew from here (also after a reset)."""
-        real = time.monotonic()
-        elapsed, advanced = real - self._real, simulated_ns - self._simulated
-        self._real, self._simulated = real, simulated_ns
-        self.factor = max(0.0, advanced / 1e9 / elapsed) if elapsed > 0.0 else 0.0
+        """Return the factor since the reading before."""
+        elapsed, advanced = time.monotonic() - self._real, simulated_ns - self._simulated
+        if elapsed >= self.SHORTEST:
+            self.begin(simulated_ns)
+            self.factor = max(0.0, advanced / 1e9 / elapsed)
         return self.factor
 
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 import functools
 import importlib
 import sys
-import threading
 import time
 import traceback
 from collections.abc import Callable
@@ -25,7 +24,7 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes import reports
-from spinning_top_sim.nodes.pacing import DeadlineThread, MonotonicClock
+from spinning_top_sim.nodes.pacing import DeadlineThread, FairLock, MonotonicClock
 from spinning_top_sim.nodes.recording_session import RecordingSession
 from spinning_top_sim.nodes.ros_parameters import SPIN, ParameterChanges, declare, start_values
 from spinning_top_sim.nodes.tick_loop import Hooks, TickLoop
@@ -97,7 +96,7 @@ class Simulator(Node):
         self._date = self.get_clock() if self._follows else Clock(clock_type=ClockType.SYSTEM_TIME)
         self._followed = MonotonicClock(lambda: self._date.now().nanoseconds)
         self._stepped_back_ns = 0               # as far as a warning has said so
-        self._lock = threading.RLock()
+        self._lock = FairLock()
         self._session = RecordingSession(self._simulation, self._lock, self.resolve_topic_name)
         self._loop = TickLoop(
             self._simulation, values,
@@ -185,7 +184,7 @@ class Simulator(Node):
         epoch_ns = self._simulation.epoch_ns = _ceil_to(now_ns, EPOCH_GRID_NS)
         if not self._follows:
             time.sleep((epoch_ns - now_ns) / NANOSECONDS)
-        self._report.speed.read(0)
+        self._report.speed.begin(0)
         with self._lock:
             self._loop.start()
         if self._values['record.enabled']:
@@ -277,7 +276,16 @@ class Simulator(Node):
             self._session.write_command(self._loop.command(l3, lz), l3, lz)
 
     def _apply(self, values: dict[str, Any], changed: set[str]) -> None:
-        """Put a validated change of parameters into effect.  Raises ValueError to refuse."""
+        """Put a validated change into effect.  Raises ValueError or RuntimeError to refuse."""
+        try:
+            self._apply_together(values, changed)
+        except (ValueError, RuntimeError):
+            raise
+        except Exception as error:
+            self.fail(error)
+            raise RuntimeError(f'{type(error).__name__}: {error}') from error
+
+    def _apply_together(self, values: dict[str, Any], changed: set[str]) -> None:
         with self._lock:
             if changed & set(SPIN):
                 self._command(values['spin.l3'], values['spin.lz'])
@@ -360,7 +368,7 @@ class Simulator(Node):
             except (ValueError, IntegrationError) as error:
                 response.message = f'not reset: {error}'
                 return response
-            self._report.speed.read(0)
+            self._report.speed.begin(0)
             self._session.write_event('reset', 0, sent_ns, epoch_ns=simulation.epoch_ns,
                                       parameters=values)
             response.success = True
