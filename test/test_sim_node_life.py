@@ -93,7 +93,7 @@ def test_the_duration_ends_the_run_and_its_last_sample_is_in_the_log(finished):
 
 
 def test_runs_of_the_same_parameters_are_the_same_bytes_but_for_stamps(finished):
-    """However often ticks come, and whatever paces them."""
+    """However often ticks come; `pacing` is accepted, and without effect."""
     logs = []
     for node in finished.nodes[:3]:
         log, _ = log_of(the_log(node.folder))
