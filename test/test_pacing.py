@@ -126,7 +126,7 @@ def test_simulated_time_knows_when_it_will_be_what():
     clock.start(100)
     now[0] += 50
     assert (clock.now(), clock.when(0), clock.when(200)) == (200, 4_950, 5_050)
-    clock.scale = 0.5
+    clock.set_scale(0.5)
     now[0] += 100
     assert (clock.now(), clock.when(250)) == (250, 5_150)
     clock.stop()

@@ -2,6 +2,7 @@
 """The services of the running node, remapping, and clocks."""
 
 import math
+import re
 import time
 from types import SimpleNamespace
 
@@ -70,16 +71,24 @@ def test_a_pause_is_a_pause_and_a_resume_catches_nothing_up(peer, diagnostics, s
     assert_steps(stamps, PERIODS_NS['pose'], diagnostics.next(node)['skipped samples'])
 
 
+def time_in(answer):
+    """Return the simulated time that a service has answered [ns]."""
+    seconds, nanoseconds = re.search(r'at t = (\d+)\.(\d{9}) s', answer.message).groups()
+    return int(seconds) * SECOND + int(nanoseconds)
+
+
 def test_a_step_is_a_step(peer, diagnostics, served):
     node, pose = served.node, served.pose
     answer = peer.trigger(node, 'step')
     assert not answer.success
     assert 'paused' in answer.message
-    assert peer.switch(node, 'set_pause', True).success
+    paused_at = time_in(peer.switch(node, 'set_pause', True))
     assert peer.set_together(node, step__count=7, step__dt=0.03).successful
     count = settled(pose)
     for turn in range(1, 4):
-        assert peer.trigger(node, 'step').success
+        answer = peer.trigger(node, 'step')
+        assert answer.success
+        assert time_in(answer) == paused_at + turn * 210_000_000
         pose.wait(count + 21 * turn)
     assert settled(pose) == count + 63
     assert set(np.diff(stamps_of(pose)[count - 1:])) == {PERIODS_NS['pose']}
@@ -89,12 +98,14 @@ def test_a_step_is_a_step(peer, diagnostics, served):
 
 
 def test_an_endless_step_leaves_the_node_to_others(peer, served):
-    """A million steps of 1000 s: answered in time, or refused, and services and signals live."""
+    """A million steps of 1000 s: the answer says how far it came, and services live."""
     node = served.node
-    assert peer.switch(node, 'set_pause', True).success
+    paused_at = time_in(peer.switch(node, 'set_pause', True)) / 1e9
     assert peer.set_together(node, step__count=1_000_000, step__dt=1000.0).successful
     answer = peer.trigger(node, 'step')
-    assert not answer.success or 't = ' in answer.message
+    assert not answer.success
+    left = float(re.search(r'takes too long, (\S+) s are left', answer.message)[1])
+    assert time_in(answer) / 1e9 + left == pytest.approx(paused_at + 1e9, abs=2.0)     # 9 digits
     assert peer.set_together(node, step__count=1, step__dt=0.01).successful
     assert peer.trigger(node, 'reset').success
     assert peer.switch(node, 'set_pause', False).success

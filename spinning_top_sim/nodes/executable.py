@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How every node of ours runs: start, spin, and end properly whichever way it is asked to."""
+"""What the executables of nodes share: start, spin, and end properly on every signal."""
 
 from __future__ import annotations
 
@@ -23,9 +23,13 @@ SPIN_S = 0.2
 
 class RunnableNode(Protocol):
     """
-    A node as `run` needs it, besides what rclpy wants.
+    A node as `run` needs it.
 
-    finished: completes when the node ends by itself, with its exit code (None is 0)
+    Attributes
+    ----------
+    finished : rclpy.task.Future
+        Completes when the node ends by itself, with its exit code (None is 0).
+
     """
 
     finished: Future
@@ -72,11 +76,18 @@ class _Signals:
 def run(name: str, argv: list[str],
         prepare: Callable[[list[str]], Callable[[], RunnableNode] | None]) -> int:
     """
-    Run a node; return 0 after an ordinary end, 2 for what could not be started.
+    Run a node; return 0 after an ordinary end, 2 if it cannot be started.
 
-    prepare: gets the arguments before ROS does; returns what makes the node, or None when there is
-    nothing to run.  It and what it returns may raise ValueError, RuntimeError or OSError, whose
-    text is shown.
+    Parameters
+    ----------
+    name
+        Of the executable, for messages.
+    argv
+        Arguments, with those for ROS.
+    prepare
+        Takes the arguments; returns a function that makes the node, or None if there is nothing to
+        run.  Both may raise ValueError, RuntimeError or OSError, whose text is shown.
+
     """
     signals = _Signals()
     try:

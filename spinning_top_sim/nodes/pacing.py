@@ -12,8 +12,6 @@ class SimulatedClock:
     """
     Maps a source clock to simulated time: scale times as fast, with pauses.
 
-    Stands at 0 until `start`.
-
     Parameters
     ----------
     source
@@ -33,18 +31,13 @@ class SimulatedClock:
         """Whether time passes."""
         return self._from_source is not None
 
-    @property
-    def scale(self) -> float:
-        """Simulated over source time; may be set while the clock runs."""
-        return self._scale
-
-    @scale.setter
-    def scale(self, scale: float) -> None:
-        if self._from_source is not None:
-            source_ns = self._source()
-            self._from_simulated = self._at(source_ns, self._from_source)
-            self._from_source = source_ns
+    def set_scale(self, scale: float) -> None:
+        """Go on from the present time at another speed."""
+        now_ns, running = self.now(), self.running
         self._scale = scale
+        self.stop(now_ns)
+        if running:
+            self.start(now_ns)
 
     def start(self, simulated_ns: int) -> None:
         """Run from this simulated time on."""
@@ -59,10 +52,7 @@ class SimulatedClock:
         """Return the simulated time [ns]."""
         if self._from_source is None:
             return self._from_simulated
-        return self._at(self._source(), self._from_source)
-
-    def _at(self, source_ns: int, from_source_ns: int) -> int:
-        return self._from_simulated + int((source_ns - from_source_ns) * self._scale)
+        return self._from_simulated + int((self._source() - self._from_source) * self._scale)
 
     def when(self, simulated_ns: int) -> int | None:
         """Return the source's time of a simulated time [ns]; None while the clock stands."""
@@ -73,9 +63,7 @@ class SimulatedClock:
 
 class MonotonicClock:
     """
-    Follows a clock that may step back, such as the /clock of a log played in a loop.
-
-    A step back is left out: time goes on from the newest reading.
+    Follows a clock and leaves out its steps back, as of the /clock of a log played in a loop.
 
     Parameters
     ----------
@@ -106,8 +94,7 @@ class FairLock:
     """
     A reentrant lock that threads get in the order in which they ask for it.
 
-    With an ordinary lock, a thread that takes it again right after giving it back leaves no other
-    thread a turn.
+    A thread that takes an ordinary lock again and again leaves the others no turn.
     """
 
     def __init__(self) -> None:

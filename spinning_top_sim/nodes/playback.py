@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded messages at their recorded distances: reading ahead, rounds, and the moment to send."""
+"""Recorded messages with their recorded spacing: reading ahead, rounds, and when to send."""
 
 from __future__ import annotations
 
@@ -29,8 +29,15 @@ def rounds(read: Callable[[], Iterable[Message]], span_ns: int, loop: bool) -> I
     """
     Yield the messages once, or again and again with times that go on.
 
-    read: returns the messages of one round;  span_ns: from the begin of a round to its end, after
-    which ROUND_GAP_NS pass until the next one
+    Parameters
+    ----------
+    read
+        Returns the messages of one round.
+    span_ns
+        Length of a round [ns]; the next one begins ROUND_GAP_NS later.
+    loop
+        Whether there is a next round.
+
     """
     shift = 0
     while True:
@@ -47,8 +54,8 @@ class ReadAhead:
     """
     Iterates over messages that a thread reads ahead, a bounded number of them.
 
-    Reading takes a while whenever a chunk begins; whoever waits for deadlines should not do it.
-    What the reading raises is raised here, in its place.
+    Reading takes a while whenever a chunk begins, so the thread that waits for deadlines does not
+    read.  An error of the reading is raised after the messages before it.
     """
 
     _END = object()
@@ -72,7 +79,7 @@ class ReadAhead:
     def stop(self) -> None:
         """End both the reading and the iterating."""
         self._stopped = True
-        # Whichever of the two waits for the other finds something: room, and the end.
+        # The thread that reads may wait for room, and the one that iterates for a batch.
         with contextlib.suppress(queue.Empty):
             while True:
                 self._batches.get_nowait()
@@ -102,16 +109,28 @@ class ReadAhead:
 
 class Playback:
     """
-    Sends messages when their time has come by a clock that can stand still and change its rate.
+    Sends messages at their times, by a clock that can be paused and change its rate.
 
-    A deadline is computed from the clock alone, never from the one before, so nothing drifts.
-    What is due together is sent together; what is late is sent at once and counted, not dropped.
+    Each deadline is computed from the clock, never from the one before, so nothing drifts.  A
+    late message is sent at once and counted, not dropped.
 
-    messages: in the order of their times;  begin_ns: time at which the clock starts
-    send: called with (which publisher, CDR)
-    source, sleep: steady time [ns], and what waits that many seconds (None: until told), or less
+    Parameters
+    ----------
+    messages
+        In the order of their times.
+    begin_ns, rate
+        Time at which the clock starts [ns], and its speed.
+    send
+        Takes the index of a publisher, and CDR.
+    source, sleep
+        Returns steady time [ns]; waits at most so many seconds (None: until woken).
 
-    sent, late: counts;  paused: whether the clock stands
+    Attributes
+    ----------
+    sent, late : int
+        Counts of messages.
+    paused : bool
+
     """
 
     def __init__(self, messages: Iterable[Message], begin_ns: int, rate: float,
@@ -123,7 +142,7 @@ class Playback:
         self._clock.stop(begin_ns)
         self._begun = False
         self._stopped = False
-        self._known_until = begin_ns        # no message of before this is still to be sent
+        self._known_until = begin_ns        # all messages before this time are sent
         self._wake = threading.Event()
         self._sleep = sleep or self._sleep_until_told
         self._lock = FairLock()             # the clock, and sending
@@ -143,12 +162,12 @@ class Playback:
                 return
 
     def now(self) -> int:
-        """Return the time of the messages [ns]: all of before are sent."""
+        """Return the time up to which all messages are sent [ns]."""
         with self._control():
             return min(self._clock.now(), self._known_until)
 
     def pause(self, paused: bool) -> None:
-        """Stand still, or go on as if no time had passed; no message is sent after the return."""
+        """Pause, or go on without catching up; once paused, no message is sent any more."""
         with self._control():
             self.paused = paused
             self._run_clock()
@@ -156,7 +175,7 @@ class Playback:
     def set_rate(self, rate: float) -> None:
         """Go on at another rate."""
         with self._control():
-            self._clock.scale = rate
+            self._clock.set_scale(rate)
 
     def stop(self) -> None:
         """Make `run` return, soon."""
@@ -164,7 +183,7 @@ class Playback:
             self._stopped = True
 
     def rest(self, seconds: float) -> bool:
-        """Wait before or after playing; return whether nobody said stop."""
+        """Wait before or after playing; return False once stopped."""
         self._sleep(seconds)
         return not self._stopped
 

@@ -37,15 +37,13 @@ class RecordingSession:
     """
     Records a simulation into one log at a time.
 
-    Whatever waits for the disk is done without the lock of the simulation: while a log is being
-    opened, its messages are kept in memory.
+    Nothing waits for the disk while it holds the simulation's lock: while a log is being opened,
+    its messages are kept in memory.
 
     Parameters
     ----------
-    simulation
-        What is recorded.
-    lock
-        Held while the simulation is used.
+    simulation, lock
+        What is recorded, and the lock to hold while it is used.
     resolve
         Returns the full name of a topic.
 
@@ -70,15 +68,7 @@ class RecordingSession:
     # ------------------------------------------------------------------------ start and stop
 
     def start(self, values: Mapping[str, Any], publishers: Mapping[str, Publisher]) -> str:
-        """
-        Record from now on; see `attach` and `open`.
-
-        Returns
-        -------
-        str
-            What to tell the user.
-
-        """
+        """Record from now on, as `attach` and `open` do; return what to tell the user."""
         if self._recorder is not None:
             return f'recording already to {self._recorder.path}'
         self.attach(values, publishers)
@@ -93,7 +83,7 @@ class RecordingSession:
         values
             Checked parameters, as they are now.
         publishers
-            By the names of the streams' topics; their QoS is recorded too.
+            By the topics of streams; their QoS is recorded too.
 
         """
         from spinning_top_sim.recording.provenance import provenance  # noqa: PLC0415
@@ -148,17 +138,12 @@ class RecordingSession:
 
     def stop(self, error: str | None = None) -> str | None:
         """
-        Close the log.
+        Close the log; return what it holds, for the user, or None if there is no recording.
 
         Parameters
         ----------
         error
-            Why the recording stops, if nobody asked for it.
-
-        Returns
-        -------
-        str or None
-            What the log holds, for the user; None if there was no recording.
+            Why the recording stops, if the user has not asked for it.
 
         """
         with self._file_lock:

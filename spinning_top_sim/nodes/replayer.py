@@ -10,7 +10,7 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,44 +57,45 @@ UNKNOWN = {
     'durability': {QoSDurabilityPolicy.UNKNOWN},
     'liveliness': {QoSLivelinessPolicy.UNKNOWN},
 }
-# How long the last messages may take to reach those who listen: Fast DDS asks every 3 s whether
-# they have.
+# Longest wait for the last messages to be acknowledged: Fast DDS asks for it every 3 s.
 LAST_WORD_S = 5.0
-# How long they have where nothing is acknowledged: shared memory goes with its sender.
+# Wait for subscribers that acknowledge nothing: shared memory goes with its sender.
 UNACKNOWLEDGED_S = 0.3
-# How often subscribers are counted while waiting for them, and stops are looked for.
+# How often subscribers are counted, and stops looked for, while waiting.
 LOOK_S = 0.02
-# A thread that wants to send gets Python's lock this soon from the one that reads ahead.
+# The thread that sends gets Python's lock this soon from the one that reads ahead.
 SWITCH_INTERVAL_S = 0.0005
 
 
 @dataclass(frozen=True)
 class Options:
-    """
-    What to play and how.
+    """What to play and how; see the options of `replay_node`."""
 
-    rate: None where the parameter decides;  start: from the log's begin [s];  topics: recorded
-    names, none for all;  clock: rate of /clock [Hz], 0 for none;  partial: whether damage is all
-    right;  delay: before the first message [s];  subscribers: how many to wait for
-    """
-
-    rate: float | None = None
+    rate: float | None = None           # None: the parameter decides
     loop: bool = False
-    start: float = 0.0
-    topics: tuple[str, ...] = ()
-    clock: float = 0.0
-    partial: bool = False
-    paused: bool = False
-    delay: float = 0.0
-    subscribers: int = 0
+    start: float = 0.0                  # after the begin of the log [s]
+    topics: Sequence[str] = ()          # by their recorded names; none: all
+    clock: float = 0.0                  # rate of /clock [Hz]; 0: none
+    partial: bool = False               # whether a damaged log is played in part
+    start_paused: bool = False
+    delay: float = 0.0                  # before the first message [s]
+    wait_for_subscribers: int = 0
 
 
 class Replayer(Node):
     """
-    Plays a log once it is started.
+    The node: plays a log once it is started.
 
-    finished: completes with the exit code when all is played.  Construct, `start`, spin, `stop`.
-    Raises ValueError for what cannot be played at all.
+    Attributes
+    ----------
+    finished : rclpy.task.Future
+        Completes with the exit code when all is played.
+
+    Raises
+    ------
+    ValueError
+        If the log cannot be played at all.
+
     """
 
     def __init__(self, log: LogReader, options: Options) -> None:
@@ -149,7 +150,7 @@ class Replayer(Node):
     # -------------------------------------------------------------------------- publishers
 
     def _open_publishers(self) -> None:
-        """Have a publisher for every topic that is wanted and can be published; name the rest."""
+        """Make a publisher for every topic to be played; warn of those that cannot be played."""
         wanted = set(self._options.topics)
         there = {topic.name for topic in self._log.topics}
         if wanted and not wanted & there:
@@ -172,7 +173,7 @@ class Replayer(Node):
                 self._outputs.update((channel.channel_id, publisher) for channel in alike)
 
     def _publisher(self, channels: list[LogTopic]) -> Publisher:
-        """Return what publishes channels of one name and type; or raise LookupError."""
+        """Return a publisher for channels of one name and type, or raise LookupError."""
         topic = channels[0]
         if topic.name == '/clock' and self._options.clock:
             raise LookupError('--clock publishes another /clock')
@@ -196,7 +197,7 @@ class Replayer(Node):
                 'who listens may misread it')
 
     def _profile(self, name: str, profiles: list[Mapping[str, Any]]) -> QoSProfile:
-        """Return the QoS that was recorded; what publishers did not agree on is as usual."""
+        """Return the recorded QoS; the default where publishers had different ones."""
         if any(profile != profiles[0] for profile in profiles):
             self.get_logger().warning(f'{name} was recorded from publishers with different QoS: '
                                       'published as reliable, volatile')
@@ -219,7 +220,7 @@ class Replayer(Node):
         publish = {index: publisher.publish for index, publisher in self._outputs.items()}
         self._playback = Playback(self._ahead, self._begin_ns, self._rate,
                                   lambda index, data: publish[index](data),
-                                  paused=self._options.paused)
+                                  paused=self._options.start_paused)
         if self._options.clock:
             self._clock_thread = DeadlineThread(self._publish_clock, self._options.clock,
                                                 name='clock')
@@ -239,7 +240,7 @@ class Replayer(Node):
         self._terminal.end()
 
     def _play(self) -> None:
-        """Do it all, in a thread beside the one that serves."""
+        """Play all; the body of a thread beside the executor's."""
         code = 0
         try:
             if self._wait_to_begin():
@@ -248,12 +249,20 @@ class Replayer(Node):
             if self._tell_damage():
                 code = 2
         except Exception as error:
-            if not self.context.ok():       # publishing fails once the context is down
-                return
-            self.get_logger().error(f'cannot be played any further: {error}')
-            code = 2
+            self._fail(error)
+            return
         if self.context.ok():
             self._terminal.tell(self._summary())
+            self._finish(code)
+
+    def _fail(self, error: Exception) -> None:
+        if self.context.ok():               # publishing fails once the context is down
+            self.get_logger().error(f'cannot be played any further: {error}')
+            self._terminal.tell(self._summary())
+            self._finish(2)
+
+    def _finish(self, code: int) -> None:
+        if not self.finished.done():
             self.finished.set_result(code)
 
     def _messages(self) -> Iterator[Message]:
@@ -265,7 +274,7 @@ class Replayer(Node):
                 yield message.log_time, message.channel_id, message.data
 
     def _tell_damage(self) -> bool:
-        """Return whether a piece was found damaged that nobody knew of; say so once."""
+        """Return whether messages are missing unexpectedly; say so once."""
         damaged = self._log.left_out > 0 and not self._options.partial
         if damaged and not self._told_damage:
             self._told_damage = True
@@ -276,7 +285,7 @@ class Replayer(Node):
     def _wait_to_begin(self) -> bool:
         """Wait for subscribers and the delay; return False when stopped meanwhile."""
         begin = time.monotonic() + self._options.delay
-        while (time.monotonic() < begin or self._subscribers() < self._options.subscribers):
+        while (time.monotonic() < begin or self._subscribers() < self._options.wait_for_subscribers):
             if not self._playback.rest(LOOK_S):
                 return False
         return True
@@ -286,7 +295,7 @@ class Replayer(Node):
         return sum(publisher.get_subscription_count() for publisher in publishers)
 
     def _wait_for_delivery(self) -> None:
-        """Wait until all who listen have the last messages, or too long."""
+        """Wait until all subscribers have the last messages, or for too long."""
         heard = [publisher for publisher in set(self._outputs.values())
                  if publisher.get_subscription_count()]
         now = time.monotonic()
@@ -303,11 +312,10 @@ class Replayer(Node):
         try:
             message = ClockMessage(clock=Time(nanoseconds=self._playback.now()).to_msg())
             self._clock_publishers[0].publish(message)
-        except Exception:
-            if self.context.ok():
-                raise
+        except Exception as error:
+            self._fail(error)
 
-    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> Any:
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._playback.pause(request.data)
         response.success = True
         response.message = f'{"paused" if request.data else "playing"} at {self._position()}'
@@ -372,7 +380,7 @@ def message_class(type_name: str) -> type:
     return found
 
 
-def _checked_rate(value: Any) -> float:
+def _checked_rate(value: object) -> float:
     """Return a rate as a float.  Raises ValueError saying what is allowed."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) \
             or not math.isfinite(value) or not SLOWEST <= value <= FASTEST:

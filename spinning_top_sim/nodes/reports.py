@@ -24,17 +24,9 @@ OK, WARN, ERROR = 0, 1, 2
 
 
 class Speedometer:
-    """
-    Measures the real-time factor: simulated over real time between two readings.
+    """Measures the real-time factor, simulated over real time between two readings."""
 
-    Attributes
-    ----------
-    factor : float
-        The newest one.
-
-    """
-
-    # Reports that were held up come at once; time between them is too short to measure [s].
+    # Reports that were held up follow each other at once: less time than this [s] is not measured.
     SHORTEST = 0.1
 
     def __init__(self) -> None:
@@ -55,15 +47,7 @@ class Speedometer:
 
 
 class MotionReport:
-    """
-    Describes a running simulation; the caller holds the simulation's lock.
-
-    Parameters
-    ----------
-    simulation, loop, session
-        What is described.
-
-    """
+    """Describes a running simulation; the caller holds the simulation's lock."""
 
     def __init__(self, simulation: Simulation, loop: TickLoop, session: RecordingSession) -> None:
         self._simulation, self._loop, self._session = simulation, loop, session

@@ -53,19 +53,13 @@ def descriptor(parameter: Parameter) -> ParameterDescriptor:
 
 def start_values(node: Node) -> dict[str, Any]:
     """
-    Return the parameters that a node was started with, and warn of unknown ones.
+    Return the checked parameters that a node was started with, and warn of unknown ones.
 
     Parameters
     ----------
     node
-        Made with `automatically_declare_parameters_from_overrides`: the public way to learn of
-        overrides that nobody declares.  They are undeclared here, so that `declare` and
-        `create_publisher` declare them with their descriptors.
-
-    Returns
-    -------
-    dict
-        Checked values of the whole table.
+        Made with `automatically_declare_parameters_from_overrides`, the public way to learn of
+        overrides that nobody declares.
 
     Raises
     ------
@@ -86,6 +80,7 @@ def start_values(node: Node) -> dict[str, Any]:
             near = difflib.get_close_matches(name, parameters.BY_NAME, 1)
             hint = f'; did you mean {near[0]}?' if near else ''
             node.get_logger().warning(f'there is no parameter {name}: ignored{hint}')
+        # It is declared later, with its descriptor, by `declare` or `create_publisher`.
         node.undeclare_parameter(name)
     return parameters.checked(given)
 

@@ -64,7 +64,7 @@ class Simulator(Node):
     """
     The node; docs/interface.md has its topics, services and parameters.
 
-    One thread ticks.  The executor's thread serves everything else.  Both hold the lock while
+    One thread ticks, and the executor's thread does everything else.  Both hold the lock while
     they use the simulation.
 
     Attributes

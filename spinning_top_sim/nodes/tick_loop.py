@@ -44,40 +44,29 @@ class Counters:
     rejected_commands: int = 0
 
 
+def _nothing(*_: object) -> None:
+    pass
+
+
 @dataclass(frozen=True)
 class Hooks:
-    """
-    What a tick loop asks of its surroundings.
+    """What a tick loop asks of its surroundings."""
 
-    Attributes
-    ----------
-    update_subscribers
-        Sets `publish` of each stream that has subscribers; called every 50 ms.
-    has_room
-        Returns whether the recording takes more messages.
-    wait_for_room
-        Waits a short while until the recording takes more messages.
-    stopping
-        Returns whether the node is about to end.
-    clock_started
-        Takes the time of the clock's source [ns] at which simulated time is 0.
-    overloaded
-        Takes what happens because the machine cannot keep up.
-    failed
-        Takes the reason why the motion cannot go on.
-    duration_passed
-        Called once, when all samples of `duration` are sent.
-
-    """
-
-    update_subscribers: Callable[[], None] = lambda: None
+    # Sets `publish` of each stream that has subscribers; called every 50 ms.
+    update_subscribers: Callable[[], None] = _nothing
+    # Returns whether the recording takes more messages; waits a short while until it does.
     has_room: Callable[[], bool] = lambda: True
-    wait_for_room: Callable[[], None] = lambda: None
+    wait_for_room: Callable[[], None] = _nothing
+    # Returns whether the node is about to end.
     stopping: Callable[[], bool] = lambda: False
-    clock_started: Callable[[int], None] = lambda origin_ns: None
-    overloaded: Callable[[str], None] = lambda consequence: None
-    failed: Callable[[str], None] = lambda reason: None
-    duration_passed: Callable[[], None] = lambda: None
+    # Takes the source's time [ns] of simulated time 0, whenever simulated time begins to run.
+    clock_started: Callable[[int], None] = _nothing
+    # Takes what happens because the machine cannot keep up; called once.
+    overloaded: Callable[[str], None] = _nothing
+    # Takes the reason why the motion cannot go on.
+    failed: Callable[[str], None] = _nothing
+    # Called when all samples of `duration` are sent.
+    duration_passed: Callable[[], None] = _nothing
 
 
 class TickLoop:
@@ -152,15 +141,7 @@ class TickLoop:
     # ------------------------------------------------------------------------------- ticks
 
     def tick(self) -> bool:
-        """
-        Send what is due.
-
-        Returns
-        -------
-        bool
-            Whether `idle` has something to do before the next tick.
-
-        """
+        """Send what is due; return whether `idle` has something to do before the next tick."""
         now_ns, late_from_ns = self._steady(), self._late_from_ns
         self._late_from_ns = now_ns + self._late_after_ns
         due_ns = self._clock.now()
@@ -267,17 +248,12 @@ class TickLoop:
 
     def step(self, count: int, dt: float) -> int:
         """
-        Move a paused motion on by count x dt, rounded to 1 ns.
-
-        Parameters
-        ----------
-        count, dt
-            Number of steps, and the length of one [s].
+        Move a paused motion on by count x dt [s], rounded to 1 ns.
 
         Returns
         -------
         int
-            What is left to do [ns]: more than 0 where it takes too long, or fails.
+            Simulated time left to do [ns]: not 0 if the step takes too long, or fails.
 
         """
         self._hooks.update_subscribers()
@@ -298,22 +274,17 @@ class TickLoop:
 
     def command(self, l3: float, lz: float) -> int:
         """
-        Let L3 and Lz jump, after sending what is due.
-
-        Parameters
-        ----------
-        l3, lz
-            Angular momenta from now on [kg m^2/s].
+        Send what is due, then let L3 and Lz jump [kg m^2/s].
 
         Returns
         -------
         int
-            The simulated time of the command [ns].
+            Simulated time of the command [ns].
 
         Raises
         ------
         ValueError
-            If there is no such motion, or none at all since `failure`; nothing changes then.
+            If there is no such motion, or the motion has failed; nothing changes then.
 
         """
         if self.running:
@@ -333,12 +304,12 @@ class TickLoop:
         values
             Checked parameters of the motion that begins.
         epoch_ns
-            Returns the new stamp of t = 0 [ns] for the stamp of the last sample.
+            Takes the stamp of the last sample, returns the new stamp of t = 0 [ns].
 
         Raises
         ------
         ValueError, IntegrationError
-            If there is no motion from there; the present one goes on then.
+            If no motion begins there; the present one goes on then.
 
         """
         simulation = self._simulation
@@ -384,10 +355,9 @@ class TickLoop:
             1.5 * self._tick_period_ns, min(TICKS_AHEAD * self._tick_period_ns, AHEAD_NS)))
         self._latest_ns = int(LATEST_NS * time_scale)
         self._longest_lag_ns = int(LONGEST_LAG_NS * time_scale)
-        if time_scale != self._clock.scale:
-            self._clock.scale = time_scale
-            if self._clock.running:
-                self._hooks.clock_started(self._clock.when(0))
+        self._clock.set_scale(time_scale)
+        if self._clock.running:
+            self._hooks.clock_started(self._clock.when(0))
 
     def look_for_subscribers(self) -> None:
         """Have the next tick count subscribers, as when publishers have come or gone."""
