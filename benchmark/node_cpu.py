@@ -7,9 +7,8 @@ Processor time of `sim_node`, beside an ordinary rclpy node and beside one that 
     python benchmark/node_cpu.py --rates 1000 --subscribers 1 --rounds 5 --no-report
 
 Three streams (pose, joint_states, imu/data_raw) at the same rate, for 0, 1 and 3 other processes
-that subscribe to all three.  `sim_node` runs with `pacing: thread` and a tick a sample, and with
-the timer that it has by default: 200 ticks a second, so above that samples come several at a
-time.  Beside it `straightforward_node.py` (a timer, scipy's RK45, message objects) and
+that subscribe to all three.  `sim_node` runs with a tick a sample, and with the 200 ticks a second
+that it has by default, so above that samples come several at a time.  Beside it `straightforward_node.py` (a timer, scipy's RK45, message objects) and
 `bare_node.py` (the floor: constant bytes, a tick a sample, by timer and by thread).  Everything
 takes turns, in every round; what is reported are medians of rounds and of ratios within a round.
 Processor time is that of the whole process, its DDS threads too, over the time measured; arrivals
@@ -39,8 +38,8 @@ OTHERS = ('ground_truth_imu', 'ground_truth_odom', 'invariants')
 RATES = (100, 200, 500, 1000, 2000)
 SUBSCRIBERS = (0, 1, 3)
 KINDS = {
-    'ours, timer, recording': ('timer', True), 'ours, timer': ('timer', False),
-    'ours, thread, recording': ('thread', True), 'ours, thread': ('thread', False),
+    'ours, 200 ticks, recording': (False, True), 'ours, 200 ticks': (False, False),
+    'ours, recording': (True, True), 'ours': (True, False),
     'straightforward': None, 'floor, timer': None, 'floor, thread': None,
 }
 STRAIGHT, FLOOR = 'straightforward', 'floor, thread'
@@ -61,9 +60,9 @@ def program(kind: str, rate: float, namespace: str, folder: Path) -> list[str]:
     """Return what python is given to run this kind of node."""
     ours = KINDS[kind]
     if ours is not None:
-        pacing, records = ours
-        parameters = {'pacing': pacing, 'status_period': 0.0,
-                      **({'tick_rate': float(rate)} if pacing == 'thread' else {}),
+        tick_a_sample, records = ours
+        parameters = {'status_period': 0.0,
+                      **({'tick_rate': float(rate)} if tick_a_sample else {}),
                       'record.enabled': records, 'record.uri': str(folder) + '/',
                       **{f'{name}.rate': float(rate) for name in STREAMS},
                       **{f'{name}.enabled': False for name in OTHERS}}
@@ -205,19 +204,17 @@ def idle(rounds: int, seconds: float) -> str:
     """Return the table of what streams cost that nobody listens to."""
     switches = [f'{name}.enabled' for name in (*STREAMS, 'imu_data', *OTHERS, 'clock')]
 
-    def node(pacing: str, enabled: bool) -> Callable[[str], list[str]]:
+    def node(enabled: bool) -> Callable[[str], list[str]]:
         return lambda namespace: [*SIM_NODE, *ros_arguments(namespace, {
-            'pacing': pacing, 'tick_rate': 1000.0, 'status_period': 0.0,
-            **dict.fromkeys(switches, enabled)})]
+            'tick_rate': 1000.0, 'status_period': 0.0, **dict.fromkeys(switches, enabled)})]
 
     return table(
-        ('pacing', 'all streams enabled [%]', 'none enabled [%]', 'ratio', 'lowest', 'highest'),
-        [(pacing, *pair_row(together({'all': node(pacing, True), 'none': node(pacing, False)},
-                                     rounds, seconds))) for pacing in ('timer', 'thread')])
+        ('all streams enabled [%]', 'none enabled [%]', 'ratio', 'lowest', 'highest'),
+        [pair_row(together({'all': node(True), 'none': node(False)}, rounds, seconds))])
 
 
 def beside_the_floor(rounds: int, seconds: float) -> str:
-    """Return the table of what `pacing: thread` costs beside the floor, at 1 kHz."""
+    """Return the table of what a tick a sample costs beside the floor, at 1 kHz."""
     with tempfile.TemporaryDirectory() as name:
         def node(kind: str) -> Callable[[str], list[str]]:
             return lambda namespace: program(kind, 1000, namespace, Path(name))
@@ -226,7 +223,7 @@ def beside_the_floor(rounds: int, seconds: float) -> str:
             ('node', 'it [%]', 'the floor [%]', 'ratio', 'lowest', 'highest'),
             [(kind, *pair_row(together({kind: node(kind), FLOOR: node(FLOOR)}, rounds, seconds,
                                        subscribers=1)))
-             for kind in ('ours, thread, recording', 'ours, thread')])
+             for kind in ('ours, recording', 'ours')])
 
 
 def mean_rate(one: Result) -> float:
@@ -250,11 +247,9 @@ def share_table(found: dict) -> str:
     return table(('Hz', 'subscribers', *kinds), rows)
 
 
-COMPARED = (('ours, thread, recording', STRAIGHT), ('ours, thread', STRAIGHT),
-            ('ours, timer, recording', STRAIGHT), ('ours, timer', STRAIGHT),
-            ('floor, timer', STRAIGHT),
-            ('ours, thread, recording', FLOOR), ('ours, thread', FLOOR),
-            ('ours, timer', 'floor, timer'))
+COMPARED = (('ours, recording', STRAIGHT), ('ours', STRAIGHT),
+            ('ours, 200 ticks, recording', STRAIGHT), ('ours, 200 ticks', STRAIGHT),
+            ('floor, timer', STRAIGHT), ('ours, recording', FLOOR), ('ours', FLOOR))
 
 
 def ratio_table(found: dict, per_sample: bool = False) -> str:

@@ -6,7 +6,7 @@
     python benchmark/soak.py                    # 30 minutes
     python benchmark/soak.py --minutes 4
 
-Three streams at 1 kHz with `pacing: thread`, a subscribing process that comes and goes, a log
+Three streams at 1 kHz with a tick a sample, a subscribing process that comes and goes, a log
 begun and ended again and again, a parameter changed every second (a command, a switch or a rate
 in turn).  At the end: how the resident memory went, whether every log has every sample between
 its first and its last, and what the node has said.  Exit code 1 where something is not in order:
@@ -100,7 +100,7 @@ def missing_in(path: Path) -> dict[str, tuple[int, int]]:
 def soak(minutes: float, log_every: float, listen_every: float, folder: Path) -> dict:
     """Let it run; return what was seen."""
     namespace = '/soak'
-    parameters = {'pacing': 'thread', 'tick_rate': RATE, 'status_period': 0.0,
+    parameters = {'tick_rate': RATE, 'status_period': 0.0,
                   'record.uri': f'{folder}/', 'imu.gyroscope_noise_density': 1e-3,
                   **{f'{name}.rate': RATE for name in STREAMS}}
     memory: list[tuple[float, int]] = []

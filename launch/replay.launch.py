@@ -12,7 +12,7 @@ from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction
 from launch_ros.actions import Node
 
-from spinning_top_sim.nodes import launching
+from spinning_top_sim.nodes import launch_helpers
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.tools.rerun import NotOursError, read_account
@@ -46,19 +46,19 @@ def generate_launch_description() -> LaunchDescription:
 def _nodes(context: LaunchContext) -> list:
     given = {name: context.launch_configurations[name] for name in (
         'file', 'rate', 'start', 'loop', 'clock', 'partial', 'tf', 'rviz')}
-    on = {name: launching.switch(name, given[name])
+    on = {name: launch_helpers.switch(name, given[name])
           for name in ('loop', 'partial', 'tf', 'rviz')}
-    options = ['--rate', str(launching.number('rate', given['rate'])),
-               '--start', str(launching.number('start', given['start'], zero=True))]
+    options = ['--rate', str(launch_helpers.number('rate', given['rate'])),
+               '--start', str(launch_helpers.number('start', given['start'], zero=True))]
     options += [f'--{name}' for name in ('loop', 'partial') if on[name]]
     clocked = given['clock'].lower() != 'false'
     if clocked:
         options.append('--clock')
         if given['clock'].lower() != 'true':
-            options.append(str(launching.number('clock', given['clock'])))
+            options.append(str(launch_helpers.number('clock', given['clock'])))
     node = Node(package='spinning_top_sim', executable='replay_node', output='screen',
                 emulate_tty=True, arguments=[given['file'], *options])
-    actions = launching.until_it_ends(node)
+    actions = launch_helpers.until_it_ends(node)
     if not (on['tf'] or on['rviz']):
         return actions
     try:
@@ -70,10 +70,10 @@ def _nodes(context: LaunchContext) -> list:
     topics = {name: topic for topic, name in account.topics.items()}
     namespace = _namespace(topics)
     if on['tf'] and 'joint_states' in topics:
-        actions += launching.state_publisher(
+        actions += launch_helpers.state_publisher(
             SHARE, account.now, namespace, topics['joint_states'], clocked)
     if on['rviz']:
-        actions.append(launching.rviz(SHARE, account.now['world_frame'], namespace, clocked))
+        actions.append(launch_helpers.rviz(SHARE, account.now['world_frame'], namespace, clocked))
     return actions
 
 

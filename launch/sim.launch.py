@@ -15,7 +15,7 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from spinning_top_sim.nodes import launching
+from spinning_top_sim.nodes import launch_helpers
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
 from spinning_top_sim.tools.simulate import resolve
@@ -65,7 +65,7 @@ def _nodes(context: LaunchContext) -> list:
     given = {name: context.launch_configurations[name] for name in (
         'scene', 'params_file', 'set', 'namespace', 'frame_prefix', 'record', 'use_sim_time',
         'tf', 'rviz', 'markers')}
-    on = {name: launching.switch(name, given[name])
+    on = {name: launch_helpers.switch(name, given[name])
           for name in ('use_sim_time', 'tf', 'rviz', 'markers')}
     namespace = given['namespace'].strip('/')
     files = [_scene_file(given['scene']), *filter(None, [given['params_file']])]
@@ -92,13 +92,13 @@ def _nodes(context: LaunchContext) -> list:
                     **{name: list(value) if isinstance(value, tuple) else value
                        for name, value in asked.items()},
                     'use_sim_time': on['use_sim_time']}])
-    actions = launching.until_it_ends(node)
+    actions = launch_helpers.until_it_ends(node)
     if on['tf']:
-        actions += launching.state_publisher(
+        actions += launch_helpers.state_publisher(
             SHARE, values, namespace, resolve('joint_states', namespace),
             on['use_sim_time'])
     if on['rviz']:
-        actions.append(launching.rviz(SHARE, values['world_frame'], namespace,
+        actions.append(launch_helpers.rviz(SHARE, values['world_frame'], namespace,
                                       on['use_sim_time']))
     return actions
 

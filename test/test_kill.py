@@ -25,9 +25,9 @@ MAX_LOSS_S = 0.3
 TICK_S = 0.002
 # Three streams at 1 kHz: 3000 messages a second.
 PARAMETERS = {
-    'record.enabled': True, 'record.max_loss': MAX_LOSS_S, 'pacing': 'thread',
-    'tick_rate': 1.0 / TICK_S, 'pose.rate': 1000.0, 'joint_states.rate': 1000.0,
-    'ground_truth_imu.rate': 1000.0, 'imu.enabled': False, 'ground_truth_odom.enabled': False,
+    'record.enabled': True, 'record.max_loss': MAX_LOSS_S, 'tick_rate': 1.0 / TICK_S,
+    'pose.rate': 1000.0, 'joint_states.rate': 1000.0, 'ground_truth_imu.rate': 1000.0,
+    'imu.enabled': False, 'ground_truth_odom.enabled': False,
     'invariants.enabled': False, 'status_period': 0.0}
 TOPICS = ('pose', 'joint_states', 'ground_truth/imu')
 

@@ -63,15 +63,15 @@ def installed(monkeypatch):
         for name in names:
             setattr(made, name, type(name, (Kept,), {}))
         monkeypatch.setitem(sys.modules, module, made)
-    forget_launching()
+    forget_launch_helpers()
     yield there
-    forget_launching()
+    forget_launch_helpers()
 
 
-def forget_launching():
+def forget_launch_helpers():
     """Let what imports launch be imported anew."""
-    sys.modules.pop('spinning_top_sim.nodes.launching', None)
-    vars(nodes).pop('launching', None)
+    sys.modules.pop('spinning_top_sim.nodes.launch_helpers', None)
+    vars(nodes).pop('launch_helpers', None)
 
 
 def described(name):

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """When ticks come: the thread that paces them, on a clock of its own."""
 
+import threading
+import time
+
 import pytest
 
 from spinning_top_sim.nodes import pacing
@@ -27,15 +30,15 @@ class Run:
     """
     A DeadlineThread run here; `seen` are its ticks, in periods after the begin.
 
-    costs: time that some ticks take, by their number [periods];  wants: ticks that ask for spare
-    time;  at: what happens in some ticks, by their number
+    costs: time that some ticks take, by their number [periods];  wants: ticks that ask for idle
+    work;  at: what happens in some ticks, by their number
     """
 
     def __init__(self, monkeypatch, count, costs=None, wants=(), at=None):
-        self.time, self.seen, self.spared = Time(), [], []
+        self.time, self.seen, self.idled = Time(), [], []
         self._count, self._costs, self._wants, self._at = count, costs or {}, wants, at or {}
         monkeypatch.setattr(pacing, 'time', self.time)
-        self.thread = pacing.DeadlineThread(self._tick, 1.0 / PERIOD, self._spare)
+        self.thread = pacing.DeadlineThread(self._tick, 1.0 / PERIOD, self._idle)
         self.thread.run()
 
     def _tick(self):
@@ -47,8 +50,8 @@ class Run:
             self.thread._stopped = True
         return number in self._wants
 
-    def _spare(self):
-        self.spared.append((self.time.now - BEGIN) / PERIOD)
+    def _idle(self):
+        self.idled.append((self.time.now - BEGIN) / PERIOD)
         self.time.now += 0.125 * PERIOD
 
 
@@ -80,16 +83,40 @@ def test_a_new_rate_holds_from_the_next_deadline_on(monkeypatch):
     assert seen == [1.0, 2.0, 2.5, 3.0]
 
 
-def test_spare_time_begins_a_moment_after_the_tick_that_asks_for_it(monkeypatch):
+def test_idle_work_begins_a_moment_after_the_tick_that_asks_for_it(monkeypatch):
     run = Run(monkeypatch, 5, wants={1, 3})
     assert run.seen == [1.0, 2.0, 3.0, 4.0, 5.0]
-    assert run.spared == pytest.approx([2.25 + run.thread.NAP, 4.25 + run.thread.NAP])
+    assert run.idled == pytest.approx([2.25 + run.thread.NAP, 4.25 + run.thread.NAP])
 
 
 def test_a_far_deadline_is_waited_for_in_pieces(monkeypatch):
     run = Run(monkeypatch, 2, at={0: lambda run: run.thread.set_rate(1.0)})
     assert max(run.time.naps) <= run.thread.LONGEST_SLEEP
     assert run.seen[1] * PERIOD == pytest.approx(1.0)
+
+
+def test_a_lock_is_left_to_who_waits_for_it():
+    lock, theirs, overtaken, done = pacing.FairLock(), [], [], threading.Event()
+
+    def busy():
+        turn = 0                                    # that another thread waits for
+        while not done.is_set():
+            with lock, lock:                        # reentrant
+                overtaken.append(len(theirs) < turn)
+                turn = len(theirs) + 1 if lock._queue.locked() else 0
+
+    thread = threading.Thread(target=busy, daemon=True)
+    thread.start()
+    for _ in range(50):
+        count = len(overtaken)
+        while len(overtaken) < count + 10:          # it is busy again
+            time.sleep(1e-5)
+        with lock:
+            theirs.append(None)
+    done.set()
+    thread.join(60.0)
+    assert not thread.is_alive()
+    assert not any(overtaken)
 
 
 def test_simulated_time_knows_when_it_will_be_what():
@@ -109,6 +136,6 @@ def test_simulated_time_knows_when_it_will_be_what():
 
 def test_a_followed_clock_goes_on_where_it_steps_back():
     readings = iter([100, 150, 40, 41, 90, 10, 20])
-    onward = pacing.Onward(lambda: next(readings))
-    assert [onward() for _ in range(7)] == [100, 150, 150, 151, 200, 200, 210]
-    assert onward.stepped_back_ns == 110 + 80
+    clock = pacing.MonotonicClock(lambda: next(readings))
+    assert [clock() for _ in range(7)] == [100, 150, 150, 151, 200, 200, 210]
+    assert clock.stepped_back_ns == 110 + 80

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The package as colcon, pip and `ros2 run` see it: manifest, versions, executables, files."""
 
+import inspect
 import os
 import re
 import subprocess
@@ -93,7 +94,7 @@ def test_the_manifest_names_every_ros_package_that_is_imported():
 def test_the_manifest_names_every_package_that_is_launched():
     declared = {dependency.name for dependency in
                 parse_package(str(ROOT / 'package.xml')).exec_depends} | {NAME}
-    sources = [*(ROOT / 'launch').glob('*.py'), ROOT / NAME / 'nodes/launching.py']
+    sources = [*(ROOT / 'launch').glob('*.py'), ROOT / NAME / 'nodes/launch_helpers.py']
     named = re.compile(r"(?:package=|STATE_PUBLISHER = )'(\w+)'")
     launched = {name for path in sources for name in named.findall(path.read_text())}
     assert launched == {NAME, 'robot_state_publisher', 'rviz2'}
@@ -113,6 +114,34 @@ def test_manifest_and_setup_py_tell_the_same(setup_py):
     assert setup_py.get_license() == package.licenses[0]
     assert setup_py.get_maintainer() == maintainer.name
     assert setup_py.get_maintainer_email() == maintainer.email
+
+
+def test_no_private_name_of_rclpy_is_used():
+    """What ends with a release of rclpy: `rclpy.impl`, and attributes like `node._parameters`."""
+    private = re.compile(r'rclpy\.impl|rclpy_implementation|_rclpy\b|publish_raw'
+                         r'|(?<!\bself)(?<!\bcls)\._[a-z]')
+    found = [f'{path.name}:{number}: {line.strip()}'
+             for path in (*(ROOT / NAME / 'nodes').glob('*.py'), *(ROOT / 'launch').glob('*.py'))
+             for number, line in enumerate(path.read_text(encoding='utf-8').splitlines(), 1)
+             if private.search(line)]
+    assert found == []
+    assert private.search('node._parameter_overrides') and private.search('publisher.publish_raw')
+
+
+def test_nodes_neither_use_nor_replace_what_is_private_in_rclpys_node():
+    pytest.importorskip('rclpy')
+    from rclpy.node import Node
+
+    from spinning_top_sim.nodes.replayer import Replayer
+    from spinning_top_sim.nodes.simulator import Simulator
+
+    theirs = {name for name in vars(Node) if not name.startswith('__')}
+    source = inspect.getsource(Node.__init__)
+    theirs |= set(re.findall(r'self\.(_[a-z]\w*)', source))
+    for kind in (Simulator, Replayer):
+        ours = set(vars(kind)) | set(re.findall(r'self\.(_[a-z]\w*)', inspect.getsource(kind)))
+        assert not {name for name in ours & theirs if not name.startswith('__')}
+    assert '_parameter_overrides' in theirs
 
 
 # -------------------------------------------------------------------------------- executables

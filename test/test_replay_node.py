@@ -8,6 +8,7 @@ is decided by how long something took, except that nothing may come before its t
 
 import contextlib
 import dataclasses
+import importlib
 import itertools
 import signal
 import threading
@@ -30,8 +31,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from spinning_top_sim.nodes import playback
-from spinning_top_sim.nodes.message_types import message_type
 from spinning_top_sim.nodes.playback import ROUND_GAP_NS, Playback, ReadAhead, rounds
+from spinning_top_sim.nodes.replayer import message_class
 from spinning_top_sim.recording import writer
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.schemas import find_definition
@@ -140,6 +141,33 @@ def test_told_to_stop_it_sends_nothing_more():
     assert player.sent == 1
 
 
+def test_a_pause_from_another_thread_waits_for_the_message_that_is_being_sent():
+    """Nothing is sent after `pause` has returned, though the playback never rests here."""
+    sending, go_on = threading.Event(), threading.Event()
+
+    def send(index, _):
+        if index == 3:
+            sending.set()
+            assert go_on.wait(PATIENCE_S)
+
+    player = Playback(messages_at(*range(10_000)), EPOCH_NS, 1.0, send)
+    playing = threading.Thread(target=player.run, daemon=True)
+    playing.start()
+    assert sending.wait(PATIENCE_S)
+    pausing = threading.Thread(target=player.pause, args=(True,), daemon=True)
+    pausing.start()
+    pausing.join(0.2)
+    assert pausing.is_alive()
+    go_on.set()
+    pausing.join(PATIENCE_S)
+    sent = player.sent
+    time.sleep(0.1)
+    assert player.sent == sent
+    player.stop()
+    playing.join(PATIENCE_S)
+    assert not playing.is_alive()
+
+
 def test_the_time_told_never_passes_a_message_that_is_still_to_be_sent():
     told = []
 
@@ -155,13 +183,13 @@ def test_the_time_told_never_passes_a_message_that_is_still_to_be_sent():
 
 def test_rounds_go_on_where_the_last_one_ended():
     log = [(EPOCH_NS, 0, b'a'), (EPOCH_NS + 500, 1, b'b')]
-    length = 500 + ROUND_GAP_NS
-    endless = rounds(lambda: log, length, loop=True)
+    endless = rounds(lambda: log, 700, loop=True)
     found = list(itertools.islice(endless, 5))
-    assert found == [(at + turn * length, index, data) for turn in range(3)
-                     for at, index, data in log][:5]
-    assert list(rounds(lambda: log, length, loop=False)) == log
-    assert list(rounds(list, length, loop=True)) == []
+    turn = 700 + 10_000_000
+    assert found == [*log, (EPOCH_NS + turn, 0, b'a'), (EPOCH_NS + turn + 500, 1, b'b'),
+                     (EPOCH_NS + 2 * turn, 0, b'a')]
+    assert list(rounds(lambda: log, 700, loop=False)) == log
+    assert list(rounds(list, 700, loop=True)) == []
 
 
 def test_reading_ahead_is_bounded_in_order_and_ends():
@@ -182,15 +210,18 @@ def test_reading_ahead_is_bounded_in_order_and_ends():
     assert last[0] < 1_000 + most
 
 
-def test_what_reading_raises_comes_after_what_was_read():
+@pytest.mark.parametrize('count', [1, playback.BATCH_MESSAGES, 700])
+def test_what_reading_raises_comes_after_what_was_read(count):
     def broken():
-        yield 1, 0, b'a'
+        for number in range(count):
+            yield number, 0, b'a'
         raise OSError('gone')
 
     found = []
     with pytest.raises(OSError, match='gone'):
-        found.extend(ReadAhead(broken()))
-    assert len(found) == 0 or found == [(1, 0, b'a')]
+        for message in ReadAhead(broken()):
+            found.append(message)       # noqa: PERF402 - extend() would lose what came before
+    assert found == [(number, 0, b'a') for number in range(count)]
 
 
 def test_stopping_wakes_who_waits_for_a_reader():
@@ -302,7 +333,7 @@ class Listening:
     def __init__(self, peer, topics):
         self.topics, self._matched = [], {}
         for name, kind in topics:
-            topic = Topic(message_type(kind))
+            topic = Topic(message_class(kind))
             matched = self._matched[name] = threading.Event()
             peer.node.create_subscription(
                 topic.kind, name, topic.receive,
@@ -412,6 +443,23 @@ def test_start_and_topics_choose_what_is_played(peer, tmp_path, strangers_log):
     assert 'on 1 topics' in node.out
 
 
+def test_only_message_classes_of_installed_ros_packages_are_found(monkeypatch):
+    assert message_class(TWIST) is message_class('geometry_msgs/Twist')
+    assert message_class(STRING).__name__ == 'String'
+    imported = []
+    monkeypatch.setattr(importlib, 'import_module', imported.append)
+    for name in ('antigravity/msg/X', 'os/msg/System', '/msg/String', 'std_msgs', 'std_msgs/msg/',
+                 'std_msgs/msg/string', 'std_msgs.msg/msg/String', '../std_msgs/msg/String',
+                 'std_msgs/msg/String\n', 'json/decoder/JSONDecoder', 'nowhere_msgs/msg/Thing'):
+        with pytest.raises(LookupError):
+            message_class(name)
+    assert imported == []
+    monkeypatch.undo()
+    for name in ('std_msgs/msg/Nothing', 'std_srvs/srv/Trigger', 'std_srvs/action/Trigger'):
+        with pytest.raises(LookupError):
+            message_class(name)
+
+
 def test_an_unknown_type_is_named_once_and_the_rest_plays(peer, tmp_path):
     store = get_typestore(Stores.ROS2_JAZZY)
     store.register(get_types_from_msg('int32 x', THING))
@@ -516,6 +564,20 @@ def test_loops_go_on_with_a_clock_that_never_goes_back(peer, tmp_path):
         assert times[0] == EPOCH_NS
         assert times == sorted(times)
         assert times[-1] > EPOCH_NS + 2 * (19 * 2_000_000 + ROUND_GAP_NS)
+
+
+def test_a_log_of_one_moment_is_repeated_a_gap_apart(peer, tmp_path):
+    path = tmp_path / 'moment.mcap'
+    write_log(path, 2, step_ns=0)
+    with replaying(peer, tmp_path, path, (*OURS, ('/clock', 'rosgraph_msgs/msg/Clock')), '--loop',
+                   '--clock', '200') as (node, heard):
+        peer.switch(node, 'set_pause', False)
+        heard.topics[0].wait(5)
+        clock = heard.topics[2].wait_more(20).last().clock
+        assert clock.sec * SECOND + clock.nanosec - EPOCH_NS >= 4 * ROUND_GAP_NS
+        answer = peer.switch(node, 'set_pause', True).message
+        assert int(answer.split('round ')[1]) >= 5
+        assert node.end() == 0, node.err
 
 
 def test_pause_stands_still_however_often_it_is_asked_for(peer, tmp_path):

@@ -45,8 +45,8 @@ from node_logs import (
 WATCHED_S = 10
 
 RUNS = {
-    'timer': {},
-    'thread': {'pacing': 'thread', 'imu.lever_arm': [0.1, -0.05, 0.3], 'imu.rpy': [0.3, -0.2, 1.1],
+    'plain': {},
+    'mounted': {'imu.lever_arm': [0.1, -0.05, 0.3], 'imu.rpy': [0.3, -0.2, 1.1],
                'initial.theta': 0.8, 'initial.theta_dot': 0.4, 'spin.l3': 1.2, 'spin.lz': 0.5,
                'imu.frame_id': 'sensor', 'world_frame': 'map', 'body_frame': 'wheel'},
 }
@@ -57,9 +57,9 @@ def both_runs(peer, diagnostics, tmp_path_factory):
     """Two nodes side by side in namespaces of their own, recorded, watched, and ended."""
     folder = tmp_path_factory.mktemp('runs')
     runs = {}
-    with (SimNode(folder, {**RUNS['timer'], 'record.enabled': True}, namespace='/timer') as one,
-          SimNode(folder, {**RUNS['thread'], 'record.enabled': True},
-                  namespace='/thread') as two):
+    with (SimNode(folder, {**RUNS['plain'], 'record.enabled': True}, namespace='/plain') as one,
+          SimNode(folder, {**RUNS['mounted'], 'record.enabled': True},
+                  namespace='/mounted') as two):
         for node in (one, two):
             topics = {name: peer.listen(node.topic(name), kind) for name, kind in KINDS.items()}
             runs[node.namespace[1:]] = SimpleNamespace(node=node, topics=topics)
@@ -69,8 +69,8 @@ def both_runs(peer, diagnostics, tmp_path_factory):
             for topic in run.topics.values():
                 peer.stop_listening(topic)
             run.said = diagnostics.next(run.node)
-        runs['timer'].code = one.end(signal.SIGINT)
-        runs['thread'].code = two.end(signal.SIGTERM)
+        runs['plain'].code = one.end(signal.SIGINT)
+        runs['mounted'].code = two.end(signal.SIGTERM)
     for run in runs.values():
         run.log, run.metadata = log_of(the_log(run.node.folder))
     return runs
@@ -153,7 +153,7 @@ def test_joint_velocities_are_the_derivatives_of_the_positions(run):
 
 def test_the_accelerometer_at_the_pivot_reads_gravity(both_runs):
     """REP-145: +g along the vertical, whatever the motion, for nothing accelerates there."""
-    messages = both_runs['timer'].topics['ground_truth/imu'].messages()
+    messages = both_runs['plain'].topics['ground_truth/imu'].messages()
     q = np.array([xyzw(m.orientation) for m in messages])
     vertical = turned(conjugate(q), np.tile([0.0, 0.0, 1.0], (len(q), 1)))
     found = np.array([xyz(m.linear_acceleration) for m in messages])
@@ -162,13 +162,13 @@ def test_the_accelerometer_at_the_pivot_reads_gravity(both_runs):
 
 def test_the_accelerometer_on_the_body_reads_the_acceleration_of_its_place(both_runs):
     """Second differences of where the sensor is, plus gravity, in the sensor's frame."""
-    run = both_runs['thread']
+    run = both_runs['mounted']
     messages = gapless(run, 'ground_truth/imu')
     q_sensor = np.array([xyzw(m.orientation) for m in messages])
-    roll, pitch, yaw = (np.array(angle) for angle in RUNS['thread']['imu.rpy'])
+    roll, pitch, yaw = (np.array(angle) for angle in RUNS['mounted']['imu.rpy'])
     mounting = product(product(about_z(yaw), about_y(pitch)), about_x(roll))
     q_body = product(q_sensor, conjugate(np.tile(mounting, (len(q_sensor), 1))))
-    arm = np.tile(RUNS['thread']['imu.lever_arm'], (len(q_body), 1))
+    arm = np.tile(RUNS['mounted']['imu.lever_arm'], (len(q_body), 1))
     force = difference(turned(q_body, arm), 0.005, order=2) + np.array([0.0, 0.0, GRAVITY])
     expected = turned(conjugate(q_sensor[5:-5]), force)
     found = np.array([xyz(m.linear_acceleration) for m in messages])[5:-5]
@@ -177,9 +177,9 @@ def test_the_accelerometer_on_the_body_reads_the_acceleration_of_its_place(both_
 
 
 def test_the_attitude_of_the_mounted_sensor_is_that_of_the_body_and_the_mounting(both_runs):
-    run = both_runs['thread']
+    run = both_runs['mounted']
     common, (imus, poses) = in_common(run.topics['ground_truth/imu'], run.topics['pose'])
-    roll, pitch, yaw = (np.array(angle) for angle in RUNS['thread']['imu.rpy'])
+    roll, pitch, yaw = (np.array(angle) for angle in RUNS['mounted']['imu.rpy'])
     mounting = product(product(about_z(yaw), about_y(pitch)), about_x(roll))
     expected = product(np.array([xyzw(p.pose.orientation) for p in poses]),
                        np.tile(mounting, (len(common), 1)))
@@ -198,8 +198,8 @@ def test_a_perfect_sensor_reads_the_truth(run):
 
 
 def test_frames_are_those_of_the_parameters(both_runs):
-    for name, sensor, world, body in (('timer', 'imu_link', 'world', 'base_link'),
-                                      ('thread', 'sensor', 'map', 'wheel')):
+    for name, sensor, world, body in (('plain', 'imu_link', 'world', 'base_link'),
+                                      ('mounted', 'sensor', 'map', 'wheel')):
         topics = both_runs[name].topics
         assert {m.header.frame_id for m in topics['pose'].messages()} == {world}
         assert {m.header.frame_id for m in topics['imu/data_raw'].messages()} == {sensor}
@@ -250,7 +250,7 @@ def test_every_message_of_a_log_is_near_the_date(run):
 
 
 def test_two_nodes_in_two_namespaces_do_not_disturb_each_other(both_runs):
-    for name, other in (('timer', 'thread'), ('thread', 'timer')):
+    for name, other in (('plain', 'mounted'), ('mounted', 'plain')):
         topics = both_runs[name].log
         assert all(topic.startswith(f'/{name}/') for topic in topics), topics
         got = {bytes(data) for topic in both_runs[name].topics.values() for data in topic.raw}

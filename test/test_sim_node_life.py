@@ -25,6 +25,7 @@ from node_logs import (
     by_parameters,
     decoded,
     log_of,
+    settled,
     the_log,
 )
 from sensor_msgs.msg import JointState
@@ -40,7 +41,7 @@ from spinning_top_sim.nodes.sim_node import main
 from spinning_top_sim.nodes.simulator import Simulator
 ordinary, counts = Simulator._tick, []
 def tick(self):
-    ordinary(self)
+    wanted = ordinary(self)
     counts.append(None)
     if len(counts) in (1000, 3000):
         gc.collect()
@@ -48,6 +49,7 @@ def tick(self):
     if len(counts) == 3000:
         open('objects.json', 'w').write(json.dumps([counts[999], counts[2999]]))
         self._finish()
+    return wanted
 Simulator._tick = tick
 sys.exit(main())
 """
@@ -91,7 +93,7 @@ def test_the_duration_ends_the_run_and_its_last_sample_is_in_the_log(finished):
 
 
 def test_runs_of_the_same_parameters_are_the_same_bytes_but_for_stamps(finished):
-    """However often ticks come, and whatever paces them."""
+    """However often ticks come; `pacing` is accepted, and without effect."""
     logs = []
     for node in finished.nodes[:3]:
         log, _ = log_of(the_log(node.folder))
@@ -142,9 +144,8 @@ def test_what_a_scene_does_not_need_is_not_imported(finished):
         assert ('spinning_top_sim.recording.writer' in modules) == records
 
 
-@pytest.mark.parametrize('pacing', ['timer', 'thread'])
-def test_wake_ups_leave_no_objects_behind(tmp_path, pacing):
-    with SimNode(tmp_path, {**QUIET, 'pacing': pacing, 'tick_rate': 1000.0},
+def test_wake_ups_leave_no_objects_behind(tmp_path):
+    with SimNode(tmp_path, {**QUIET, 'tick_rate': 1000.0},
                  program=('-c', OBJECTS)) as node:
         assert_clean_end(node, node.wait())
     early, late = json.loads((node.folder / 'objects.json').read_text())
@@ -158,8 +159,8 @@ def test_the_default_scene_imports_just_what_it_uses(finished):
             if name.startswith('spinning_top_sim.') and name.count('.') == 2}
     assert ours == {
         *(f'nodes.{name}' for name in (
-            'executable', 'message_types', 'occasional', 'pacing', 'prompt', 'reports',
-            'ros_parameters', 'simulator')),
+            'executable', 'pacing', 'recording_session', 'reports', 'ros_parameters',
+            'simulator', 'tick_loop')), 'recording.errors',
         *(f'physics.{name}' for name in (
             'attitude', 'kinematics', 'pairs', 'regimes', 'shape', 'top')),
         *(f'solvers.{name}' for name in (
@@ -180,14 +181,14 @@ def test_the_default_scene_imports_just_what_it_uses(finished):
 ENDS = {'sigint': (signal.SIGINT, 1, 0.0), 'sigterm': (signal.SIGTERM, 1, 0.0),
         'twice at once': (signal.SIGINT, 2, 0.0), 'twice, 50 ms': (signal.SIGINT, 2, 0.05),
         'twice, 200 ms': (signal.SIGINT, 2, 0.2), 'term twice': (signal.SIGTERM, 2, 0.02),
-        'five times': (signal.SIGINT, 5, 0.01)}
+        'five times': (signal.SIGINT, 5, 0.01), 'sighup': (signal.SIGHUP, 1, 0.0),
+        'sigquit': (signal.SIGQUIT, 1, 0.0), 'hup and hup': (signal.SIGHUP, 2, 0.05)}
 
 
 @pytest.mark.parametrize('case', ENDS)
 def test_however_it_is_ended_the_log_is_whole(peer, tmp_path, case):
     number, times, gap = ENDS[case]
-    pacing = 'thread' if 'twice' in case else 'timer'
-    with SimNode(tmp_path, {'record.enabled': True, 'pacing': pacing}) as node:
+    with SimNode(tmp_path, {'record.enabled': True}) as node:
         pose = peer.listen(node.topic('pose'), PoseStamped).wait(20)
         code = node.end(number, times, gap)
         peer.stop_listening(pose)
@@ -335,6 +336,63 @@ def test_the_euler_form_at_a_pole_stands_still_and_says_why(peer, diagnostics, t
         assert_clean_end(node, node.end())
         peer.stop_listening(joints)
     assert 'leapt over a pole' in node.err
+
+
+# A method that raises as long as there is a file `broken`.
+BREAKABLE = """
+import importlib, os, sys
+from spinning_top_sim.nodes.sim_node import main
+module, kind, name = {method!r}.rsplit('.', 2)
+kind = getattr(importlib.import_module('spinning_top_sim.nodes.' + module), kind)
+ordinary = getattr(kind, name)
+def method(*arguments):
+    if os.path.exists('broken'):
+        raise ZeroDivisionError('nobody expected this')
+    return ordinary(*arguments)
+setattr(kind, name, method)
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize('method', [
+    'tick_loop.TickLoop.tick', 'tick_loop.TickLoop.idle', 'reports.MotionReport.diagnostics',
+    'reports.MotionReport.status_line', 'tick_loop.TickLoop.pause', 'tick_loop.TickLoop.command',
+    'simulator.Simulator._put_into_effect'])
+def test_an_error_that_nobody_expects_stops_the_motion_loudly_until_a_reset(
+        peer, diagnostics, tmp_path, method):
+    """In a tick, in idle work, in a report, in a service, in a topic, in a parameter's change."""
+    with SimNode(tmp_path, {'record.enabled': True, 'status_period': 0.2},
+                 program=('-c', BREAKABLE.format(method=method))) as node:
+        pose = peer.listen(node.topic('pose'), PoseStamped).wait(20)
+        if method.endswith('command'):
+            peer.introduce(node, diagnostics)
+        (node.folder / 'broken').touch()
+        if method.endswith('pause'):
+            answer = peer.switch(node, 'set_pause', True)
+            assert not answer.success and 'nobody expected this' in answer.message
+        elif method.endswith('command'):
+            peer.send_command(node, 1.0, 1.0)
+        elif method.endswith('effect'):
+            answer = peer.set_together(node, pose__rate=50.0)
+            assert not answer.successful and 'nobody expected this' in answer.reason
+        wait_for('an error', lambda: 'the motion stands still until ~/reset' in node.err)
+        (node.folder / 'broken').unlink()
+        status = diagnostics.wait_for(node, 'an error', lambda s: s.level == b'\x02')
+        assert 'unexpected ZeroDivisionError: nobody expected this' in status.message
+        wait_for('the status line', lambda: ' FAILED |' in node.out.splitlines()[-1])
+        count = settled(pose)
+        logged = [data for _, data in log_of(the_log(node.folder))[0][node.topic('pose')]]
+        assert_received_from(pose.raw, logged)
+        assert peer.trigger(node, 'reset').success
+        pose.wait(count + 50)
+        diagnostics.wait_for(node, 'the recording that ended', lambda s: 'recording: unexpected'
+                             in s.message)
+        assert peer.set_together(node, record__uri='second.mcap').successful is True
+        assert peer.switch(node, 'record', True).success
+        diagnostics.wait_for(node, 'no error', lambda s: s.level == b'\x00')
+        assert node.end() == 0, node.err
+        peer.stop_listening(pose)
+    log_of(node.folder / 'second.mcap')
 
 
 SMALL_FILES = """

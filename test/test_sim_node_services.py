@@ -2,6 +2,7 @@
 """The services of the running node, remapping, and clocks."""
 
 import math
+import re
 import time
 from types import SimpleNamespace
 
@@ -33,16 +34,14 @@ from rosbags.highlevel import AnyReader
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu
 
-from spinning_top_sim.nodes.occasional import OccasionalGroup
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.pipeline import Simulation
 
 
-@pytest.fixture(scope='module', params=['timer', 'thread'])
-def served(request, peer, tmp_path_factory):
+@pytest.fixture(scope='module')
+def served(peer, tmp_path_factory):
     folder = tmp_path_factory.mktemp('served')
-    with SimNode(folder, {**QUIET, 'pacing': request.param},
-                 namespace=f'/served_{request.param}') as node:
+    with SimNode(folder, QUIET, namespace='/served') as node:
         pose = peer.listen(node.topic('pose'), PoseStamped).wait(3)
         yield SimpleNamespace(node=node, pose=pose)
         assert_clean_end(node, node.end())
@@ -72,16 +71,24 @@ def test_a_pause_is_a_pause_and_a_resume_catches_nothing_up(peer, diagnostics, s
     assert_steps(stamps, PERIODS_NS['pose'], diagnostics.next(node)['skipped samples'])
 
 
+def time_in(answer):
+    """Return the simulated time that a service has answered [ns]."""
+    seconds, nanoseconds = re.search(r'at t = (\d+)\.(\d{9}) s', answer.message).groups()
+    return int(seconds) * SECOND + int(nanoseconds)
+
+
 def test_a_step_is_a_step(peer, diagnostics, served):
     node, pose = served.node, served.pose
     answer = peer.trigger(node, 'step')
     assert not answer.success
     assert 'paused' in answer.message
-    assert peer.switch(node, 'set_pause', True).success
+    paused_at = time_in(peer.switch(node, 'set_pause', True))
     assert peer.set_together(node, step__count=7, step__dt=0.03).successful
     count = settled(pose)
     for turn in range(1, 4):
-        assert peer.trigger(node, 'step').success
+        answer = peer.trigger(node, 'step')
+        assert answer.success
+        assert time_in(answer) == paused_at + turn * 210_000_000
         pose.wait(count + 21 * turn)
     assert settled(pose) == count + 63
     assert set(np.diff(stamps_of(pose)[count - 1:])) == {PERIODS_NS['pose']}
@@ -91,12 +98,14 @@ def test_a_step_is_a_step(peer, diagnostics, served):
 
 
 def test_an_endless_step_leaves_the_node_to_others(peer, served):
-    """A million steps of 1000 s: answered in time, or refused, and services and signals live."""
+    """A million steps of 1000 s: the answer says how far it came, and services live."""
     node = served.node
-    assert peer.switch(node, 'set_pause', True).success
+    paused_at = time_in(peer.switch(node, 'set_pause', True)) / 1e9
     assert peer.set_together(node, step__count=1_000_000, step__dt=1000.0).successful
     answer = peer.trigger(node, 'step')
-    assert not answer.success or 't = ' in answer.message
+    assert not answer.success
+    left = float(re.search(r'takes too long, (\S+) s are left', answer.message)[1])
+    assert time_in(answer) / 1e9 + left == pytest.approx(paused_at + 1e9, abs=2.0)     # 9 digits
     assert peer.set_together(node, step__count=1, step__dt=0.01).successful
     assert peer.trigger(node, 'reset').success
     assert peer.switch(node, 'set_pause', False).success
@@ -200,10 +209,8 @@ def test_remapping_and_qos_overrides_work(peer, tmp_path):
     assert offered['/ns/imu/data_raw'].depth == 3
 
 
-@pytest.mark.parametrize('pacing', ['timer', 'thread'])
-def test_a_subscription_with_another_qos_is_warned_about(peer, tmp_path, pacing):
-    """The publishers' events are looked at now and then only, but they are."""
-    with SimNode(tmp_path, {**QUIET, 'pacing': pacing}) as node:
+def test_a_subscription_with_another_qos_is_warned_about(peer, tmp_path):
+    with SimNode(tmp_path, QUIET) as node:
         topic = node.topic('pose')
         subscription = peer.node.create_subscription(
             PoseStamped, topic, lambda _: None, QoSProfile(
@@ -212,14 +219,6 @@ def test_a_subscription_with_another_qos_is_warned_about(peer, tmp_path, pacing)
         assert "on topic 'pose'" in node.err + node.out
         assert_clean_end(node, node.end())
         assert subscription.topic_name == topic
-
-
-def test_publishers_events_are_left_out_of_the_wait_set_but_for_a_moment():
-    group = OccasionalGroup()
-    assert not group.can_execute(None)
-    group.open()
-    assert group.can_execute(None)
-    wait_for('the end of the moment', lambda: not group.can_execute(None))
 
 
 def test_a_dump_of_the_parameters_makes_the_same_run(peer, tmp_path):

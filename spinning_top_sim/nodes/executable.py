@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How every node of ours runs: start, spin, and end properly whichever way it is asked to."""
+"""What the executables of nodes share: start, spin, and end properly on every signal."""
 
 from __future__ import annotations
 
@@ -14,14 +14,22 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from rclpy.context import Context
+    from rclpy.executors import Executor
     from rclpy.task import Future
+
+# Longest wait of the executor [s]: Python answers SIGHUP and SIGQUIT between two waits.
+SPIN_S = 0.2
 
 
 class RunnableNode(Protocol):
     """
-    A node as `run` needs it, besides what rclpy wants.
+    A node as `run` needs it.
 
-    finished: completes when the node ends by itself, with its exit code (None is 0)
+    Attributes
+    ----------
+    finished : rclpy.task.Future
+        Completes when the node ends by itself, with its exit code (None is 0).
+
     """
 
     finished: Future
@@ -36,50 +44,62 @@ class RunnableNode(Protocol):
     def destroy_node(self) -> None: ...
 
 
-class _InterruptOnce:
+class _Signals:
     """
     Raises KeyboardInterrupt at the first SIGINT only, and not once `told` is set.
 
-    A launched node is told twice, by the terminal and by launch, and the second one would come in
-    the midst of ending properly.  Where SIGINT is ignored (nohup), it stays so.
+    A launched node is told twice, by the terminal and by launch, and the second signal would
+    interrupt the end of the node.  SIGHUP and SIGQUIT end a node as SIGTERM does.  A signal that
+    is ignored, as by nohup, stays so.
     """
 
     def __init__(self) -> None:
         self.told = False
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            signal.signal(signal.SIGINT, self)
+            signal.signal(signal.SIGINT, self._interrupt)
+        for number in (signal.SIGHUP, signal.SIGQUIT):
+            if signal.getsignal(number) is signal.SIG_DFL:
+                signal.signal(number, lambda *_: signal.raise_signal(signal.SIGTERM))
 
-    def __call__(self, number: int, frame: FrameType | None) -> None:
+    def _interrupt(self, number: int, frame: FrameType | None) -> None:
         if not self.told:
             self.told = True
             raise KeyboardInterrupt
 
     def off(self) -> None:
-        """Ignore every SIGINT from now on, also while the interpreter ends."""
+        """Ignore these signals from now on, also while the interpreter ends."""
         self.told = True
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
+            signal.signal(number, signal.SIG_IGN)
 
 
 def run(name: str, argv: list[str],
         prepare: Callable[[list[str]], Callable[[], RunnableNode] | None]) -> int:
     """
-    Run a node; return 0 after an ordinary end, 2 for what could not be started.
+    Run a node; return 0 after an ordinary end, 2 if it cannot be started.
 
-    prepare: gets the arguments before ROS does; returns what makes the node, or None when there is
-    nothing to run.  It and what it returns may raise ValueError, RuntimeError or OSError, whose
-    text is shown.
+    Parameters
+    ----------
+    name
+        Of the executable, for messages.
+    argv
+        Arguments, with those for ROS.
+    prepare
+        Takes the arguments; returns a function that makes the node, or None if there is nothing to
+        run.  Both may raise ValueError, RuntimeError or OSError, whose text is shown.
+
     """
-    interrupt = _InterruptOnce()
+    signals = _Signals()
     try:
         try:
             make_node = prepare(argv)
         except (ValueError, RuntimeError, OSError) as error:
             return _cannot_start(name, error)
-        return 0 if make_node is None else _run(name, argv, make_node, interrupt)
+        return 0 if make_node is None else _run(name, argv, make_node, signals)
     except KeyboardInterrupt:           # before the node was there
         return 130
     except ImportError:                 # what rclpy makes of one in the midst of its own import
-        if interrupt.told:
+        if signals.told:
             return 130
         raise
 
@@ -91,13 +111,21 @@ def _cannot_start(name: str, error: Exception) -> int:
     return 2
 
 
+def _executor() -> Executor:
+    """Return the executor that takes least processor time of those that rclpy has here."""
+    try:
+        from rclpy.experimental import EventsExecutor  # noqa: PLC0415
+    except ImportError:
+        from rclpy.executors import SingleThreadedExecutor  # noqa: PLC0415
+        return SingleThreadedExecutor()
+    return EventsExecutor()
+
+
 def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode],
-         interrupt: _InterruptOnce) -> int:
+         signals: _Signals) -> int:
     import rclpy  # noqa: PLC0415 - so that Ctrl-C while rclpy is imported ends quietly too
     from rclpy.exceptions import ParameterException  # noqa: PLC0415
     from rclpy.executors import ExternalShutdownException  # noqa: PLC0415
-
-    from spinning_top_sim.nodes.prompt import PromptExecutor  # noqa: PLC0415
 
     try:
         rclpy.init(args=argv)
@@ -109,8 +137,9 @@ def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode],
             node = make_node()
         except (ValueError, RuntimeError, OSError, ParameterException) as error:
             return _cannot_start(name, error) if rclpy.ok() else 0
-        executor = PromptExecutor()
+        executor = _executor()
         executor.add_node(node)
+        node.finished.add_done_callback(lambda _: executor.wake())
         gc.collect()
         gc.freeze()             # what there is now stays: no full collection in the middle of it
         # Which waits until there is a quarter more than the one before has found: of nothing now,
@@ -118,8 +147,10 @@ def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode],
         gc.collect()
         node.start()
         # rclpy ends the spin at any signal; an exception in the midst of its code only does harm.
-        interrupt.told = True
-        executor.run_until(node.finished)
+        signals.told = True
+        # Without a timeout, the EventsExecutor of Jazzy hangs.
+        while rclpy.ok() and not node.finished.done():
+            executor.spin_once(SPIN_S)
         if node.finished.done():
             return node.finished.result() or 0
     except (KeyboardInterrupt, ExternalShutdownException):
@@ -129,10 +160,10 @@ def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode],
         if rclpy.ok():
             raise
     finally:
-        interrupt.off()
+        signals.off()
         if node is not None:
             node.stop()
             node.destroy_node()
         rclpy.try_shutdown()
-        interrupt.off()                 # rclpy has put back the handler that it had found
+        signals.off()                 # rclpy has put back the handler that it had found
     return 0

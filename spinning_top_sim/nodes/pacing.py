@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which simulated time it should be by now, and a thread that asks at absolute deadlines."""
+"""Clocks, and the thread that calls a function at absolute deadlines."""
 
 from __future__ import annotations
 
@@ -10,15 +10,20 @@ from collections.abc import Callable
 
 class SimulatedClock:
     """
-    Maps a running clock to simulated time, so that a late look loses nothing.
+    Maps a source clock to simulated time: scale times as fast, with pauses.
 
-    source: returns nanoseconds of the clock to follow (steady, or ROS time);  scale: simulated
-    over real time.  Does not run before `start`.
+    Parameters
+    ----------
+    source
+        Returns the time of the clock to follow [ns].
+    scale
+        Simulated over source time.
+
     """
 
     def __init__(self, source: Callable[[], int], scale: float) -> None:
         self._source, self._scale = source, scale
-        self._from_source: int | None = None
+        self._from_source: int | None = None        # None: the clock stands
         self._from_simulated = 0
 
     @property
@@ -26,42 +31,50 @@ class SimulatedClock:
         """Whether time passes."""
         return self._from_source is not None
 
+    def set_scale(self, scale: float) -> None:
+        """Go on from the present time at another speed."""
+        now_ns, running = self.now(), self.running
+        self._scale = scale
+        self.stop(now_ns)
+        if running:
+            self.start(now_ns)
+
     def start(self, simulated_ns: int) -> None:
         """Run from this simulated time on."""
         self._from_source, self._from_simulated = self._source(), simulated_ns
 
     def stop(self, at_ns: int | None = None) -> None:
-        """Stand still: a pause, here or at this simulated time."""
+        """Stand at this simulated time, or at the present one."""
         self._from_simulated = self.now() if at_ns is None else at_ns
         self._from_source = None
 
     def now(self) -> int:
-        """Return the simulated time that is due [ns]."""
+        """Return the simulated time [ns]."""
         if self._from_source is None:
             return self._from_simulated
-        elapsed = self._source() - self._from_source
-        return self._from_simulated + int(elapsed * self._scale)
+        return self._from_simulated + int((self._source() - self._from_source) * self._scale)
 
     def when(self, simulated_ns: int) -> int | None:
-        """Return at what time of the source it will be this simulated time; None: it stands."""
+        """Return the source's time of a simulated time [ns]; None while the clock stands."""
         if self._from_source is None:
             return None
         return self._from_source + round((simulated_ns - self._from_simulated) / self._scale)
 
-    def set_scale(self, scale: float) -> None:
-        """Go on from now at another speed."""
-        now = self.now()
-        self._scale = scale
-        self._from_simulated = now
-        if self.running:
-            self.start(now)
 
-
-class Onward:
+class MonotonicClock:
     """
-    The readings of a clock less the steps back that it takes: a log that is played anew.
+    Follows a clock and leaves out its steps back, as of the /clock of a log played in a loop.
 
-    source: returns nanoseconds;  stepped_back_ns: by how much it has gone back, all together
+    Parameters
+    ----------
+    source
+        Returns the time of the clock to follow [ns].
+
+    Attributes
+    ----------
+    stepped_back_ns : int
+        Sum of all steps back [ns].
+
     """
 
     def __init__(self, source: Callable[[], int]) -> None:
@@ -77,31 +90,66 @@ class Onward:
         return reading + self.stepped_back_ns
 
 
+class FairLock:
+    """
+    A reentrant lock that threads get in the order in which they ask for it.
+
+    A thread that takes an ordinary lock again and again leaves the others no turn.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._queue = threading.Lock()      # held by the thread that is next
+        self._owner: int | None = None
+        self._depth = 0
+
+    def __enter__(self) -> None:
+        this = threading.get_ident()
+        if self._owner != this:
+            with self._queue:
+                self._lock.acquire()
+            self._owner = this
+        self._depth += 1
+
+    def __exit__(self, *_: object) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            self._owner = None
+            self._lock.release()
+
+
 class DeadlineThread(threading.Thread):
     """
-    Calls `tick` at absolute deadlines, rate times a second, until it is stopped.
+    Calls a function at absolute deadlines until it is stopped.
 
-    tick: returns whether `spare` shall be called before the next one
+    A tick that comes late comes at once.  Deadlines that have passed meanwhile are skipped, and
+    the grid of deadlines stays.  A sleeping thread wakes up at less processor time than an rclpy
+    timer (`python benchmark/wake_up.py`).
 
-    A sleeping thread wakes up at half the processor time of a wait set with services and
-    subscriptions (`python benchmark/wake_up.py`): worth it from 500 Hz on.  Who comes late ticks
-    at once, and deadlines that have passed meanwhile are skipped, not made up for; the grid of
-    deadlines stays.
+    Parameters
+    ----------
+    tick
+        Called at each deadline; returns whether `idle` is called before the next one.
+    rate
+        Deadlines per second [Hz].
+    idle
+        Does what is left to do between two ticks.
+
     """
 
-    # Looked at this often while waiting for a far deadline, so that `stop` is quick.
+    # Longest sleep [s], so that `stop` is quick.
     LONGEST_SLEEP = 0.05
-    # `spare` is called after this share of the period: whom the tick has woken is often put on
-    # the same core, because its waker will sleep soon, and waits for that.  At high rates there is
-    # no time for it.
+    # `idle` is called after this share of the period: a thread woken by the tick is often put on
+    # the same core, because its waker will sleep soon.  At high rates there is no time for that.
     NAP = 0.15
     SHORTEST_NAP = 1e-4
 
     def __init__(self, tick: Callable[[], object], rate: float,
-                 spare: Callable[[], None] = lambda: None, *, name: str = 'simulation') -> None:
+                 idle: Callable[[], None] = lambda: None, *, name: str = 'simulation') -> None:
         super().__init__(name=name, daemon=True)
-        self._tick, self._spare = tick, spare
+        self._tick, self._idle = tick, idle
         self._stopped = False
+        # Origin and period [s].  Another thread may replace it at any time.
         self._grid = time.monotonic(), 1.0 / rate
 
     def set_rate(self, rate: float) -> None:
@@ -109,16 +157,16 @@ class DeadlineThread(threading.Thread):
         self._grid = self._grid[0], 1.0 / rate
 
     def align(self, origin: float) -> None:
-        """Have deadlines at whole periods from this time on the monotonic clock [s]."""
+        """Put deadlines at whole periods from this time of the monotonic clock [s]."""
         self._grid = origin, self._grid[1]
 
     def run(self) -> None:
         grid: tuple[float, float] | None = None
         newest = 0
         while not self._stopped:
-            before, grid = grid, self._grid     # which another thread may change at any time
+            before, grid = grid, self._grid
             origin, period = grid
-            passed = int((time.monotonic() - origin) // period)     # the deadline before now
+            passed = int((time.monotonic() - origin) // period)     # the newest deadline
             if grid is not before:
                 newest = passed
             if passed <= newest:
@@ -132,10 +180,10 @@ class DeadlineThread(threading.Thread):
                 nap = min(self.NAP * period, self.LONGEST_SLEEP)
                 if nap >= self.SHORTEST_NAP:
                     time.sleep(nap)
-                self._spare()
+                self._idle()
 
     def stop(self) -> None:
         """Ask the thread to end, and wait for it."""
         self._stopped = True
-        if self is not threading.current_thread():
+        if self.is_alive() and self is not threading.current_thread():
             self.join(5.0)

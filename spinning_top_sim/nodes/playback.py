@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded messages at their recorded distances: reading ahead, rounds, and the moment to send."""
+"""Recorded messages with their recorded spacing: reading ahead, rounds, and when to send."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 
-from spinning_top_sim.nodes.pacing import SimulatedClock
+from spinning_top_sim.nodes.pacing import FairLock, SimulatedClock
 
 Message = tuple[int, int, bytes]    # time [ns], which publisher, CDR
 
@@ -25,11 +25,19 @@ BATCH_MESSAGES = 512
 BATCHES = 16
 
 
-def rounds(read: Callable[[], Iterable[Message]], length_ns: int, loop: bool) -> Iterator[Message]:
+def rounds(read: Callable[[], Iterable[Message]], span_ns: int, loop: bool) -> Iterator[Message]:
     """
     Yield the messages once, or again and again with times that go on.
 
-    read: returns the messages of one round;  length_ns: from the first round's begin to the next's
+    Parameters
+    ----------
+    read
+        Returns the messages of one round.
+    span_ns
+        Length of a round [ns]; the next one begins ROUND_GAP_NS later.
+    loop
+        Whether there is a next round.
+
     """
     shift = 0
     while True:
@@ -39,15 +47,15 @@ def rounds(read: Callable[[], Iterable[Message]], length_ns: int, loop: bool) ->
             yield at_ns + shift, index, data
         if empty or not loop:
             return
-        shift += length_ns
+        shift += span_ns + ROUND_GAP_NS
 
 
 class ReadAhead:
     """
     Iterates over messages that a thread reads ahead, a bounded number of them.
 
-    Reading takes a while whenever a chunk begins; whoever waits for deadlines should not do it.
-    What the reading raises is raised here, in its place.
+    Reading takes a while whenever a chunk begins, so the thread that waits for deadlines does not
+    read.  An error of the reading is raised after the messages before it.
     """
 
     _END = object()
@@ -71,7 +79,7 @@ class ReadAhead:
     def stop(self) -> None:
         """End both the reading and the iterating."""
         self._stopped = True
-        # Whichever of the two waits for the other finds something: room, and the end.
+        # The thread that reads may wait for room, and the one that iterates for a batch.
         with contextlib.suppress(queue.Empty):
             while True:
                 self._batches.get_nowait()
@@ -81,9 +89,10 @@ class ReadAhead:
             self._thread.join(1.0)
 
     def _read(self) -> None:
+        batch: list[Message] = []
+        size = 0
+        last: object = self._END
         try:
-            batch: list[Message] = []
-            size = 0
             for message in self._messages:
                 batch.append(message)
                 size += len(message[2])
@@ -92,24 +101,36 @@ class ReadAhead:
                     batch, size = [], 0
                 if self._stopped:
                     return
-            self._batches.put(batch)
-            self._batches.put(self._END)
         except Exception as error:
-            self._batches.put(error)
+            last = error
+        self._batches.put(batch)
+        self._batches.put(last)
 
 
 class Playback:
     """
-    Sends messages when their time has come by a clock that can stand still and change its rate.
+    Sends messages at their times, by a clock that can be paused and change its rate.
 
-    A deadline is computed from the clock alone, never from the one before, so nothing drifts.
-    What is due together is sent together; what is late is sent at once and counted, not dropped.
+    Each deadline is computed from the clock, never from the one before, so nothing drifts.  A
+    late message is sent at once and counted, not dropped.
 
-    messages: in the order of their times;  begin_ns: time at which the clock starts
-    send: called with (which publisher, CDR)
-    source, sleep: steady time [ns], and what waits that many seconds (None: until told), or less
+    Parameters
+    ----------
+    messages
+        In the order of their times.
+    begin_ns, rate
+        Time at which the clock starts [ns], and its speed.
+    send
+        Takes the index of a publisher, and CDR.
+    source, sleep
+        Returns steady time [ns]; waits at most so many seconds (None: until woken).
 
-    sent, late: counts;  paused: whether the clock stands
+    Attributes
+    ----------
+    sent, late : int
+        Counts of messages.
+    paused : bool
+
     """
 
     def __init__(self, messages: Iterable[Message], begin_ns: int, rate: float,
@@ -121,12 +142,10 @@ class Playback:
         self._clock.stop(begin_ns)
         self._begun = False
         self._stopped = False
-        self._known_until = begin_ns        # no message of before this is still to be sent
+        self._known_until = begin_ns        # all messages before this time are sent
         self._wake = threading.Event()
         self._sleep = sleep or self._sleep_until_told
-        self._lock = threading.Lock()       # the clock, and sending
-        # Held while waiting for the lock, so that who plays without a rest leaves it to others.
-        self._turnstile = threading.Lock()
+        self._lock = FairLock()             # the clock, and sending
         self.paused = paused
         self.sent = self.late = 0
 
@@ -143,12 +162,12 @@ class Playback:
                 return
 
     def now(self) -> int:
-        """Return the time of the messages [ns]: all of before are sent."""
+        """Return the time up to which all messages are sent [ns]."""
         with self._control():
             return min(self._clock.now(), self._known_until)
 
     def pause(self, paused: bool) -> None:
-        """Stand still, or go on as if no time had passed; no message is sent after the return."""
+        """Pause, or go on without catching up; once paused, no message is sent any more."""
         with self._control():
             self.paused = paused
             self._run_clock()
@@ -164,7 +183,7 @@ class Playback:
             self._stopped = True
 
     def rest(self, seconds: float) -> bool:
-        """Wait before or after playing; return whether nobody said stop."""
+        """Wait before or after playing; return False once stopped."""
         self._sleep(seconds)
         return not self._stopped
 
@@ -178,8 +197,6 @@ class Playback:
     def _send_when_due(self, at_ns: int, index: int, data: bytes) -> bool:
         """Send a message when its time has come; return False when stopped before."""
         while True:
-            with self._turnstile:
-                pass
             with self._lock:
                 if self._stopped:
                     return False
@@ -194,7 +211,7 @@ class Playback:
 
     @contextlib.contextmanager
     def _control(self) -> Iterator[None]:
-        with self._turnstile, self._lock:
+        with self._lock:
             yield
         self._wake.set()
 

@@ -50,18 +50,13 @@ def main(argv: list[str] | None = None) -> int:
 def _prepare(argv: list[str]) -> Callable[[], Replayer]:
     from rclpy.utilities import remove_ros_args  # noqa: PLC0415
 
-    arguments = _parser().parse_args(remove_ros_args(argv)[1:])
-
-    log = _open(arguments.file, partial=arguments.partial)
+    options = vars(_parser().parse_args(remove_ros_args(argv)[1:]))
+    log = _open(options.pop('file'), partial=options['partial'])
 
     def make_node() -> Replayer:
         from spinning_top_sim.nodes.replayer import Options, Replayer  # noqa: PLC0415
 
-        return Replayer(log, Options(
-            rate=arguments.rate, loop=arguments.loop, start=arguments.start,
-            topics=tuple(arguments.topics), clock=arguments.clock,
-            partial=arguments.partial, paused=arguments.start_paused, delay=arguments.delay,
-            subscribers=arguments.wait_for_subscribers))
+        return Replayer(log, Options(**options))
 
     return make_node
 

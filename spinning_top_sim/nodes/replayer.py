@@ -3,12 +3,16 @@
 
 from __future__ import annotations
 
+import importlib
 import math
+import os
+import re
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
@@ -28,11 +32,11 @@ from rclpy.qos import (
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.task import Future
 from rclpy.time import Time
+from rclpy.type_support import check_is_valid_msg_type
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes import reports
-from spinning_top_sim.nodes.message_types import message_type
 from spinning_top_sim.nodes.pacing import DeadlineThread
 from spinning_top_sim.nodes.playback import ROUND_GAP_NS, Message, Playback, ReadAhead, rounds
 from spinning_top_sim.recording.errors import DefinitionNotFoundError
@@ -41,6 +45,10 @@ from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
 from spinning_top_sim.recording.schemas import find_definition
 
 NANOSECONDS = 1_000_000_000
+# REP-144 and the ROS 2 interface names.
+TYPE_NAME = re.compile(
+    r'(?P<package>[a-z][a-z0-9_]*)/((?P<folder>msg|srv|action)/)?(?P<name>[A-Z][A-Za-z0-9_]*)')
+AMENT_INDEX = 'share/ament_index/resource_index/packages'
 SLOWEST, FASTEST = 1e-6, 1e9
 # Policies that tell nothing, and that no publisher can offer.
 UNKNOWN = {
@@ -49,44 +57,45 @@ UNKNOWN = {
     'durability': {QoSDurabilityPolicy.UNKNOWN},
     'liveliness': {QoSLivelinessPolicy.UNKNOWN},
 }
-# How long the last messages may take to reach those who listen: Fast DDS asks every 3 s whether
-# they have.
+# Longest wait for the last messages to be acknowledged: Fast DDS asks for it every 3 s.
 LAST_WORD_S = 5.0
-# How long they have where nothing is acknowledged: shared memory goes with its sender.
+# Wait for subscribers that acknowledge nothing: shared memory goes with its sender.
 UNACKNOWLEDGED_S = 0.3
-# How often subscribers are counted while waiting for them, and stops are looked for.
+# How often subscribers are counted, and stops looked for, while waiting.
 LOOK_S = 0.02
-# A thread that wants to send gets Python's lock this soon from the one that reads ahead.
+# The thread that sends gets Python's lock this soon from the one that reads ahead.
 SWITCH_INTERVAL_S = 0.0005
 
 
 @dataclass(frozen=True)
 class Options:
-    """
-    What to play and how.
+    """What to play and how; see the options of `replay_node`."""
 
-    rate: None where the parameter decides;  start: from the log's begin [s];  topics: recorded
-    names, none for all;  clock: rate of /clock [Hz], 0 for none;  partial: whether damage is all
-    right;  delay: before the first message [s];  subscribers: how many to wait for
-    """
-
-    rate: float | None = None
+    rate: float | None = None           # None: the parameter decides
     loop: bool = False
-    start: float = 0.0
-    topics: tuple[str, ...] = ()
-    clock: float = 0.0
-    partial: bool = False
-    paused: bool = False
-    delay: float = 0.0
-    subscribers: int = 0
+    start: float = 0.0                  # after the begin of the log [s]
+    topics: Sequence[str] = ()          # by their recorded names; none: all
+    clock: float = 0.0                  # rate of /clock [Hz]; 0: none
+    partial: bool = False               # whether a damaged log is played in part
+    start_paused: bool = False
+    delay: float = 0.0                  # before the first message [s]
+    wait_for_subscribers: int = 0
 
 
 class Replayer(Node):
     """
-    Plays a log once it is started.
+    The node: plays a log once it is started.
 
-    finished: completes with the exit code when all is played.  Construct, `start`, spin, `stop`.
-    Raises ValueError for what cannot be played at all.
+    Attributes
+    ----------
+    finished : rclpy.task.Future
+        Completes with the exit code when all is played.
+
+    Raises
+    ------
+    ValueError
+        If the log cannot be played at all.
+
     """
 
     def __init__(self, log: LogReader, options: Options) -> None:
@@ -101,7 +110,7 @@ class Replayer(Node):
         if self._begin_ns > self._end_ns:
             raise ValueError(f'--start {options.start:g}: the log lasts '
                              f'{(self._end_ns - self._log_begin_ns) / NANOSECONDS:.3f} s')
-        self._length_ns = self._end_ns - self._begin_ns + ROUND_GAP_NS
+        self._span_ns = self._end_ns - self._begin_ns
         self._outputs: dict[int, Publisher] = {}        # by channel
         self._open_publishers()
         self._ahead: ReadAhead | None = None
@@ -141,7 +150,7 @@ class Replayer(Node):
     # -------------------------------------------------------------------------- publishers
 
     def _open_publishers(self) -> None:
-        """Have a publisher for every topic that is wanted and can be published; name the rest."""
+        """Make a publisher for every topic to be played; warn of those that cannot be played."""
         wanted = set(self._options.topics)
         there = {topic.name for topic in self._log.topics}
         if wanted and not wanted & there:
@@ -164,13 +173,13 @@ class Replayer(Node):
                 self._outputs.update((channel.channel_id, publisher) for channel in alike)
 
     def _publisher(self, channels: list[LogTopic]) -> Publisher:
-        """Return what publishes channels of one name and type; or raise LookupError."""
+        """Return a publisher for channels of one name and type, or raise LookupError."""
         topic = channels[0]
         if topic.name == '/clock' and self._options.clock:
             raise LookupError('--clock publishes another /clock')
         if topic.encoding != 'cdr':
             raise LookupError(f'its messages are encoded as {topic.encoding!r}, not as CDR')
-        kind = message_type(topic.type_name)
+        kind = message_class(topic.type_name)
         self._compare_types(topic)
         profiles = [profile for channel in channels for profile in channel.qos]
         return self.create_publisher(
@@ -188,7 +197,7 @@ class Replayer(Node):
                 'who listens may misread it')
 
     def _profile(self, name: str, profiles: list[Mapping[str, Any]]) -> QoSProfile:
-        """Return the QoS that was recorded; what publishers did not agree on is as usual."""
+        """Return the recorded QoS; the default where publishers had different ones."""
         if any(profile != profiles[0] for profile in profiles):
             self.get_logger().warning(f'{name} was recorded from publishers with different QoS: '
                                       'published as reliable, volatile')
@@ -207,11 +216,11 @@ class Replayer(Node):
         """Begin to play, after what the options say to wait for."""
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         self._ahead = ReadAhead(
-            rounds(self._messages, self._length_ns, self._options.loop))
+            rounds(self._messages, self._span_ns, self._options.loop))
         publish = {index: publisher.publish for index, publisher in self._outputs.items()}
         self._playback = Playback(self._ahead, self._begin_ns, self._rate,
                                   lambda index, data: publish[index](data),
-                                  paused=self._options.paused)
+                                  paused=self._options.start_paused)
         if self._options.clock:
             self._clock_thread = DeadlineThread(self._publish_clock, self._options.clock,
                                                 name='clock')
@@ -231,7 +240,7 @@ class Replayer(Node):
         self._terminal.end()
 
     def _play(self) -> None:
-        """Do it all, in a thread beside the one that serves."""
+        """Play all; the body of a thread beside the executor's."""
         code = 0
         try:
             if self._wait_to_begin():
@@ -240,12 +249,20 @@ class Replayer(Node):
             if self._tell_damage():
                 code = 2
         except Exception as error:
-            if not self.context.ok():       # publishing fails once the context is down
-                return
-            self.get_logger().error(f'cannot be played any further: {error}')
-            code = 2
+            self._fail(error)
+            return
         if self.context.ok():
             self._terminal.tell(self._summary())
+            self._finish(code)
+
+    def _fail(self, error: Exception) -> None:
+        if self.context.ok():               # publishing fails once the context is down
+            self.get_logger().error(f'cannot be played any further: {error}')
+            self._terminal.tell(self._summary())
+            self._finish(2)
+
+    def _finish(self, code: int) -> None:
+        if not self.finished.done():
             self.finished.set_result(code)
 
     def _messages(self) -> Iterator[Message]:
@@ -257,7 +274,7 @@ class Replayer(Node):
                 yield message.log_time, message.channel_id, message.data
 
     def _tell_damage(self) -> bool:
-        """Return whether a piece was found damaged that nobody knew of; say so once."""
+        """Return whether messages are missing unexpectedly; say so once."""
         damaged = self._log.left_out > 0 and not self._options.partial
         if damaged and not self._told_damage:
             self._told_damage = True
@@ -268,7 +285,7 @@ class Replayer(Node):
     def _wait_to_begin(self) -> bool:
         """Wait for subscribers and the delay; return False when stopped meanwhile."""
         begin = time.monotonic() + self._options.delay
-        while (time.monotonic() < begin or self._subscribers() < self._options.subscribers):
+        while (time.monotonic() < begin or self._subscribers() < self._options.wait_for_subscribers):
             if not self._playback.rest(LOOK_S):
                 return False
         return True
@@ -278,7 +295,7 @@ class Replayer(Node):
         return sum(publisher.get_subscription_count() for publisher in publishers)
 
     def _wait_for_delivery(self) -> None:
-        """Wait until all who listen have the last messages, or too long."""
+        """Wait until all subscribers have the last messages, or for too long."""
         heard = [publisher for publisher in set(self._outputs.values())
                  if publisher.get_subscription_count()]
         now = time.monotonic()
@@ -295,11 +312,10 @@ class Replayer(Node):
         try:
             message = ClockMessage(clock=Time(nanoseconds=self._playback.now()).to_msg())
             self._clock_publishers[0].publish(message)
-        except Exception:
-            if self.context.ok():
-                raise
+        except Exception as error:
+            self._fail(error)
 
-    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> Any:
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._playback.pause(request.data)
         response.success = True
         response.message = f'{"paused" if request.data else "playing"} at {self._position()}'
@@ -309,9 +325,9 @@ class Replayer(Node):
 
     def _position(self) -> str:
         passed = self._playback.now() - self._begin_ns
-        number, within = divmod(passed, self._length_ns)
+        number, within = divmod(passed, self._span_ns + ROUND_GAP_NS)
         span = self._end_ns - self._log_begin_ns
-        at = min(within, self._end_ns - self._begin_ns) + self._begin_ns - self._log_begin_ns
+        at = min(within, self._span_ns) + self._begin_ns - self._log_begin_ns
         percent = 100.0 * at / span if span else 100.0
         which = f' of round {number + 1}' if self._options.loop else ''
         return (f'{at / NANOSECONDS:.2f} of {span / NANOSECONDS:.2f} s, {percent:.0f} %{which}')
@@ -331,7 +347,40 @@ class Replayer(Node):
         return f'played {playback.sent} messages on {topics} topics{late}'
 
 
-def _checked_rate(value: Any) -> float:
+def message_class(type_name: str) -> type:
+    """
+    Return the class of a message type that a log names.
+
+    Parameters
+    ----------
+    type_name
+        Such as 'geometry_msgs/msg/Pose' ('msg' may be left out).
+
+    Raises
+    ------
+    LookupError
+        If it is no message type of an installed ROS package.  No other module is ever imported.
+
+    """
+    match = TYPE_NAME.fullmatch(type_name)
+    if match is None:
+        raise LookupError(f'{type_name!r} is not the name of a message type')
+    package, folder, name = match['package'], match['folder'] or 'msg', match['name']
+    prefixes = [*filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)),
+                sys.prefix]
+    if not any(Path(prefix, AMENT_INDEX, package).is_file() for prefix in prefixes):
+        raise LookupError(f'{type_name} is not installed')
+    try:
+        found: type = getattr(importlib.import_module(f'{package}.{folder}'), name)
+        check_is_valid_msg_type(found)
+    except (ImportError, AttributeError) as error:
+        raise LookupError(f'{type_name} is not installed') from error
+    except RuntimeError as error:
+        raise LookupError(f'{type_name} is no message type') from error
+    return found
+
+
+def _checked_rate(value: object) -> float:
     """Return a rate as a float.  Raises ValueError saying what is allowed."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) \
             or not math.isfinite(value) or not SLOWEST <= value <= FASTEST:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the node says about itself: /diagnostics, and the status line on the terminal."""
+"""What the nodes say about themselves: /diagnostics, and the status line on the terminal."""
 
 from __future__ import annotations
 
@@ -7,68 +7,147 @@ import math
 import os
 import sys
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from spinning_top_sim.streams.cdr import NANOSECONDS
 
-@dataclass
-class Counters:
-    """Counts since the start."""
+if TYPE_CHECKING:
+    from spinning_top_sim.nodes.recording_session import RecordingSession
+    from spinning_top_sim.nodes.tick_loop import TickLoop
+    from spinning_top_sim.streams.pipeline import Simulation
 
-    late_ticks: int = 0
-    skipped_ticks: int = 0
-    commands: int = 0
-    rejected_commands: int = 0
-    slipped_ns: int = 0
+OK, WARN, ERROR = 0, 1, 2
 
 
 class Speedometer:
-    """Simulated over real time since it was last read."""
+    """Measures the real-time factor, simulated over real time between two readings."""
+
+    # Reports that were held up follow each other at once: less time than this [s] is not measured.
+    SHORTEST = 0.1
 
     def __init__(self) -> None:
-        self._real, self._simulated = time.monotonic(), 0
+        self.begin(0)
+
+    def begin(self, simulated_ns: int) -> None:
+        """Measure from here on, as after a reset."""
+        self._real, self._simulated = time.monotonic(), simulated_ns
+        self.factor = 0.0
 
     def read(self, simulated_ns: int) -> float:
-        """Return the factor, and begin anew from here (also after a reset)."""
-        real = time.monotonic()
-        elapsed, advanced = real - self._real, simulated_ns - self._simulated
-        self._real, self._simulated = real, simulated_ns
-        return max(0.0, advanced / 1e9 / elapsed) if elapsed > 0.0 else 0.0
+        """Return the factor since the reading before."""
+        elapsed, advanced = time.monotonic() - self._real, simulated_ns - self._simulated
+        if elapsed >= self.SHORTEST:
+            self.begin(simulated_ns)
+            self.factor = max(0.0, advanced / 1e9 / elapsed)
+        return self.factor
 
 
-def diagnostics(stamp: object, name: str, problems: list[tuple[int, str]],
-                values: dict[str, object]) -> DiagnosticArray:
-    """
-    Return the array with one status: its level and message are those of the worst problem.
+class MotionReport:
+    """Describes a running simulation; the caller holds the simulation's lock."""
 
-    problems: (DiagnosticStatus level as an int, text);  values: the numbers, as text
-    """
-    level, message = max(problems, key=lambda p: p[0], default=(0, 'running'))
-    status = DiagnosticStatus(
-        level=bytes([level]), name=name, hardware_id='none', message=message,
-        values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
-    array = DiagnosticArray(status=[status])
-    array.header.stamp = stamp
-    return array
+    def __init__(self, simulation: Simulation, loop: TickLoop, session: RecordingSession) -> None:
+        self._simulation, self._loop, self._session = simulation, loop, session
+        self.speed = Speedometer()
+        self._described: object = None          # the motion that `_regime` names
+        self._regime = ''
+
+    def diagnostics(self, stamp: Time, name: str, max_error: float) -> DiagnosticArray:
+        """
+        Return the message for /diagnostics; its level is that of the worst problem.
+
+        Parameters
+        ----------
+        stamp, name
+            Time of the message, and what it calls the node.
+        max_error
+            Largest orientation error [rad] that is no problem; 0: the error is not computed.
+
+        """
+        simulation, loop = self._simulation, self._loop
+        error = math.nan if max_error == 0.0 else simulation.orientation_error(
+            simulation.state(), loop.now_ns)
+        skipped = sum(stream.skipped for stream in simulation.streams)
+        problems = []
+        if loop.paused:
+            problems.append((OK, 'paused'))
+        if skipped or loop.counters.slipped_ns:
+            problems.append((WARN, 'this machine cannot keep up'))
+        if error > max_error > 0.0:
+            problems.append((WARN, f'orientation error {error:.3g} rad: more than max_error = '
+                                   f'{max_error:g} rad'))
+        if self._session.error:
+            problems.append((ERROR, f'recording: {self._session.error}'))
+        if loop.failure:
+            problems.append((ERROR, loop.failure))
+        level, message = max(problems, key=lambda problem: problem[0], default=(OK, 'running'))
+        values = {**self._numbers(error, skipped), **self._session.numbers()}
+        array = DiagnosticArray(status=[DiagnosticStatus(
+            level=bytes([level]), name=name, hardware_id='none', message=message,
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])])
+        array.header.stamp = stamp
+        return array
+
+    def _numbers(self, error: float, skipped: int) -> dict[str, object]:
+        simulation, counters, now_ns = self._simulation, self._loop.counters, self._loop.now_ns
+        return {
+            'simulated time [s]': f'{now_ns / NANOSECONDS:.6f}',
+            'real-time factor': f'{self.speed.read(now_ns):.3f}',
+            'late ticks': counters.late_ticks,
+            'skipped ticks': counters.skipped_ticks,
+            'published messages': self._sent(),
+            'skipped samples': skipped,
+            'clock slip [s]': f'{counters.slipped_ns / NANOSECONDS:.3f}',
+            'orientation error [rad]': f'{error:.3g}',
+            'commands': counters.commands,
+            'rejected commands': counters.rejected_commands,
+            'integration steps': simulation.steps,
+            'evaluations': simulation.evaluations,
+        }
+
+    def _sent(self) -> int:
+        return sum(stream.sent for stream in self._simulation.streams)
+
+    def new_motion(self) -> str | None:
+        """Return the present motion in numbers if that was not said yet."""
+        simulation = self._simulation
+        if simulation.begun is self._described:
+            return None
+        self._described = simulation.begun
+        description = simulation.describe()
+        self._regime = 'beyond doubles' if description is None else description.name
+        return None if description is None else str(description)
+
+    def status_line(self) -> str:
+        """Return the line for the terminal, with the angle in degrees."""
+        simulation, loop, size = self._simulation, self._loop, self._session.size
+        state = simulation.state()
+        flag = ' FAILED' if loop.failure else ' paused' if loop.paused else ''
+        log = '' if size is None else f' | log {human_readable(size)}'
+        return (f't {loop.now_ns / NANOSECONDS:9.2f} s{flag} | {self._regime} | '
+                f'theta {math.degrees(state.theta):6.2f} deg | '
+                f'L3 {simulation.l3:.4g} Lz {simulation.lz:.4g} | x{self.speed.factor:.2f} | '
+                f'dE/E {simulation.energy_drift(state):+.0e} | {self._sent()} msgs{log}')
 
 
-def bytes_for_people(count: float) -> str:
-    """Return a size such as 1.2 MB."""
-    for unit in ('B', 'kB', 'MB', 'GB'):
-        if count < 1000.0 or unit == 'GB':
+def impossible_body(values: Mapping[str, Any]) -> str:
+    """Return the warning of moments of inertia that no rigid body has."""
+    return (f'top.lambda3 = {values["top.lambda3"]!r} kg m^2: no rigid body has this with '
+            f'top.lambda1 = {values["top.lambda1"]!r}, top.mass = {values["top.mass"]!r} and '
+            f'top.com_distance = {values["top.com_distance"]!r} (lambda3 <= 2 (lambda1 - M R^2)); '
+            'simulated all the same')
+
+
+def human_readable(count: float) -> str:
+    """Return a number of bytes as a size such as 1.2 MB."""
+    for unit in ('B', 'kB', 'MB'):
+        if count < 1000.0:
             return f'{count:.0f} {unit}' if unit == 'B' else f'{count:.1f} {unit}'
         count /= 1000.0
-    raise AssertionError
-
-
-def status_line(t_ns: int, state: str, regime: str, theta: float, l3: float, lz: float,
-                factor: float, drift: float, sent: int, log_bytes: int | None) -> str:
-    """Return the line for the terminal; angles in degrees, as people think."""
-    log = '' if log_bytes is None else f' | log {bytes_for_people(log_bytes)}'
-    return (f't {t_ns / 1e9:9.2f} s{state} | {regime} | theta {math.degrees(theta):6.2f} deg | '
-            f'L3 {l3:.4g} Lz {lz:.4g} | x{factor:.2f} | dE/E {drift:+.0e} | '
-            f'{sent} msgs{log}')
+    return f'{count:.1f} GB'
 
 
 class Terminal:
@@ -102,7 +181,7 @@ class Terminal:
         try:
             print(text, end='', flush=True)
         except OSError:
-            # Whoever read this has gone, as in `sim_node | head`: the motion goes on unread.
+            # The reader has gone, as in `sim_node | head`: the motion goes on unread.
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, sys.stdout.fileno())
             os.close(nowhere)

@@ -22,12 +22,17 @@ from spinning_top_sim.streams.parameters import Effect, Parameter
 
 LARGEST = sys.float_info.max
 SPIN = ('spin.l3', 'spin.lz')
-# Parameters that a node has of itself.
-FOREIGN = ('use_sim_time', 'qos_overrides.', 'start_type_description_service')
+# Parameters that rclpy declares itself.
+OF_RCLPY = ('use_sim_time', 'start_type_description_service')
+QOS_OVERRIDES = 'qos_overrides.'
 
 
 def descriptor(parameter: Parameter) -> ParameterDescriptor:
-    """Return what `ros2 param describe` shows.  Types are checked by us: an int is a double."""
+    """
+    Return what `ros2 param describe` shows.
+
+    Typing is dynamic because an integer is accepted for a double; `Parameter.check` decides.
+    """
     result = ParameterDescriptor(
         name=parameter.name, description=parameter.description, dynamic_typing=True,
         read_only=parameter.effect is Effect.START,
@@ -48,19 +53,35 @@ def descriptor(parameter: Parameter) -> ParameterDescriptor:
 
 def start_values(node: Node) -> dict[str, Any]:
     """
-    Return the checked parameters that the node was started with; log what is unknown.
+    Return the checked parameters that a node was started with, and warn of unknown ones.
 
-    Raises ValueError naming the parameter, its value and what is allowed.
+    Parameters
+    ----------
+    node
+        Made with `automatically_declare_parameters_from_overrides`, the public way to learn of
+        overrides that nobody declares.
+
+    Raises
+    ------
+    ValueError
+        For a bad value; the text names the parameter, its value and what is allowed.
+
     """
     given = {}
-    # rclpy tells the overrides of undeclared parameters nowhere in public.
-    for name, override in node._parameter_overrides.items():
+    for name in node.get_parameters_by_prefix(''):
+        value = node.get_parameter(name).value
+        if name == 'use_sim_time' and not isinstance(value, bool):
+            raise ValueError(f'{name} = {value!r}: must be true or false')
+        if name in OF_RCLPY:
+            continue
         if name in parameters.BY_NAME:
-            given[name] = override.value
-        elif not name.startswith(FOREIGN):
+            given[name] = value
+        elif not name.startswith(QOS_OVERRIDES):
             near = difflib.get_close_matches(name, parameters.BY_NAME, 1)
             hint = f'; did you mean {near[0]}?' if near else ''
             node.get_logger().warning(f'there is no parameter {name}: ignored{hint}')
+        # It is declared later, with its descriptor, by `declare` or `create_publisher`.
+        node.undeclare_parameter(name)
     return parameters.checked(given)
 
 
@@ -78,11 +99,25 @@ def declare(node: Node, values: Mapping[str, Any]) -> None:
 
 class ParameterChanges:
     """
-    Validates changes while the node runs, and hands them over all together or not at all.
+    Validates changes while the node runs; applies all of them together or none.
 
-    values: as they are;  start_spin: spin.* as the node was started with
-    apply(values, changed): called with every parameter's value and the names that changed;
-    raises ValueError to refuse.  refused(names): called with what was not to be changed
+    Parameters
+    ----------
+    node
+        Has all parameters declared.
+    values, start_spin
+        The values now, and those of spin.* that the node was started with.
+    apply
+        Takes all values and the names of those that change; raises ValueError or RuntimeError to
+        refuse.
+    refused
+        Takes the names of a refused change.
+
+    Attributes
+    ----------
+    values : dict
+        The values now, by name.
+
     """
 
     def __init__(self, node: Node, values: Mapping[str, Any], start_spin: Mapping[str, Any],
@@ -109,8 +144,8 @@ class ParameterChanges:
             for name, value in ours.items():
                 if value is None:
                     raise ValueError(f'{name}: cannot be unset while the node runs')
-            # Whether there is a motion is asked of the start, with its own spin, to which a reset
-            # goes back; the spin of now is a command's, and asked where the top is now.
+            # A reset goes back to the start state with its own spin, so these are checked
+            # together.  The present spin belongs to the present state: `apply` checks it.
             values = parameters.checked({**self.values, **ours, **self.start_spin})
             values.update({name: parameters.BY_NAME[name].check(ours.get(name, self.values[name]))
                            for name in SPIN})
@@ -121,14 +156,13 @@ class ParameterChanges:
         self.values = values
         return SetParametersResult(successful=True)
 
-    def follow(self, **values: float) -> None:
-        """Show values that changed by other ways (a command, a reset), `__` for the dot."""
-        named = {name.replace('__', '.'): value for name, value in values.items()}
-        self.values.update(named)
+    def show_spin(self, l3: float, lz: float) -> None:
+        """Show the spin [kg m^2/s] that a command or a reset has set."""
+        spin = dict(zip(SPIN, (l3, lz), strict=True))
+        self.values.update(spin)
         self._following = True
         try:
-            self._node.set_parameters([
-                RosParameter(name, RosParameter.Type.DOUBLE, value)
-                for name, value in named.items()])
+            self._node.set_parameters([RosParameter(name, RosParameter.Type.DOUBLE, value)
+                                       for name, value in spin.items()])
         finally:
             self._following = False

@@ -197,8 +197,9 @@ TABLE: tuple[Parameter, ...] = (
               maximum=1e-2, effect=Effect.RESET),
     Parameter('max_error', 1e-6, 'rk45: warn in /diagnostics when the orientation is further '
               'from the exact solution; 0 = do not look', 'rad', minimum=0.0),
-    Parameter('pacing', 'timer', 'An rclpy timer, or a thread with absolute deadlines '
-              '(from 500 Hz on)', choices=('timer', 'thread'), effect=Effect.START),
+    Parameter('pacing', 'timer', 'Without effect, and accepted for older files: a thread with '
+              'absolute deadlines makes the ticks', choices=('timer', 'thread'),
+              effect=Effect.START),
     Parameter('tick_rate', 200.0, 'How often due samples are sent', 'Hz', above=0.0,
               maximum=HIGHEST_RATE),
     Parameter('time_scale', 1.0, 'Simulated over real time', above=0.0, maximum=1e6),

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The recording of a running simulation: opening beside the ticks, names, failures."""
+
+import json
+import threading
+import time
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip('rclpy')
+
+from node_harness import PATIENCE_S
+from node_logs import events_in, log_of
+from rclpy.qos import QoSProfile
+
+from spinning_top_sim.nodes.recording_session import RecordingSession
+from spinning_top_sim.recording.errors import RecordingError
+from spinning_top_sim.recording.writer import McapRecorder
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.pipeline import Simulation
+
+EPOCH_NS = 1_700_000_000_000_000_000
+SECOND = 1_000_000_000
+
+
+class Recorded:
+    """A simulation, its lock and its recording session."""
+
+    def __init__(self, folder, **values):
+        given = {name.replace('__', '.'): value for name, value in values.items()}
+        self.values = parameters.checked({'record.uri': str(folder), 'record.min_free_bytes': 0,
+                                          **given})
+        self.simulation = Simulation(self.values, EPOCH_NS)
+        self.publishers = {
+            stream.topic: SimpleNamespace(topic_name=f'/ns/{stream.topic.lstrip("~/")}',
+                                          qos_profile=QoSProfile(depth=10))
+            for stream in self.simulation.streams}
+        self.lock = threading.RLock()
+        self.session = RecordingSession(self.simulation, self.lock,
+                                        lambda name: f'/ns/top/{name.lstrip("~/")}')
+
+    def start(self):
+        return self.session.start(self.values, self.publishers)
+
+    def stop(self):
+        """Close the log; return what is in it, and its metadata."""
+        return log_of(self.session.stop().split(': ')[0])
+
+
+@pytest.fixture
+def slow_disk(monkeypatch):
+    """Have a log opened no sooner than `go_on` is set; `opening` says that it is at it."""
+    disk = SimpleNamespace(opening=threading.Event(), go_on=threading.Event())
+    ordinary = McapRecorder.open.__func__
+
+    def opened(cls, *arguments, **options):
+        disk.opening.set()
+        assert disk.go_on.wait(PATIENCE_S)
+        return ordinary(cls, *arguments, **options)
+
+    monkeypatch.setattr(McapRecorder, 'open', classmethod(opened))
+    return disk
+
+
+def test_ticks_and_commands_go_on_while_a_log_is_being_opened_and_are_in_it(tmp_path, slow_disk):
+    recorded = Recorded(tmp_path)
+    simulation, session = recorded.simulation, recorded.session
+    simulation.advance(SECOND)
+    answers = []
+    opening = threading.Thread(target=lambda: answers.append(recorded.start()), daemon=True)
+    opening.start()
+    assert slow_disk.opening.wait(PATIENCE_S)
+    # This thread gets the lock though the other one waits for the disk.
+    assert recorded.lock.acquire(timeout=PATIENCE_S)
+    simulation.advance(2 * SECOND)
+    simulation.command(2.0, 1.0)
+    session.write_command(2 * SECOND, 2.0, 1.0)
+    simulation.advance(3 * SECOND)
+    recorded.lock.release()
+    assert session.has_room() and session.size is None
+    slow_disk.go_on.set()
+    opening.join(PATIENCE_S)
+    assert answers[0].startswith('recording to ')
+    simulation.advance(4 * SECOND)
+    log, metadata = recorded.stop()
+    times = [at - EPOCH_NS for at, _ in log['/ns/pose']]
+    assert times == list(range(SECOND + 10_000_000, 4 * SECOND + 1, 10_000_000))
+    assert metadata['spinning_top_sim']['begun_ns'] == str(SECOND)
+    assert json.loads(metadata['spinning_top_sim']['history']) == []
+    assert [event['event'] for event in events_in(log)] == ['start', 'command']
+    assert len(log['/ns/top/commands']) == 1
+
+
+def test_what_waits_for_the_file_is_bounded(tmp_path, slow_disk, monkeypatch):
+    monkeypatch.setattr('spinning_top_sim.nodes.recording_session.MOST_PENDING', 10)
+    recorded = Recorded(tmp_path)
+    opening = threading.Thread(target=recorded.start, daemon=True)
+    opening.start()
+    assert slow_disk.opening.wait(PATIENCE_S)
+    assert recorded.session.has_room()
+    with recorded.lock:
+        recorded.simulation.advance(SECOND)
+    assert not recorded.session.has_room()
+    slow_disk.go_on.set()
+    opening.join(PATIENCE_S)
+    assert recorded.session.has_room()
+    log, _ = recorded.stop()
+    assert len(log['/ns/pose']) == 101
+
+
+def test_two_nodes_that_start_in_the_same_second_take_different_names(tmp_path, monkeypatch):
+    monkeypatch.setattr(time, 'strftime', lambda _: 'spinning_top_2000-01-01_00-00-00')
+    nodes = [Recorded(tmp_path) for _ in range(3)]
+    together = threading.Barrier(len(nodes))
+
+    def start(node):
+        together.wait(PATIENCE_S)
+        node.start()
+
+    threads = [threading.Thread(target=start, args=(node,), daemon=True) for node in nodes]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(PATIENCE_S)
+    for number, node in enumerate(nodes):
+        node.simulation.advance(number * SECOND)
+    stem = 'spinning_top_2000-01-01_00-00-00'
+    assert {path.name for path in tmp_path.iterdir()} == {
+        f'{stem}.mcap', f'{stem}_2.mcap', f'{stem}_3.mcap'}
+    assert [len(node.stop()[0]['/ns/pose']) for node in nodes] == [1, 101, 201]
+
+
+def test_a_file_that_is_named_is_never_overwritten_and_nothing_is_kept(tmp_path):
+    path = tmp_path / 'there.mcap'
+    path.write_bytes(b'precious')
+    recorded = Recorded(path)
+    with pytest.raises(RecordingError, match='exists'):
+        recorded.start()
+    assert path.read_bytes() == b'precious'
+    assert not any(stream.recorded for stream in recorded.simulation.streams)
+    recorded.simulation.advance(SECOND)
+    assert recorded.session.stop() is None
+    assert recorded.session.numbers() == {'recorder': 'off'}
+
+
+def test_a_second_start_and_a_second_stop_do_nothing(tmp_path):
+    recorded = Recorded(tmp_path / 'one.mcap')
+    recorded.start()
+    assert recorded.start() == f'recording already to {tmp_path / "one.mcap"}'
+    recorded.simulation.advance(SECOND)
+    assert recorded.session.stop().startswith(str(tmp_path / 'one.mcap'))
+    assert recorded.session.stop() is None
+
+
+def test_a_recording_that_fails_is_closed_and_says_why(tmp_path, monkeypatch):
+    recorded = Recorded(tmp_path / 'one.mcap')
+    recorded.start()
+    assert recorded.session.check() is None
+    monkeypatch.setattr(McapRecorder, 'error', 'the disk is gone')
+    assert recorded.session.check() == 'the disk is gone'
+    assert recorded.session.check() is None
+    assert recorded.session.error == 'the disk is gone'
+    assert recorded.session.numbers() == {'recorder': 'failed'}
+    assert not any(stream.recorded for stream in recorded.simulation.streams)

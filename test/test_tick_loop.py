@@ -1,0 +1,304 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a tick does, on clocks of its own: due samples, late ticks, overload, pause, step, reset."""
+
+import pytest
+
+from spinning_top_sim.nodes import tick_loop
+from spinning_top_sim.nodes.tick_loop import Hooks, TickLoop
+from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.pipeline import Simulation
+
+TICK_NS = 5_000_000             # 200 Hz
+POSE_NS = 10_000_000
+SECOND = 1_000_000_000
+BEGIN_NS = 77
+
+
+class Clock:
+    """A steady clock that stands still, or goes on a little whenever it is read."""
+
+    def __init__(self):
+        self.now_ns, self.step_ns = BEGIN_NS, 0
+
+    def __call__(self):
+        self.now_ns += self.step_ns
+        return self.now_ns
+
+
+class Run:
+    """
+    A loop, the steady clock it is on, and what came of it.
+
+    stamps: of the poses recorded;  published: of those published
+    told: what hooks were called with
+    """
+
+    def __init__(self, room=lambda: True, **values):
+        given = {name.replace('__', '.'): value for name, value in values.items()}
+        self.values = parameters.checked(given)
+        self.clock, self.stamps, self.published, self.told = Clock(), [], [], []
+        self.simulation = Simulation(self.values)
+        self.loop = TickLoop(
+            self.simulation, self.values, Hooks(
+                update_subscribers=lambda: self.told.append('subscribers'),
+                has_room=lambda: room(), clock_started=lambda at: self.told.append(('began', at)),
+                overloaded=lambda what: self.told.append(what),
+                failed=lambda why: self.told.append(f'failed: {why}'),
+                duration_passed=lambda: self.told.append('passed')),
+            source=self.clock, steady=self.clock)
+
+    @property
+    def pose(self):
+        return next(stream for stream in self.simulation.streams if stream.topic == 'pose')
+
+    def record(self):
+        self.pose.record = lambda stamp, data: self.stamps.append(stamp)
+        return self
+
+    def publish(self):
+        self.pose.publish = self.published.append
+        return self
+
+    def tick(self, after_ns=TICK_NS, idle=True):
+        """Tick once, so much later, and do the idle work that is asked for."""
+        self.clock.now_ns += after_ns
+        if self.loop.tick() and idle:
+            self.loop.idle()
+
+    def ticks(self, count, **options):
+        for _ in range(count):
+            self.tick(**options)
+        return self
+
+
+def started(**values):
+    run = Run(**values).record()
+    run.loop.start()
+    return run
+
+
+def grid(until_ns):
+    return list(range(0, until_ns + 1, POSE_NS))
+
+
+@pytest.mark.parametrize('idle', [False, True])
+def test_ticks_send_all_that_is_due_however_late_they_come(idle):
+    run = started()
+    run.ticks(20, idle=idle)
+    assert run.stamps == grid(20 * TICK_NS)
+    run.tick(123_456_789, idle=idle)
+    assert run.simulation.now_ns == 20 * TICK_NS + 123_456_789
+    run.ticks(200, idle=idle)
+    assert run.stamps == grid(run.simulation.now_ns)
+    assert len(run.stamps) > 100
+
+
+def test_idle_work_makes_most_ticks_take_the_fast_path(monkeypatch):
+    monkeypatch.setattr(tick_loop, 'BUSY_SHARE', 1e6)       # as fast as this machine may be
+    run = started()
+    slow = []
+    ordinary = run.loop._slow_tick
+    monkeypatch.setattr(run.loop, '_slow_tick', lambda now: slow.append(now) or ordinary(now))
+    run.ticks(1000)
+    assert len(slow) < 300
+    assert run.stamps == grid(1000 * TICK_NS)
+    # Each 50 ms, or a tick later.
+    assert 1000 / 11 <= run.told.count('subscribers') <= 101
+
+
+def test_late_and_skipped_ticks_are_counted():
+    run = started()
+    run.ticks(10)
+    counters = run.loop.counters
+    assert (counters.late_ticks, counters.skipped_ticks) == (0, 0)
+    run.tick(7_400_000)                             # not yet 1.5 periods
+    assert (counters.late_ticks, counters.skipped_ticks) == (0, 0)
+    run.tick(10_100_000)
+    assert (counters.late_ticks, counters.skipped_ticks) == (1, 1)
+    run.tick(50 * TICK_NS)
+    assert (counters.late_ticks, counters.skipped_ticks) == (2, 1 + 49)
+
+
+@pytest.mark.parametrize('ticks_meanwhile', [0, 3])
+def test_a_pause_makes_no_tick_late(ticks_meanwhile):
+    run = started().ticks(10)
+    run.loop.pause()
+    run.ticks(ticks_meanwhile, after_ns=SECOND)
+    run.clock.now_ns += 10 * SECOND
+    run.loop.resume()
+    run.ticks(5)
+    assert run.loop.counters.late_ticks == run.loop.counters.skipped_ticks == 0
+
+
+def test_a_pause_sends_what_is_due_holds_and_catches_nothing_up():
+    run = started().ticks(4)
+    run.clock.now_ns += 3_000_001
+    run.loop.pause()
+    at_ns = 4 * TICK_NS + 3_000_001
+    assert run.loop.paused and run.loop.now_ns == at_ns
+    run.ticks(10)
+    run.loop.pause()
+    assert run.loop.now_ns == at_ns
+    run.loop.resume()
+    run.loop.resume()
+    run.tick()
+    assert run.loop.now_ns == at_ns + TICK_NS
+    assert run.stamps == grid(at_ns + TICK_NS)
+
+
+@pytest.mark.parametrize('time_scale', [1.0, 50.0])
+def test_a_step_is_exact_also_after_a_pause_in_mid_run_while_clocks_go_on(time_scale):
+    run = started(time_scale=time_scale)
+    run.ticks(7)
+    run.clock.step_ns = 1_333                       # any code takes time
+    run.loop.pause()
+    for count, dt in ((7, 0.03), (1, 0.01), (3, 1.0 / 3.0), (1_000, 1e-9), (10, 1e-10)):
+        run.ticks(5)
+        before = run.loop.now_ns
+        assert run.loop.step(count, dt) == 0
+        run.ticks(5)
+        assert run.loop.now_ns - before == round(count * dt * 1e9)
+    run.loop.pause()
+    run.loop.resume()
+    run.ticks(3)
+    assert run.stamps == grid(run.simulation.now_ns)
+
+
+def test_a_step_that_takes_too_long_says_what_is_left(monkeypatch):
+    monkeypatch.setattr(tick_loop, 'STEP_BUDGET_NS', 1_000_000)
+    run = started(start_paused=True)
+    run.clock.step_ns = 100_000
+    left = run.loop.step(1, 10.0)
+    assert 0 < left < 10 * SECOND
+    assert run.loop.now_ns == 10 * SECOND - left
+    run.ticks(3)
+    assert run.loop.now_ns == 10 * SECOND - left
+
+
+def test_started_paused_nothing_moves():
+    run = started(start_paused=True).ticks(5)
+    assert run.stamps == [] and run.loop.now_ns == 0
+    run.loop.step(1, 0.01)
+    assert run.stamps == [0, POSE_NS]
+    run.loop.resume()
+    run.tick(2 * TICK_NS)
+    assert run.stamps == [0, POSE_NS, 2 * POSE_NS]
+
+
+def test_the_duration_ends_with_its_last_sample():
+    run = started(duration=0.0723)
+    run.ticks(100)
+    assert run.loop.now_ns == 72_300_000
+    assert run.stamps == grid(72_300_000)
+    assert run.told.count('passed') == 1
+    assert not run.loop.running
+
+
+def test_what_is_too_late_is_recorded_but_not_published_and_warned_about_once():
+    run = started().publish()
+    for stream in run.simulation.streams:
+        if stream.topic == 'joint_states':
+            stream.publish = lambda data: None      # nobody records it
+    run.ticks(3)
+    sent = len(run.published)
+    for _ in range(2):
+        run.tick(700_000_000)
+    assert run.stamps == grid(run.simulation.now_ns)
+    assert len(run.published) - sent == 2 * 50
+    assert run.pose.skipped > 0
+    assert [what for what in run.told if 'skip' in what] == ['live topics skip samples']
+
+
+def test_a_clock_too_far_ahead_slips():
+    """Whatever the recording cannot take is computed later, so nothing is missing."""
+    room = [True]
+    run = Run(room=lambda: room[0]).record()
+    run.loop.start()
+    run.ticks(4)
+    room[0] = False
+    run.tick(900_000_000)
+    assert run.loop.counters.slipped_ns == 0
+    assert run.loop.now_ns == 4 * TICK_NS
+    run.tick(200_000_000)
+    assert run.loop.counters.slipped_ns == 1_100_000_000
+    room[0] = True
+    run.ticks(4)
+    assert run.loop.now_ns == 8 * TICK_NS
+    assert run.stamps == grid(8 * TICK_NS)
+    assert 'the clock slips' in run.told
+
+
+def test_a_tick_gives_way_when_its_time_is_up(monkeypatch):
+    monkeypatch.setattr(tick_loop, 'TICK_BUDGET_NS', 500_000)
+    run = started()
+    run.tick()
+    run.clock.step_ns = 100_000
+    run.tick(900_000_000)
+    assert run.loop.now_ns < 900_000_000
+    first = len(run.stamps)
+    run.ticks(100)
+    assert run.stamps == grid(run.simulation.now_ns)
+    assert len(run.stamps) > first
+
+
+def test_a_time_scale_holds_from_its_moment_on():
+    run = started().ticks(4)
+    run.loop.set_pace({**run.values, 'time_scale': 10.0})
+    run.tick()
+    assert run.loop.now_ns == 4 * TICK_NS + 10 * TICK_NS
+    began = [told for told in run.told if told[0] == 'began']
+    # Where t = 0 would have been at the new pace, so that ticks can be aligned with samples.
+    assert began == [('began', BEGIN_NS), ('began', BEGIN_NS + 4 * TICK_NS - 2_000_000)]
+
+
+def test_a_reset_begins_again_at_a_later_stamp_and_a_pause_remains():
+    run = started().ticks(7)
+    run.loop.reset(run.values, lambda last_ns: last_ns + 1_000)
+    assert run.simulation.epoch_ns == 7 * TICK_NS + 1_000
+    run.ticks(2)
+    assert run.loop.now_ns == 2 * TICK_NS
+    run.loop.pause()
+    run.loop.reset(run.values, lambda last_ns: last_ns + 1_000)
+    del run.stamps[:]
+    run.loop.idle()                                 # idle work may come behind a reset
+    run.ticks(3)
+    assert run.loop.now_ns == 0 and run.loop.paused
+    assert run.stamps == []
+
+
+def test_equations_that_cannot_go_on_stop_the_motion_until_a_reset():
+    euler = {'solver__equations': 'euler', 'initial__theta': 0.5, 'initial__theta_dot': -3.0,
+             'spin__l3': 0.2, 'spin__lz': -0.2}
+    run = started(**euler)
+    run.ticks(400)
+    stands_at = run.loop.now_ns
+    assert 'pole' in run.loop.failure
+    assert sum('failed' in told for told in run.told) == 1
+    with pytest.raises(ValueError, match='stands still'):
+        run.loop.command(1.0, 1.0)
+    run.ticks(5)
+    assert run.loop.now_ns == stands_at
+    run.loop.reset(parameters.checked({}), lambda last_ns: last_ns + 1)
+    assert run.loop.failure is None
+    run.ticks(4)
+    assert run.loop.now_ns == 4 * TICK_NS
+
+
+def test_a_reset_that_is_refused_changes_nothing():
+    run = started().ticks(4)
+    with pytest.raises((ValueError, IntegrationError)):
+        run.loop.reset({**run.values, 'spin.l3': 1e20, 'spin.lz': 1e20}, lambda last_ns: 0)
+    run.ticks(4)
+    assert run.stamps == grid(8 * TICK_NS)
+
+
+def test_a_command_comes_after_what_is_due():
+    run = started().ticks(4)
+    run.clock.now_ns += 3_000_000
+    assert run.loop.command(2.0, 1.0) == 23_000_000
+    assert run.simulation.history == [(23_000_000, 2.0, 1.0)]
+    assert run.loop.counters.commands == 1
+    with pytest.raises(ValueError, match='nan'):
+        run.loop.command(float('nan'), 1.0)
+    assert run.loop.counters.commands == 1
