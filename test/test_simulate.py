@@ -184,6 +184,40 @@ def test_parquet(tmp_path):
     assert table.num_rows == 101 and table.column_names[:2] == ['t', 'theta']
 
 
+def test_commands_at_one_time_are_applied_in_the_order_given(tmp_path):
+    """The last one given holds, whether its momenta are larger or smaller."""
+    for number, (first, last) in enumerate((('2.0:1.5', '1.7:1.4'), ('1.7:1.4', '2.0:1.5'))):
+        log, _ = read(simulate(tmp_path / f'{number}.mcap', '--duration', 1.2, '--command',
+                               f'1:{first}', '--command', f'1:{last}'))
+        labels = messages_of(log, '/spinning_top/invariants')
+        assert labels[1_000_000_000][1] == pytest.approx(1.6)        # samples, then commands
+        assert labels[1_100_000_000][1] == pytest.approx(float(last.split(':')[0]))
+        table = simulate(tmp_path / f'{number}.csv', '--duration', 1.2, '--command', f'1:{first}',
+                         '--command', f'1:{last}')
+        with open(table, newline='') as file:
+            *_, row = csv.DictReader(file)
+        assert float(row['l3 [kg m^2/s]']) == pytest.approx(float(last.split(':')[0]))
+
+
+def messages_of(log, topic):
+    """Return the numbers of each message of `~/invariants` by time: E, L3, Lz, and the rest."""
+    stream = next(stream for stream in Simulation(parameters.checked({})).streams
+                  if stream.topic == topic.replace('/spinning_top', '~'))
+    return {t: stream.template.decode_many(data)[0][0] for t, data in log[topic].items()}
+
+
+def test_a_command_exactly_at_the_end_is_applied(tmp_path):
+    log, _ = read(simulate(tmp_path / 'run.mcap', '--duration', 1, '--command', '1:2.0:1.5'))
+    assert list(log['/spinning_top/commands']) == [1_000_000_000]
+    events = events_of(log)
+    assert [event['event'] for event in events] == ['start', 'command']
+    assert max(log['/pose']) == 1_000_000_000
+
+
+def events_of(log):
+    return [json.loads(data[8:].rstrip(b'\0')) for data in log['/spinning_top/events'].values()]
+
+
 @pytest.mark.parametrize(('arguments', 'message'), [
     (['--duration', '0'], 'duration = 0.0 s'), ([], 'duration = 0.0 s'),
     (['--duration', '1', '-p', 'top.lambda1:=-1'], 'top.lambda1 = -1'),
@@ -239,7 +273,7 @@ def test_a_full_disk_leaves_a_readable_log(tmp_path):
 def test_events_tell_the_run(tmp_path):
     log, metadata = read(simulate(tmp_path / 'run.mcap', '--duration', 1,
                                   '--command', '0.5:2.0:1.5'))
-    events = [json.loads(data[8:].rstrip(b'\0')) for data in log['/spinning_top/events'].values()]
+    events = events_of(log)
     assert [event['event'] for event in events] == ['start', 'command']
     assert events[1] == {'event': 'command', 't_ns': 500_000_000, 'sent_ns': 500_000_000,
                          'l3': 2.0, 'lz': 1.5}
