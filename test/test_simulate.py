@@ -225,6 +225,9 @@ def events_of(log):
     (['--duration', '1', '--params', '/nowhere.yaml'], '/nowhere.yaml'),
     (['--duration', '1', '--command', '1:2'], '--command 1:2'),
     (['--duration', '1', '--command=-1:2:2'], '--command -1:2:2'),
+    (['--duration', '1', '--command', '1.000000001:2:1.5'], 'end of the run, 1 s'),
+    (['--duration', '1', '--command', 'nan:2:1.5'], '--command nan:2:1.5'),
+    (['--duration', '1', '-p', 'spin.l3:=[1'], 'spin.l3:=[1 is not YAML'),
     (['--duration', '1', '-p', 'initial.theta:=0.0', '--command', '0.5:2.0:1.0'], 'at a pole'),
     (['--duration', '1', '-p', 'initial.theta:=0.0', '-p', 'solver.equations:=euler'],
      'transport'),
@@ -238,12 +241,33 @@ def test_what_cannot_be_simulated_is_told_in_a_line(tmp_path, capsys, arguments,
 
 def test_a_params_file_that_is_no_yaml_or_of_another_node(tmp_path, capsys):
     broken = tmp_path / 'broken.yaml'
-    for text, message in ((': : [', 'no YAML'), ('other:\n  ros__parameters:\n    a: 1\n',
+    for text, message in ((': : [', 'not YAML'), ('other:\n  ros__parameters:\n    a: 1\n',
                                                  'no parameters for the node spinning_top')):
         broken.write_text(text)
         assert main(['-o', str(tmp_path / 'r.mcap'), '--params', str(broken), '--duration', '1',
                      '--quiet']) == 1
         assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('name', ['run', 'run.bag', 'run.mcap.zst', 'run.CSV'])
+def test_an_unknown_extension_is_refused(tmp_path, capsys, name):
+    assert main(['-o', str(tmp_path / name), '--duration', '1', '--quiet']) == 1
+    error = capsys.readouterr().err
+    assert name in error and '.mcap, .csv, .parquet' in error
+    assert list(tmp_path.iterdir()) == []
+    arguments = ['--duration', '1', '--quiet', '--format', 'mcap']
+    assert main(['-o', str(tmp_path / name), *arguments]) == 0
+    assert read(tmp_path / name)
+
+
+@pytest.mark.parametrize('arguments', [
+    ['-o', 'run.parquet'], ['-o', 'run.csv', '-p', 'initial.theta:=0.0', '-p', 'spin.lz:=1.0'],
+    ['-o', 'run.mcap', '--command', '2:1.0:1.0'], ['-o', 'run.csv', '--command', '2:1.0:1.0']])
+def test_what_is_refused_leaves_no_file(tmp_path, monkeypatch, arguments):
+    monkeypatch.setitem(sys.modules, 'pyarrow', None)
+    monkeypatch.chdir(tmp_path)
+    assert main([*arguments, '--duration', '1', '--quiet']) == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_nothing_is_overwritten(tmp_path, capsys):
