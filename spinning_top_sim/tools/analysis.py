@@ -253,14 +253,10 @@ def interpolate(values: NDArray[Number], at: Reals) -> NDArray[Number]:
 
 @dataclass(frozen=True)
 class Measured:
-    """
-    A motion in the numbers of `regimes.Description`, from its samples alone.
-
-    nutations: how many whole ones they hold;  missing: why numbers are None, in words
-    """
+    """The numbers of `regimes.Description`, from the samples of a motion alone."""
 
     samples: int
-    nutations: int
+    nutations: int                        # whole ones
     nutation_period: float | None
     theta_min: float
     theta_max: float
@@ -268,32 +264,32 @@ class Measured:
     mean_spin_rate: float | None
     precession_min: float | None
     precession_max: float | None
-    missing: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()         # why numbers are None
 
 
 def measure(tilts: Tilts) -> Measured:
     """
-    Return what the samples of one motion tell.
+    Measure a motion.
 
-    A nutation lasts from one rise of the tip through its middle height to the next: there the
-    time is sharpest, and the tip is far from the poles, where phi may leap.
+    Parameters
+    ----------
+    tilts : Tilts
+        Samples of one motion.
+
+    Notes
+    -----
+    A nutation lasts from one rise of the tip through its middle height to the next.  There its
+    time is known best, and the tip is far from the poles, where phi may jump.
     """
     missing: list[str] = []
     low, high = (_extreme(tilts, sign) for sign in (1.0, -1.0))
-    precession: tuple[float | None, float | None] = (None, None)
-    if tilts.phi_dot is not None:
-        precession = (float(np.min(tilts.phi_dot)), float(np.max(tilts.phi_dot)))
     nutations, period, begin, end = 0, None, 0.0, len(tilts.time) - 1.0
-    if high - low < RESTS:
-        if len(tilts.time) < 2:
-            missing.append('rates need two samples')
-    else:
+    if high - low >= RESTS:
         nutations, begin, end = _crossings(tilts)
         if nutations:
             period = (end - begin) / nutations * tilts.period
-            unresolved = _unresolved(tilts, period)
-            if unresolved:
-                missing.append(unresolved)
+            if reason := _unresolved(tilts, period):
+                missing.append(reason)
                 period = None
         else:
             missing.append('not one whole nutation')
@@ -306,7 +302,9 @@ def measure(tilts: Tilts) -> Measured:
     return Measured(
         samples=len(tilts.time), nutations=nutations, nutation_period=period, theta_min=low,
         theta_max=high, mean_precession_rate=rates[0], mean_spin_rate=rates[1],
-        precession_min=precession[0], precession_max=precession[1], missing=tuple(missing))
+        precession_min=None if tilts.phi_dot is None else float(np.min(tilts.phi_dot)),
+        precession_max=None if tilts.phi_dot is None else float(np.max(tilts.phi_dot)),
+        missing=tuple(missing))
 
 
 def _extreme(tilts: Tilts, sign: float) -> float:
@@ -352,17 +350,16 @@ def _root(values: Reals, level: float, index: int) -> float:
 
 def _unresolved(tilts: Tilts, period: float) -> str:
     """Return why the samples are too few for a nutation, '' if they are not."""
-    samples = period / tilts.period
-    if tilts.sin2_half_rate is not None:
-        count = len(tilts.time)
-        at = np.unique(np.linspace(POINTS // 2, max(count - POINTS // 2, 0), 200).astype(int))
-        at = at[at < count - 1]
+    samples, count = period / tilts.period, len(tilts.time)
+    if tilts.sin2_half_rate is not None and count > POINTS:
+        # Too few samples show a slower nutation, whose rate is not the one in the data.
+        at = np.linspace(POINTS // 2, count - POINTS // 2 - 1, 200).astype(int)
         step = 1e-3
-        rate = (interpolate(tilts.sin2_half, at + step)
-                 - interpolate(tilts.sin2_half, at - step)) / (2.0 * step * tilts.period)
-        off = float(np.max(np.abs(rate - tilts.sin2_half_rate[at]))) if len(at) else 0.0
-        if off > RATE_TOLERANCE * float(np.max(np.abs(tilts.sin2_half_rate))):
-            return 'a nutation is over in a few samples: the rates tell of more than they show'
+        ahead, behind = (interpolate(tilts.sin2_half, at + sign * step) for sign in (1, -1))
+        difference = (ahead - behind) / (2.0 * step * tilts.period) - tilts.sin2_half_rate[at]
+        if np.max(np.abs(difference)) > RATE_TOLERANCE * np.max(np.abs(tilts.sin2_half_rate)):
+            return ('a nutation takes only a few samples: '
+                    'the rates in the data are not those of the curve')
     if samples < LEAST_SAMPLES:
         return f'{samples:.1f} samples in a nutation are too few'
     return ''
@@ -378,7 +375,7 @@ def _mean_rate(tilts: Tilts, angle: Reals, phasor: Complexes, begin: float,
         return None
     if begin == 0.0 and end == len(angle) - 1.0:    # theta rests: so do the rates
         return float((angle[-1] - angle[0]) / (end * tilts.period))
-    # Without its mean rate the phasor is slow, however fast the top spins.
+    # The phasor is smooth where the angle jumps, and slow without its mean rate.
     rate = (angle[-1] - angle[0]) / (len(angle) - 1)
     index = np.arange(len(angle))
     ends = []
@@ -386,17 +383,27 @@ def _mean_rate(tilts: Tilts, angle: Reals, phasor: Complexes, begin: float,
         near = slice(max(0, int(at) - POINTS), int(at) + POINTS + 2)
         here = round(at)
         slow = phasor[near] * np.exp(-1j * rate * (index[near] - here))
-        value = interpolate(slow, np.array([at - index[near][0]]))[0]
-        ends.append(angle[here] + rate * (at - here)
-                    + float(np.angle(value * np.conj(phasor[here]))))
+        value = _value(slow, at - index[near][0])
+        ends.append(angle[here] + rate * (at - here) + np.angle(value * np.conj(phasor[here])))
     return float((ends[1] - ends[0]) / ((end - begin) * tilts.period))
 
 
 def measured_regime(top: Top, theta: float, theta_dot: float, l3: float, lz: float) -> str:
     """
-    Return the motion's name from numbers that were measured.
+    Return the name of a motion from numbers that were measured.
 
-    What differs from a special motion by less than SNAP is taken for it.
+    Parameters
+    ----------
+    top : Top
+        Its constants.
+    theta, theta_dot : float
+        Of one sample [rad], [rad/s].
+    l3, lz : float
+        [kg m^2/s].
+
+    Notes
+    -----
+    A motion that differs from a special one by less than SNAP is taken for it.
     """
     natural = math.sqrt(top.lambda1 * max(abs(top.gravity_torque),
                                           top.lambda1 * theta_dot * theta_dot))

@@ -28,45 +28,21 @@ ENOUGH_SAMPLES = 12.0       # in a nutation: a faster stream shows nothing new
 
 @dataclass
 class MotionReport:
-    """
-    One motion of the top.
+    """One motion of the top."""
 
-    Attributes
-    ----------
-    cause : {'start', 'command', 'reset'}
-        What it began with.
-    begin_ns, end_ns : int
-        Log times [ns].
-    origin_ns : int
-        Log time at which the exact solution has t = 0 [ns].
-    top : Top
-    l3, lz, energy : float
-        Constants of the motion as it began [kg m^2/s], [J].
-    exact : ExactSolution or None
-        None where it cannot hold the motion.
-    described : Description or None
-        Its numbers.
-    measured : Measured or None
-        The same numbers from the data.
-    source : str or None
-        The topic of these data.
-    regime : str or None
-        Name of the motion by the data.
-    """
-
-    cause: str
-    begin_ns: int
+    cause: str                            # start, command or reset
+    begin_ns: int                         # log times [ns]
     end_ns: int
-    origin_ns: int
+    origin_ns: int                        # log time at which the exact solution has t = 0 [ns]
     top: Top
-    l3: float
+    l3: float                             # constants of the motion as it began [kg m^2/s], [J]
     lz: float
     energy: float
-    exact: ExactSolution | None
-    described: Description | None
-    measured: Measured | None = None
-    source: str | None = None
-    regime: str | None = None
+    exact: ExactSolution | None           # None where it cannot hold the motion
+    described: Description | None         # its numbers
+    measured: Measured | None = None      # the same numbers from the data
+    source: str | None = None             # topic of these data
+    regime: str | None = None             # name of the motion by the data
 
     @property
     def nutation_period(self) -> float:
@@ -77,30 +53,15 @@ class MotionReport:
 
 @dataclass
 class Section:
-    """
-    A part of a motion with the same rates: the samples later than begin_ns, up to end_ns.
-
-    Attributes
-    ----------
-    motion : MotionReport
-    begin_ns, end_ns : int
-        Log times [ns].
-    epoch_ns : int
-        Stamp of t = 0 [ns].
-    streams : dict of str to Stream
-        Stream with its rate and its layout, by topic of the log.
-    imu : Imu
-    source : str or None
-        Topic that measures the motion best.
-    """
+    """A part of a motion with the same rates: the samples later than begin_ns, up to end_ns."""
 
     motion: MotionReport
-    begin_ns: int
+    begin_ns: int                         # log times [ns]
     end_ns: int
-    epoch_ns: int
-    streams: dict[str, Stream]
+    epoch_ns: int                         # stamp of t = 0 [ns]
+    streams: dict[str, Stream]            # with their rates and layouts, by topic of the log
     imu: Imu
-    source: str | None
+    source: str | None                    # topic that measures the motion best
 
 
 def find_sections(run: RunDescription, end_ns: int) -> tuple[list[Section], str]:

@@ -25,70 +25,32 @@ class ForeignLogError(Exception):
 
 @dataclass(frozen=True)
 class Event:
-    """
-    An entry of the journal.
+    """An entry of the journal."""
 
-    Attributes
-    ----------
-    name : {'start', 'command', 'parameters', 'reset'}
-    stamp_ns : int
-        Log time [ns].
-    t_ns : int
-        Simulated time [ns].
-    sent_ns : int
-        Simulated time up to which all samples had been sent [ns].
-    details : mapping
-        The rest of the entry.
-    """
-
-    name: str
-    stamp_ns: int
-    t_ns: int
-    sent_ns: int
-    details: Mapping[str, Any]
+    name: str                             # one of EVENT_NAMES
+    stamp_ns: int                         # log time [ns]
+    t_ns: int                             # simulated time [ns]
+    sent_ns: int                          # time up to which all samples had been sent [ns]
+    details: Mapping[str, Any]            # the rest of the entry
 
 
 @dataclass(frozen=True)
 class RunDescription:
-    """
-    The run of a log.
+    """The run of a log, by its metadata and journal."""
 
-    Attributes
-    ----------
-    values, now : mapping
-        Checked parameters when the motion began, and when the recording began.
-    epoch_ns : int
-        Stamp of t = 0 [ns].
-    begun_ns : int
-        Simulated time at which the recording began [ns].
-    history : tuple of (int, float, float)
-        Commands before that: time [ns], L3 and Lz [kg m^2/s].
-    evaluation : str
-        How states were computed.
-    surroundings : mapping
-        Version, platform and libraries of the recording.
-    topics : mapping
-        Stream, such as 'imu/data_raw', by topic of the log.
-    commands_topic, events_topic : str or None
-        None where the log has none.
-    events : tuple of Event
-        The journal.
-    broken : tuple of (int, str)
-        Stamp [ns] of each entry that is not as it was written, and the reason.
-    """
-
-    values: Mapping[str, Any]
-    now: Mapping[str, Any]
-    epoch_ns: int
-    begun_ns: int
+    values: Mapping[str, Any]             # checked parameters when the motion began
+    now: Mapping[str, Any]                # and when the recording began
+    epoch_ns: int                         # stamp of t = 0 [ns]
+    begun_ns: int                         # simulated time at which the recording began [ns]
+    # commands before that: time [ns], L3 and Lz [kg m^2/s]
     history: tuple[tuple[int, float, float], ...]
-    evaluation: str
-    surroundings: Mapping[str, str]
-    topics: Mapping[str, str]
-    commands_topic: str | None
+    evaluation: str                       # how states were computed
+    surroundings: Mapping[str, str]       # version, platform and libraries
+    topics: Mapping[str, str]             # stream, such as imu/data_raw, by topic of the log
+    commands_topic: str | None            # None where the log has none
     events_topic: str | None
-    events: tuple[Event, ...]
-    broken: tuple[tuple[int, str], ...]
+    events: tuple[Event, ...]             # the journal
+    broken: tuple[tuple[int, str], ...]   # stamp [ns] of each damaged entry, and the reason
 
 
 def read_run_description(reader: LogReader) -> RunDescription:

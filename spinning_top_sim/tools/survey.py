@@ -35,43 +35,20 @@ IMU_TOPICS = ('imu/data_raw', 'ground_truth/imu', 'ground_truth/imu_bias')
 
 @dataclass
 class TopicReport:
-    """
-    What is in a topic.
-
-    Attributes
-    ----------
-    type_name : str
-    stream : str or None
-        The stream that it is; None in a log of others.
-    count : int
-        Number of messages.
-    first_ns, last_ns : int or None
-        Log times of the first and the last message [ns].
-    longest_step_ns : int
-        Longest time between two messages [ns].
-    grid_rate : float or None
-        Rate by the parameters [Hz].
-    expected : int or None
-        Number of samples on the grid.
-    off_grid : int
-        Number of samples that are not on it.
-    gaps : list of (int, int)
-        The first gaps: log times of the first and the last missing sample [ns].
-    odd_size : int
-        Number of messages of another size than the stream's.
-    """
+    """What is in a topic."""
 
     type_name: str
-    stream: str | None = None
+    stream: str | None = None             # which of our streams it is
     count: int = 0
-    first_ns: int | None = None
+    first_ns: int | None = None           # log times of the first and the last message [ns]
     last_ns: int | None = None
-    longest_step_ns: int = 0
-    grid_rate: float | None = None
-    expected: int | None = None
-    off_grid: int = 0
+    longest_step_ns: int = 0              # longest time between two messages [ns]
+    grid_rate: float | None = None        # by the parameters [Hz]
+    expected: int | None = None           # samples on the grid
+    off_grid: int = 0                     # samples that are not on it
+    # The first gaps: log times of the first and the last missing sample [ns]
     gaps: list[tuple[int, int]] = field(default_factory=list)
-    odd_size: int = 0
+    odd_size: int = 0                     # messages of another size than the stream's
     _epoch_ns: int = 0          # of the grid
     _period_ns: int = 1
     _newest_ns: int = 0         # the newest sample, or the grid point before the first
@@ -172,41 +149,21 @@ NO_READINGS = Readings(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3))
 
 @dataclass
 class Survey:
-    """
-    All findings about a log.
-
-    Attributes
-    ----------
-    damage : Damage
-    whole : bool
-        The log was closed, and nothing is lost.
-    topics : dict of str to TopicReport
-    run : RunDescription or None
-        None for a log that this package did not record.
-    foreign_reason : str
-        Then the reason.
-    motions : list of MotionReport
-    drifts : dict of str to dict of str to Series
-        By topic, of energy, l3 and lz: relative to their values at the beginning of the motion,
-        absolute where these are 0.
-    errors : dict of str to Series
-        By topic: angle between the attitude and the exact solution [rad].
-    shown : Tilts or None
-        The samples shown in pictures.
-    readings : dict of str to Readings
-        By topic: of the IMU, in the same time.
-    notes : list of str
-    """
+    """All findings about a log."""
 
     damage: Damage
-    whole: bool
+    whole: bool                           # the log was closed, and nothing is lost
     topics: dict[str, TopicReport]
-    run: RunDescription | None = None
-    foreign_reason: str = ''
+    run: RunDescription | None = None     # None for a log that this package did not record
+    foreign_reason: str = ''              # why not
     motions: list[MotionReport] = field(default_factory=list)
+    # By topic, of energy, l3 and lz: relative to their values at the beginning of the motion,
+    # absolute where these are 0.
     drifts: dict[str, dict[str, Series]] = field(default_factory=dict)
+    # By topic: angle between the attitude and the exact solution [rad].
     errors: dict[str, Series] = field(default_factory=dict)
-    shown: analysis.Tilts | None = None
+    shown: analysis.Tilts | None = None   # the samples shown in pictures
+    # By topic: of the IMU, in the same time.
     readings: dict[str, Readings] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 

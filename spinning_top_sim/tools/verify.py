@@ -35,62 +35,28 @@ FIELDS = {
 
 @dataclass(frozen=True)
 class Difference:
-    """
-    The first place where a log and the computation differ.
-
-    Attributes
-    ----------
-    topic : str
-    stamp_ns : int
-        Log time of the message [ns].
-    byte : int or None
-        The first byte that differs; None where one of them has no such message.
-    field : str
-        Name of the field there.
-    logged, computed : str
-        Its two values, or what is different instead.
-    """
+    """The first place where a log and the computation differ."""
 
     topic: str
-    stamp_ns: int
-    byte: int | None
-    field: str
-    logged: str
+    stamp_ns: int                         # log time of the message [ns]
+    byte: int | None                      # None where one of them has no such message
+    field: str                            # name of the field there
+    logged: str                           # its two values, or what is different instead
     computed: str
 
 
 @dataclass
 class Verdict:
-    """
-    The result of a comparison.
+    """The result of a comparison."""
 
-    Attributes
-    ----------
-    whole : bool
-        The log is whole.
-    compared : dict of str to int
-        Number of messages that both have, by topic.
-    different : int
-        Number of those that differ.
-    missing : int
-        Messages that were computed and are not in the log.
-    unexpected : int
-        Messages that are in the log and were not computed.
-    first : Difference or None
-        The first of all these.
-    stopped : str
-        Why the run could not be computed to its end, '' if it was.
-    warnings : list of str
-        Differences of version and machine, which may change the last bits.
-    """
-
-    whole: bool
-    compared: dict[str, int]
-    different: int = 0
-    missing: int = 0
-    unexpected: int = 0
-    first: Difference | None = None
-    stopped: str = ''
+    whole: bool                           # the log is whole
+    compared: dict[str, int]              # messages that both have, by topic
+    different: int = 0                    # how many of these differ
+    missing: int = 0                      # messages that were computed and are not in the log
+    unexpected: int = 0                   # messages that are in the log and were not computed
+    first: Difference | None = None       # the first of all these
+    stopped: str = ''                     # why the run could not be computed to its end
+    # Differences of version and machine, which may change the last bits
     warnings: list[str] = field(default_factory=list)
 
     @property
