@@ -5,6 +5,7 @@
 What is measured is compared with the closed form, which test_exact.py holds against 30 digits.
 """
 
+import io
 import json
 import re
 import struct
@@ -251,6 +252,18 @@ def test_interpolation_is_as_good_as_its_bound():
     assert np.array_equal(analysis.interpolate(samples, np.arange(200.0)), samples)
 
 
+@pytest.mark.parametrize('number', [0.0, np.nan, np.inf])
+def test_an_attitude_that_is_none_is_left_out(stepped, tmp_path, capsys, number):
+    """Of one message; the rest is as accurate as before."""
+    path = rewritten(stepped, tmp_path / 'run.mcap', lambda topic, index, data: (
+        data[:-32] + struct.pack('<4d', *(4 * [number]))
+        if (topic, index) == ('/a/b/pose', 250) else data))
+    code, content = as_json(capsys, path)
+    assert code == 0
+    assert content['orientation_error']['/a/b/pose']['max'] < 1e-9
+    assert content['motions'][-1]['measured']['nutations'] >= 1
+
+
 def test_missing_samples_are_told_where_they_are(stepped, tmp_path, capsys):
     path = rewritten(stepped, tmp_path / 'gap.mcap', lambda topic, number, data: (
         None if topic == '/a/b/pose' and 50 <= number < 60 else data))
@@ -488,6 +501,30 @@ def test_what_cannot_be_read_says_so(tmp_path, capsys, content):
         path.write_bytes(content)
     code, out, err = told(capsys, path)
     assert code == 1 and not out and str(path) in err
+
+
+def test_a_reader_that_leaves_is_no_error(stepped):
+    run = subprocess.Popen([sys.executable, '-m', 'spinning_top_sim.tools.inspect', stepped],
+                           stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    run.stdout.close()
+    assert run.stderr.read() == b''
+    assert run.wait(60) == 0
+
+
+def test_progress_is_shown_on_a_terminal_only(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    monkeypatch.setitem(sys.modules, 'tqdm', None)
+    for stream, quiet, shown in ((Terminal(), False, ['  0 %', ' 50 %', '100 %']),
+                                 (Terminal(), True, []), (io.StringIO(), False, [])):
+        monkeypatch.setattr(sys, 'stderr', stream)
+        with cli.progress('simulated', 20.0, 's', quiet=quiet) as show:
+            for done in (0.0, 10.0, 10.0001, 20.0):
+                show(done)
+        assert re.findall(r'\rsimulated (.{5})', stream.getvalue()) == shown
+        assert stream.getvalue().endswith('\r\033[K') == bool(shown)
 
 
 def test_wrong_arguments_are_2(capsys):

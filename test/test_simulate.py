@@ -17,6 +17,7 @@ from rosbags.highlevel import AnyReader
 from spinning_top_sim import solve
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.tools.blocks import BlockSource
 from spinning_top_sim.tools.simulate import main
 
 EVERYTHING = ['-p', 'imu_data.enabled:=true', '-p', 'clock.enabled:=true',
@@ -292,6 +293,30 @@ def test_a_full_disk_leaves_a_readable_log(tmp_path):
     assert 'File too large' in run.stderr
     found, _ = read(path)
     assert len(found['/pose']) > 100
+
+
+@pytest.mark.parametrize('method', ['exact', 'rk45'])
+def test_an_interrupted_run_is_a_shorter_log(tmp_path, capsys, monkeypatch, method):
+    advance, calls = BlockSource.advance, []
+
+    def interrupted(self, target_ns, send):
+        calls.append(target_ns)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        advance(self, target_ns, send)
+
+    monkeypatch.setattr(BlockSource, 'advance', interrupted)
+    assert main(['-o', str(tmp_path / 'run.mcap'), '--duration', '20', '--quiet',
+                 '-p', f'solver.method:={method}']) == 130
+    assert capsys.readouterr().err == 'simulate: interrupted\n'
+    found, _ = read(tmp_path / 'run.mcap')
+    assert list(found['/pose']) == list(range(0, calls[1] + 1, 10_000_000))
+
+
+def test_no_streams_are_a_log_of_events(tmp_path):
+    log, _ = read(simulate(tmp_path / 'run.mcap', '--duration', 1, '-p', 'record.streams:=[]',
+                           '--command', '0.5:2.0:1.5'))
+    assert set(log) == {'/spinning_top/events', '/spinning_top/commands'}
 
 
 def test_events_tell_the_run(tmp_path):

@@ -60,12 +60,16 @@ class Attitudes:
     rates: Reals | None = None
     angles: Reals | None = None
 
-    def part(self, begin: int, end: int) -> Attitudes:
-        """Return the samples from index `begin` on, before index `end`."""
-        piece = slice(begin, end)
+    def part(self, piece: slice | NDArray[np.bool_]) -> Attitudes:
+        """Return some of the samples."""
         return Attitudes(self.stamps_ns[piece], self.quaternion[piece],
                          None if self.rates is None else self.rates[:, piece],
                          None if self.angles is None else self.angles[:, piece])
+
+    def valid(self) -> Attitudes:
+        """Return the samples whose quaternion is one: not zero, and finite."""
+        norm = np.linalg.norm(self.quaternion, axis=1)
+        return self.part(np.isfinite(norm) & (norm > 0.0))
 
 
 def join(parts: list[Attitudes]) -> Attitudes:
@@ -93,12 +97,6 @@ def from_joint_states(stamps_ns: NDArray[np.int64], positions: Reals,
     order = [1, 0, 2]
     return Attitudes(stamps_ns, Rotation.from_euler('ZYZ', positions).as_quat(),
                      angles=np.concatenate((positions[:, order], velocities[:, order]), axis=1).T)
-
-
-def _rotations(quaternion: Reals) -> Rotation:
-    """Return the attitudes (n, 4) as rotations; NaN for a damaged one that is zero."""
-    norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
-    return Rotation.from_quat(np.where(norm > 0.0, quaternion, np.nan))
 
 
 def constants(top: Top, data: Attitudes) -> tuple[Reals, Reals, Reals] | None:
@@ -132,12 +130,12 @@ def constants(top: Top, data: Attitudes) -> tuple[Reals, Reals, Reals] | None:
 
 def angle_between(p: Reals, q: Reals) -> Reals:
     """Return the angles (n,) [rad] between attitudes (n, 4), accurate near 0."""
-    return (_rotations(p).inv() * _rotations(q)).magnitude()
+    return (Rotation.from_quat(p).inv() * Rotation.from_quat(q)).magnitude()
 
 
 def _vertical(quaternion: Reals) -> Reals:
     """Return the upward vertical in the body frame, (3, n)."""
-    return _rotations(quaternion).as_matrix()[:, 2].T
+    return Rotation.from_quat(quaternion).as_matrix()[:, 2].T
 
 
 class Tilts:
@@ -199,7 +197,7 @@ class Tilts:
         # Not from the cosine, which loses the digits of a small tilt.
         self.sin2_half, self.cos2_half = x * x + y * y, z * z + w * w
         self.theta = 2.0 * np.arctan2(np.sqrt(self.sin2_half), np.sqrt(self.cos2_half))
-        axis = _rotations(quaternion).as_matrix()[:, :, 2].T
+        axis = Rotation.from_quat(quaternion).as_matrix()[:, :, 2].T
         up = _vertical(quaternion)
         self.tip = axis[0] + 1j * axis[1]
         self.body_tip = -up[0] + 1j * up[1]
@@ -213,7 +211,8 @@ class Tilts:
 
     def first(self, seconds: float) -> Tilts:
         """Return the samples of the first seconds, two at least."""
-        return Tilts(self._data.part(0, max(2, int(np.searchsorted(self.time, seconds, 'right')))))
+        return Tilts(self._data.part(
+            slice(max(2, int(np.searchsorted(self.time, seconds, 'right'))))))
 
     @property
     def height(self) -> Reals:

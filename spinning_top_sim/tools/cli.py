@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import os
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -43,9 +44,11 @@ def exit_code(name: str, command: Callable[[], int],
         The code of `command`, FAILED after one of `errors`, or INTERRUPTED after Ctrl-C.
     """
     try:
-        return command()
-    except BrokenPipeError:         # the reader of our output, such as a pager, has ended
-        sys.stderr.close()
+        code = command()
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader of the output, such as a pager, has ended.  Python flushes it once more.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
     except errors as error:
         print_line(f'{name}: {error}', sys.stderr)
@@ -53,6 +56,7 @@ def exit_code(name: str, command: Callable[[], int],
     except KeyboardInterrupt:
         print_line(f'{name}: interrupted', sys.stderr)
         return INTERRUPTED
+    return code
 
 
 def print_line(text: str, file: TextIO | None = None) -> None:

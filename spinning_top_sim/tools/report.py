@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The findings about a log: as JSON for programs, as lines and tables for people."""
+"""The findings about a log: as JSON, and as human-readable lines and tables."""
 
 from __future__ import annotations
 

@@ -283,7 +283,7 @@ class _SectionAnalyser:
                 motion.top, float(tilts.theta[middle]), float(tilts.theta_dot[middle]), l3, lz)
         count = int(np.count_nonzero(data.stamps_ns <= self._found.shown_until_ns))
         if self._found.shown is None and count > 1:
-            self._found.shown = analysis.Tilts(data.part(0, count))
+            self._found.shown = analysis.Tilts(data.part(slice(count)))
 
     def _flush(self, topic: str) -> None:
         """Analyse the samples of a topic that have been collected."""
@@ -305,8 +305,10 @@ class _SectionAnalyser:
         if stream.topic in IMU_TOPICS:
             self._keep_readings(topic, stamps_ns, fields)
         data = attitudes_of(stream, self.section.imu, stamps_ns, fields)
-        if data is None:
+        data = None if data is None else data.valid()
+        if data is None or not len(data.stamps_ns):
             return
+        stamps_ns = data.stamps_ns
         if topic == self.section.source:
             self._kept.append(data)
         values = None if stream.topic == 'imu/data' else analysis.constants(motion.top, data)
@@ -339,4 +341,4 @@ def _longest_run(data: analysis.Attitudes) -> analysis.Attitudes:
     steps = np.diff(data.stamps_ns)
     cuts = [0, *(np.flatnonzero(np.diff(steps)) + 1).tolist(), len(steps)]
     begin, end = max(itertools.pairwise(cuts), key=lambda pair: pair[1] - pair[0])
-    return data.part(begin, end + 1)
+    return data.part(slice(begin, end + 1))
