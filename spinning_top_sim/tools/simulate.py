@@ -30,9 +30,6 @@ if TYPE_CHECKING:
     from spinning_top_sim.recording.mcap_file import McapFile
     from spinning_top_sim.streams.topics import Stream
 
-    # Number of a topic, stamps (n,) [ns], messages as rows (n, size).
-    Block = tuple[int, NDArray[np.int64], NDArray[np.uint8]]
-
 # In ROS a stamp of 0 means "no time".
 DEFAULT_EPOCH = 1.0
 FORMATS = {'.mcap': 'mcap', '.csv': 'csv', '.parquet': 'parquet'}
@@ -207,72 +204,74 @@ def write_log(path: Path, values: Mapping[str, Any], duration_ns: int,
 
     simulation = Simulation(values, epoch_ns)
     streams = journal.recorded_streams(simulation.streams, values)
-    numbers = {stream.topic: number for number, stream in enumerate(streams)}
     topics = [RecordedTopic(resolve_topic(name, namespace), type_name) for name, type_name in
               (*((stream.topic, stream.type_name) for stream in streams), *journal.TOPICS)]
-    commands_topic, events_topic = len(streams), len(streams) + 1
     columns = values['solver.method'] == 'exact'
     metadata = provenance(values, epoch_ns, -1, (), values,
                           'columns' if columns else 'one state at a time')
     source = BlockSource(simulation, streams, columns=columns)
     file = create_file(path, topics, metadata, compression=values['record.compression'])
-    writer = _BackgroundWriter(file)
-
-    def advance(target_ns: int) -> None:
-        blocks: list[Block] = []
-
-        def take(stream: Stream, stamps_ns: NDArray[np.int64], rows: NDArray[np.uint8]) -> None:
-            blocks.append((numbers[stream.topic], stamps_ns, rows))
-
-        try:
-            source.advance(target_ns, take)
-        finally:                    # also what was computed before the motion could not go on
-            writer.write_blocks(blocks)
-
+    writer = _LogWriter(file, streams, epoch_ns)
     try:
-        writer.write_message(events_topic, epoch_ns, journal.event('start', 0, -1))
+        writer.write_event('start', 0, -1)
         stops = [*((command[0], command) for command in commands), (duration_ns, None)]
         for target_ns, command in targets(0, stops, block_length(streams)):
-            advance(target_ns)
+            try:
+                source.advance(target_ns, writer.take)
+            finally:                # also what was computed before the motion could not go on
+                writer.write_blocks()
             if command is not None:
                 _, l3, lz = command
                 simulation.command(l3, lz)
-                at_ns = simulation.history[-1][0]
-                writer.write_message(
-                    events_topic, epoch_ns + at_ns,
-                    journal.event('command', at_ns, simulation.now_ns, l3=l3, lz=lz))
-                writer.write_message(commands_topic, epoch_ns + at_ns, journal.command(l3, lz))
+                writer.write_command(*simulation.history[-1], simulation.now_ns)
             show(target_ns)
     finally:
         writer.close()
     return f'{sum(file.counts)} messages, {file.size / 1e6:.1f} MB'
 
 
-class _BackgroundWriter:
+class _LogWriter:
     """
-    Writes a log, and compresses and writes a chunk in a thread while the next one is computed.
+    Writes a log.  A thread compresses and writes a chunk while the next one is computed.
 
     Compression and the file system leave Python to other threads while they work.
     """
 
-    def __init__(self, file: McapFile) -> None:
-        self._file = file
+    def __init__(self, file: McapFile, streams: Sequence[Stream], epoch_ns: int) -> None:
+        self._file, self._epoch_ns = file, epoch_ns
+        self._numbers = {stream.topic: number for number, stream in enumerate(streams)}
+        self._commands_topic, self._events_topic = len(streams), len(streams) + 1
+        self._blocks: list[tuple[int, NDArray[np.int64], NDArray[np.uint8]]] = []
         self._executor = ThreadPoolExecutor(1)
         self._pending: Future[None] | None = None
 
-    def write_message(self, topic_index: int, stamp_ns: int, data: bytes) -> None:
-        """Write one message with the next chunk.  Raises OSError."""
-        self._wait()
-        if self._file.append(topic_index, stamp_ns, data):
-            self._file.write_chunk()
+    def write_event(self, name: str, t_ns: int, sent_ns: int, **details: float) -> None:
+        """Write an entry of the journal with the next chunk.  Raises OSError."""
+        self._write(self._events_topic, t_ns, journal.event(name, t_ns, sent_ns, **details))
 
-    def write_blocks(self, blocks: list[Block]) -> None:
-        """Write a chunk, after the one before.  Raises OSError of the one before."""
+    def write_command(self, t_ns: int, l3: float, lz: float, sent_ns: int) -> None:
+        """Write an applied command with the next chunk.  Raises OSError."""
+        self.write_event('command', t_ns, sent_ns, l3=l3, lz=lz)
+        self._write(self._commands_topic, t_ns, journal.command(l3, lz))
+
+    def take(self, stream: Stream, stamps_ns: NDArray[np.int64],
+             rows: NDArray[np.uint8]) -> None:
+        """Take a block of samples, which `write_blocks` writes."""
+        self._blocks.append((self._numbers[stream.topic], stamps_ns, rows))
+
+    def write_blocks(self) -> None:
+        """Begin to write a chunk of the blocks.  Raises OSError of the chunk before."""
+        blocks, self._blocks = self._blocks, []
         if blocks:
             chunk = self._file.chunk_of_rows(blocks)
             self._wait()
             self._file.write_chunk()
             self._pending = self._executor.submit(self._file.put_plain_chunk, chunk)
+
+    def _write(self, topic_index: int, t_ns: int, data: bytes) -> None:
+        self._wait()
+        if self._file.append(topic_index, self._epoch_ns + t_ns, data):
+            self._file.write_chunk()
 
     def _wait(self) -> None:
         pending, self._pending = self._pending, None
