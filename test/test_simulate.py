@@ -243,7 +243,10 @@ def test_what_cannot_be_simulated_is_told_in_a_line(tmp_path, capsys, arguments,
 def test_a_params_file_that_is_no_yaml_or_of_another_node(tmp_path, capsys):
     broken = tmp_path / 'broken.yaml'
     for text, message in ((': : [', 'not YAML'), ('other:\n  ros__parameters:\n    a: 1\n',
-                                                 'no parameters for the node spinning_top')):
+                                                 'no parameters for the node spinning_top'),
+                          ('spinning_top:\n  ros__parameters: [1]\n',
+                           'no parameters for the node spinning_top'),
+                          ('[1, 2]', 'no parameters for the node spinning_top')):
         broken.write_text(text)
         assert main(['-o', str(tmp_path / 'r.mcap'), '--params', str(broken), '--duration', '1',
                      '--quiet']) == 1

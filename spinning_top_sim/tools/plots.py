@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from spinning_top_sim.tools.survey import Survey
 # From the world to the viewer: towards, right, up.
 VIEW = Rotation.from_euler('zy', (60.0, 45.0), degrees=True)
 INK, FAINT, PATH = '#1b1b1b', '#c9c9c9', '#0b6fa4'
-# Okabe and Ito's colours: told apart by the colour-blind, and by their greys.
+# Okabe and Ito's colours: distinct also for the colour-blind, and as greys.
 COLOURS = ('#0072b2', '#d55e00', '#009e73', '#cc79a7', '#e69f00', '#56b4e9')
 FINER = 10                  # points drawn for each sample
 PAGE_NUTATIONS, PAGE_S = 8, 5.0      # on the page; seconds where theta rests
@@ -275,7 +276,7 @@ def animate(found: Survey, path: Path) -> None:
     figure = Figure(figsize=(FRAME_SIZE, FRAME_SIZE), dpi=FRAME_DPI)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
 
-    def frame(number: int) -> list[Any]:
+    def frame(number: int) -> list[Artist]:
         axes.clear()
         draw_sphere(axes, (np.pi / 2,), lowest)
         shown = number * FINER + 1

@@ -7,7 +7,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from spinning_top_sim.recording.damage import count, seconds
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -27,7 +26,7 @@ ROWS = (('nutation period', 'nutation_period', 1.0, 's'),
         ('fastest precession seen', 'precession_max', 1.0, 'rad/s'))
 
 
-def as_json(path: Path, found: Survey, verdict: Verdict | None) -> dict[str, Any]:
+def as_json(path: Path, found: Survey, verdict: Verdict | None) -> dict[str, object]:
     """
     Return all findings as what JSON can hold.
 
@@ -46,7 +45,7 @@ def as_json(path: Path, found: Survey, verdict: Verdict | None) -> dict[str, Any
         See docs/inspect.md for its keys.
     """
     damage = found.damage
-    content: dict[str, Any] = {
+    content: dict[str, object] = {
         'file': str(path),
         'whole': found.whole,
         'damage': {'torn': damage.torn, 'lost_bytes': damage.lost_bytes,
@@ -85,7 +84,7 @@ def as_json(path: Path, found: Survey, verdict: Verdict | None) -> dict[str, Any
     return {key: _json_value(value) for key, value in content.items()}
 
 
-def _motion_as_json(motion: MotionReport) -> dict[str, Any]:
+def _motion_as_json(motion: MotionReport) -> dict[str, object]:
     return {'cause': motion.cause, 'begin_ns': motion.begin_ns, 'end_ns': motion.end_ns,
             'l3': motion.l3, 'lz': motion.lz, 'energy': motion.energy,
             'source': motion.source, 'regime': motion.regime,
@@ -93,7 +92,7 @@ def _motion_as_json(motion: MotionReport) -> dict[str, Any]:
             'measured': None if motion.measured is None else asdict(motion.measured)}
 
 
-def _json_value(value: Any) -> Any:
+def _json_value(value: object) -> object:
     """Return a value with null for the numbers that JSON does not have."""
     if isinstance(value, dict):
         return {str(key): _json_value(item) for key, item in value.items()}
@@ -157,14 +156,14 @@ def _topics(found: Survey) -> Iterator[str | Table]:
         if topic.off_grid:
             yield f'{name}: {topic.off_grid} stamps are not on the grid'
         if topic.odd_size:
-            yield f'{name}: {topic.odd_size} messages have another size than ours'
+            yield f'{name}: {topic.odd_size} messages do not have the size of this stream'
 
 
 def _journal(found: Survey) -> Iterator[str]:
     run = found.run
     assert run is not None
     if run.events_topic is None:
-        yield 'no journal: commands and resets cannot be told from the data'
+        yield 'no journal: commands and resets are unknown'
         return
     nouns = {'command': 'commands', 'reset': 'resets', 'parameters': 'changes of parameters'}
     yield 'journal: ' + ', '.join(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a log tells of its run, in metadata and journal: enough to compute the run again."""
+"""The run of a log, from its metadata and journal: enough to compute it again."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EVENT_NAMES = ('start', 'command', 'parameters', 'reset')
 
 
 class ForeignLogError(Exception):
-    """A log does not tell what is needed to compute it again; the text says what is missing."""
+    """A log lacks what is needed to compute its run again; the text says what."""
 
 
 @dataclass(frozen=True)

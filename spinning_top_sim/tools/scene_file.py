@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 from spinning_top_sim.streams import parameters
 
@@ -15,7 +14,7 @@ NODES = ('/**', 'spinning_top', '/spinning_top', '/**/spinning_top')
 ROS_PARAMETERS = ('use_sim_time', 'qos_overrides')
 
 
-def read_scene(path: str | Path) -> dict[str, Any]:
+def read_scene(path: str | Path) -> dict[str, object]:
     """
     Return the parameters that a ROS 2 parameter file sets for the node spinning_top.
 
@@ -41,17 +40,18 @@ def read_scene(path: str | Path) -> dict[str, Any]:
     except UnicodeDecodeError as error:
         raise ValueError(f'{path} is not YAML: {error}') from error
     content = _parse_yaml(text, str(path))
-    values: dict[str, Any] = {}
+    values: dict[str, object] = {}
     for node, sections in content.items() if isinstance(content, Mapping) else ():
-        if node in NODES and isinstance(sections, Mapping):
-            values.update(_flatten(sections.get('ros__parameters') or {}))
+        section = sections.get('ros__parameters') if isinstance(sections, Mapping) else None
+        if node in NODES and isinstance(section, Mapping):
+            values.update(_flatten(section))
     if not values:
         raise ValueError(f'{path} has no parameters for the node spinning_top: it must have '
                          "'/**:' or 'spinning_top:', and 'ros__parameters:' in it")
     return values
 
 
-def parse_assignment(text: str) -> tuple[str, Any]:
+def parse_assignment(text: str) -> tuple[str, object]:
     """Return name and value of NAME:=VALUE, the value read as YAML.  Raises ValueError."""
     name, separator, value = text.partition(':=')
     if not separator or name not in parameters.BY_NAME:
@@ -59,7 +59,7 @@ def parse_assignment(text: str) -> tuple[str, Any]:
     return name, _parse_yaml(value, text)
 
 
-def _parse_yaml(text: str, name: str) -> Any:
+def _parse_yaml(text: str, name: str) -> object:
     """Return the content of a YAML text.  Raises ValueError, which begins with the name."""
     try:
         import yaml  # noqa: PLC0415
@@ -71,7 +71,7 @@ def _parse_yaml(text: str, name: str) -> Any:
         raise ValueError(f'{name} is not YAML: {" ".join(str(error).split())}') from error
 
 
-def _flatten(section: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
+def _flatten(section: Mapping[str, object], prefix: str = '') -> Iterator[tuple[str, object]]:
     """Yield dotted names and values of the parameters in a section, those of ROS left out."""
     for name, value in section.items():
         full = f'{prefix}{name}'

@@ -101,7 +101,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the checked parameters of the command line.  Raises ValueError."""
-    given: dict[str, Any] = {}
+    given: dict[str, object] = {}
     for path in arguments.params:
         given.update(read_scene(path))
     given.update(parse_assignment(text) for text in arguments.param)
