@@ -24,6 +24,7 @@ import numpy as np
 import report
 from ahrs.filters import AngularRate
 from cases import ROOT
+from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.solvers.propagator import propagate
 from spinning_top_sim.streams import parameters
@@ -196,8 +197,9 @@ def integration() -> str:
                 integrator, attitude = AngularRate(Dt=1 / rate), attitudes[0]
                 for one in used:
                     attitude = integrator.update(attitude, one, method=method, order=1)
-                w, x, y, z = FILTERS._product(attitude, attitudes[-1] * (1, -1, -1, -1))
-                angle = 2.0 * math.atan2(math.hypot(x, y, z), abs(w))
+                reached, truth = (Rotation.from_quat(np.roll(quaternion, -1))
+                                  for quaternion in (attitude, attitudes[-1]))
+                angle = (reached * truth.inv()).magnitude()
                 row.append(f'{math.degrees(angle) / seconds:.2g}')
         lines.append(row)
         print('integration', row, flush=True)

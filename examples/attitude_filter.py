@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.nodes import executable
 
@@ -110,49 +111,44 @@ class Error(NamedTuple):
     heading: float
 
 
-def error_of(estimate: Sequence[float], truth: Sequence[float]) -> tuple[float, float]:
-    """
-    Return tilt and heading of the rotation, in the world, from the truth to an estimate [rad].
-
-    estimate: w, x, y, z;  truth: x, y, z, w
-    """
-    w, x, y, z = _product(estimate, (truth[3], -truth[0], -truth[1], -truth[2]))
+def error_of(estimate: Rotation, truth: Rotation) -> tuple[float, float]:
+    """Return tilt and heading of an estimate relative to the truth, in the world frame [rad]."""
+    x, y, z, w = (estimate * truth.inv()).as_quat()
     return 2.0 * math.atan2(math.hypot(x, y), math.hypot(z, w)), 2.0 * math.atan2(z, w)
-
-
-def mounting_of(roll: float, pitch: float, yaw: float) -> tuple[float, ...]:
-    """Return q(body <- IMU) of the URDF's roll, pitch and yaw [rad], as w, x, y, z."""
-    about_x, about_y, about_z = ((math.cos(0.5 * angle), math.sin(0.5 * angle))
-                                 for angle in (roll, pitch, yaw))
-    turn = _product((about_z[0], 0.0, 0.0, about_z[1]), (about_y[0], 0.0, about_y[1], 0.0))
-    return _product(turn, (about_x[0], about_x[1], 0.0, 0.0))
-
-
-def _product(p: Sequence[float], q: Sequence[float]) -> tuple[float, ...]:
-    (a, b, c, d), (w, x, y, z) = p, q
-    return (a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w)
 
 
 class Comparison:
     """
     One filter, fed with samples of the IMU and compared with poses of the same stamps.
 
-    errors: so far;  lost: samples that never came, bridged by a straight line;  restarts: of the
-    filter, after gaps too long for that or stamps that went back
+    Parameters
+    ----------
+    name : str
+        One of FILTERS.
+    rpy : sequence of float
+        Mounting of the IMU in the body: roll, pitch and yaw as in URDF [rad].
+
+    Attributes
+    ----------
+    errors : list of Error
+        So far.
+    lost : int
+        Samples that never came, bridged by a straight line.
+    restarts : int
+        Of the filter, after gaps too long for that or stamps that went back.
     """
 
-    def __init__(self, name: str, mounting: Sequence[float] = (1.0, 0.0, 0.0, 0.0)) -> None:
+    def __init__(self, name: str, rpy: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
         self.name = name
         self.errors: list[Error] = []
         self.lost = self.restarts = 0
-        self._mounting = mounting
+        self._mounting = Rotation.from_euler('xyz', rpy)
         self._first: list[tuple[int, np.ndarray, np.ndarray]] = []
         self._period_ns = 0
         self._step: Step
         self._last: tuple[int, np.ndarray, np.ndarray]
-        self._estimates: dict[int, Sequence[float]] = {}
-        self._truths: dict[int, Sequence[float]] = {}
+        self._estimates: dict[int, Rotation] = {}
+        self._truths: dict[int, Rotation] = {}
 
     def imu(self, stamp_ns: int, rates: Sequence[float], force: Sequence[float]) -> None:
         """Take a sample: rates [rad/s] and specific force [m/s^2]."""
@@ -170,8 +166,7 @@ class Comparison:
 
     def pose(self, stamp_ns: int, attitude: Sequence[float]) -> None:
         """Take the body's true attitude, x, y, z, w."""
-        w, x, y, z = _product((attitude[3], *attitude[:3]), self._mounting)
-        self._truths[stamp_ns] = (x, y, z, w)
+        self._truths[stamp_ns] = Rotation.from_quat(attitude) * self._mounting
         self._match(stamp_ns)
 
     def _start(self, sample: tuple[int, np.ndarray, np.ndarray]) -> None:
@@ -195,7 +190,8 @@ class Comparison:
             estimate = self._step(last_rates + middle * (rates - last_rates),
                                   last_force + (k + 1) / steps * (force - last_force))
         self._last = sample
-        self._estimates[stamp_ns] = estimate
+        w, x, y, z = estimate
+        self._estimates[stamp_ns] = Rotation.from_quat((x, y, z, w))
         self._match(stamp_ns)
 
     def _match(self, stamp_ns: int) -> None:
@@ -288,7 +284,7 @@ def compare(path: Path, names: Sequence[str], namespace: str = '/',
         if rpy is None:
             provenance = reader.metadata.get('spinning_top_sim', {})
             rpy = json.loads(provenance.get('parameters', '{}')).get('imu.rpy', (0.0, 0.0, 0.0))
-        comparisons = [Comparison(name, mounting_of(*rpy)) for name in names]
+        comparisons = [Comparison(name, rpy) for name in names]
         for message in reader.messages([imu, pose]):
             decoded = typestore.deserialize_cdr(message.data, there[message.topic])
             for comparison in comparisons:
@@ -353,8 +349,8 @@ def make_node(arguments: argparse.Namespace) -> Any:
         def __init__(self) -> None:
             super().__init__('attitude_filter')
             self.finished: Future = Future()
-            mounting = mounting_of(*(arguments.rpy or (0.0, 0.0, 0.0)))
-            self._comparisons = [Comparison(name, mounting) for name in arguments.filter]
+            self._comparisons = [Comparison(name, arguments.rpy or (0.0, 0.0, 0.0))
+                                 for name in arguments.filter]
             self._reported_ns = 0
             # Deep: a sample lost is lost for the filter.
             profile = QoSProfile(depth=1000)

@@ -15,7 +15,7 @@ from launch_ros.actions import Node
 from spinning_top_sim.nodes import launch_helpers
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.tools.rerun import NotOursError, read_account
+from spinning_top_sim.tools.run_description import ForeignLogError, read_run_description
 
 SHARE = Path(get_package_share_directory('spinning_top_sim'))
 SWITCH = ['true', 'false']
@@ -63,17 +63,17 @@ def _nodes(context: LaunchContext) -> list:
         return actions
     try:
         with LogReader(Path(given['file'])) as log:
-            account = read_account(log)
-    except (LogError, NotOursError, OSError) as error:
+            run = read_run_description(log)
+    except (LogError, ForeignLogError, OSError) as error:
         # What cannot be played replay_node will tell.
         return [*actions, LogInfo(msg=f'neither TF nor RViz: {error}')]
-    topics = {name: topic for topic, name in account.topics.items()}
+    topics = {name: topic for topic, name in run.topics.items()}
     namespace = _namespace(topics)
     if on['tf'] and 'joint_states' in topics:
         actions += launch_helpers.state_publisher(
-            SHARE, account.now, namespace, topics['joint_states'], clocked)
+            SHARE, run.now, namespace, topics['joint_states'], clocked)
     if on['rviz']:
-        actions.append(launch_helpers.rviz(SHARE, account.now['world_frame'], namespace, clocked))
+        actions.append(launch_helpers.rviz(SHARE, run.now['world_frame'], namespace, clocked))
     return actions
 
 

@@ -17,8 +17,8 @@ from launch_ros.actions import Node
 
 from spinning_top_sim.nodes import launch_helpers
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.tools.names import resolve_topic
 from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
-from spinning_top_sim.tools.simulate import resolve
 
 SHARE = Path(get_package_share_directory('spinning_top_sim'))
 SCENES = sorted(path.stem for path in (SHARE / 'config').glob('*.yaml'))
@@ -95,7 +95,7 @@ def _nodes(context: LaunchContext) -> list:
     actions = launch_helpers.until_it_ends(node)
     if on['tf']:
         actions += launch_helpers.state_publisher(
-            SHARE, values, namespace, resolve('joint_states', namespace),
+            SHARE, values, namespace, resolve_topic('joint_states', namespace),
             on['use_sim_time'])
     if on['rviz']:
         actions.append(launch_helpers.rviz(SHARE, values['world_frame'], namespace,

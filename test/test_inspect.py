@@ -5,6 +5,7 @@
 What is measured is compared with the closed form, which test_exact.py holds against 30 digits.
 """
 
+import io
 import json
 import re
 import struct
@@ -19,8 +20,7 @@ from reference import ROOT, SCENES, scene_parameters
 
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.pipeline import Simulation
-from spinning_top_sim.tools import analysis, inspect, simulate
+from spinning_top_sim.tools import analysis, cli, inspect, simulate
 from spinning_top_sim.tools.survey import survey
 
 RUN_S = 20
@@ -120,10 +120,10 @@ def test_every_scene_is_measured_from_its_data(tmp_path, scene, method):
     if (scene, method) == ('waking_sleeper', 'rk45'):   # grows what the tolerance leaves
         arguments += ['-p', 'solver.rtol:=1.0e-13']
     found = surveyed(log_of(tmp_path / 'run.mcap', *arguments))
-    truth = Simulation(parameters.checked(scene_parameters(scene))).describe()
     motion, = found.motions
-    assert motion.described == truth
-    assert motion.described.name == motion.regime == NAMES[scene]
+    truth = motion.described
+    assert_exact_numbers(truth, parameters.checked(scene_parameters(scene)))
+    assert truth.name == motion.regime == NAMES[scene]
     measured = motion.measured
     if scene in RESTING:
         assert measured.nutation_period is None and measured.nutations == 0
@@ -137,6 +137,65 @@ def test_every_scene_is_measured_from_its_data(tmp_path, scene, method):
     assert measured.theta_min == pytest.approx(truth.theta_min, abs=1e-6)
     assert measured.theta_max == pytest.approx(truth.theta_max, abs=1e-6)
     assert not measured.missing
+
+
+def assert_exact_numbers(described, values):
+    """
+    Compare the exact numbers with the cubic u'^2 = f(u), u = cos(theta), solved by numpy.
+
+    The extremes of phi' are compared with phi' at tilts all over the swing.
+    """
+    top, start = parameters.top_of(values), parameters.start_state(values)
+    torque, lambda1, l3, lz = top.gravity_torque, top.lambda1, start.l3, start.lz
+    if torque == 0.0:
+        assert described.gyroscopic_ratio == np.inf
+    else:
+        assert described.gyroscopic_ratio == pytest.approx(
+            l3 * l3 / (4.0 * lambda1 * abs(torque)), rel=1e-12)
+    u0 = np.cos(start.theta)
+    kinetic = 0.5 * lambda1 * start.theta_dot ** 2
+    if np.sin(start.theta):
+        kinetic += 0.5 * (lz - l3 * u0) ** 2 / lambda1 / np.sin(start.theta) ** 2
+    line = np.polynomial.Polynomial([kinetic + torque * u0, -torque])
+    f = (2.0 / lambda1 * line * np.polynomial.Polynomial([1.0, 0.0, -1.0])
+         - np.polynomial.Polynomial([lz / lambda1, -l3 / lambda1]) ** 2)
+    roots = np.sort(f.trim().roots().real)
+    low, high = (roots[:2] if torque >= 0.0 else roots[1:]).clip(-1.0, 1.0)
+    # A root that is double, or at a pole, is known to the root of the last bit only.
+    assert np.cos([described.theta_max, described.theta_min]) == pytest.approx(
+        [low, high], abs=1e-7)
+    if torque > 0.0:
+        assert described.separatrix_distance == pytest.approx(
+            (roots[2] - roots[1]) / (roots[2] - roots[0]), rel=1e-5, abs=1e-7)
+    if l3 == lz == 0.0:
+        assert described.precession_min == described.precession_max == 0.0
+        return
+    tilts = np.linspace(described.theta_min, described.theta_max, 100_001)
+    if start.theta == 0.0:                  # upright: the limit at the pole
+        rates = np.array([0.5 * l3 / lambda1])
+    else:
+        rates = (lz - l3 * np.cos(tilts)) / lambda1 / np.sin(tilts) ** 2
+    close = {'rel': 1e-6, 'abs': 1e-7 * np.abs(rates).max()}
+    assert described.precession_min == pytest.approx(rates.min(), **close)
+    assert described.precession_max == pytest.approx(rates.max(), **close)
+
+
+@pytest.mark.parametrize(('l3', 'lz'), [(1.6, 1.7), (1.6, -1.7), (-1.6, 1.7)])
+def test_the_slowest_precession_may_be_within_the_swing(tmp_path, l3, lz):
+    """|Lz| > |L3|: phi' is extreme at a tilt between the ends, where L3 u^2 - 2 Lz u + L3 = 0."""
+    scene = {'initial.theta': 0.75 if l3 * lz > 0.0 else 2.39, 'initial.theta_dot': 3.0,
+             'spin.l3': l3, 'spin.lz': lz}
+    found = surveyed(log_of(tmp_path / 'run.mcap', '--duration', 2, '-p', 'solver.method:=exact',
+                            *(argument for name, value in scene.items()
+                              for argument in ('-p', f'{name}:={value}'))))
+    motion, = found.motions
+    assert_exact_numbers(motion.described, parameters.checked(scene))
+    inner = np.arccos((lz - np.copysign(np.sqrt(lz * lz - l3 * l3), lz)) / l3)
+    assert motion.described.theta_min < inner < motion.described.theta_max
+    # The samples reach the extremes, too, as far as samples do.
+    for name in ('precession_min', 'precession_max'):
+        assert getattr(motion.measured, name) == pytest.approx(
+            getattr(motion.described, name), rel=1e-2)
 
 
 def test_a_slow_topic_says_that_it_does_not_resolve_the_nutation(tmp_path):
@@ -191,6 +250,18 @@ def test_interpolation_is_as_good_as_its_bound():
     off = analysis.interpolate(samples, at) - np.cos(2.0 * np.pi * at / 10.0 + 0.3)
     assert np.max(np.abs(off)) < 1.5 * np.sin(np.pi / 10.0) ** 24 + 2e-15
     assert np.array_equal(analysis.interpolate(samples, np.arange(200.0)), samples)
+
+
+@pytest.mark.parametrize('number', [0.0, np.nan, np.inf])
+def test_an_attitude_that_is_none_is_left_out(stepped, tmp_path, capsys, number):
+    """Of one message; the rest is as accurate as before."""
+    path = rewritten(stepped, tmp_path / 'run.mcap', lambda topic, index, data: (
+        data[:-32] + struct.pack('<4d', *(4 * [number]))
+        if (topic, index) == ('/a/b/pose', 250) else data))
+    code, content = as_json(capsys, path)
+    assert code == 0
+    assert content['orientation_error']['/a/b/pose']['max'] < 1e-9
+    assert content['motions'][-1]['measured']['nutations'] >= 1
 
 
 def test_missing_samples_are_told_where_they_are(stepped, tmp_path, capsys):
@@ -363,16 +434,33 @@ def test_a_torn_file_is_told_and_what_is_left_verifies(columns, tmp_path, capsys
     assert content['motions'][2]['measured']['nutations'] > 5
 
 
-def test_text_tells_the_numbers_with_and_without_rich(stepped, capsys, monkeypatch):
-    texts = [told(capsys, stepped)[1]]
-    monkeypatch.setitem(sys.modules, 'rich', None)
-    texts.append(told(capsys, stepped)[1])
-    for text in texts:
-        assert 'whole, 3 s' in text and '/a/b/ground_truth/imu' in text
-        assert 'motion 3 (command), 1 to 2.0031 s: loops' in text
-        assert re.search(r'nutation period \[s\] +0\.433970\d+ +0\.433970\d+ +-?\d\.\de-1\d', text)
-        assert 'orientation error against the exact solution' in text
-        assert 'journal: 3 commands, 0 resets' in text
+def test_text_tells_the_numbers(stepped, capsys):
+    text = told(capsys, stepped)[1]
+    assert 'whole, 3 s' in text and '/a/b/ground_truth/imu' in text
+    assert 'motion 3 (command), 1 to 2.0031 s: loops' in text
+    assert re.search(r'nutation period \[s\] +0\.433970\d+ +0\.433970\d+ +-?\d\.\de-1\d', text)
+    assert 'orientation error against the exact solution' in text
+    assert 'journal: 3 commands, 0 resets' in text
+
+
+@pytest.mark.parametrize('width', [200, 70, 40])
+def test_a_table_breaks_no_word_however_narrow(width):
+    """Lines fit where words do; in each column the pieces of a cell make the cell again."""
+    head = ('topic', 'type', 'messages', 'rate [Hz]')
+    rows = [('/a/b/ground_truth/imu', 'geometry_msgs/msg/PoseStamped', '1000', '99.9'),
+            ('/markers', 'visualization_msgs/msg/MarkerArray', '', '')]
+    _, title, *lines = cli.Table('topics', head, rows).lines(width)
+    assert title == 'topics'
+    words = {piece for row in (head, *rows) for cell in row
+             for piece in re.findall(r'[^/ ]+/?|/', cell)}
+    for line in lines:
+        assert len(line) <= max(width, 52)
+        assert set(re.findall(r'[^/ ]+/?|/', line)) <= words
+    text = ''.join(''.join(lines).split())
+    for row in rows:
+        for piece in re.findall(r'[^/]+/?', row[1]):
+            assert piece in text
+    assert len(lines) == 3 if width == 200 else len(lines) > 3
 
 
 def test_json_is_strict_and_documented(columns, capsys):
@@ -400,7 +488,7 @@ def test_a_strangers_log_is_listed(tmp_path, capsys):
     assert content['topics']['/thing']['count'] == 11
     assert content['topics']['/thing']['rate'] == pytest.approx(10.0)
     code, out, _ = told(capsys, path)
-    assert code == 0 and 'not one of ours' in out and '/thing' in out
+    assert code == 0 and 'not recorded by spinning_top_sim' in out and '/thing' in out
     assert told(capsys, path, '--verify')[0] == 1
     code, _, err = told(capsys, path, '--plot', tmp_path / 'no.png')
     assert code == 1 and 'nothing to draw' in err and not (tmp_path / 'no.png').exists()
@@ -413,6 +501,30 @@ def test_what_cannot_be_read_says_so(tmp_path, capsys, content):
         path.write_bytes(content)
     code, out, err = told(capsys, path)
     assert code == 1 and not out and str(path) in err
+
+
+def test_a_reader_that_leaves_is_no_error(stepped):
+    run = subprocess.Popen([sys.executable, '-m', 'spinning_top_sim.tools.inspect', stepped],
+                           stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    run.stdout.close()
+    assert run.stderr.read() == b''
+    assert run.wait(60) == 0
+
+
+def test_progress_is_shown_on_a_terminal_only(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    monkeypatch.setitem(sys.modules, 'tqdm', None)
+    for stream, quiet, shown in ((Terminal(), False, ['  0 %', ' 50 %', '100 %']),
+                                 (Terminal(), True, []), (io.StringIO(), False, [])):
+        monkeypatch.setattr(sys, 'stderr', stream)
+        with cli.progress('simulated', 20.0, 's', quiet=quiet) as show:
+            for done in (0.0, 10.0, 10.0001, 20.0):
+                show(done)
+        assert re.findall(r'\rsimulated (.{5})', stream.getvalue()) == shown
+        assert stream.getvalue().endswith('\r\033[K') == bool(shown)
 
 
 def test_wrong_arguments_are_2(capsys):
@@ -441,7 +553,7 @@ def test_the_path_that_is_drawn_has_cusps(tmp_path, method):
 
     found = surveyed(log_of(tmp_path / 'run.mcap', '--duration', 6,
                             '-p', f'solver.method:={method}'))
-    time, tip, height = smooth_tip(found.tilts)
+    time, tip, height = smooth_tip(found.shown)
     points = np.stack((tip.real, tip.imag, height))
     velocity = np.diff(points, axis=1) / np.diff(time)
     speed = np.linalg.norm(velocity, axis=0)
@@ -501,8 +613,9 @@ def test_without_matplotlib_there_is_a_hint(stepped, tmp_path):
 
 def test_neither_ros_nor_pictures_are_imported_unasked(stepped):
     code = ('import sys\nfrom spinning_top_sim.tools.inspect import main\n'
+            'early = sorted({"numpy", "scipy"} & set(sys.modules))\n'
             f'main([{str(stepped)!r}, "--verify"])\n'
-            'print("loaded:", sorted({"rclpy", "scipy", "matplotlib"} & set(sys.modules)))')
+            'print("loaded:", early, sorted({"rclpy", "matplotlib"} & set(sys.modules)))')
     run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                          timeout=60, check=True)
-    assert run.stdout.strip().endswith('loaded: []')
+    assert run.stdout.strip().endswith('loaded: [] []')

@@ -17,6 +17,7 @@ from rosbags.highlevel import AnyReader
 from spinning_top_sim import solve
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.tools.blocks import BlockSource
 from spinning_top_sim.tools.simulate import main
 
 EVERYTHING = ['-p', 'imu_data.enabled:=true', '-p', 'clock.enabled:=true',
@@ -184,6 +185,40 @@ def test_parquet(tmp_path):
     assert table.num_rows == 101 and table.column_names[:2] == ['t', 'theta']
 
 
+def test_commands_at_one_time_are_applied_in_the_order_given(tmp_path):
+    """The last one given holds, whether its momenta are larger or smaller."""
+    for number, (first, last) in enumerate((('2.0:1.5', '1.7:1.4'), ('1.7:1.4', '2.0:1.5'))):
+        log, _ = read(simulate(tmp_path / f'{number}.mcap', '--duration', 1.2, '--command',
+                               f'1:{first}', '--command', f'1:{last}'))
+        labels = messages_of(log, '/spinning_top/invariants')
+        assert labels[1_000_000_000][1] == pytest.approx(1.6)        # samples, then commands
+        assert labels[1_100_000_000][1] == pytest.approx(float(last.split(':')[0]))
+        table = simulate(tmp_path / f'{number}.csv', '--duration', 1.2, '--command', f'1:{first}',
+                         '--command', f'1:{last}')
+        with open(table, newline='') as file:
+            *_, row = csv.DictReader(file)
+        assert float(row['l3 [kg m^2/s]']) == pytest.approx(float(last.split(':')[0]))
+
+
+def messages_of(log, topic):
+    """Return the numbers of each message of `~/invariants` by time: E, L3, Lz, and the rest."""
+    stream = next(stream for stream in Simulation(parameters.checked({})).streams
+                  if stream.topic == topic.replace('/spinning_top', '~'))
+    return {t: stream.template.decode_many(data)[0][0] for t, data in log[topic].items()}
+
+
+def test_a_command_exactly_at_the_end_is_applied(tmp_path):
+    log, _ = read(simulate(tmp_path / 'run.mcap', '--duration', 1, '--command', '1:2.0:1.5'))
+    assert list(log['/spinning_top/commands']) == [1_000_000_000]
+    events = events_of(log)
+    assert [event['event'] for event in events] == ['start', 'command']
+    assert max(log['/pose']) == 1_000_000_000
+
+
+def events_of(log):
+    return [json.loads(data[8:].rstrip(b'\0')) for data in log['/spinning_top/events'].values()]
+
+
 @pytest.mark.parametrize(('arguments', 'message'), [
     (['--duration', '0'], 'duration = 0.0 s'), ([], 'duration = 0.0 s'),
     (['--duration', '1', '-p', 'top.lambda1:=-1'], 'top.lambda1 = -1'),
@@ -191,6 +226,9 @@ def test_parquet(tmp_path):
     (['--duration', '1', '--params', '/nowhere.yaml'], '/nowhere.yaml'),
     (['--duration', '1', '--command', '1:2'], '--command 1:2'),
     (['--duration', '1', '--command=-1:2:2'], '--command -1:2:2'),
+    (['--duration', '1', '--command', '1.000000001:2:1.5'], 'end of the run, 1 s'),
+    (['--duration', '1', '--command', 'nan:2:1.5'], '--command nan:2:1.5'),
+    (['--duration', '1', '-p', 'spin.l3:=[1'], 'spin.l3:=[1 is not YAML'),
     (['--duration', '1', '-p', 'initial.theta:=0.0', '--command', '0.5:2.0:1.0'], 'at a pole'),
     (['--duration', '1', '-p', 'initial.theta:=0.0', '-p', 'solver.equations:=euler'],
      'transport'),
@@ -204,12 +242,36 @@ def test_what_cannot_be_simulated_is_told_in_a_line(tmp_path, capsys, arguments,
 
 def test_a_params_file_that_is_no_yaml_or_of_another_node(tmp_path, capsys):
     broken = tmp_path / 'broken.yaml'
-    for text, message in ((': : [', 'no YAML'), ('other:\n  ros__parameters:\n    a: 1\n',
-                                                 'no parameters for the node spinning_top')):
+    for text, message in ((': : [', 'not YAML'), ('other:\n  ros__parameters:\n    a: 1\n',
+                                                 'no parameters for the node spinning_top'),
+                          ('spinning_top:\n  ros__parameters: [1]\n',
+                           'no parameters for the node spinning_top'),
+                          ('[1, 2]', 'no parameters for the node spinning_top')):
         broken.write_text(text)
         assert main(['-o', str(tmp_path / 'r.mcap'), '--params', str(broken), '--duration', '1',
                      '--quiet']) == 1
         assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('name', ['run', 'run.bag', 'run.mcap.zst', 'run.CSV'])
+def test_an_unknown_extension_is_refused(tmp_path, capsys, name):
+    assert main(['-o', str(tmp_path / name), '--duration', '1', '--quiet']) == 1
+    error = capsys.readouterr().err
+    assert name in error and '.mcap, .csv, .parquet' in error
+    assert list(tmp_path.iterdir()) == []
+    arguments = ['--duration', '1', '--quiet', '--format', 'mcap']
+    assert main(['-o', str(tmp_path / name), *arguments]) == 0
+    assert read(tmp_path / name)
+
+
+@pytest.mark.parametrize('arguments', [
+    ['-o', 'run.parquet'], ['-o', 'run.csv', '-p', 'initial.theta:=0.0', '-p', 'spin.lz:=1.0'],
+    ['-o', 'run.mcap', '--command', '2:1.0:1.0'], ['-o', 'run.csv', '--command', '2:1.0:1.0']])
+def test_what_is_refused_leaves_no_file(tmp_path, monkeypatch, arguments):
+    monkeypatch.setitem(sys.modules, 'pyarrow', None)
+    monkeypatch.chdir(tmp_path)
+    assert main([*arguments, '--duration', '1', '--quiet']) == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_nothing_is_overwritten(tmp_path, capsys):
@@ -236,10 +298,34 @@ def test_a_full_disk_leaves_a_readable_log(tmp_path):
     assert len(found['/pose']) > 100
 
 
+@pytest.mark.parametrize('method', ['exact', 'rk45'])
+def test_an_interrupted_run_is_a_shorter_log(tmp_path, capsys, monkeypatch, method):
+    advance, calls = BlockSource.advance, []
+
+    def interrupted(self, target_ns, send):
+        calls.append(target_ns)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        advance(self, target_ns, send)
+
+    monkeypatch.setattr(BlockSource, 'advance', interrupted)
+    assert main(['-o', str(tmp_path / 'run.mcap'), '--duration', '20', '--quiet',
+                 '-p', f'solver.method:={method}']) == 130
+    assert capsys.readouterr().err == 'simulate: interrupted\n'
+    found, _ = read(tmp_path / 'run.mcap')
+    assert list(found['/pose']) == list(range(0, calls[1] + 1, 10_000_000))
+
+
+def test_no_streams_are_a_log_of_events(tmp_path):
+    log, _ = read(simulate(tmp_path / 'run.mcap', '--duration', 1, '-p', 'record.streams:=[]',
+                           '--command', '0.5:2.0:1.5'))
+    assert set(log) == {'/spinning_top/events', '/spinning_top/commands'}
+
+
 def test_events_tell_the_run(tmp_path):
     log, metadata = read(simulate(tmp_path / 'run.mcap', '--duration', 1,
                                   '--command', '0.5:2.0:1.5'))
-    events = [json.loads(data[8:].rstrip(b'\0')) for data in log['/spinning_top/events'].values()]
+    events = events_of(log)
     assert [event['event'] for event in events] == ['start', 'command']
     assert events[1] == {'event': 'command', 't_ns': 500_000_000, 'sent_ns': 500_000_000,
                          'l3': 2.0, 'lz': 1.5}

@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from reference import ROOT, SCENES, scene_parameters
+from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.physics.shape import shape_of
 from spinning_top_sim.streams import parameters
@@ -38,11 +39,7 @@ def robot(tmp_path, values):
 
 
 def matrix(q):
-    x, y, z, w = q
-    return np.array([
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
-        [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
-        [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)]])
+    return Rotation.from_quat(q).as_matrix()
 
 
 # ---------------------------------------------------------------------------------- kinematics
@@ -155,7 +152,7 @@ def test_it_looks_as_the_markers_do(values):
 def test_the_defaults_of_the_xacro_file_are_the_nodes():
     import xacro
 
-    bare = xacro.process_file(str(ROOT / 'urdf' / urdf.NAME)).documentElement.toxml()
+    bare = xacro.process_file(str(ROOT / 'urdf' / urdf.XACRO_FILE)).documentElement.toxml()
     full = ElementTree.canonicalize(described({}), strip_text=True)
     assert ElementTree.canonicalize(bare, strip_text=True) == full
 

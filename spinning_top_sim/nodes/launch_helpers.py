@@ -16,7 +16,7 @@ from launch.events import Shutdown
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from spinning_top_sim.tools.simulate import resolve
+from spinning_top_sim.tools.names import resolve_topic
 from spinning_top_sim.tools.urdf import inertia_warning, robot_description
 
 STATE_PUBLISHER = 'robot_state_publisher'
@@ -75,7 +75,7 @@ def rviz(share: Path, world_frame: str, namespace: str, use_sim_time: bool) -> N
     return Node(
         package='rviz2', executable='rviz2', namespace=namespace,
         arguments=['-d', str(share / 'rviz/spinning_top.rviz'), '-f', world_frame],
-        remappings=[(f'/{topic}', resolve(topic, namespace))
+        remappings=[(f'/{topic}', resolve_topic(topic, namespace))
                     for topic in ('markers', 'robot_description')],
         parameters=[{'use_sim_time': use_sim_time}])
 

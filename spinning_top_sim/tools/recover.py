@@ -5,24 +5,21 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-ALL_KEPT = 0
-FAILED = 1
-SOME_LOST = 3
-INTERRUPTED = 130
+from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.tools.cli import OK, exit_code, print_line, progress
 
-_PROGRESS_BYTES = 50_000_000  # smaller files are through before one could read it
+SOME_LOST = 3
+# Smaller files are done before one could read the progress.
+PROGRESS_BYTES = 50_000_000
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
     arguments = _parser().parse_args(argv)
-    try:
-        return _run(arguments)
-    except KeyboardInterrupt:
-        return INTERRUPTED
+    return exit_code('recover', lambda: _run(arguments), (LogError,))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -32,11 +29,12 @@ def _parser() -> argparse.ArgumentParser:
                     'that every reader takes: chunks as they are, index and summary made anew.\n'
                     'The old file is only read.',
         epilog='exit codes:\n'
-               '  0  everything was kept (index and summary do not count)\n'
-               '  1  nothing was written: no whole message in it, no MCAP file, not readable, or\n'
-               '     the output exists\n'
-               '  2  wrong arguments\n'
-               '  3  some was lost: what and how much is said\n')
+               '  0    everything was kept (index and summary do not count)\n'
+               '  1    nothing was written: no whole message in it, no MCAP file, not readable,\n'
+               '       or the output exists\n'
+               '  2    wrong arguments\n'
+               '  3    some was lost: what and how much is printed\n'
+               '  130  interrupted: nothing was written\n')
     parser.add_argument('log', type=Path, help='the MCAP file, of this package or any other')
     parser.add_argument(
         '-o', '--output', type=Path, metavar='FILE',
@@ -47,48 +45,21 @@ def _parser() -> argparse.ArgumentParser:
 def _run(arguments: argparse.Namespace) -> int:
     # Not before: --help needs none of it.
     from spinning_top_sim.recording.damage import count  # noqa: PLC0415
-    from spinning_top_sim.recording.errors import LogError  # noqa: PLC0415
     from spinning_top_sim.recording.reader import LogReader  # noqa: PLC0415
     from spinning_top_sim.recording.recovery import recover  # noqa: PLC0415
 
     log: Path = arguments.log
     output: Path = arguments.output or log.with_name(f'{log.stem}_recovered.mcap')
-    try:
-        with LogReader(log) as reader:
-            recovered = recover(reader, output, _progress(reader.size))
-    except LogError as error:
-        _say(f'recover: {error}', sys.stderr)
-        return FAILED
+    with LogReader(log) as reader, progress(
+            'recovered', reader.size, 'bytes', quiet=reader.size < PROGRESS_BYTES) as show:
+        recovered = recover(reader, output, lambda done, total: show(done))
     damage = recovered.damage
     for line in damage.lines():
-        _say(line)
+        print_line(line)
     kept = (f'{count(recovered.messages, "message")} in {count(recovered.chunks, "chunk")}, '
             f'{count(recovered.bytes, "byte")}')
-    _say(f'{"kept all" if damage.lossless else "kept"}: {kept} in {recovered.path}')
-    return ALL_KEPT if damage.lossless else SOME_LOST
-
-
-def _say(text: str, stream=None) -> None:
-    """Print a line, whatever bytes a file name holds."""
-    print(text.encode(errors='backslashreplace').decode(), file=stream or sys.stdout)
-
-
-def _progress(size: int) -> Callable[[int, int], None]:
-    """Return what shows how far a recovery is: for big files, on a terminal, in percent."""
-    shown = -1
-
-    def show(done: int, total: int) -> None:
-        nonlocal shown
-        percent = 100 * done // total
-        if percent != shown:
-            shown = percent
-            end = '\r\033[K' if done == total else ''
-            print(f'\r{percent:3d} %{end}', end='', file=sys.stderr, flush=True)
-
-    def be_silent(done: int, total: int) -> None:
-        pass
-
-    return show if size >= _PROGRESS_BYTES and sys.stderr.isatty() else be_silent
+    print_line(f'{"kept all" if damage.lossless else "kept"}: {kept} in {recovered.path}')
+    return OK if damage.lossless else SOME_LOST
 
 
 if __name__ == '__main__':

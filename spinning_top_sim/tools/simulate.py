@@ -2,58 +2,59 @@
 """
 The executable `simulate`: the node's pipeline offline, as fast as the machine goes.
 
-The same parameters, seed and commands give the same messages as a live run, the offset of the
-stamps aside.  rk45 has the bytes of a live run; the exact solution is evaluated and written in
-whole columns of its own.
+The same parameters, seed and commands give the same messages as a live run, apart from the
+offset of the stamps.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.solvers.rk45 import NANOSECONDS
 from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.streams.pipeline import Messages, Simulation
+from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.tools.cli import OK, exit_code, print_line, progress
+from spinning_top_sim.tools.names import resolve_topic
 from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor, Future
+    import numpy as np
+    from numpy.typing import NDArray
 
-# Simulated time between two looks at the progress, when states go one by one.
-STRIDE_NS = NANOSECONDS
-# Uncompressed size of a chunk of columns: large enough for numpy, small enough for a reader.
-CHUNK_BYTES = 1 << 21
+    from spinning_top_sim.recording.mcap_file import McapFile
+    from spinning_top_sim.streams.topics import Stream
+
 # In ROS a stamp of 0 means "no time".
 DEFAULT_EPOCH = 1.0
+FORMATS = {'.mcap': 'mcap', '.csv': 'csv', '.parquet': 'parquet'}
 
+# Time [ns], L3 and Lz [kg m^2/s].
 Command = tuple[int, float, float]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run it; return 0, or 1 for what cannot be simulated or written."""
+    """Run the command with these arguments, by default the program's; return its exit code."""
     arguments = _parser().parse_args(argv)
-    try:
-        values = _values(arguments)
-        _run(arguments, values)
-    except (ValueError, RecordingError, IntegrationError, OSError) as error:
-        print(f'simulate: {error}', file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print('simulate: interrupted', file=sys.stderr)
-        return 130
-    return 0
+    return exit_code('simulate', lambda: _run(arguments),
+                     (ValueError, RecordingError, IntegrationError, OSError))
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog='simulate', description='Simulate the heavy symmetric top offline, into a log (MCAP) '
-        'or a table of the truth (CSV, Parquet).')
+        prog='simulate', formatter_class=argparse.RawDescriptionHelpFormatter,
+        description='Simulate the heavy symmetric top offline, into a log (MCAP) or a table of '
+        'the\ntrue states (CSV, Parquet).',
+        epilog='exit codes:\n'
+               '  0    done\n'
+               '  1    the run cannot be simulated or written; the reason is printed\n'
+               '  2    wrong arguments\n'
+               '  130  interrupted; the log holds what was computed before\n')
     parser.add_argument('--params', metavar='FILE', action='append', default=[],
                         help='parameter file as for the node; may be repeated')
     parser.add_argument('-p', '--param', metavar='NAME:=VALUE', action='append', default=[],
@@ -64,19 +65,43 @@ def _parser() -> argparse.ArgumentParser:
                         help='file to write; an existing one is never overwritten')
     parser.add_argument('--seed', type=int, help='seed of the noise: the parameter seed')
     parser.add_argument('--command', metavar='T:L3:LZ', action='append', default=[],
-                        help='at T [s] let L3 and Lz [kg m^2/s] jump; may be repeated')
+                        help='at T [s] set L3 and Lz [kg m^2/s]; may be repeated; commands at '
+                             'the same time are applied in the order given')
     parser.add_argument('--epoch', type=float, default=DEFAULT_EPOCH, metavar='S',
                         help='stamp of t = 0 [s], default %(default)g')
     parser.add_argument('--namespace', default='/', help='of the topics in the log')
-    parser.add_argument('--format', choices=('mcap', 'csv', 'parquet'),
-                        help='default: by the name of the output, else mcap')
+    parser.add_argument('--format', choices=tuple(FORMATS.values()),
+                        help='format of the output; default: by the extension of its name')
     parser.add_argument('--quiet', action='store_true', help='no progress, no summary')
     return parser
 
 
-def _values(arguments: argparse.Namespace) -> dict[str, Any]:
+def _run(arguments: argparse.Namespace) -> int:
+    values = _parameters(arguments)
+    duration_ns = round(values['duration'] * NANOSECONDS)
+    commands = parse_commands(arguments.command, duration_ns)
+    output = Path(arguments.output)
+    file_format = arguments.format or _format_of(output)
+    with progress('simulated', values['duration'], 's', quiet=arguments.quiet) as show:
+        def show_ns(t_ns: int) -> None:
+            show(t_ns / NANOSECONDS)
+
+        if file_format == 'mcap':
+            summary = write_log(output, values, duration_ns, commands,
+                                epoch_ns=round(arguments.epoch * NANOSECONDS),
+                                namespace=arguments.namespace, show=show_ns)
+        else:
+            from spinning_top_sim.tools.table import write_table  # noqa: PLC0415
+
+            summary = write_table(output, file_format, values, duration_ns, commands, show_ns)
+    if not arguments.quiet:
+        print_line(f'{output}: {summary}')
+    return OK
+
+
+def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the checked parameters of the command line.  Raises ValueError."""
-    given: dict[str, Any] = {}
+    given: dict[str, object] = {}
     for path in arguments.params:
         given.update(read_scene(path))
     given.update(parse_assignment(text) for text in arguments.param)
@@ -90,8 +115,22 @@ def _values(arguments: argparse.Namespace) -> dict[str, Any]:
     return values
 
 
-def parse_commands(texts: Sequence[str]) -> list[Command]:
-    """Return (t_ns, l3, lz) of each T:L3:LZ in order of time.  Raises ValueError."""
+def parse_commands(texts: Sequence[str], duration_ns: int) -> list[Command]:
+    """
+    Return the commands of a command line in the order in which they are applied.
+
+    Parameters
+    ----------
+    texts : sequence of str
+        Each T:L3:LZ, in s and kg m^2/s.
+    duration_ns : int
+        End of the run [ns], the latest time of a command.
+
+    Raises
+    ------
+    ValueError
+        Names the text and what is allowed.
+    """
     commands = []
     for text in texts:
         try:
@@ -99,196 +138,154 @@ def parse_commands(texts: Sequence[str]) -> list[Command]:
             at_ns = round(t * NANOSECONDS)
         except (ValueError, OverflowError):
             raise ValueError(f'--command {text}: must be T:L3:LZ, three numbers') from None
-        if at_ns < 0:
-            raise ValueError(f'--command {text}: T must be >= 0')
+        if not 0 <= at_ns <= duration_ns:
+            raise ValueError(f'--command {text}: T must be from 0 to the end of the run, '
+                             f'{duration_ns / NANOSECONDS:g} s')
         commands.append((at_ns, l3, lz))
+    # The sort is stable: commands at the same time keep their order.
     return sorted(commands, key=lambda command: command[0])
 
 
-def _run(arguments: argparse.Namespace, values: dict[str, Any]) -> None:
-    commands = parse_commands(arguments.command)
-    output = Path(arguments.output)
-    kind = arguments.format or {'.csv': 'csv', '.parquet': 'parquet'}.get(output.suffix, 'mcap')
-    duration_ns = round(values['duration'] * NANOSECONDS)
-    with progress(values['duration'], arguments.quiet) as show:
-        if kind == 'mcap':
-            summary = write_log(output, values, duration_ns, commands,
-                                epoch_ns=round(arguments.epoch * NANOSECONDS),
-                                namespace=arguments.namespace, show=show)
-        else:
-            from spinning_top_sim.tools.table import write_table  # noqa: PLC0415
-
-            summary = write_table(output, kind, values, duration_ns, commands, show)
-    if not arguments.quiet:
-        print(f'{output}: {summary}')
-
-
-class progress:  # noqa: N801 - a context manager, used like a function
-    """Shows simulated seconds on a terminal: `show(t)`."""
-
-    def __init__(self, total: float, quiet: bool) -> None:
-        self._bar: Any = None
-        if not quiet and sys.stderr.isatty():
-            try:
-                from tqdm import tqdm  # noqa: PLC0415
-            except ImportError:
-                return
-            self._bar = tqdm(total=total, unit='s', desc='simulated', unit_scale=False,
-                             bar_format='{desc} {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} s '
-                                        '[{elapsed}<{remaining}]')
-
-    def __enter__(self) -> Callable[[int], None]:
-        return self._show
-
-    def _show(self, t_ns: int) -> None:
-        if self._bar is not None:
-            self._bar.update(t_ns / NANOSECONDS - self._bar.n)
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.close()
+def _format_of(output: Path) -> str:
+    if output.suffix not in FORMATS:
+        raise ValueError(f'{output}: the name must end in {", ".join(FORMATS)}, or --format be '
+                         'given')
+    return FORMATS[output.suffix]
 
 
 def write_log(path: Path, values: Mapping[str, Any], duration_ns: int,
               commands: Sequence[Command] = (), *, epoch_ns: int, namespace: str = '/',
               show: Callable[[int], None] = lambda t_ns: None) -> str:
     """
-    Simulate into a new log; return what to tell about it.
+    Simulate a run into a new log.
 
-    Raises RecordingError where the file cannot be made, OSError where the disk gives up,
-    ValueError for a command that is refused, IntegrationError where the Euler form stops.  What
-    was written until then is closed and readable.
+    Parameters
+    ----------
+    path : Path
+        The log; it must not exist.
+    values : mapping
+        Checked parameters (`parameters.checked`).
+    duration_ns : int
+        Simulated time [ns].
+    commands : sequence of (int, float, float)
+        Time [ns], L3 and Lz [kg m^2/s], in ascending order of time.
+    epoch_ns : int
+        Stamp of t = 0 [ns].
+    namespace : str
+        Namespace of the topics.
+    show : callable
+        Takes the simulated time reached [ns].
+
+    Returns
+    -------
+    str
+        Number of messages and size of the file.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be created.
+    OSError
+        Writing failed.
+    ValueError
+        The motion cannot begin, or a command is refused.
+    IntegrationError
+        The Euler form cannot go on.
+
+    Notes
+    -----
+    After an error the log is closed and readable, and holds what was computed before.
     """
     from spinning_top_sim.recording.provenance import provenance  # noqa: PLC0415
     from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
     from spinning_top_sim.recording.writer import create_file  # noqa: PLC0415
+    from spinning_top_sim.streams.pipeline import Simulation  # noqa: PLC0415
+    from spinning_top_sim.tools.blocks import BlockSource, block_length, targets  # noqa: PLC0415
 
     simulation = Simulation(values, epoch_ns)
-    columns = values['solver.method'] == 'exact'
     streams = journal.recorded_streams(simulation.streams, values)
-    topics = [RecordedTopic(resolve(name, namespace), type_name) for name, type_name in
+    topics = [RecordedTopic(resolve_topic(name, namespace), type_name) for name, type_name in
               (*((stream.topic, stream.type_name) for stream in streams), *journal.TOPICS)]
-    commands_topic, events_topic = len(streams), len(streams) + 1
+    columns = values['solver.method'] == 'exact'
     metadata = provenance(values, epoch_ns, -1, (), values,
                           'columns' if columns else 'one state at a time')
+    source = BlockSource(simulation, streams, columns=columns)
     file = create_file(path, topics, metadata, compression=values['record.compression'])
-
-    behind = _Behind(file.put_plain_chunk if columns else file.append_all)
-    taken: list[Messages] = []
-
-    def write(topic_index: int, stamp_ns: int, data: bytes) -> None:
-        behind.wait()
-        if file.append(topic_index, stamp_ns, data):
-            file.write_chunk()
-
-    def flush() -> None:
-        nonlocal taken
-        if taken:
-            behind.wait()
-            batch, taken = taken, []        # before: interrupted, a log is shorter, not doubled
-            behind.start(batch)
-
-    def advance(target_ns: int) -> None:
-        if not columns:
-            simulation.advance(target_ns)
-            if sum(size for *_, size in taken) >= CHUNK_BYTES:
-                flush()
-            return
-        parts: list[tuple[int, Any, Any]] = []
-        simulation.advance_in_columns(target_ns, lambda stream, stamps, rows: parts.append(
-            (streams.index(stream), stamps, rows)))
-        if parts:
-            chunk = file.chunk_of_rows(parts)
-            behind.wait()
-            file.write_chunk()
-            behind.start(chunk)
-
-    simulation.log_to(lambda *messages: taken.append(messages), streams)
-    write(events_topic, epoch_ns, journal.event('start', 0, -1))
+    writer = _LogWriter(file, streams, epoch_ns)
     try:
-        for target_ns, command in stretches(duration_ns, commands,
-                                            stride(streams) if columns else STRIDE_NS):
-            advance(target_ns)
+        writer.write_event('start', 0, -1)
+        stops = [*((command[0], command) for command in commands), (duration_ns, None)]
+        for target_ns, command in targets(0, stops, block_length(streams)):
+            try:
+                source.advance(target_ns, writer.take)
+            finally:                # also what was computed before the motion could not go on
+                writer.write_blocks()
             if command is not None:
                 _, l3, lz = command
                 simulation.command(l3, lz)
-                at_ns = simulation.history[-1][0]
-                write(events_topic, epoch_ns + at_ns,
-                      journal.event('command', at_ns, simulation.now_ns, l3=l3, lz=lz))
-                write(commands_topic, epoch_ns + at_ns, journal.command(l3, lz))
+                writer.write_command(*simulation.history[-1], simulation.now_ns)
             show(target_ns)
-        flush()
-        behind.wait()
     finally:
-        behind.close()
-        file.append_all(taken)          # of a motion that could not go on
-        file.write_chunk()
-        file.finish()
+        writer.close()
     return f'{sum(file.counts)} messages, {file.size / 1e6:.1f} MB'
 
 
-class _Behind:
+class _LogWriter:
     """
-    Does something with one item in a thread, while the next item is made.
+    Writes a log.  A thread compresses and writes a chunk while the next one is computed.
 
-    Compressing and writing take as long as computing, and leave Python to others meanwhile.
+    Compression and the file system leave Python to other threads while they work.
     """
 
-    def __init__(self, work: Callable[[Any], None]) -> None:
-        self._work = work
-        self._thread: Executor | None = None
+    def __init__(self, file: McapFile, streams: Sequence[Stream], epoch_ns: int) -> None:
+        self._file, self._epoch_ns = file, epoch_ns
+        self._numbers = {stream.topic: number for number, stream in enumerate(streams)}
+        self._commands_topic, self._events_topic = len(streams), len(streams) + 1
+        self._blocks: list[tuple[int, NDArray[np.int64], NDArray[np.uint8]]] = []
+        self._executor = ThreadPoolExecutor(1)
         self._pending: Future[None] | None = None
 
-    def start(self, item: Any) -> None:
-        """Begin the work with an item; call `wait` before."""
-        if self._thread is None:
-            from concurrent.futures import ThreadPoolExecutor  # noqa: PLC0415
+    def write_event(self, name: str, t_ns: int, sent_ns: int, **details: float) -> None:
+        """Write an entry of the journal with the next chunk.  Raises OSError."""
+        self._write(self._events_topic, t_ns, journal.event(name, t_ns, sent_ns, **details))
 
-            self._thread = ThreadPoolExecutor(1)
-        self._pending = self._thread.submit(self._work, item)
+    def write_command(self, t_ns: int, l3: float, lz: float, sent_ns: int) -> None:
+        """Write an applied command with the next chunk.  Raises OSError."""
+        self.write_event('command', t_ns, sent_ns, l3=l3, lz=lz)
+        self._write(self._commands_topic, t_ns, journal.command(l3, lz))
 
-    def wait(self) -> None:
-        """Wait until the work is done.  Raises what it raised."""
+    def take(self, stream: Stream, stamps_ns: NDArray[np.int64],
+             rows: NDArray[np.uint8]) -> None:
+        """Take a block of samples, which `write_blocks` writes."""
+        self._blocks.append((self._numbers[stream.topic], stamps_ns, rows))
+
+    def write_blocks(self) -> None:
+        """Begin to write a chunk of the blocks.  Raises OSError of the chunk before."""
+        blocks, self._blocks = self._blocks, []
+        if blocks:
+            chunk = self._file.chunk_of_rows(blocks)
+            self._wait()
+            self._file.write_chunk()
+            self._pending = self._executor.submit(self._file.put_plain_chunk, chunk)
+
+    def _write(self, topic_index: int, t_ns: int, data: bytes) -> None:
+        self._wait()
+        if self._file.append(topic_index, self._epoch_ns + t_ns, data):
+            self._file.write_chunk()
+
+    def _wait(self) -> None:
         pending, self._pending = self._pending, None
         if pending is not None:
             pending.result()
 
     def close(self) -> None:
-        """Wait until the work is done, whatever became of it, and end the thread."""
-        if self._thread is not None:
-            self._thread.shutdown()
-
-
-def stretches(duration_ns: int, commands: Sequence[Command], stride_ns: int,
-              ) -> Iterator[tuple[int, Command | None]]:
-    """
-    Yield how far to go next, and the command to apply there.
-
-    The last bits of columns depend on it.
-    """
-    now = 0
-    due = [command for command in commands if command[0] <= duration_ns]
-    for until_ns, command in (*((command[0], command) for command in due), (duration_ns, None)):
-        while until_ns - now > stride_ns:
-            now += stride_ns
-            yield now, None
-        now = until_ns
-        yield now, command
-
-
-def stride(streams: Sequence[Any]) -> int:
-    """Return the simulated time that fills a chunk of columns [ns]."""
-    bytes_per_ns = sum(len(stream.template) / stream.period_ns for stream in streams)
-    return max(int(CHUNK_BYTES / bytes_per_ns), 1) if bytes_per_ns else STRIDE_NS
-
-
-def resolve(topic: str, namespace: str) -> str:
-    """Return a topic's full name, as ROS resolves it for the node spinning_top."""
-    if topic.startswith('/'):
-        return topic
-    space = '/' + namespace.strip('/')
-    name = topic.replace('~', 'spinning_top', 1)
-    return f'{space.rstrip("/")}/{name}'
+        """Finish the file.  Raises OSError."""
+        try:
+            self._wait()
+        finally:
+            self._executor.shutdown()
+            self._file.write_chunk()
+            self._file.finish()
 
 
 if __name__ == '__main__':

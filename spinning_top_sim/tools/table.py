@@ -1,104 +1,124 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The truth as a table for people without ROS tools: CSV, or Parquet through pyarrow."""
+"""Tables of the true states, for programs without ROS: CSV, or Parquet through pyarrow."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
-from spinning_top_sim.solvers.propagator import ExactPropagator
-from spinning_top_sim.solvers.rk45 import NANOSECONDS
+from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.tools.blocks import states_at
 
-# Name, unit, and how to read it from states.
-COLUMNS: tuple[tuple[str, str, Callable[[Any], Any]], ...] = (
-    ('theta', 'rad', lambda s: s.theta), ('theta_dot', 'rad/s', lambda s: s.theta_dot),
-    ('phi', 'rad', lambda s: s.phi), ('phi_dot', 'rad/s', lambda s: s.phi_dot),
-    ('psi', 'rad', lambda s: s.psi), ('psi_dot', 'rad/s', lambda s: s.psi_dot),
-    *((f'q{axis}', '1', lambda s, i=i: _component(s.quaternion, i))
-      for i, axis in enumerate('xyzw')),
-    *((f'omega_{i + 1}', 'rad/s', lambda s, i=i: s.body_rates[i]) for i in range(3)),
-    ('energy', 'J', lambda s: s.energy), ('l3', 'kg m^2/s', lambda s: s.l3),
-    ('lz', 'kg m^2/s', lambda s: s.lz))
+# Names and units of the columns.
+UNITS = {
+    't': 's', 'theta': 'rad', 'theta_dot': 'rad/s', 'phi': 'rad', 'phi_dot': 'rad/s',
+    'psi': 'rad', 'psi_dot': 'rad/s', 'qx': '1', 'qy': '1', 'qz': '1', 'qw': '1',
+    'omega_1': 'rad/s', 'omega_2': 'rad/s', 'omega_3': 'rad/s', 'energy': 'J',
+    'l3': 'kg m^2/s', 'lz': 'kg m^2/s'}
 ROWS_AT_ONCE = 20_000
 
+# The columns of consecutive rows, in the order of UNITS, each (n,).
+Rows = Sequence[NDArray[np.float64]]
 
-def _component(quaternion: Any, i: int) -> Any:
-    return quaternion[:, i] if isinstance(quaternion, np.ndarray) else quaternion[i]
 
-
-def write_table(path: Path, kind: str, values: Mapping[str, Any], duration_ns: int,
+def write_table(path: Path, file_format: str, values: Mapping[str, Any], duration_ns: int,
                 commands: Sequence[tuple[int, float, float]],
                 show: Callable[[int], None]) -> str:
     """
-    Write the states on the grid of `pose.rate` into a new file; return what to tell about it.
+    Simulate a run into a new table of states, on the grid of `pose.rate`.
 
-    kind: 'csv' or 'parquet'.  Raises OSError (FileExistsError rather than overwrite), ValueError.
+    Parameters
+    ----------
+    path : Path
+        The table; it must not exist.
+    file_format : {'csv', 'parquet'}
+        Format of the file.
+    values : mapping
+        Checked parameters (`parameters.checked`).
+    duration_ns : int
+        Simulated time [ns].
+    commands : sequence of (int, float, float)
+        Time [ns], L3 and Lz [kg m^2/s], in ascending order of time.
+    show : callable
+        Takes the simulated time reached [ns].
+
+    Returns
+    -------
+    str
+        Number of rows and names of columns.
+
+    Raises
+    ------
+    OSError
+        The file exists, or writing failed.
+    ValueError
+        pyarrow is missing, the motion cannot begin, or a command is refused.
+    IntegrationError
+        The Euler form cannot go on.
     """
-    names = ['t', *(name for name, _, _ in COLUMNS)]
-    rows = 0
-    with open(path, 'xb') as file:
-        write, close = _writer(kind, file, names)
-        for block in _blocks(values, duration_ns, commands, show):
-            write(block)
-            rows += len(block[0])
-        close()
-    return f'{rows} rows of {", ".join(names)}'
-
-
-def _blocks(values: Mapping[str, Any], duration_ns: int,
-            commands: Sequence[tuple[int, float, float]],
-            show: Callable[[int], None]) -> Iterator[list[Any]]:
-    """Yield columns of consecutive states, t [s] first."""
+    # Before there is a file: pyarrow may be missing, and there may be no motion.
+    write = _write_csv if file_format == 'csv' else _parquet_writer()
     simulation = Simulation(values)
-    period = max(1, round(NANOSECONDS / values['pose.rate']))
-    ends = [(at_ns, (l3, lz)) for at_ns, l3, lz in commands if at_ns <= duration_ns]
+    period_ns = max(1, round(NANOSECONDS / values['pose.rate']))
+    count = 0
+
+    def counted() -> Iterator[Rows]:
+        nonlocal count
+        for rows in _rows(simulation, period_ns, duration_ns, commands):
+            yield rows
+            count += len(rows[0])
+            show(count * period_ns)
+
+    with open(path, 'xb') as file:
+        write(file, counted())
+    return f'{count} rows of {", ".join(UNITS)}'
+
+
+def _rows(simulation: Simulation, period_ns: int, duration_ns: int,
+          commands: Sequence[tuple[int, float, float]]) -> Iterator[Rows]:
+    """Yield consecutive rows of the table.  A command changes the rows after its time."""
     next_ns = 0
-    for end_ns, command in (*ends, (duration_ns, None)):
+    stops = [*((at_ns, (l3, lz)) for at_ns, l3, lz in commands), (duration_ns, None)]
+    for end_ns, momenta in stops:
         while next_ns <= end_ns:
-            count = min((end_ns - next_ns) // period + 1, ROWS_AT_ONCE)
-            times = next_ns + period * np.arange(count, dtype=np.int64)
-            yield [times / NANOSECONDS, *_columns(simulation, times, period)]
-            next_ns += count * period
-            show(int(times[-1]))
+            count = min((end_ns - next_ns) // period_ns + 1, ROWS_AT_ONCE)
+            times_ns = next_ns + period_ns * np.arange(count, dtype=np.int64)
+            states = states_at(simulation, times_ns)
+            columns = (times_ns / NANOSECONDS, states.theta, states.theta_dot, states.phi,
+                       states.phi_dot, states.psi, states.psi_dot, *states.quaternion.T,
+                       *states.angular_velocity.T, states.energy, states.l3, states.lz)
+            yield [np.broadcast_to(column, count) for column in columns]
+            next_ns += count * period_ns
         simulation.advance(end_ns)
-        if command is not None:
-            simulation.command(*command)
+        if momenta is not None:
+            simulation.command(*momenta)
 
 
-def _columns(simulation: Simulation, times: Any, period: int) -> list[Any]:
-    solver = simulation.solver
-    if isinstance(solver, ExactPropagator):
-        grid = solver.grid(int(times[0]) - simulation.anchor_ns, period, len(times))
-        return [np.broadcast_to(read(grid), len(times)) for _, _, read in COLUMNS]
-    rows = []
-    for t_ns in times.tolist():
-        state = solver.at_ns(t_ns - simulation.anchor_ns)
-        rows.append([read(state) for _, _, read in COLUMNS])
-    return list(np.array(rows).T)
+def _write_csv(file: BinaryIO, blocks: Iterable[Rows]) -> None:
+    head = ','.join(f'{name} [{unit}]' for name, unit in UNITS.items())
+    file.write(f'{head}\n'.encode())
+    for columns in blocks:
+        lines = zip(*(column.tolist() for column in columns), strict=True)
+        file.write(''.join(','.join(map(repr, line)) + '\n' for line in lines).encode())
 
 
-def _writer(kind: str, file: Any, names: Sequence[str]) -> tuple[Callable[[list[Any]], None],
-                                                                 Callable[[], None]]:
-    if kind == 'csv':
-        units = ['s', *(unit for _, unit, _ in COLUMNS)]
-        head = ','.join(f'{name} [{unit}]' for name, unit in zip(names, units, strict=True))
-        file.write(f'{head}\n'.encode())
-
-        def write_csv(columns: list[Any]) -> None:
-            lists = [np.asarray(column).tolist() for column in columns]
-            text = '\n'.join(','.join(map(repr, row)) for row in zip(*lists, strict=True))
-            file.write(f'{text}\n'.encode())
-        return write_csv, lambda: None
+def _parquet_writer() -> Callable[[BinaryIO, Iterable[Rows]], None]:
+    """Return what writes a Parquet file.  Raises ValueError where pyarrow is missing."""
     try:
         import pyarrow as pa  # noqa: PLC0415
         from pyarrow import parquet  # noqa: PLC0415
     except ImportError as error:
         raise ValueError(f'parquet needs the Python package pyarrow: {error}') from error
-    schema = pa.schema([(name, pa.float64()) for name in names])
-    writer = parquet.ParquetWriter(file, schema)
-    return (lambda columns: writer.write_table(pa.table(
-        [np.ascontiguousarray(column) for column in columns], schema=schema))), writer.close
+    schema = pa.schema([(name, pa.float64()) for name in UNITS])
+
+    def write(file: BinaryIO, blocks: Iterable[Rows]) -> None:
+        with parquet.ParquetWriter(file, schema) as writer:
+            for columns in blocks:
+                writer.write_table(pa.table(list(map(np.ascontiguousarray, columns)),
+                                            schema=schema))
+    return write

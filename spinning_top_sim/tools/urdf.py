@@ -10,38 +10,46 @@ from typing import Any
 
 from spinning_top_sim.streams import parameters
 
-NAME = 'spinning_top.urdf.xacro'
-# Arguments of the xacro file and the parameters they are.
+XACRO_FILE = 'spinning_top.urdf.xacro'
+# Arguments of the xacro file, and the parameters of the same meaning.
 NUMBERS = {name: f'top.{name}' for name in ('mass', 'com_distance', 'lambda1', 'lambda3')}
 VECTORS = {'imu_lever_arm': 'imu.lever_arm', 'imu_rpy': 'imu.rpy'}
 FRAMES = {'world_frame': 'world_frame', 'body_frame': 'body_frame', 'imu_frame_id': 'imu.frame_id'}
-BETWEEN = ('precession_link', 'nutation_link')
+LINKS_BETWEEN = ('precession_link', 'nutation_link')
 FRAME_NAME = re.compile(r'[\w.-]+(/[\w.-]+)*')
 
 
 def arguments(values: Mapping[str, Any]) -> dict[str, str]:
     """
-    Return the arguments of the xacro file for checked parameters.
+    Return the arguments of the xacro file.
 
-    The frames between world and body have the prefix of the body's: a/base_link, a/nutation_link.
-    Raises ValueError for frames that no tree can have, naming the parameter and what is allowed.
+    Parameters
+    ----------
+    values : mapping
+        Checked parameters.  The links between world and body get the prefix of the body's frame:
+        a/base_link, a/nutation_link.
+
+    Raises
+    ------
+    ValueError
+        The frames cannot form a tree; names the parameter and what is allowed.
     """
     for name in FRAMES.values():
         if not FRAME_NAME.fullmatch(values[name]):
             raise ValueError(f'{name} = {values[name]!r}: must be letters, digits, _ . - with / '
-                             'between, to be a frame of the robot description')
+                             'between')
     world, body, imu = (values[name] for name in FRAMES.values())
     prefix = body[:body.rfind('/') + 1]
-    between = [prefix + name for name in BETWEEN]
+    between = [prefix + name for name in LINKS_BETWEEN]
     for name, value, others in (('world_frame', world, [body, imu, *between]),
                                 ('body_frame', body, between), ('imu.frame_id', imu, between)):
         if value in others:
-            raise ValueError(f'{name} = {value!r}: is the name of another frame of the robot '
-                             'description; must be one of its own')
+            raise ValueError(f'{name} = {value!r}: must be another name than those of the '
+                             'other frames of the robot description')
     mounted = any(values['imu.lever_arm']) or any(values['imu.rpy'])
     if imu == body and mounted:
-        raise ValueError(f'imu.frame_id = {imu!r}: must not be body_frame, for imu.lever_arm or '
-                         'imu.rpy is not zero')
+        raise ValueError(f'imu.frame_id = {imu!r}: must not be the body_frame where '
+                         'imu.lever_arm or imu.rpy is not zero')
     return {**{name: repr(values[parameter]) for name, parameter in NUMBERS.items()},
             **{name: ' '.join(map(repr, values[parameter]))
                for name, parameter in VECTORS.items()},
@@ -50,13 +58,25 @@ def arguments(values: Mapping[str, Any]) -> dict[str, str]:
 
 def robot_description(values: Mapping[str, Any], folder: str | Path) -> str:
     """
-    Return the URDF for checked parameters.
+    Return the URDF.
 
-    folder: with the xacro file.  Raises ValueError as `arguments` does, ImportError without xacro.
+    Parameters
+    ----------
+    values : mapping
+        Checked parameters.
+    folder : str or Path
+        Folder of the xacro file.
+
+    Raises
+    ------
+    ValueError
+        See `arguments`.
+    ImportError
+        xacro is not installed.
     """
     import xacro  # noqa: PLC0415
 
-    document = xacro.process_file(str(Path(folder) / NAME), mappings=arguments(values))
+    document = xacro.process_file(str(Path(folder) / XACRO_FILE), mappings=arguments(values))
     text: str = document.documentElement.toprettyxml(indent='  ')
     return f'<?xml version="1.0"?>\n{text}'
 

@@ -6,18 +6,21 @@ from __future__ import annotations
 import json
 import struct
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from spinning_top_sim.recording.provenance import surroundings
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.topics import Stream
-from spinning_top_sim.tools.rerun import Account, DepartureError, Rerun
+from spinning_top_sim.tools.rerun import DepartureError, Rerun
+from spinning_top_sim.tools.run_description import RunDescription
 
-# What the runs of a template are called in the message definition, in their order.
+# Names in the message definition of the arrays of numbers in a template, in their order.
 FIELDS = {
     'geometry_msgs/msg/PoseStamped': ('pose.orientation',),
     'sensor_msgs/msg/JointState': ('position', 'velocity'),
@@ -32,113 +35,118 @@ FIELDS = {
 
 @dataclass(frozen=True)
 class Difference:
-    """
-    Where a log and the computation part.
-
-    byte: the first that differs in the message, None where one of them has no such message
-    field: what stands there;  logged, computed: its value in either, or what else is the matter
-    """
+    """The first place where a log and the computation differ."""
 
     topic: str
-    stamp_ns: int
-    byte: int | None
-    field: str
-    logged: str
+    stamp_ns: int                         # log time of the message [ns]
+    byte: int | None                      # None where one of them has no such message
+    field: str                            # name of the field there
+    logged: str                           # its two values, or what is different instead
     computed: str
 
 
 @dataclass
 class Verdict:
-    """
-    What the comparison found.
+    """The result of a comparison."""
 
-    compared: messages that both have, by topic;  different: of these;  missing: computed, but not
-    in the log;  unexpected: in the log, but not computed;  first: the first of all these
-    stopped: why the run could not be computed any further, '' if it was
-    warnings: what else makes bits differ;  whole: whether the log was whole
-    """
-
-    whole: bool
-    compared: dict[str, int]
-    different: int = 0
-    missing: int = 0
-    unexpected: int = 0
-    first: Difference | None = None
-    stopped: str = ''
+    whole: bool                           # the log is whole
+    compared: dict[str, int]              # messages that both have, by topic
+    different: int = 0                    # how many of these differ
+    missing: int = 0                      # messages that were computed and are not in the log
+    unexpected: int = 0                   # messages that are in the log and were not computed
+    first: Difference | None = None       # the first of all these
+    stopped: str = ''                     # why the run could not be computed to its end
+    # Differences of version and machine, which may change the last bits
     warnings: list[str] = field(default_factory=list)
 
     @property
     def identical(self) -> bool:
-        """Whether each message is as computed; of a torn log, each that is left."""
+        """Whether every message is as computed; of a torn log, every message that is left."""
         return not (self.different or self.unexpected or self.stopped
                     or (self.missing and self.whole))
 
 
-def verify(reader: LogReader, account: Account, end_ns: int,
+def verify(reader: LogReader, run: RunDescription, end_ns: int,
            show: Callable[[int], None] = lambda stamp_ns: None) -> Verdict:
     """
-    Compare a log of ours with its run computed again, side by side.
+    Compute the run of a log again and compare all messages, side by side.
 
-    end_ns: log time of the last message;  show: takes the log time reached, now and then
+    Parameters
+    ----------
+    reader : LogReader
+        The log.
+    run : RunDescription
+        Its run.
+    end_ns : int
+        Log time of the last message [ns].
+    show : callable
+        Takes the log time reached [ns].
     """
-    return _Comparison(reader, account, end_ns, show).run()
+    return _Comparison(reader, run, end_ns, show).run()
 
 
 class _Comparison:
-    def __init__(self, reader: LogReader, account: Account, end_ns: int,
+    """The messages of a log, and those computed that still wait for their counterparts."""
+
+    def __init__(self, reader: LogReader, run: RunDescription, end_ns: int,
                  show: Callable[[int], None]) -> None:
-        self._reader, self._account, self._end_ns, self._show = reader, account, end_ns, show
-        self._names = {name: topic for topic, name in account.topics.items()}
-        topics = list(account.topics)
-        if account.commands_topic is not None:
-            topics.append(account.commands_topic)
-            self._names[journal.COMMANDS] = account.commands_topic
-        self._waiting: dict[str, deque[tuple[int, bytes]]] = {name: deque() for name in topics}
+        self._reader, self._run, self._end_ns, self._show = reader, run, end_ns, show
+        self._topics = {name: topic for topic, name in run.topics.items()}
+        if run.commands_topic is not None:
+            self._topics[journal.COMMANDS] = run.commands_topic
+        self._waiting: dict[str, deque[tuple[int, bytes]]] = {
+            topic: deque() for topic in self._topics.values()}
         self._verdict = Verdict(not reader.damage.torn and reader.damage.lossless,
-                                dict.fromkeys(topics, 0), warnings=_warnings(account))
+                                dict.fromkeys(self._waiting, 0), warnings=_warnings(run))
 
     def run(self) -> Verdict:
         verdict = self._verdict
-        for stamp_ns, reason in self._account.broken:
+        for stamp_ns, reason in self._run.broken:
             verdict.different += 1
-            self._note(Difference(self._account.events_topic or '', stamp_ns, None, 'entry',
+            self._note(Difference(self._run.events_topic or '', stamp_ns, None, 'entry',
                                   reason, 'an entry of the journal'))
         try:
-            self._rerun = Rerun(self._account, self._take)
+            self._rerun = Rerun(self._run, self._take)
         except (DepartureError, ValueError, IntegrationError) as error:
             verdict.stopped = str(error)
             return verdict
-        self._legs = self._rerun.legs(self._end_ns)
+        self._progress = self._rerun.advance(self._end_ns)
         for message in self._reader.messages(topics=list(self._waiting)):
             self._compare(message.topic, message.log_time, message.data)
-        while self._go_on():
-            self._drop_all()
-        self._drop_all()
+        while self._compute_more():
+            self._miss_all()
+        self._miss_all()
         return verdict
 
-    def _take(self, name: str, stamp_ns: int, data: bytes) -> None:
-        if stamp_ns <= self._end_ns:
-            self._waiting[self._names[name]].append((stamp_ns, data))
+    def _take(self, stream: Stream, stamps_ns: NDArray[np.int64],
+              rows: NDArray[np.uint8]) -> None:
+        """Let a block of computed messages wait for those of the log."""
+        rows = rows[stamps_ns <= self._end_ns]
+        size, data = rows.shape[1], rows.tobytes()
+        self._waiting[self._topics[stream.topic]].extend(
+            (stamp_ns, data[i * size:(i + 1) * size])
+            for i, stamp_ns in enumerate(stamps_ns[:len(rows)].tolist()))
 
-    def _go_on(self) -> bool:
-        """Compute one leg more; return whether there was one."""
+    def _compute_more(self) -> bool:
+        """Compute one more block; return whether there was one."""
         try:
-            event = next(self._legs)
+            event = next(self._progress)
         except StopIteration:
             return False
         except (DepartureError, ValueError) as error:
             self._verdict.stopped = self._verdict.stopped or str(error)
             return False
         self._show(self._rerun.stamp_ns)
-        if event is not None and event.name == 'command' and journal.COMMANDS in self._names:
-            self._take(journal.COMMANDS, event.stamp_ns,
-                       journal.command(event.details['l3'], event.details['lz']))
+        if event is not None and event.name == 'command' and self._run.commands_topic and (
+                event.stamp_ns <= self._end_ns):
+            self._waiting[self._run.commands_topic].append(
+                (event.stamp_ns, journal.command(event.details['l3'], event.details['lz'])))
         return True
 
     def _compare(self, topic: str, stamp_ns: int, data: bytes) -> None:
         waiting, verdict = self._waiting[topic], self._verdict
         while True:
-            while not waiting and self._go_on():
+            while not waiting and self._compute_more():
                 pass
             if not waiting or waiting[0][0] > stamp_ns:
                 verdict.unexpected += 1
@@ -155,8 +163,8 @@ class _Comparison:
             if verdict.first is None:
                 self._note(self._difference(topic, stamp_ns, data, computed))
 
-    def _drop_all(self) -> None:
-        """Count what has been computed and is not in the log."""
+    def _miss_all(self) -> None:
+        """Count the messages that were computed and are not in the log."""
         for topic, waiting in self._waiting.items():
             while waiting:
                 self._miss(topic, waiting.popleft()[0])
@@ -167,8 +175,7 @@ class _Comparison:
             self._note(Difference(topic, stamp_ns, None, 'message', 'no such message', 'there'))
 
     def _note(self, difference: Difference) -> None:
-        if self._verdict.first is None:
-            self._verdict.first = difference
+        self._verdict.first = self._verdict.first or difference
 
     def _difference(self, topic: str, stamp_ns: int, data: bytes,
                     computed: bytes) -> Difference:
@@ -177,39 +184,38 @@ class _Comparison:
                               f'{len(data)} bytes', f'{len(computed)} bytes')
         at = next(i for i, pair in enumerate(zip(data, computed, strict=True))
                   if pair[0] != pair[1])
-        name = self._account.topics.get(topic)
+        name = self._run.topics.get(topic)
         stream = next((stream for stream in self._rerun.simulation.streams
                        if stream.topic == name), None)
         what, read = _field_at(stream, at)
         return Difference(topic, stamp_ns, at, what, read(data), read(computed))
 
 
-def _field_at(stream: Stream | None, at: int) -> tuple[str, Any]:
-    """Return the name of what stands at a byte of a message, and a function that shows it."""
+def _field_at(stream: Stream | None, at: int) -> tuple[str, Callable[[bytes], str]]:
+    """Return the name of the field at a byte of a message, and what formats its value."""
     place = None if stream is None else stream.template.field_at(at)
     if stream is None or place is None:
         return f'byte {at}', lambda data: f'0x{data[at]:02x}'
-    run, element, offset = place
-    if run < 0:
+    number, element, offset = place
+    if number < 0:
         return 'header.stamp', lambda data: '{}.{:09d}'.format(
             *struct.unpack_from('<iI', data, offset))
-    return (f'{FIELDS[stream.type_name][run]}[{element}]',
+    return (f'{FIELDS[stream.type_name][number]}[{element}]',
             lambda data: repr(struct.unpack_from('<d', data, offset)[0]))
 
 
-def _warnings(account: Account) -> list[str]:
-    """Return in what this machine differs from that of the recording."""
-    here = surroundings()
-    return [f'{what} was {then}, is {now}'
-            for what, then, now in (*_parts(account.surroundings, here),) if then != now]
+def _warnings(run: RunDescription) -> list[str]:
+    """Return the differences of this machine from that of the recording."""
+    then, now = _versions(run.surroundings), _versions(surroundings())
+    return [f'{what} was {then[what]}, is {now[what]}' for what in now
+            if then[what] != now[what]]
 
 
-def _parts(then: Any, now: Any) -> Iterator[tuple[str, str, str]]:
-    yield 'the version of spinning_top_sim', then['version'], now['version']
-    yield 'the platform', then['platform'], now['platform']
+def _versions(recorded: Mapping[str, str]) -> dict[str, str]:
     try:
-        libraries = json.loads(then['libraries'])
+        numpy_version = str(json.loads(recorded['libraries']).get('numpy'))
     except ValueError:
-        libraries = {}
-    # Other libraries compute nothing.
-    yield 'numpy', str(libraries.get('numpy')), json.loads(now['libraries'])['numpy']
+        numpy_version = 'unknown'
+    # Of the libraries only numpy computes.
+    return {'the version of spinning_top_sim': recorded['version'],
+            'the platform': recorded['platform'], 'numpy': numpy_version}

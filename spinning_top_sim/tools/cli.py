@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the executables share: exit codes, errors in one line, progress, and tables of text."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TextIO
+
+OK = 0
+FAILED = 1
+INTERRUPTED = 130
+
+# Where there is no terminal to ask for its width.
+TEXT_WIDTH = 118
+# Between the columns of a table, and before the first.
+GAP = '  '
+# A text that is wider than its column is broken after one of these.
+BREAK_AFTER = '/ '
+
+
+def exit_code(name: str, command: Callable[[], int],
+              errors: tuple[type[Exception], ...]) -> int:
+    """
+    Run a command and return its exit code.
+
+    Parameters
+    ----------
+    name : str
+        Name of the executable; it begins each line about an error.
+    command : callable
+        Does the work and returns an exit code.
+    errors : tuple of exception types
+        Errors of the user's input or of the system.  They are printed in one line.
+
+    Returns
+    -------
+    int
+        The code of `command`, FAILED after one of `errors`, or INTERRUPTED after Ctrl-C.
+    """
+    try:
+        code = command()
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader of the output, such as a pager, has ended.  Python flushes it once more.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OK
+    except errors as error:
+        print_line(f'{name}: {error}', sys.stderr)
+        return FAILED
+    except KeyboardInterrupt:
+        print_line(f'{name}: interrupted', sys.stderr)
+        return INTERRUPTED
+    return code
+
+
+def print_line(text: str, file: TextIO | None = None) -> None:
+    """Print a line, by default to the standard output, whatever bytes a file name holds."""
+    print(text.encode(errors='backslashreplace').decode(), file=file or sys.stdout)
+
+
+@contextlib.contextmanager
+def progress(what: str, total: float, unit: str, *, quiet: bool = False,
+             ) -> Iterator[Callable[[float], None]]:
+    """
+    Show progress on a terminal: a bar where tqdm is installed, else a percentage.
+
+    Parameters
+    ----------
+    what : str
+        What is being done, such as 'simulated'.
+    total : float
+        Amount at the end, in `unit`.
+    unit : str
+        Unit of the amounts.
+    quiet : bool
+        Show nothing.
+
+    Yields
+    ------
+    callable
+        Takes the amount done so far.
+    """
+    if quiet or not sys.stderr.isatty() or not total > 0.0:
+        yield lambda done: None
+        return
+    try:
+        from tqdm import tqdm  # noqa: PLC0415
+    except ImportError:
+        shown = -1
+
+        def show(done: float) -> None:
+            nonlocal shown
+            percent = int(100.0 * done / total)
+            if percent != shown:
+                shown = percent
+                print(f'\r{what} {percent:3d} %', end='', file=sys.stderr, flush=True)
+
+        try:
+            yield show
+        finally:
+            print('\r\033[K', end='', file=sys.stderr, flush=True)
+        return
+    with tqdm(total=total, unit=unit, desc=what, bar_format=(
+            '{desc} {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} {unit} '
+            '[{elapsed}<{remaining}]')) as bar:
+        yield lambda done: bar.update(done - bar.n)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of text.  The first column is aligned to the left, the others to the right."""
+
+    title: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+    def lines(self, width: int) -> Iterator[str]:
+        """Yield the table's lines, at most `width` characters long where its words allow it."""
+        cells = [list(self.head), *map(list, self.rows)]
+        columns = list(zip(*cells, strict=True))
+        widths = [max(map(len, column)) for column in columns]
+        least = [max(len(piece.rstrip()) for cell in column for piece in _pieces(cell))
+                 for column in columns]
+        excess = sum(widths) + len(GAP) * len(widths) - width
+        # The columns that are wider than their longest word give way, the widest first.
+        for number in sorted(range(len(widths)), key=lambda number: -widths[number]):
+            narrowed = max(widths[number] - max(excess, 0), least[number])
+            excess -= widths[number] - narrowed
+            widths[number] = narrowed
+        yield from ('', self.title)
+        for row in cells:
+            wrapped = [_wrapped(cell, wide) for cell, wide in zip(row, widths, strict=True)]
+            for line in itertools.zip_longest(*wrapped, fillvalue=''):
+                yield GAP + GAP.join(
+                    cell.ljust(wide) if number == 0 else cell.rjust(wide)
+                    for number, (cell, wide) in enumerate(zip(line, widths, strict=True))
+                ).rstrip()
+
+
+def _pieces(text: str) -> list[str]:
+    """Return the pieces of a text between which a line may be broken."""
+    pieces = ['']
+    for character in text:
+        pieces[-1] += character
+        if character in BREAK_AFTER:
+            pieces.append('')
+    return pieces
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    """Return the lines of a text in a column."""
+    lines = ['']
+    for piece in _pieces(text):
+        if len(lines[-1] + piece.rstrip()) > width and lines[-1]:
+            lines.append('')
+        lines[-1] += piece
+    return [line.rstrip() for line in lines]
+
+
+def print_report(content: Iterable[str | Table]) -> None:
+    """Print lines and tables, as wide as the terminal."""
+    width = shutil.get_terminal_size((TEXT_WIDTH, 0)).columns if sys.stdout.isatty() else (
+        TEXT_WIDTH)
+    for item in content:
+        for line in [item] if isinstance(item, str) else item.lines(width):
+            print_line(line)
