@@ -5,8 +5,8 @@
 from pathlib import Path
 
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, all_streams
+from spinning_top_sim.streams.all_streams import all_streams
+from spinning_top_sim.streams.topics import INVARIANTS, JOINTS
 
 HEAD = """<!-- Written by docs/interface.py from the code. -->
 # Interface of sim_node
@@ -70,7 +70,7 @@ def page() -> str:
     """Return the page."""
     values = parameters.checked({})
     lines = [HEAD]
-    for stream in all_streams(values, Imu(values)):
+    for stream in all_streams(values):
         rate, on = values[f'{stream.parameter}.rate'], values[f'{stream.parameter}.enabled']
         lines.append(f'| `{stream.topic}` | {stream.type_name} | {rate:g} | '
                      f'{"yes" if on else "no"} | `{stream.parameter}.enabled`, `.rate` |\n')

@@ -68,8 +68,7 @@ class MotionReport:
 
         """
         simulation, loop = self._simulation, self._loop
-        error = math.nan if max_error == 0.0 else simulation.orientation_error(
-            simulation.state(), loop.now_ns)
+        error = math.nan if max_error == 0.0 else simulation.orientation_error
         skipped = sum(stream.skipped for stream in simulation.streams)
         problems = []
         if loop.paused:
@@ -114,9 +113,9 @@ class MotionReport:
     def new_motion(self) -> str | None:
         """Return the present motion in numbers if that was not said yet."""
         simulation = self._simulation
-        if simulation.begun is self._described:
+        if simulation.segment is self._described:
             return None
-        self._described = simulation.begun
+        self._described = simulation.segment
         description = simulation.describe()
         self._regime = 'beyond doubles' if description is None else description.name
         return None if description is None else str(description)
@@ -128,9 +127,9 @@ class MotionReport:
         flag = ' FAILED' if loop.failure else ' paused' if loop.paused else ''
         log = '' if size is None else f' | log {human_readable(size)}'
         return (f't {loop.now_ns / NANOSECONDS:9.2f} s{flag} | {self._regime} | '
-                f'theta {math.degrees(state.theta):6.2f} deg | '
+                f'theta {math.degrees(float(state.theta[0])):6.2f} deg | '
                 f'L3 {simulation.l3:.4g} Lz {simulation.lz:.4g} | x{self.speed.factor:.2f} | '
-                f'dE/E {simulation.energy_drift(state):+.0e} | {self._sent()} msgs{log}')
+                f'dE/E {simulation.energy_drift:+.0e} | {self._sent()} msgs{log}')
 
 
 def impossible_body(values: Mapping[str, Any]) -> str:

@@ -309,7 +309,6 @@ class Simulator(Node):
         for stream in self._simulation.streams:
             if f'{stream.parameter}.rate' in changed:
                 stream.set_rate(values[f'{stream.parameter}.rate'])
-                stream.resume(self._simulation.now_ns)
         if any(name.endswith('.enabled') for name in changed):
             self._open_publishers()
         if 'status_period' in changed:
@@ -421,8 +420,8 @@ class Simulator(Node):
     def _prepare_reference(self) -> None:
         """Set up the exact solution of the present motion without keeping ticks waiting."""
         with self._lock:
-            set_up = self._simulation.exact_in_advance()
-        set_up()
+            reference = self._simulation.segment.reference
+        reference.prepare()
 
     @guarded
     def _show_status(self) -> None:

@@ -11,13 +11,11 @@ from typing import Any
 from spinning_top_sim.nodes.pacing import SimulatedClock
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.pipeline import NEVER_NS, Simulation
+from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.schedule import NEVER_NS
 
 # How often subscribers are counted; a new one waits at most this long.
 SUBSCRIBERS_PERIOD_NS = 50_000_000
-# Instants computed together, ahead of their time: many as columns, where they cost little more
-# than one, and fewer one by one.
-COLUMNS_AHEAD, ONES_AHEAD = 256, 16
 # The look-ahead is computed in pieces that fill this share of the time between two ticks, so that
 # the next tick finds the processor free.  It begins this many ticks, or this much time, before it
 # is needed.
@@ -159,8 +157,7 @@ class TickLoop:
         """Compute some of the samples that are due next, until about the next tick."""
         simulation = self._simulation
         self._computing = not simulation.prepare(
-            simulation.now_ns + self._ahead_ns,
-            COLUMNS_AHEAD if simulation.in_columns else ONES_AHEAD, self._busy_ns)
+            simulation.now_ns + self._ahead_ns, self._busy_ns)
         self._update_look_ahead()
 
     def _slow_tick(self, now_ns: int) -> bool:

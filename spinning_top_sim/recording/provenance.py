@@ -16,15 +16,13 @@ LIBRARIES = ('numpy', 'mcap', 'rclpy')
 
 
 def provenance(values: Mapping[str, Any], epoch_ns: int, begun_ns: int,
-               history: Iterable[tuple[int, float, float]], now: Mapping[str, Any],
-               evaluation: str = 'one state at a time') -> dict[str, str]:
+               history: Iterable[tuple[int, float, float]], now: Mapping[str, Any]) -> dict[str, str]:
     """
     Return the `spinning_top_sim` metadata record.
 
     values: parameters at the start of the motion (the last reset);  now: as they are, with later
     changes;  epoch_ns: stamp of t = 0;  begun_ns: simulated time at which the recording begins;
-    history: commands applied before, as (t_ns, l3, lz);  evaluation: how states were computed,
-    which decides their last bits.
+    history: commands applied before, as (t_ns, l3, lz)
     """
     return {
         'format': FORMAT,
@@ -34,7 +32,6 @@ def provenance(values: Mapping[str, Any], epoch_ns: int, begun_ns: int,
         'epoch_ns': str(epoch_ns),
         'begun_ns': str(begun_ns),
         'history': json.dumps(list(history)),
-        'evaluation': evaluation,
         **surroundings(),
     }
 

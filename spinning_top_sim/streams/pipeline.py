@@ -164,6 +164,10 @@ class Simulation:
             stream.log_index = streams.index(stream) if stream in streams else None
         self._schedule.invalidate()
 
+    def record_blocks(self, streams: Sequence[Stream]) -> None:
+        """Record these streams by `advance_in_blocks` from now on."""
+        self.log_to(lambda *_: None, streams)
+
     def advance(self, target_ns: int, publish_from_ns: int = 0,
                 give_way: Callable[[], bool] = lambda: False) -> bool:
         """

@@ -48,6 +48,10 @@ class Reference:
             self._is_known = True
         return self._solution
 
+    def prepare(self) -> None:
+        """Set up the solution if it is not there yet."""
+        _ = self.solution
+
     def states(self, times_ns: NDArray[np.int64]) -> States | None:
         """Return the exact states at simulated times (n,) [ns], or None without a solution."""
         solution = self.solution

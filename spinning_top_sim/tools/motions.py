@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.top import Top
 from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.streams.all_streams import all_streams
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.topics import Stream, all_streams
+from spinning_top_sim.streams.topics import Stream
 from spinning_top_sim.tools.analysis import Attitudes, Measured, from_joint_states
 from spinning_top_sim.tools.rerun import DepartureError, Rerun
 from spinning_top_sim.tools.run_description import RunDescription
@@ -110,18 +111,18 @@ def find_sections(run: RunDescription, end_ns: int) -> tuple[list[Section], str]
 
 def _motion(rerun: Rerun, cause: str, begin_ns: int) -> MotionReport:
     simulation = rerun.simulation
-    exact = simulation.exact()
+    segment = simulation.segment
     return MotionReport(
-        cause, begin_ns, begin_ns, simulation.epoch_ns + simulation.anchor_ns, simulation.top,
-        simulation.l3, simulation.lz, simulation.start_energy,
-        None if exact is None else exact.solution, simulation.describe())
+        cause, begin_ns, begin_ns, simulation.epoch_ns + segment.start_ns, simulation.top,
+        segment.l3, segment.lz, segment.energy, segment.reference.solution,
+        simulation.describe())
 
 
 def _section(run: RunDescription, rerun: Rerun, motion: MotionReport, begin_ns: int,
              values: Mapping[str, Any]) -> Section:
     """Return a section with copies of the streams as they are now."""
     imu = Imu(values)
-    copies = {stream.topic: stream for stream in all_streams(values, imu)}
+    copies = {stream.topic: stream for stream in all_streams(values)}
     for stream in rerun.simulation.streams:
         copies[stream.topic].set_rate(NANOSECONDS / stream.period_ns)
     streams = {topic: copies[name] for topic, name in run.topics.items()}
@@ -153,7 +154,7 @@ def attitudes_of(stream: Stream, imu: Imu, stamps_ns: NDArray[np.int64],
     stamps_ns : NDArray[np.int64], shape (n,)
         Log times [ns].
     fields : tuple of NDArray[np.float64], each (n, size)
-        Numbers in the messages, as `Template.decode_many` returns them.
+        Numbers in the messages, as `Template.decode` returns them.
     """
     if stream.topic == 'joint_states':
         return from_joint_states(stamps_ns, *fields)

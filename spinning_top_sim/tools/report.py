@@ -76,7 +76,7 @@ def as_json(path: Path, found: Survey, verdict: Verdict | None) -> dict[str, obj
         content['run'] = {
             'parameters': dict(run.values), 'seed': run.values['seed'],
             'epoch_ns': run.epoch_ns, 'begun_ns': run.begun_ns,
-            'evaluation': run.evaluation, **run.surroundings}
+            **run.surroundings}
         content['events'] = [{'event': event.name, 'stamp_ns': event.stamp_ns,
                               't_ns': event.t_ns, **event.details} for event in run.events]
     if verdict is not None:
@@ -130,7 +130,7 @@ def as_text(path: Path, found: Survey, verdict: Verdict | None) -> Iterator[str 
             '' if values['solver.method'] == 'exact' else
             f" ({values['solver.equations']}, rtol {values['solver.rtol']:g})")
         yield (f'spinning_top_sim {run.surroundings["version"]}, {solver}, seed '
-               f'{values["seed"]}, evaluated {run.evaluation}')
+               f'{values["seed"]}')
     yield from _topics(found)
     if run is None:
         return

@@ -8,8 +8,9 @@ from typing import Any
 
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.pipeline import NEVER_NS, Simulation
-from spinning_top_sim.tools.blocks import BlockSource, SendBlock, block_length, targets
+from spinning_top_sim.streams.pipeline import Rows, Simulation
+from spinning_top_sim.streams.schedule import NEVER_NS
+from spinning_top_sim.tools.blocks import block_length, targets
 from spinning_top_sim.tools.run_description import Event, RunDescription
 
 
@@ -44,9 +45,9 @@ class Rerun:
         There is no motion with these parameters.
     """
 
-    def __init__(self, run: RunDescription, send: SendBlock | None = None) -> None:
+    def __init__(self, run: RunDescription, send: Rows | None = None) -> None:
         self._run, self._send = run, send
-        self._source: BlockSource | None = None
+        self._sends = False
         self._stopped = False       # the equations could not go on
         self.simulation = simulation = Simulation(run.values, run.epoch_ns)
         for at_ns, l3, lz in run.history:
@@ -61,9 +62,9 @@ class Rerun:
                          if value != run.values[name]})
         if send is not None:
             names = set(run.topics.values())
-            self._source = BlockSource(
-                simulation, [stream for stream in simulation.streams if stream.topic in names],
-                columns=run.evaluation == 'columns')
+            simulation.record_blocks(
+                [stream for stream in simulation.streams if stream.topic in names])
+            self._sends = True
         self.stamp_ns = run.epoch_ns + simulation.now_ns
 
     def advance(self, end_ns: int) -> Iterator[Event | None]:
@@ -93,10 +94,10 @@ class Rerun:
     def _advance_to(self, stop_ns: int, event: Event | None) -> Iterator[Event | None]:
         """Advance to a simulated time, then apply an event."""
         simulation = self.simulation
-        block_ns = NEVER_NS if self._source is None else block_length(
-            [stream for stream in simulation.streams if stream.recorded])
+        block_ns = NEVER_NS if not self._sends else block_length(
+            [stream for stream in simulation.streams if stream.has_sinks])
         for target_ns, item in targets(max(simulation.now_ns, 0), [(stop_ns, event)], block_ns):
-            if self._source is not None or (item is not None and item.name == 'command'):
+            if self._sends or (item is not None and item.name == 'command'):
                 self._reach(target_ns)
             self.stamp_ns = simulation.epoch_ns + target_ns
             if item is not None:
@@ -109,8 +110,8 @@ class Rerun:
         if target_ns <= self.simulation.now_ns or self._stopped:
             return
         try:
-            if self._send is not None and self._source is not None:
-                self._source.advance(target_ns, self._send)
+            if self._sends and self._send is not None:
+                self.simulation.advance_in_blocks(target_ns, self._send)
             else:
                 self.simulation.advance(target_ns)
         except IntegrationError:
@@ -145,4 +146,3 @@ class Rerun:
             name = f'{stream.parameter}.rate'
             if name in changed:
                 stream.set_rate(parameters.BY_NAME[name].check(changed[name]))
-                stream.resume(self.simulation.now_ns)

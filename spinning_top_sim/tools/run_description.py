@@ -12,9 +12,8 @@ from typing import Any
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.writer import METADATA_NAME
 from spinning_top_sim.streams import journal, parameters
+from spinning_top_sim.streams.all_streams import all_streams
 from spinning_top_sim.streams.cdr import ENCAPSULATION
-from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.topics import all_streams
 
 EVENT_NAMES = ('start', 'command', 'parameters', 'reset')
 
@@ -44,7 +43,6 @@ class RunDescription:
     begun_ns: int                         # simulated time at which the recording began [ns]
     # commands before that: time [ns], L3 and Lz [kg m^2/s]
     history: tuple[tuple[int, float, float], ...]
-    evaluation: str                       # how states were computed
     surroundings: Mapping[str, str]       # version, platform and libraries
     topics: Mapping[str, str]             # stream, such as imu/data_raw, by topic of the log
     commands_topic: str | None            # None where the log has none
@@ -72,7 +70,6 @@ def read_run_description(reader: LogReader) -> RunDescription:
         epoch_ns, begun_ns = int(metadata['epoch_ns']), int(metadata['begun_ns'])
         history = tuple((int(t_ns), float(l3), float(lz))
                         for t_ns, l3, lz in json.loads(metadata['history']))
-        evaluation = metadata['evaluation']
         surroundings = {key: metadata[key] for key in ('version', 'platform', 'libraries')}
     except (KeyError, TypeError, ValueError) as error:
         raise ForeignLogError(f'its metadata {METADATA_NAME!r} cannot be used: '
@@ -83,7 +80,7 @@ def read_run_description(reader: LogReader) -> RunDescription:
     events, broken = _read_events(reader, events_topic)
     return RunDescription(
         values=values, now=now, epoch_ns=epoch_ns, begun_ns=begun_ns, history=history,
-        evaluation=evaluation, surroundings=surroundings,
+        surroundings=surroundings,
         topics={topic: name for topic, name in names.items()
                 if topic not in (commands_topic, events_topic)},
         commands_topic=commands_topic, events_topic=events_topic, events=events, broken=broken)
@@ -96,7 +93,7 @@ def _names(topics: Sequence[LogTopic], now: Mapping[str, Any]) -> dict[str, str]
     A log as it was written has them in a known order, whatever they were remapped to.  In a log
     that was put together anew they are known by the ends of their names.
     """
-    every = all_streams(now, Imu(now))
+    every = all_streams(now)
     recorded = [(stream.topic, stream.type_name)
                 for stream in journal.recorded_streams(every, now)] + list(journal.TOPICS)
     if [topic.type_name for topic in topics] == [type_name for _, type_name in recorded]:

@@ -200,24 +200,22 @@ def write_log(path: Path, values: Mapping[str, Any], duration_ns: int,
     from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
     from spinning_top_sim.recording.writer import create_file  # noqa: PLC0415
     from spinning_top_sim.streams.pipeline import Simulation  # noqa: PLC0415
-    from spinning_top_sim.tools.blocks import BlockSource, block_length, targets  # noqa: PLC0415
+    from spinning_top_sim.tools.blocks import block_length, targets  # noqa: PLC0415
 
     simulation = Simulation(values, epoch_ns)
     streams = journal.recorded_streams(simulation.streams, values)
     topics = [RecordedTopic(resolve_topic(name, namespace), type_name) for name, type_name in
               (*((stream.topic, stream.type_name) for stream in streams), *journal.TOPICS)]
-    columns = values['solver.method'] == 'exact'
-    metadata = provenance(values, epoch_ns, -1, (), values,
-                          'columns' if columns else 'one state at a time')
-    source = BlockSource(simulation, streams, columns=columns)
+    metadata = provenance(values, epoch_ns, -1, (), values)
     file = create_file(path, topics, metadata, compression=values['record.compression'])
     writer = _LogWriter(file, streams, epoch_ns)
+    simulation.record_blocks(streams)
     try:
         writer.write_event('start', 0, -1)
         stops = [*((command[0], command) for command in commands), (duration_ns, None)]
         for target_ns, command in targets(0, stops, block_length(streams)):
             try:
-                source.advance(target_ns, writer.take)
+                simulation.advance_in_blocks(target_ns, writer.take)
             finally:                # also what was computed before the motion could not go on
                 writer.write_blocks()
             if command is not None:
@@ -257,7 +255,7 @@ class _LogWriter:
     def take(self, stream: Stream, stamps_ns: NDArray[np.int64],
              rows: NDArray[np.uint8]) -> None:
         """Take a block of samples, which `write_blocks` writes."""
-        self._blocks.append((self._numbers[stream.topic], stamps_ns, rows))
+        self._blocks.append((self._numbers[stream.topic], stamps_ns, rows.copy()))
 
     def write_blocks(self) -> None:
         """Begin to write a chunk of the blocks.  Raises OSError of the chunk before."""

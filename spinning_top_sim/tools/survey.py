@@ -297,7 +297,7 @@ class _SectionAnalyser:
         stamps_ns = np.array([stamp_ns for stamp_ns, _ in samples], np.int64)
         report.add_to_grid(stamps_ns)
         self._analyse(topic, stream, stamps_ns,
-                      stream.template.decode_many(b''.join(data for _, data in samples)))
+                      stream.template.decode(b''.join(data for _, data in samples)))
 
     def _analyse(self, topic: str, stream: Stream, stamps_ns: NDArray[np.int64],
                  fields: tuple[NDArray[np.float64], ...]) -> None:
@@ -319,7 +319,7 @@ class _SectionAnalyser:
                                             (motion.energy, motion.l3, motion.lz), strict=True):
                 series.add(stamps_ns, (value - start) / (abs(start) or 1.0))
         if motion.exact is not None:
-            exact = motion.exact.states_at_ns(stamps_ns - motion.origin_ns).quaternion
+            exact = motion.exact.states(stamps_ns - motion.origin_ns).quaternion
             found.errors.setdefault(topic, Series()).add(
                 stamps_ns, analysis.angle_between(data.quaternion, exact))
 

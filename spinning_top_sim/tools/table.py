@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import Simulation
-from spinning_top_sim.tools.blocks import states_at
 
 # Names and units of the columns.
 UNITS = {
@@ -87,9 +86,9 @@ def _rows(simulation: Simulation, period_ns: int, duration_ns: int,
     for end_ns, momenta in stops:
         while next_ns <= end_ns:
             count = min((end_ns - next_ns) // period_ns + 1, ROWS_AT_ONCE)
-            times_ns = next_ns + period_ns * np.arange(count, dtype=np.int64)
-            states = states_at(simulation, times_ns)
-            columns = (times_ns / NANOSECONDS, states.theta, states.theta_dot, states.phi,
+            times = range(next_ns, next_ns + count * period_ns, period_ns)
+            states = simulation.segment.states(times)
+            columns = (np.array(times) / NANOSECONDS, states.theta, states.theta_dot, states.phi,
                        states.phi_dot, states.psi, states.psi_dot, *states.quaternion.T,
                        *states.angular_velocity.T, states.energy, states.l3, states.lz)
             yield [np.broadcast_to(column, count) for column in columns]
