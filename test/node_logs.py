@@ -13,6 +13,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from nav_msgs.msg import Odometry
 from node_harness import LIFETIME_S
+from recorded import recorded
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import Imu, JointState
 
@@ -136,10 +137,7 @@ def simulated(log, metadata, until_ns):
     assert 0 <= until_ns < LIFETIME_S * SECOND, 'the stamp of t = 0 in the log is wrong'
     simulation = Simulation(parameters.checked(json.loads(record['parameters'])),
                             int(record['epoch_ns']))
-    taken = {}
-    for stream in simulation.streams:
-        rows = taken[stream.topic] = []
-        stream.record = lambda stamp, data, rows=rows: rows.append((stamp, data))
+    taken = recorded(simulation)
     for event in events_in(log):
         if event['event'] in ('command', 'parameters'):
             simulation.advance(event['t_ns'])
@@ -149,7 +147,6 @@ def simulated(log, metadata, until_ns):
             rate = event.get(f'{stream.parameter}.rate')
             if event['event'] == 'parameters' and rate is not None:
                 stream.set_rate(rate)
-                stream.resume(event['t_ns'])
     simulation.advance(until_ns)
     return taken
 

@@ -149,7 +149,7 @@ def assert_same_bytes(found, expected):
         assert [stamp for stamp, _ in mine] == [stamp for stamp, _ in other], stream.topic
         for k, (one, two) in enumerate(zip(mine, other, strict=True)):
             assert one == two, (stream.topic, k, one[0] - EPOCH_NS, *(
-                [run.tolist() for run in stream.template.decode_many(data)]
+                [run.tolist() for run in stream.template.decode(data)]
                 for _, data in (one, two)))
 
 

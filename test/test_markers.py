@@ -41,7 +41,7 @@ def markers_of(values=None, commands=(), duration_ns=3 * SECOND, *, listening=(0
 
 def decoded(run, t_ns):
     """Return position and orientation of the body, orientation of the axis, points (n, 3)."""
-    position, body, axis, *points = run.stream.template.decode_many(run.sent[t_ns])
+    position, body, axis, *points = run.stream.template.decode(run.sent[t_ns])
     return position[0], body[0], axis[0], points[0].reshape(-1, 3) if points else None
 
 
@@ -143,14 +143,14 @@ def test_the_trace_goes_on_through_commands():
         pose.advance(t)
         pose.command(l3, lz)
     pose.advance(3 * SECOND)
-    tip = run.stream.template.decode_many(run.sent[0])[3][0][-3:]
+    tip = run.stream.template.decode(run.sent[0])[3][0][-3:]
     for t_ns in (750_000_000, 1_250_000_000, 1_500_000_000, 2_200_000_000):
         points = decoded(run, t_ns)[3]
         found = {m * 25_000_000: point for m, point in zip(
             range((t_ns - 1) // 25_000_000 - 39, (t_ns - 1) // 25_000_000 + 1), points,
             strict=False)}
         for time, point in found.items():
-            (q,) = stream.template.decode_many(poses[max(time, 0)])
+            (q,) = stream.template.decode(poses[max(time, 0)])
             assert point == pytest.approx(np.linalg.norm(tip) * axis_of(q[0]), abs=1e-8)
 
 

@@ -138,7 +138,7 @@ def test_a_file_that_is_named_is_never_overwritten_and_nothing_is_kept(tmp_path)
     with pytest.raises(RecordingError, match='exists'):
         recorded.start()
     assert path.read_bytes() == b'precious'
-    assert not any(stream.recorded for stream in recorded.simulation.streams)
+    assert not any(stream.has_sinks for stream in recorded.simulation.streams)
     recorded.simulation.advance(SECOND)
     assert recorded.session.stop() is None
     assert recorded.session.numbers() == {'recorder': 'off'}
@@ -162,4 +162,4 @@ def test_a_recording_that_fails_is_closed_and_says_why(tmp_path, monkeypatch):
     assert recorded.session.check() is None
     assert recorded.session.error == 'the disk is gone'
     assert recorded.session.numbers() == {'recorder': 'failed'}
-    assert not any(stream.recorded for stream in recorded.simulation.streams)
+    assert not any(stream.has_sinks for stream in recorded.simulation.streams)

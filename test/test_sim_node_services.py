@@ -30,6 +30,7 @@ from node_logs import (
 )
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
+from recorded import recorded
 from rosbags.highlevel import AnyReader
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu
@@ -126,9 +127,9 @@ def test_a_reset_begins_again_and_stamps_go_on(peer, served):
     (first,) = np.flatnonzero(stamps == epoch)
     assert first >= count
     offline = Simulation(parameters.checked({}), epoch)
-    expected = {}
-    next(s for s in offline.streams if s.topic == 'pose').record = expected.__setitem__
+    rows = recorded(offline, ['pose'])
     offline.advance(int(stamps[-1]) - epoch)
+    expected = dict(rows['pose'])
     assert all(expected[stamp] == data
                for stamp, data in zip(stamps[first:], pose.raw[first:len(stamps)], strict=True))
     assert peer.get(node, 'spin.l3', 'spin.lz') == [1.6, 1.6 * math.cos(math.radians(30.0))]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a tick does, on clocks of its own: due samples, late ticks, overload, pause, step, reset."""
+"""What a tick does on clocks of its own: due samples, lateness, overload, pause, step, reset."""
 
 import pytest
 
@@ -42,8 +42,8 @@ class Run:
         self.loop = TickLoop(
             self.simulation, self.values, Hooks(
                 update_subscribers=lambda: self.told.append('subscribers'),
-                has_room=lambda: room(), clock_started=lambda at: self.told.append(('began', at)),
-                overloaded=lambda what: self.told.append(what),
+                has_room=room, clock_started=lambda at: self.told.append(('began', at)),
+                overloaded=self.told.append,
                 failed=lambda why: self.told.append(f'failed: {why}'),
                 duration_passed=lambda: self.told.append('passed')),
             source=self.clock, steady=self.clock)
@@ -53,7 +53,7 @@ class Run:
         return next(stream for stream in self.simulation.streams if stream.topic == 'pose')
 
     def record(self):
-        self.pose.record = lambda stamp, data: self.stamps.append(stamp)
+        self.simulation.log_to(lambda _, stamp, *rest: self.stamps.append(stamp), [self.pose])
         return self
 
     def publish(self):

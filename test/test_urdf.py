@@ -6,6 +6,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from recorded import recorded
 from reference import ROOT, SCENES, scene_parameters
 from scipy.spatial.transform import Rotation
 
@@ -52,16 +53,16 @@ def test_the_joint_states_put_base_link_where_the_pose_is(tmp_path, scene):
     simulation = Simulation(parameters.checked(values))
     pose = next(s for s in simulation.streams if isinstance(s, Pose))
     joints = next(s for s in simulation.streams if isinstance(s, JointStates))
-    poses, positions = [], []
-    pose.record = lambda stamp, data: poses.append(pose.template.decode_many(data)[0][0])
-    joints.record = lambda stamp, data: positions.append(joints.template.decode_many(data)[0][0])
+    rows = recorded(simulation, [pose.topic, joints.topic])
     simulation.advance(5 * SECOND)
+    poses, positions = ([stream.template.decode(data)[0][0] for _, data in rows[stream.topic]]
+                        for stream in (pose, joints))
     assert len(poses) == len(positions) == 501
     assert model.actuated_joint_names == list(JOINTS)
     arm = np.array(MOUNTED['imu.lever_arm'])
     mounting = Imu(simulation.values)
     state = simulation.state()
-    imu = matrix(mounting.orientation(state))
+    imu = matrix(np.concatenate(mounting.orientation(state)))
     # Unwrapped angles of thousands of radians cannot be told to 1e-12.
     limit = max(1e-12, 2.0 * np.spacing(np.abs(positions).max()))
     worst = 0.0
