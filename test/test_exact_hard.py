@@ -20,15 +20,7 @@ from spinning_top_sim import solve
 
 BOUND = 5e-15
 CASES = json.loads((Path(__file__).parent / 'data' / 'hard_cases.json').read_text())['cases']
-LOST = 'a tiny root of the cubic is lost by cancellation'
-REFUSED = 'a tiny root of the cubic is lost by cancellation, and the motion refused'
-ROUNDED = 'the phase is rounded next to the pole'
-NOT_YET = {
-    'below, theta 3e-26': LOST, 'below, theta 2e-28': LOST, 'below, theta 7e-44': LOST,
-    'below, theta 1e-99': LOST, 'theta_dot 5e-53': LOST, 'theta_dot 2e-53': LOST,
-    'theta_dot 6e-63': REFUSED, 'theta_dot 8e-91': REFUSED,
-    'past the top 1': ROUNDED, 'past the top 2': ROUNDED, 'past the top 3': ROUNDED,
-}
+cases = pytest.mark.parametrize('case', CASES, ids=lambda case: case['name'])
 
 
 def error(value, digits, start=0.0):
@@ -37,16 +29,7 @@ def error(value, digits, start=0.0):
     return float(abs(Decimal(float(value)) - true) / max(1, abs(true), abs(Decimal(start))))
 
 
-def cases(*reasons):
-    """Parametrize with all cases; those that are not right yet for these reasons must fail."""
-    return pytest.mark.parametrize('case', [
-        pytest.param(case, id=case['name'], marks=pytest.mark.xfail(
-            strict=True, reason=NOT_YET[case['name']])
-            if NOT_YET.get(case['name']) in reasons else ())
-        for case in CASES])
-
-
-@cases(LOST, REFUSED, ROUNDED)
+@cases
 def test_states_are_right_to_the_last_digits(case):
     top, start = top_of(case), start_of(case)
     motion = solve(top, start, np.array(case['times']))
@@ -62,7 +45,7 @@ def test_states_are_right_to_the_last_digits(case):
     assert max(map(max, errors.values())) <= BOUND, errors
 
 
-@cases(REFUSED)
+@cases
 def test_the_start_is_the_start(case):
     top, start = top_of(case), start_of(case)
     motion = solve(top, start, [0.0])
