@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from spinning_top_sim.physics.top import State, Top
 
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 __all__ = ['State', 'Top', 'solve']
 
 
-def __getattr__(name: str) -> Any:
-    """Import `solve`, and numpy with it, when it is first asked for: the node needs neither."""
+def __getattr__(name: str) -> object:
+    """Import `solve`, and numpy with it, when it is first asked for."""
     if name == 'solve':
         from spinning_top_sim.solvers import solve  # noqa: PLC0415
         return solve
