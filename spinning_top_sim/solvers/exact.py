@@ -159,9 +159,10 @@ class ExactSolution:
             If `times_ns` is not of that kind, or a time is too far away.
         """
         times = Times.from_ns(times_ns)
-        for ns in (int(min(times_ns)), int(max(times_ns))) if len(times_ns) else ():
-            if not -self.ns_limit <= ns <= self.ns_limit:
-                raise self._too_far(f'{ns} ns')
+        if len(times):
+            latest = max(float(times.high.max()), -float(times.high.min()))
+            if latest > self.ns_limit:
+                raise self._too_far(f'{latest:.0f} ns')
         return self.states_at(times)
 
     def states_at_seconds(self, t: Column) -> States:

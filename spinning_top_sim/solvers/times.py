@@ -48,10 +48,15 @@ class Times:
         Raises
         ------
         ValueError
-            If `ns` is not one-dimensional or not of integers.
+            If `ns` is not one-dimensional, not of integers, or beyond int64.
         """
-        count = (np.arange(ns.start, ns.stop, ns.step, dtype=np.int64) if isinstance(ns, range)
-                 else np.asarray(ns))
+        if isinstance(ns, range):
+            try:
+                count = np.arange(ns.start, ns.stop, ns.step, dtype=np.int64)
+            except OverflowError as error:
+                raise ValueError(f'times_ns = {ns!r}: must be within int64') from error
+        else:
+            count = np.asarray(ns)
         if count.ndim != 1 or (count.size and count.dtype.kind not in 'iu'):
             raise ValueError(f'times_ns has shape {count.shape} and type {count.dtype}: must be '
                              '(n,) integer nanoseconds')
