@@ -47,16 +47,19 @@ class Rotations:
     """
 
     def __init__(self, angles: Sequence[tuple[Decimal, Decimal]]) -> None:
-        first, second, starts = [], [], []
+        first, second, start_steps, start_rests = [], [], [], []
         for rate, start in angles:
             in_steps = rate * STEPS / 10 ** 9
             nearest = float(in_steps)
             big = SPLITTER * nearest
             first.append(big - (big - nearest))
             second.append(float(in_steps - Decimal(first[-1])))
-            starts.append(float((start - start.to_integral_value()) * STEPS))
-        self._first, self._second, self._start = (
-            np.array(numbers)[:, np.newaxis] for numbers in (first, second, starts))
+            start_in_steps = (start - start.to_integral_value()) * STEPS
+            start_steps.append(float(start_in_steps.to_integral_value()))
+            start_rests.append(float(start_in_steps - Decimal(start_steps[-1])))
+        self._first, self._second, self._whole, self._start = (
+            np.array(numbers)[:, np.newaxis]
+            for numbers in (first, second, [WHOLE + steps for steps in start_steps], start_rests))
         self._rates = [Rate(rate) for rate, _ in angles]
         fastest = max(abs(rate.high) for rate in self._rates)
         self._short_ns = SHORT_TURNS / fastest if fastest else np.inf
@@ -64,9 +67,10 @@ class Rotations:
     def cosines_and_sines(self, times: Times) -> tuple[Rows, Rows]:
         """Return cos and sin of the angles, (k, n) each."""
         major, minor = self._in_steps(times)
-        # Adding WHOLE rounds to whole steps; taking it away again is exact.
-        whole = major + WHOLE
-        rest = (major - (whole - WHOLE)) + minor
+        # Adding WHOLE rounds to whole steps, here with those of the start; taking it away again
+        # is exact.
+        whole = major + self._whole
+        rest = (major - (whole - self._whole)) + minor
         more = rest + WHOLE
         rest -= more - WHOLE
         rest *= STEP_ANGLE
@@ -80,7 +84,7 @@ class Rotations:
                 table_sine * cosine + table_cosine * sine)
 
     def _in_steps(self, times: Times) -> tuple[Rows, Rows]:
-        """Return the angles in steps, less whole turns perhaps: exact values and rests."""
+        """Return exact values and rests of the angles in steps, less `_whole`, perhaps turns."""
         t1, t2 = halves(times.high)
         major = self._first * t1
         minor = self._first * t2 + self._second * times.high
