@@ -119,8 +119,8 @@ ILL_CONDITIONED = {('sleep-unstable-1e-8', 100.0): 10.0, ('sep-rounded-a', 30.0)
 def test_reference_cases_up_to_100_s(name):
     case = CASES[name]
     top, start = top_of(case), start_of(case)
-    # The gyroscope of 1e8 takes 740 000 steps a second: it is followed for as long as it takes.
-    latest = 0.1 if name == 'fast-1e+08-cusp' else 124.0
+    # The gyroscopes of 1e8 and 1e4 take 640 000 and 6500 steps a second: not all the way.
+    latest = {'fast-1e+08-cusp': 0.1, 'fast-10000-cusp': 1.0}.get(name, 124.0)
     states = [s for s in case['states'] if s['t'] <= latest]
     motion = solve(top, start, [s['t'] for s in states], method='rk45', rtol=1e-12)
     for i, state in enumerate(states):
@@ -437,7 +437,7 @@ def test_a_limited_number_of_steps_is_taken_and_goes_on_later():
 
 def test_reading_far_ahead_keeps_few_steps():
     motion = looping_motion()
-    motion.states_at_seconds(np.array([0.0, 500.0]))
+    motion.states_at_seconds(np.array([0.0, 100.0]))
     assert motion.steps > 5 * STEPS_AT_ONCE
     assert len(motion._kept) <= STEPS_AT_ONCE + 1
 
@@ -457,30 +457,33 @@ def test_the_begin_and_the_end_of_a_step_belong_to_it():
 
 # ------------------------------------------------------------------------- unwrapped phases
 
+@pytest.mark.parametrize(('rtol', 'bound'), [(1e-3, 0.5), (1e-5, 1e-2), (1e-9, 1e-4)])
 @pytest.mark.parametrize(('l3', 'lz'), [
-    (1.5, 1.5 + 1e-9), (1.5, 1.5 - 1e-9), (1.5, 1.5), (1.5, -1.5), (0.0, 0.0), (-1.5, 1.5 + 1e-9),
+    (1.5, 1.5 + 1e-9), (1.5, 1.5 - 1e-9), (1.5, 1.5), (1.5, -1.5), (1.5, -1.5 + 1e-4), (0.0, 0.0),
     (1.5, 0.7)])
-def test_phases_are_followed_past_the_poles(l3, lz):
+def test_phases_are_followed_past_the_poles(l3, lz, rtol, bound):
     """
     Every phase at the begin of a step is the exact one there, however fast it turns.
 
-    Past a pole at 1e-9 the phase turns by half a turn within a step, in the sense of its momentum.
+    Close by a pole it turns by half a turn within a step, and with long steps by more.
     """
     top = Top(lambda1=1.0, lambda3=0.5, mass=1.0, com_distance=0.5, gravity=9.8)
-    start = State(theta=1.0 if lz >= l3 else 2.0, theta_dot=-4.0, phi=0.4, psi=-0.7, l3=l3, lz=lz)
-    equations = TransportEquations(top, start, 1e-9, 0.0)
+    start = State(theta=1.0 if l3 * lz > 0.0 else 2.0, theta_dot=-4.0, phi=0.4, psi=-0.7, l3=l3,
+                  lz=lz)
+    equations = TransportEquations(top, start, rtol, 0.0)
     line_rate = -0.5 * equations.spin_carried / top.lambda1
     integrator, phases = Integrator(equations), PhaseUnwrapper(start, line_rate)
-    steps = [integrator.step() for _ in range(1500)]
-    for part in (steps[:1], steps[1:700], steps[700:]):
+    steps = [integrator.step()]
+    while steps[-1].t1 < 20.0:
+        steps.append(integrator.step())
+    for part in (steps[:1], steps[1:20], steps[20:]):
         y = np.array([step.y0 for step in part])
         phases.extend(np.array([step.t0 for step in part]), y[:, 0], y[:, 1])
     t = np.array([0.0] + [step.t0 for step in steps])
-    assert phases.begins.shape == (3, len(t)) and t[-1] > 20.0
     exact = ExactSolution(top, start).states_at_seconds(t)
-    spin = 0.5 * equations.spin_rate * t + line_rate * t
-    assert phases.begins[0] == pytest.approx(0.5 * (exact.phi + exact.psi) - spin, abs=1e-2)
-    assert phases.begins[1] == pytest.approx(0.5 * (exact.phi - exact.psi) + spin, abs=1e-2)
-    assert phases.begins[2] == pytest.approx(0.5 * exact.theta, abs=1e-5)
-    phases.forget(1000)
-    assert phases.begins.shape == (3, len(t) - 1000)
+    spin = (0.5 * equations.spin_rate + line_rate) * t
+    assert phases.begins[0] == pytest.approx(0.5 * (exact.phi + exact.psi) - spin, abs=bound)
+    assert phases.begins[1] == pytest.approx(0.5 * (exact.phi - exact.psi) + spin, abs=bound)
+    assert phases.begins[2] == pytest.approx(0.5 * exact.theta, abs=bound)
+    phases.forget(30)
+    assert phases.begins.shape == (3, len(t) - 30)
