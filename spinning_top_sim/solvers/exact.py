@@ -49,6 +49,9 @@ class ExactSolution:
 
     Attributes
     ----------
+    top : Top
+    start : State
+        The same start with theta in [0, pi].
     nutation_period : [s], None if the nutation rests
     mean_precession_rate, mean_spin_rate : [rad/s], over a nutation
     theta_min, theta_max : [rad], of theta folded into [0, pi]
