@@ -109,17 +109,16 @@ def simulate(values: dict[str, float], hours: float) -> tuple[np.ndarray, np.nda
     """Return readings and biases of a run, (n, 6): rates [rad/s], specific force [m/s²]."""
     simulation = Simulation(parameters.checked({**HANGING, **values}))
     found: dict[str, list[np.ndarray]] = {'imu/data_raw': [], 'ground_truth/imu_bias': []}
-    for stream in simulation.streams:
-        if stream.topic in found:
-            stream.record = lambda stamp_ns, data: None
+    simulation.log_to(lambda *messages: None,
+                      [stream for stream in simulation.streams if stream.topic in found])
 
     def take(stream, stamps_ns, rows):
-        _, rates, force = stream.template.decode_many(rows.tobytes())
+        _, rates, force = stream.template.decode(rows.tobytes())
         found[stream.topic].append(np.hstack((rates, force)))
 
     end_ns = round(hours * 3600e9)
     for t_ns in range(STRETCH_NS, end_ns + STRETCH_NS, STRETCH_NS):
-        simulation.advance_in_columns(min(t_ns, end_ns), take)
+        simulation.advance_in_blocks(min(t_ns, end_ns), take)
     raw, bias = (np.vstack(parts) for parts in found.values())
     print(f'{len(raw)} samples, seed {values["seed"]}', flush=True)
     return raw, bias

@@ -26,7 +26,7 @@ from ahrs.filters import AngularRate
 from cases import ROOT
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.solvers.propagator import propagate
+from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.tools import simulate
@@ -165,10 +165,13 @@ def motion(rate: int, seconds: int) -> tuple[np.ndarray, np.ndarray]:
     """Return exact rates (n, 3) [rad/s] and attitudes w, x, y, z (n, 4) at the pivot."""
     values = parameters.checked(read_scene(SCENE))
     imu = Imu(values)
-    top = propagate(parameters.top_of(values), parameters.start_state(values), method='exact')
-    states = [top.at_ns(round(k * 1e9 / rate)) for k in range(seconds * rate + 1)]
-    attitudes = np.array([imu.orientation(state) for state in states])
-    return np.array([imu.true(state)[0] for state in states]), attitudes[:, [3, 0, 1, 2]]
+    times = np.array([round(k * 1e9 / rate) for k in range(seconds * rate + 1)])
+    states = ExactSolution(parameters.top_of(values), parameters.start_state(values)).states(times)
+    rates = np.empty((len(times), 3))
+    for k, column in enumerate(imu.true(states)[0]):
+        rates[:, k] = column
+    x, y, z, w = imu.orientation(states)
+    return rates, np.stack((w, x, y, z), axis=1)
 
 
 def spin() -> float:

@@ -41,34 +41,28 @@ MOTIONS = {
 }
 ARRAY = 100_000
 STEP_NS = 1_000_000
-SCALARS = 2_000
+GRID = range(0, ARRAY * STEP_NS, STEP_NS)
 
 
 def exact_jobs(top, state):
     """Yield the names of our costs, what to run, and how many states that makes."""
     solution = ExactSolution(top, state)
-    solution.quaternion_grid(0, STEP_NS, ARRAY)             # the factor matrices are kept
     t = np.random.default_rng(1).uniform(0.0, 100.0, ARRAY)
-    instants = [k * 54_321_987 for k in range(SCALARS)]
 
     def all_columns():
-        states = solution.states(t)
-        return (states.quaternion, states.theta, states.theta_dot, states.phi, states.psi,
-                states.angular_velocity)
-
-    def one_by_one(function):
-        for ns in instants:
-            function(ns)
+        states = solution.states_at_seconds(t)
+        return (states.rows_quaternion, states.theta, states.theta_dot, states.phi, states.psi,
+                states.rows_angular_velocity)
     yield 'set-up', lambda: ExactSolution(top, state), 1
-    yield 'one quaternion', lambda: one_by_one(solution.quaternion_at), SCALARS
-    yield 'one full state', lambda: one_by_one(solution.full_state_at), SCALARS
-    yield 'quaternions, any times', lambda: solution.quaternion(t), ARRAY
-    yield 'quaternions, grid', lambda: solution.quaternion_grid(0, STEP_NS, ARRAY), ARRAY
+    yield ('quaternions, any times', lambda: solution.states_at_seconds(t).rows_quaternion,
+           ARRAY)
+    # What `simulate` does.
+    yield 'quaternions, grid', lambda: solution.states(GRID).rows_quaternion, ARRAY
     yield 'full states, any times', all_columns, ARRAY
 
 
-def transport_form(top, state):
-    """Parameters and start of p' = (omega p)/2 with L, for the integrators; see `derivative`."""
+def quadratic_start(top, state):
+    """Return w, x, y, z, Lx, Ly at the start: the unknowns of `derivative`."""
     s, c = math.sin(state.theta), math.cos(state.theta)
     across = (state.lz - state.l3 * c) / s
     p = [math.cos(state.theta / 2), 0.0, math.sin(state.theta / 2), 0.0]
@@ -89,7 +83,7 @@ def derivative(top, state, v):
 
 def heyoka_job(heyoka, top, state):
     variables = heyoka.make_vars('w', 'x', 'y', 'z', 'lx', 'ly')
-    begin = transport_form(top, state)
+    begin = quadratic_start(top, state)
     integrator = heyoka.taylor_adaptive(
         list(zip(variables, derivative(top, state, variables), strict=True)), begin)
     t = np.arange(ARRAY + 1) * (STEP_NS * 1e-9)
@@ -102,7 +96,7 @@ def heyoka_job(heyoka, top, state):
 
 
 def scipy_job(solve_ivp, top, state):
-    begin, count = transport_form(top, state), 2000
+    begin, count = quadratic_start(top, state), 2000
     t = np.arange(count) * (STEP_NS * 1e-9)
     return 'scipy DOP853 1e-9', lambda: solve_ivp(
         lambda _, v: derivative(top, state, v), (0.0, t[-1]), begin, method='DOP853',

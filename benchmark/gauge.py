@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Which share of the spin the transport form should carry, and what projection and dense output do:
+Which share of the spin the transport equations should carry, and what projection and dense
+output do:
 
     PYTHONPATH=. python benchmark/gauge.py
 
@@ -10,7 +11,6 @@ without the projection onto the invariants, and errors at the ends of steps and 
 
 from __future__ import annotations
 
-import cmath
 import math
 import statistics
 
@@ -19,9 +19,8 @@ import report
 from cases import CUSP, HEAVY_TOP, LOOPING, NEAR_POLE, SLOW, TOY_60, TOY_200, Case, grid_ns
 from peers import angles_between
 
-from spinning_top_sim.physics import attitude
-from spinning_top_sim.solvers.dormand_prince import Integrator, Vector
-from spinning_top_sim.solvers.transport import TransportForm
+from spinning_top_sim.solvers.dormand_prince import Integrator, Interpolants, Step
+from spinning_top_sim.solvers.transport import TransportEquations, Unknowns
 
 CASES = (CUSP, TOY_60, TOY_200, LOOPING, SLOW, NEAR_POLE, HEAVY_TOP)
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -30,24 +29,31 @@ TOLERANCES = tuple(10.0 ** -k for k in range(6, 13))
 DEFAULT_TOLERANCE = 1e-11
 
 
-class Unprojected(TransportForm):
+class Unprojected(TransportEquations):
     """The same equations, left to drift."""
 
     def project(self, y):
         return y
 
+    def project_columns(self, y):
+        return y
 
-class OnlyNormalized(TransportForm):
+
+class OnlyNormalized(TransportEquations):
     """The same equations with |q| = 1 restored, and nothing else."""
 
     def project(self, y):
         alpha, beta, m = y
-        shrink = (attitude.squared_modulus(alpha) + attitude.squared_modulus(beta)) ** -0.5
+        shrink = 1.0 / math.hypot(alpha.real, alpha.imag, beta.real, beta.imag)
         return alpha * shrink, beta * shrink, m
+
+    def project_columns(self, y):
+        shrink = 1.0 / np.sqrt(sum(x * x for x in y[:4]))
+        return Unknowns(*(x * shrink for x in y[:4]), *y[4:])
 
 
 def main() -> None:
-    parts = [report.preamble('Forms of the equations'),
+    parts = [report.preamble('Gauge, projection and dense output of rk45'),
              f'## The share of the spin that is carried\n\nEvaluations in 10 s for an error of '
              f'{TARGET:g} rad, over those at c = L3/2.  The worst of 640 samples counts; '
              f'between tolerances of {TOLERANCES[0]:g} to {TOLERANCES[-1]:g} the logarithms are '
@@ -69,9 +75,9 @@ def main() -> None:
     rows = []
     for duration, rate in ((10, 64), (1000, 4)):
         for case in CASES:
-            runs = [run(form(case.top, case.start, DEFAULT_TOLERANCE, 0.1 * DEFAULT_TOLERANCE),
+            runs = [run(kind(case.top, case.start, DEFAULT_TOLERANCE, 0.1 * DEFAULT_TOLERANCE),
                         case, duration, rate)
-                    for form in (TransportForm, OnlyNormalized, Unprojected)]
+                    for kind in (TransportEquations, OnlyNormalized, Unprojected)]
             rows.append((case.title, f'{duration}',
                          *(f'{report.number(error)} / {count}' for error, count in runs),
                          report.number(runs[2][0] / runs[0][0])))
@@ -81,7 +87,7 @@ def main() -> None:
     parts.append('## Between the steps\n\nLargest error [rad] over 10 s at rtol '
                  f'{DEFAULT_TOLERANCE:g}, at the ends of the steps and halfway between them, '
                  'there by the quintic\nHermite polynomial, or by the cubic one, which needs no '
-                 'curvatures.\n')
+                 'second derivatives.\n')
     rows = [(case.title, *map(report.number, between_steps(case))) for case in CASES]
     parts.append(report.table(('case', 'ends', 'halfway, quintic', 'halfway, cubic'), rows))
     report.write('gauge.md', '\n'.join(parts))
@@ -89,7 +95,7 @@ def main() -> None:
 
 def evaluations_for(case: Case, share: float) -> float:
     """Return how many evaluations an error of TARGET takes over 10 s."""
-    runs = [run(TransportForm(case.top, case.start, rtol, 0.1 * rtol, share), case, 10, 64)
+    runs = [run(TransportEquations(case.top, case.start, rtol, 0.1 * rtol, share), case, 10, 64)
             for rtol in TOLERANCES]
     errors, counts = np.log(np.array(runs)).T
     order = np.argsort(errors)
@@ -98,43 +104,53 @@ def evaluations_for(case: Case, share: float) -> float:
 
 def between_steps(case: Case) -> tuple[float, ...]:
     """Return the largest errors at the ends of steps, halfway, and halfway by cubics."""
-    form = TransportForm(case.top, case.start, DEFAULT_TOLERANCE, 0.1 * DEFAULT_TOLERANCE)
-    integrator = Integrator(form, form.start, form.first_step)
-    ends, middles = [], []
-    found: tuple[list, ...] = [], [], []
-    while integrator.newest.t1 < 10.0:
-        step = integrator.step()
-        h, middle = step.t1 - step.t0, 0.5 * (step.t0 + step.t1)
-        slopes0, slopes1 = form.rates(*step.y0), form.rates(*step.y1)
-        cubic = tuple(0.5 * (a + b) + 0.125 * h * (p - q) for a, b, p, q in zip(
-            step.y0, step.y1, slopes0, slopes1, strict=True))
-        ends.append(step.t1)
-        middles.append(middle)
-        for rows, y, t in zip(found, (step.y1, step.interpolate(middle), cubic),
-                              (step.t1, middle, middle), strict=True):
-            rows.append(attitude_of(form, y, t))
-    return tuple(float(angles_between(np.array(rows), case.exact.quaternion(np.array(t))).max())
-                 for rows, t in zip(found, (ends, middles, middles), strict=True))
+    equations = TransportEquations(case.top, case.start, DEFAULT_TOLERANCE,
+                                   0.1 * DEFAULT_TOLERANCE)
+    steps = steps_to(10.0, Integrator(equations))
+    begins, ends = np.array([step.t0 for step in steps]), np.array([step.t1 for step in steps])
+    middles = 0.5 * (begins + ends)
+    quintic = Interpolants.of(steps, equations).at(np.arange(len(steps)), middles)
+    y0, y1 = (np.array([getattr(step, name) for step in steps]).T for name in ('y0', 'y1'))
+    slopes0, slopes1 = (np.array(equations.derivative(*y)) for y in (y0, y1))
+    cubic = 0.5 * (y0 + y1) + 0.125 * (ends - begins) * (slopes0 - slopes1)
+    return tuple(
+        float(angles_between(attitudes_of(equations, rows, t),
+                             case.exact.states_at_seconds(t).quaternion).max())
+        for rows, t in ((real_rows(y1), ends), (quintic, middles), (real_rows(cubic), middles)))
 
 
-def attitude_of(form: TransportForm, y: Vector, t: float) -> tuple[float, ...]:
-    """Return x, y, z, w of the unknowns at t [s], projected, as the simulator reads them."""
-    alpha, beta, _ = form.project(y)
-    spin = cmath.rect(1.0, 0.5 * form.spin_rate * t)
-    return attitude.quaternion(alpha * spin, beta * spin.conjugate())
+def real_rows(y: np.ndarray) -> np.ndarray:
+    """Return rows of real and imaginary parts (6, n) of complex rows (3, n)."""
+    return np.stack((y.real, y.imag), axis=1).reshape(6, -1)
 
 
-def run(form: TransportForm, case: Case, duration: int, rate: int) -> tuple[float, int]:
+def attitudes_of(equations: TransportEquations, rows: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Return x, y, z, w (n, 4) of unknowns (6, n) at t [s], projected, as the simulator does."""
+    a, a_imag, b, b_imag, _, _ = equations.project_columns(Unknowns(*rows))
+    spin = np.exp(0.5j * equations.spin_rate * t)
+    alpha, beta = (a + 1j * a_imag) * spin, (b + 1j * b_imag) * spin.conjugate()
+    return np.stack((-beta.imag, beta.real, alpha.imag, alpha.real), axis=1)
+
+
+def steps_to(end: float, integrator: Integrator) -> list[Step]:
+    """Take steps up to a time [s]."""
+    steps = [integrator.newest]
+    while integrator.newest.t1 < end:
+        steps.append(integrator.step())
+    return steps[1:]
+
+
+def run(equations: TransportEquations, case: Case, duration: int, rate: int,
+        ) -> tuple[float, int]:
     """Return the largest error of the attitude and the number of evaluations."""
-    integrator = Integrator(form, form.start, form.first_step)
+    integrator = Integrator(equations)
     ns = grid_ns(duration, rate)
-    attitudes = []
-    for t in (ns / 1e9).tolist():
-        while integrator.newest.t1 < t:
-            integrator.step()
-        attitudes.append(attitude_of(form, integrator.newest.interpolate(t), t))
-    truth = case.exact.states_at_ns(ns).quaternion
-    return float(angles_between(np.array(attitudes), truth).max()), integrator.evaluations
+    t = ns / 1e9
+    steps = steps_to(t[-1], integrator)
+    numbers = np.searchsorted([step.t1 for step in steps], t)
+    found = attitudes_of(equations, Interpolants.of(steps, equations).at(numbers, t), t)
+    return (float(angles_between(found, case.exact.states(ns).quaternion).max()),
+            integrator.evaluations)
 
 
 if __name__ == '__main__':

@@ -8,8 +8,8 @@ Time per state over the number of states, ours beside others at their fine setti
 Two states, a hundred and a hundred thousand of the cusping scene, 512 a second from the start on,
 by the very calls of `peers.py`.  Time is processor time of the whole call over the number of
 states, medians of interleaved rounds in one process and one thread; setting up our exact solution
-is part of it except where it says "prepared", compiling and loading of others are not.  "any
-times" are the same instants in random order, which steppers do not take.  Error: the largest
+is part of it except where it says "prepared", compiling and loading of others are not.  Prepared,
+"any times" are the same instants in random order, which steppers do not take.  Error: the largest
 rotation angle from the exact solution, whose own error stands in work_precision.md.
 """
 
@@ -25,11 +25,10 @@ from peers import FailedError, Peer, Runner, angles_between, peer
 from report import number, preamble, table, write_section
 from timing import TimeUpError, interleaved, one_thread, seconds_of, time_limit
 
-from spinning_top_sim import solve
 from spinning_top_sim.solvers.exact import ExactSolution
 
 COUNTS = (2, 100, 100_000)
-CHOSEN = (('exact, state by state', 0.0), ('exact, array', 0.0), ('exact, grid', 0.0),
+CHOSEN = (('exact, any times', 0.0), ('exact, grid', 0.0),
           ('rk45 transport', 1e-9), ('rk45 transport', 1e-11), ('SciPy RK45', 1e-9),
           ('SciPy DOP853', 1e-12), ('heyoka quadratic', 1e-12), ('heyoka quadratic', 2.0 ** -52),
           ('numbalsoda LSODA quadratic', 1e-12), ('numbalsoda DOP853 quadratic', 1e-12),
@@ -45,37 +44,21 @@ class _Prepared(Runner):
         self.solution = ExactSolution(case.top, case.start)
 
 
-class _PreparedOne(_Prepared):
-    def attitudes(self, ns):
-        return np.array([self.solution.quaternion_at(n) for n in ns.tolist()])
-
-
 class _PreparedArray(_Prepared):
     def attitudes(self, ns):
         shuffled = np.random.default_rng(1).permutation(len(ns))
         result = np.empty((len(ns), 4))
-        result[shuffled] = self.solution.quaternion(ns[shuffled] / 1e9)
+        result[shuffled] = self.solution.states(ns[shuffled]).quaternion
         return result
 
 
 class _PreparedGrid(_Prepared):
     def attitudes(self, ns):
-        return self.solution.quaternion_grid(0, int(ns[1]), len(ns))
+        return self.solution.states(range(0, int(ns[1]) * len(ns), int(ns[1]))).quaternion
 
 
-class _SteppedArray(Runner):
-    """`solve`, whose columns read many samples of the steps at once."""
-
-    def attitudes(self, ns):
-        return solve(self.case.top, self.case.start, ns / 1e9, method='rk45',
-                     rtol=self.setting).quaternion
-
-
-PREPARED = (Peer('exact, prepared, state by state', 'ours', _PreparedOne, (0.0,)),
-            Peer('exact, prepared, any times', 'ours', _PreparedArray, (0.0,)),
+PREPARED = (Peer('exact, prepared, any times', 'ours', _PreparedArray, (0.0,)),
             Peer('exact, prepared, grid', 'ours', _PreparedGrid, (0.0,)))
-
-STEPPED = Peer('rk45 transport, array', 'ours', _SteppedArray, (1e-11,))
 
 
 def absent() -> list[str]:
@@ -92,12 +75,11 @@ def absent() -> list[str]:
 def measure(case: Case, count: int, rounds: int) -> dict[str, tuple[float, float] | str]:
     """Return (seconds per state, error) of each method, or what happened to it."""
     ns = np.arange(count, dtype=np.int64) * FINEST_NS
-    truth = case.exact.quaternion(ns / 1e9)
+    truth = case.exact.states(ns).quaternion
     found: dict[str, tuple[float, float] | str] = {}
     runs: dict[object, Callable[[], object]] = {}
     errors = {}
-    for one, setting in [*((p, 0.0) for p in PREPARED), (STEPPED, 1e-11),
-                         *((peer(n), s) for n, s in CHOSEN)]:
+    for one, setting in [*((p, 0.0) for p in PREPARED), *((peer(n), s) for n, s in CHOSEN)]:
         name = f'{one.name} {one.setting_text(setting)}'.strip()
         if one.missing():
             found[name] = 'absent'

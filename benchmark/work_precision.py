@@ -110,8 +110,8 @@ quaternion form without poles.
 MuJoCo's setting is its fixed step.
 
 Weak points of the comparison: how many samples share a step decides how much dense output
-weighs, and it weighs most for methods that take few steps; ours in pure Python return one state
-a call, the others arrays; SciPy's right-hand side is Python, compiled by nobody; one thread each.
+weighs, and it weighs most for methods that take few steps; the right-hand sides of `rk45` and of
+SciPy are Python, compiled by nobody; one thread each.
 """
 
 
@@ -124,7 +124,7 @@ def _missing() -> str:
 def measure(case: Case, duration: int, rate: int, rounds: int, longest: float) -> list[Row]:
     """Run every method at every setting once for its error, then `rounds` times for its time."""
     ns = grid_ns(duration, rate)
-    truth = case.exact.states_at_ns(ns).quaternion
+    truth = case.exact.states(ns).quaternion
     runners: dict[int, Runner] = {}
     rows = []
     for peer in PEERS:

@@ -12,9 +12,8 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from spinning_top_sim import solve
-from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.regimes import describe
+from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import inspect, simulate
 from spinning_top_sim.tools.plots import INK, draw_sphere, draw_tip
@@ -41,11 +40,12 @@ def motions(path):
     figure, panels = plt.subplots(1, 3, figsize=(10.5, 3.5))
     for axes, (caption, name, nutations) in zip(panels, PANELS, strict=True):
         top, start = scene(name)
-        period = solve(top, start, [0.0]).solution.nutation_period
-        motion = solve(top, start, np.linspace(0.0, nutations * period, 4000))
-        facts = describe(top, start, motion.solution)
+        solution = ExactSolution(top, start)
+        facts = describe(top, start, solution)
+        t = np.linspace(0.0, nutations * facts.nutation_period, 4000)
         draw_sphere(axes, (facts.theta_min, facts.theta_max, np.pi / 2))
-        draw_tip(axes, *attitude.axis_in_world(motion.alpha, motion.beta))
+        x, y, z = solution.states_at_seconds(t).rows_axis
+        draw_tip(axes, x + 1j * y, z)
         axes.text(0.0, 1.1, caption, ha='center', color=INK, fontsize=12)
         axes.text(0.0, -0.82, f'θ from {np.degrees(facts.theta_min):.1f}° to '
                   f'{np.degrees(facts.theta_max):.1f}° every {facts.nutation_period:.2f} s',

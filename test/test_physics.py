@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.kinematics import AxisState
 from spinning_top_sim.physics.regimes import regime, swing
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.pipeline import Simulation
@@ -58,68 +57,102 @@ def test_realizable_is_the_triangle_inequality_about_the_centre_of_mass():
 
 
 def random_states(count=50):
+    """Return starts and the states (count,) there, as the Euler angles give them."""
     rng = np.random.default_rng(3)
-    for _ in range(count):
-        theta = rng.uniform(0.01, math.pi - 0.01)
-        yield AxisState(Top(**TOP), rng.normal(), rng.normal(), theta, *rng.normal(size=3))
+    starts = [State(theta=rng.uniform(0.01, math.pi - 0.01), **dict(zip(
+        ('l3', 'lz', 'theta_dot', 'phi', 'psi'), rng.normal(size=5), strict=True)))
+        for _ in range(count)]
+    return [(start, solve(Top(**TOP), start, [0.0], method='rk45', equations='euler'))
+            for start in starts]
+
+
+def rotation_of(state):
+    return Rotation.from_quat(state.quaternion[0])
 
 
 def test_quaternion_is_rz_ry_rz():
-    for state in random_states():
-        expected = Rotation.from_euler('ZYZ', (state.phi, state.theta, state.psi))
-        ours = Rotation.from_quat(state.quaternion)
-        assert (ours * expected.inv()).magnitude() < 1e-14
+    for start, state in random_states():
+        expected = Rotation.from_euler('ZYZ', (start.phi, start.theta, start.psi))
+        assert (rotation_of(state) * expected.inv()).magnitude() < 1e-14
 
 
 def test_angular_velocity_is_that_of_the_euler_angles():
     """Eq. (1): phi' z + theta' e2' + psi' e3, turned into the body by an independent library."""
-    for state in random_states():
-        rz = Rotation.from_euler('Z', state.phi)
-        e2 = rz.apply((0.0, 1.0, 0.0))
-        rotation = Rotation.from_quat(state.quaternion)
-        world = (state.phi_dot * np.array((0.0, 0.0, 1.0)) + state.theta_dot * e2
+    for start, state in random_states():
+        e2 = Rotation.from_euler('Z', start.phi).apply((0.0, 1.0, 0.0))
+        rotation = rotation_of(state)
+        world = (state.phi_dot * np.array((0.0, 0.0, 1.0)) + start.theta_dot * e2
                  + state.psi_dot * rotation.apply((0.0, 0.0, 1.0)))
-        rounding = 1e-14 * (1.0 + abs(state.phi_dot) + abs(state.psi_dot))
-        assert rotation.inv().apply(world) == pytest.approx(state.angular_velocity, abs=rounding)
+        rounding = 1e-14 * (1.0 + abs(state.phi_dot[0]) + abs(state.psi_dot[0]))
+        assert rotation.inv().apply(world) == pytest.approx(state.angular_velocity[0],
+                                                            abs=rounding)
 
 
 def test_energy_and_momenta_are_those_of_the_lagrangian():
     """Eqs. (7), (11), (13), (14)."""
-    for state in random_states():
-        top, c, s = state.top, math.cos(state.theta), math.sin(state.theta)
-        assert top.lambda3 * (state.psi_dot + state.phi_dot * c) == pytest.approx(state.l3)
-        assert top.lambda1 * state.phi_dot * s * s + state.l3 * c == pytest.approx(state.lz)
-        kinetic = (0.5 * top.lambda1 * (state.phi_dot ** 2 * s * s + state.theta_dot ** 2)
-                   + state.l3 ** 2 / (2.0 * top.lambda3))
-        assert state.energy == pytest.approx(kinetic + top.gravity_torque * c)
+    for start, state in random_states():
+        top, c, s = state.top, math.cos(start.theta), math.sin(start.theta)
+        phi_dot, psi_dot = state.phi_dot[0], state.psi_dot[0]
+        assert top.lambda3 * (psi_dot + phi_dot * c) == pytest.approx(start.l3)
+        assert top.lambda1 * phi_dot * s * s + start.l3 * c == pytest.approx(start.lz)
+        kinetic = (0.5 * top.lambda1 * (phi_dot ** 2 * s * s + start.theta_dot ** 2)
+                   + start.l3 ** 2 / (2.0 * top.lambda3))
+        assert state.energy[0] == pytest.approx(kinetic + top.gravity_torque * c)
 
 
 def test_vectors_turn_into_the_body():
-    for state in random_states(10):
-        rotation = Rotation.from_quat(state.quaternion)
-        v = np.array((0.3, -1.1, 0.7))
-        in_body = rotation.inv().apply(v)
-        transverse = attitude.transverse_in_body(state.alpha, state.beta, v[0] + 1j * v[1], v[2])
-        assert (transverse.real, transverse.imag) == pytest.approx(tuple(in_body[:2]), abs=1e-14)
-        up, along = state.vertical
-        assert (up.real, up.imag, along) == pytest.approx(
-            tuple(rotation.inv().apply((0.0, 0.0, 1.0))), abs=1e-14)
+    v = (0.3, -1.1, 0.7)
+    for _, state in random_states(10):
+        into_body = rotation_of(state).inv()
+        transverse = np.array(attitude.transverse_in_body(state.rows_quaternion, v))[:, 0]
+        assert transverse == pytest.approx(into_body.apply(v)[:2], abs=1e-14)
+        assert np.array(state.rows_vertical)[:, 0] == pytest.approx(
+            into_body.apply((0.0, 0.0, 1.0)), abs=1e-14)
+        assert np.array(state.rows_axis)[:, 0] == pytest.approx(
+            rotation_of(state).apply((0.0, 0.0, 1.0)), abs=1e-14)
+
+
+def test_products_and_angles_of_rotations():
+    one, other = Rotation.random(20, random_state=1), Rotation.random(20, random_state=2)
+    p, q = tuple(one.as_quat().T), tuple(other.as_quat().T)
+    turned = Rotation.from_quat(np.stack(attitude.product(p, q), -1))
+    assert (turned * (one * other).inv()).magnitude() == pytest.approx(0.0, abs=1e-14)
+    assert attitude.angle_between(p, q) == pytest.approx((one * other.inv()).magnitude())
+    assert attitude.angle_between(p, tuple(-x for x in p)).tolist() == [0.0] * 20
+    for small in (1e-5, 1e-12):
+        near = one * Rotation.from_rotvec([0.0, 0.6 * small, 0.8 * small])
+        assert attitude.angle_between(p, tuple(near.as_quat().T)) == pytest.approx(
+            small, abs=2e-15)
+
+
+def at_rest(theta):
+    return solve(Top(**TOP), State(theta=theta, l3=0.0, lz=0.0), [0.0])
 
 
 def test_hanging_at_rest_an_accelerometer_reads_g_upwards():
-    top = Top(**TOP)
-    hanging = AxisState(top, 0.0, 0.0, math.pi, 0.0, 0.0, 0.0)
-    assert hanging.specific_force((0.1, 0.0, 0.2)) == pytest.approx((0.0, 0.0, -top.gravity))
-    upright = AxisState(top, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    assert upright.specific_force((0.0, 0.0, 0.0)) == (0.0, 0.0, top.gravity)
+    hanging = at_rest(math.pi).specific_force((0.1, 0.0, 0.2))
+    assert np.array(hanging)[:, 0] == pytest.approx((0.0, 0.0, -TOP['gravity']))
+    upright = at_rest(0.0).specific_force((0.0, 0.0, 0.0))
+    assert tuple(float(x[0]) for x in upright) == (0.0, 0.0, TOP['gravity'])
 
 
 def test_the_centre_of_percussion_of_a_horizontal_pendulum_feels_no_force_along_its_swing():
     """At lambda1/(M R) from the pivot a released horizontal pendulum falls with g."""
-    top = Top(**TOP)
-    level = AxisState(top, 0.0, 0.0, math.pi / 2, 0.0, 0.0, 0.0)
-    arm = top.lambda1 / (top.mass * top.com_distance)
-    assert level.specific_force((0.0, 0.0, arm)) == pytest.approx((0.0, 0.0, 0.0), abs=1e-14)
+    level = at_rest(math.pi / 2)
+    arm = level.top.lambda1 / (level.top.mass * level.top.com_distance)
+    assert np.array(level.specific_force((0.0, 0.0, arm)))[:, 0] == pytest.approx(
+        (0.0, 0.0, 0.0), abs=1e-14)
+
+
+def test_states_of_many_times_have_the_shapes_that_they_say():
+    states = solve(Top(**TOP), State(**STATE), np.linspace(0.0, 1.0, 7))
+    assert len(states) == 7
+    for name in ('t', 'theta', 'phi', 'psi', 'theta_dot', 'phi_dot', 'psi_dot', 'theta_folded',
+                 'energy', 'l3', 'lz', 'norm_error'):
+        assert getattr(states, name).shape == (7,), name
+    assert states.quaternion.shape == (7, 4)
+    for name in ('angular_velocity', 'angular_acceleration'):
+        assert getattr(states, name).shape == (7, 3), name
 
 
 NAMES = {

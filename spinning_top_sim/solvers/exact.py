@@ -50,6 +50,9 @@ class ExactSolution:
 
     Attributes
     ----------
+    top : Top
+    start : State
+        The same start with theta in [0, pi].
     nutation_period : [s], None if the nutation rests
     mean_precession_rate, mean_spin_rate : [rad/s], over a nutation
     theta_min, theta_max : [rad], of theta folded into [0, pi]
@@ -173,9 +176,10 @@ class ExactSolution:
             If `times_ns` is not of that kind, or a time is too far away.
         """
         times = Times.from_ns(times_ns)
-        for ns in (int(min(times_ns)), int(max(times_ns))) if len(times_ns) else ():
-            if not -self.ns_limit <= ns <= self.ns_limit:
-                raise self._too_far(f'{ns} ns')
+        if len(times):
+            latest = max(float(times.high.max()), -float(times.high.min()))
+            if latest > self.ns_limit:
+                raise self._too_far(f'{latest:.0f} ns')
         return self._states(times)
 
     def states_at_seconds(self, t: Column) -> States:

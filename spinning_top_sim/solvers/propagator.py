@@ -107,10 +107,11 @@ def propagate(top: Top, start: State, *, method: str, equations: str = 'transpor
     if method == 'exact':
         return ExactSolution(top, start)
     try:
-        motion = _stepped(top, start, equations, rtol, atol)
-        first = motion.states(range(1))
-        held = all(abs(float(column[0])) <= MOST
-                   for column in (first.energy, first.phi_dot, first.psi_dot))
+        with np.errstate(over='raise', divide='raise', invalid='raise'):
+            motion = _stepped(top, start, equations, rtol, atol)
+            first = motion.states(range(1))
+            held = all(abs(float(column[0])) <= MOST
+                       for column in (first.energy, first.phi_dot, first.psi_dot))
     except ArithmeticError:
         held = False
     if not held:
@@ -128,5 +129,3 @@ def _stepped(top: Top, start: State, equations: str, rtol: float, atol: float) -
         except ValueError:      # beyond its range, steps go on
             pass
     return TransportMotion(top, start, rtol, atol)
-
-

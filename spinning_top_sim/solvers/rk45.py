@@ -29,9 +29,7 @@ from spinning_top_sim.solvers.unwrap import PhaseUnwrapper, spin_excess
 
 # A time that so many steps of the present size do not reach is refused at once: 3 hours of work.
 MOST_STEPS = 1e9
-# The careful first steps say nothing about that.
-TRIAL_STEPS = 100
-# Steps that are read together; more would only take memory.
+# Steps that are taken and read together; more would only take memory.
 STEPS_AT_ONCE = 256
 
 Rows = NDArray[np.float64]
@@ -89,13 +87,16 @@ class SteppedMotion(ABC):
                 return False
             self._kept.append(self._integrator.step())
             taken += 1
-            newest = self._kept[-1]
-            length = newest.t1 - newest.t0
-            if max_steps is None and taken == TRIAL_STEPS and t - newest.t1 > MOST_STEPS * length:
-                raise IntegrationError(
-                    f't = {t:.9g} s is more than {MOST_STEPS:.0e} steps of {length:.3g} s away: '
-                    "use method = 'exact'")
         return True
+
+    def _refuse_too_far(self, t: float) -> None:
+        """Raise IntegrationError if `t` is more than MOST_STEPS away."""
+        newest = self._kept[-1]
+        length = newest.t1 - newest.t0
+        if t - newest.t1 > MOST_STEPS * length:
+            raise IntegrationError(
+                f't = {t:.9g} s is more than {MOST_STEPS:.0e} steps of {length:.3g} s away: '
+                "use method = 'exact'")
 
     def release(self, before_ns: int) -> None:
         """Forget the steps that only states before this time need."""
@@ -118,18 +119,24 @@ class SteppedMotion(ABC):
         ValueError
             If a time lies before `earliest_ns`.
         IntegrationError
-            If the steps cannot go on to the last time.
+            If the steps cannot go on to the last time, or it is too many of them away.
         """
         return self.states_at_seconds(Times.from_ns(times_ns).seconds)
 
     def states_at_seconds(self, t: Column) -> States:
-        """Return the states at ascending times t (n,) [s]; see `states`."""
+        """
+        Return the states at ascending times t (n,) [s]; see `states`.
+
+        Steps before the last time may be forgotten on the way.
+        """
         if len(t) and t[0] < self._kept[0].t0:
             raise ValueError(f't = {t[0]!r} s: steps go forward, and the oldest one that is kept '
                              f'begins at {self._kept[0].t0!r} s')
         parts, begin = [], 0
         while begin < len(t):
-            self._reach(t[begin])
+            while not self._reach(t[begin], STEPS_AT_ONCE):
+                self._refuse_too_far(t[begin])
+                self._release(self._kept[-1].t1)
             while self._kept[-1].t1 < t[-1] and len(self._kept) < STEPS_AT_ONCE:
                 self._kept.append(self._integrator.step())
             end = int(np.searchsorted(t, self._kept[-1].t1, 'right'))

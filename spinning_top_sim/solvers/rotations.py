@@ -49,16 +49,19 @@ class Rotations:
     """
 
     def __init__(self, angles: Sequence[tuple[Decimal, Decimal]]) -> None:
-        first, second, starts = [], [], []
+        first, second, start_steps, start_rests = [], [], [], []
         for rate, start in angles:
             in_steps = rate * STEPS / 10 ** 9
             nearest = float(in_steps)
             big = SPLITTER * nearest
             first.append(big - (big - nearest))
             second.append(float(in_steps - Decimal(first[-1])))
-            starts.append(float((start - start.to_integral_value()) * STEPS))
-        self._first, self._second, self._start = (
-            np.array(numbers)[:, np.newaxis] for numbers in (first, second, starts))
+            start_in_steps = (start - start.to_integral_value()) * STEPS
+            start_steps.append(float(start_in_steps.to_integral_value()))
+            start_rests.append(float(start_in_steps - Decimal(start_steps[-1])))
+        self._first, self._second, self._whole, self._start = (
+            np.array(numbers)[:, np.newaxis]
+            for numbers in (first, second, [WHOLE + steps for steps in start_steps], start_rests))
         self._rates = [Rate(rate) for rate, _ in angles]
         fastest = max(abs(rate.high) for rate in self._rates)
         self._short_ns = SHORT_TURNS / fastest if fastest else np.inf
@@ -67,7 +70,7 @@ class Rotations:
 
     def cosines_and_sines(self, times: Times) -> tuple[Rows, Rows]:
         """Return cos and sin of the angles, (k, n) each."""
-        return self._of_steps(*self._in_steps(times, self._start))
+        return self._of_steps(*self._in_steps(times, self._start), self._whole)
 
     def on_grid(self, grid: range) -> tuple[Rows, Rows]:
         """
@@ -86,7 +89,7 @@ class Rotations:
             while len(self._within_row) >= STEPS_KEPT:
                 del self._within_row[next(iter(self._within_row))]
             self._within_row[step] = self._of_steps(*self._in_steps(
-                Times.from_ns(range(0, ROW * step, step)), np.zeros_like(self._start)))
+                Times.from_ns(range(0, ROW * step, step)), np.zeros_like(self._start)), WHOLE)
         cosine, sine = (x[:, np.newaxis, :] for x in self._within_row[step])
         count, begin = len(self._start), first - rows.start * ROW
         part = slice(begin, begin + len(grid))
@@ -96,11 +99,15 @@ class Rotations:
         sines += row_cosine * sine
         return cosines.reshape(count, -1)[:, part], sines.reshape(count, -1)[:, part]
 
-    def _of_steps(self, major: Rows, minor: Rows) -> tuple[Rows, Rows]:
-        """Return cos and sin of angles in steps; in place, as memory costs as much as sums."""
+    def _of_steps(self, major: Rows, minor: Rows, start: Rows | float) -> tuple[Rows, Rows]:
+        """
+        Return cos and sin of angles in steps; in place, as memory costs as much as sums.
+
+        start : WHOLE and the whole steps of the angles at t = 0
+        """
         # Adding WHOLE rounds to whole steps; taking it away again is exact.
-        whole = major + WHOLE
-        major -= whole - WHOLE
+        whole = major + start
+        major -= whole - start
         major += minor
         more = major + WHOLE
         major -= more - WHOLE
@@ -125,7 +132,7 @@ class Rotations:
         return cosines, table_sine
 
     def _in_steps(self, times: Times, start: Rows) -> tuple[Rows, Rows]:
-        """Return the angles in steps, less whole turns perhaps: exact values and rests."""
+        """Return the angles in steps, less whole ones at the start: exact values and rests."""
         t1, t2 = halves(times.high)
         major = self._first * t1
         minor = self._first * t2

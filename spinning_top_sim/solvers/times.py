@@ -50,11 +50,14 @@ class Times:
         Raises
         ------
         ValueError
-            If `ns` is not one-dimensional or not of integers.
+            If `ns` is not one-dimensional, not of integers, or beyond int64.
         """
         grid = ns if isinstance(ns, range) else None
-        count = np.asarray(ns) if grid is None else np.arange(
-            grid.start, grid.stop, grid.step, dtype=np.int64)
+        try:
+            count = np.asarray(ns) if grid is None else np.arange(
+                grid.start, grid.stop, grid.step, dtype=np.int64)
+        except OverflowError as error:
+            raise ValueError(f'times_ns = {ns!r}: must be within int64') from error
         if count.ndim != 1 or (count.size and count.dtype.kind not in 'iu'):
             raise ValueError(f'times_ns has shape {count.shape} and type {count.dtype}: must be '
                              '(n,) integer nanoseconds')
