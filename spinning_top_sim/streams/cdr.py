@@ -144,7 +144,7 @@ class Template:
         count = len(stamps_ns)
         if len(self._rows) < count:
             self._rows = np.empty(count, self._row_type)
-            self._rows.view(np.uint8).reshape(count, -1)[:] = np.frombuffer(
+            self._rows.view(np.uint8).reshape(count, len(self))[:] = np.frombuffer(
                 self._buffer, np.uint8)
         rows = self._rows[:count]
         for at in self._stamps_at:
@@ -156,7 +156,7 @@ class Template:
             else:
                 for column, numbers in enumerate(value):
                     field[:, column] = numbers
-        return rows.view(np.uint8).reshape(count, -1)
+        return rows.view(np.uint8).reshape(count, len(self))
 
     def encode_one(self, stamp_ns: int, *values: Field) -> bytes:
         """Return one message; see `encode`."""

@@ -189,20 +189,16 @@ class Simulation:
         ready = schedule.ready
         sent = False
         while True:
-            if not ready:
-                due_ns = schedule.next_due(self.now_ns)
-                if due_ns > target_ns:
-                    break
-                if due_ns > schedule.reached_ns and not self._reach(due_ns, give_way):
-                    return False
-                schedule.compute(self.now_ns, target_ns)
-            instant = ready[0]
-            if instant[0] > target_ns:
+            due_ns = ready[0][0] if ready else schedule.next_due(self.now_ns)
+            if due_ns > target_ns:
                 break
             if sent and give_way():
                 return False
-            ready.popleft()
-            self._send(instant, instant[0] >= publish_from_ns)
+            if not ready:
+                if due_ns > schedule.reached_ns and not self._reach(due_ns, give_way):
+                    return False
+                schedule.compute(self.now_ns, target_ns)
+            self._send(ready.popleft(), due_ns >= publish_from_ns)
             sent = True
         if target_ns > schedule.reached_ns and not self._reach(target_ns, give_way):
             return False
