@@ -99,13 +99,16 @@ class Markers(Stream):
 
     def _traces(self, times: range, axis: Axis) -> NDArray[np.float64]:
         """Return the points of the traces (n, 3 (count + 1)) that end at these times."""
+        count = self._count
         newest = (np.arange(times.start, times.stop, times.step) - 1) // self._spacing_ns
-        first = int(newest[0]) - self._count + 1
-        grid = np.arange(first, int(newest[-1]) + 1)
+        # A trace shares points with the one before it; there they are computed once.
+        fresh = np.minimum(np.diff(newest, prepend=newest[0] - count), count)
+        ends = np.cumsum(fresh)
+        grid = np.repeat(newest + 1 - ends, fresh) + np.arange(ends[-1])
         points = np.stack(self.past.axis(np.maximum(grid * self._spacing_ns, 0)), axis=-1)
-        traces = np.empty((len(times), self._count + 1, 3))
-        for row, begin in zip(traces, (newest - self._count + 1 - first).tolist(), strict=True):
-            row[:-1] = points[begin:begin + self._count]
+        traces = np.empty((len(times), count + 1, 3))
+        for row, end in zip(traces, ends.tolist(), strict=True):
+            row[:-1] = points[end - count:end]
         traces[:, -1] = np.stack(axis, axis=-1)
         traces *= self._shape.tip
         return traces.reshape(len(times), -1)
