@@ -192,15 +192,6 @@ def test_many_messages_are_single_ones_one_after_the_other():
             assert np.array_equal(found, np.reshape(given, found.shape))
 
 
-def test_a_template_with_fixed_numbers_takes_stamps_alone():
-    values = numbers(4), numbers(3), numbers(3)
-    template = messages.imu('imu_link', messages.EXACT, messages.EXACT, messages.EXACT)
-    fixed = template.with_fixed(*values)
-    assert fixed.encode_one(-7) == template.encode_one(-7, *values)
-    assert [field.tolist() for field in fixed.decode(fixed.encode_one(9))] == [
-        [list(value)] for value in values]
-
-
 @pytest.mark.parametrize('values', [
     {}, {'world_frame': 'map', 'body_frame': 'top', 'imu.frame_id': 'a/much/longer/frame'}])
 def test_every_stream_sends_a_message_of_its_type_with_the_frames_of_the_parameters(values):
