@@ -4,8 +4,6 @@
 import gc
 import math
 import random
-import subprocess
-import sys
 import tracemalloc
 
 import numpy as np
@@ -13,12 +11,12 @@ import pytest
 from reference import SCENES, scene_parameters
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
+from simulations import doubles, record, simulate, stream
 
 from spinning_top_sim import solve
-from spinning_top_sim.solvers.propagator import propagate
+from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.imu import Imu, Sensor
-from spinning_top_sim.streams.pipeline import Simulation
 
 # Central differences of order 8 (Fornberg, Math. Comp. 51 (1988) 699-706).
 FIRST = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
@@ -36,12 +34,12 @@ def test_readings_are_the_derivatives_of_the_exact_pose(scene, lever_arm):
     values = parameters.checked({**scene_parameters(scene), 'imu.lever_arm': lever_arm,
                                  'imu.rpy': (0.3, -0.7, 1.9)})
     top, start = parameters.top_of(values), parameters.start_state(values)
-    imu, motion = Imu(values), propagate(top, start, method='exact')
+    imu, motion = Imu(values), ExactSolution(top, start)
     mounting = Rotation.from_euler('xyz', values['imu.rpy'])
     for t in (0.31, 1.77, 4.05):
-        state = motion.at_ns(round(t * 1e9))
-        rates, force = imu.true(state)
-        step = 2e-2 / (max(np.abs(state.angular_velocity)) + 20.0)
+        states = motion.states(np.array([round(t * 1e9)]))
+        rates, force = (np.ravel(part) for part in imu.true(states))
+        step = 2e-2 / (np.abs(states.angular_velocity).max() + 20.0)
         times = round(t * 1e9) * 1e-9 + step * np.arange(-4, 5)
         turned = Rotation.from_quat(solve(top, start, times).quaternion)
         middle = turned[4] * mounting
@@ -55,7 +53,7 @@ def test_readings_are_the_derivatives_of_the_exact_pose(scene, lever_arm):
             acceleration + np.array((0.0, 0.0, top.gravity)))
         scale = 1.0 + np.linalg.norm(expected_force)
         assert force == pytest.approx(expected_force, abs=1e-7 * scale)
-        sensor = Rotation.from_quat(imu.orientation(state))
+        sensor = Rotation.from_quat(np.ravel(imu.orientation(states)))
         assert (sensor.inv() * middle).magnitude() < 1e-12
 
 
@@ -66,8 +64,8 @@ def force_at(arm, theta, theta_dot=0.0, l3=0.0, lz=0.0):
     values = parameters.checked({
         'initial.theta': theta, 'initial.theta_dot': theta_dot, 'spin.l3': l3, 'spin.lz': lz,
         'imu.lever_arm': arm})
-    motion = propagate(parameters.top_of(values), parameters.start_state(values), method='exact')
-    return Imu(values).true(motion.at_ns(0))[1], values
+    motion = ExactSolution(parameters.top_of(values), parameters.start_state(values))
+    return np.ravel(Imu(values).true(motion.states(range(1)))[1]), values
 
 
 @pytest.mark.parametrize('arm', [(0.0, 0.0, 0.0), (0.1, -0.05, 0.08)])
@@ -107,13 +105,20 @@ def test_a_pendulum_reads_what_the_textbook_says():
 
 # -------------------------------------------------------------------------------------- noise
 
+STILL = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+def read(sensor, samples, exact=STILL):
+    """Return readings and bias in consecutive samples, (n, 6) each."""
+    return tuple(np.column_stack([np.broadcast_to(axis, len(samples)) for kind in found
+                                  for axis in kind])
+                 for found in (sensor.read(exact, samples), sensor.bias(samples)))
+
+
 def readings(values, count, period_ns=5_000_000):
-    """Return what an IMU at rest reads, (count, 6), and its bias."""
+    """Return what an IMU at rest reads, (count, 6), its bias, and the sensor."""
     sensor = Sensor(parameters.checked(values), period_ns)
-    still = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    rows = [np.hstack(sensor.read(still, k)) for k in range(count)]
-    biases = [np.hstack(sensor.bias(k)) for k in range(count)]
-    return np.array(rows), np.array(biases), sensor
+    return *read(sensor, range(count)), sensor
 
 
 def test_noise_has_the_covariance_that_is_published():
@@ -131,15 +136,12 @@ def test_noise_has_the_covariance_that_is_published():
 
 def messages(values, duration_ns, *topics):
     """Return the messages of these topics, as (covariances, rows of rates and force)."""
-    simulation = Simulation(parameters.checked(values))
-    found = {}
-    for stream in simulation.streams:
-        if stream.topic in topics:
-            stream.publish = found.setdefault(stream.topic, []).append
+    simulation = simulate(values)
+    taken = record(simulation, *topics)
     simulation.advance(duration_ns)
     # The end of a sensor_msgs/Imu: rates, 9 covariances, force, 9 covariances.
-    columns = {topic: np.array([np.frombuffer(data[-192:], '<f8') for data in raw])
-               for topic, raw in found.items()}
+    columns = {topic: np.array([doubles(data, 24) for name, _, data in taken if name == topic])
+               for topic in topics}
     return {topic: (rows[0, [3, 7, 11, 15, 19, 23]], rows[:, [0, 1, 2, 12, 13, 14]])
             for topic, rows in columns.items()}
 
@@ -208,11 +210,17 @@ def test_bias_walks_with_its_own_variance():
 
 
 def test_sample_k_depends_on_seed_and_k_alone():
-    forward, _, _ = readings(NOISY, 3000)
+    """Read forwards, backwards, at random, one by one and many together, across blocks of 512."""
+    readings_at_once, biases, _ = readings(NOISY, 20_000)
     sensor = Sensor(parameters.checked(NOISY), 5_000_000)
-    still = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    for k in (2999, 0, 511, 512, 1024, 5):
-        assert np.array_equal(np.hstack(sensor.read(still, k)), forward[k])
+    begins = [0, 511, 512, 1024, 19_999, *range(0, 19_000, 973)]
+    for order in (begins, begins[::-1], random.Random(1).sample(begins, len(begins))):
+        for begin in order:
+            for count in (1, 2, 600):
+                samples = range(begin, min(begin + count, 20_000))
+                found, bias = read(sensor, samples)
+                assert np.array_equal(found, readings_at_once[samples.start:samples.stop])
+                assert np.array_equal(bias, biases[samples.start:samples.stop])
 
 
 def test_different_seeds_are_uncorrelated():
@@ -238,73 +246,44 @@ def test_readings_saturate_and_are_rounded():
     values = parameters.checked({'imu.gyroscope_range': 4.0, 'imu.gyroscope_resolution': 0.25,
                                  'imu.accelerometer_range': 20.0})
     sensor = Sensor(values, 5_000_000)
-    rates, force = sensor.read(((1.1, -9.0, 3.99), (1.1, -30.0, 25.0)), 7)
-    assert rates == (1.0, -4.0, 4.0)
-    assert force == (1.1, -20.0, 20.0)
+    exact = (((1.1, -0.1), (-9.0, 0.2), (3.99, 9.0)), ((1.1, 2.0), (-30.0, 2.0), (25.0, -2.0)))
+    found, _ = read(sensor, range(7, 9), tuple(tuple(map(np.array, kind)) for kind in exact))
+    assert found.tolist() == [[1.0, -4.0, 4.0, 1.1, -20.0, 20.0],
+                              [0.0, 0.25, 4.0, 2.0, 2.0, -2.0]]
+    assert not np.signbit(found[1, 0]), 'no reading is -0'
     assert sensor.gyroscope.variance == pytest.approx(0.25 ** 2 / 12.0)
 
 
-def collect(values, ticks_ns, others=()):
-    """Return the bytes of imu/data_raw, whatever else is wanted, however ticks fall."""
-    simulation = Simulation(parameters.checked({**NOISY, **values}))
-    raw = []
-    for stream in simulation.streams:
-        if stream.topic == 'imu/data_raw':
-            stream.publish = raw.append
-        elif stream.topic in others:
-            stream.record = lambda stamp_ns, data: None
-    for tick in ticks_ns:
-        simulation.advance(tick)
-    return raw
+def test_equal_seeds_give_equal_bytes_in_any_company():
+    def run(others=(), **values):
+        simulation = simulate(NOISY, **values)
+        raw = []
+        stream(simulation, 'imu/data_raw').publish = raw.append
+        record(simulation, *(others or ('pose',)))
+        simulation.advance(2 * SECOND_NS)
+        return raw
 
-
-def test_equal_seeds_give_equal_bytes_at_any_tick_rate():
-    every_ms = collect({}, range(0, 2_000_000_001, 1_000_000))
-    at_once = collect({}, [2_000_000_000])
-    assert every_ms == at_once and len(at_once) == 401
-    assert collect({'seed': 5}, [2_000_000_000]) != at_once
-    in_company = collect({'imu_data.enabled': True, 'imu_data.rate': 77.0}, [2_000_000_000],
-                         ('pose', 'imu/data', 'ground_truth/imu', 'ground_truth/imu_bias'))
-    assert in_company == at_once
-
-
-def test_a_perfect_imu_does_not_import_numpy():
-    code = ('import sys\nfrom spinning_top_sim.streams import parameters\n'
-            'from spinning_top_sim.streams.pipeline import Simulation\n'
-            'simulation = Simulation(parameters.checked({"solver.method": "exact"}))\n'
-            'for stream in simulation.streams:\n    stream.publish = id\n'
-            'simulation.advance(10 ** 9)\n'
-            'print(sorted({"numpy", "scipy", "rclpy"} & set(sys.modules)))\n')
-    run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
-                         timeout=60, check=True)
-    assert run.stdout.strip() == '[]'
+    alone = run()
+    assert len(alone) == 401
+    assert run(seed=5) != alone
+    assert run(('pose', 'imu/data', 'ground_truth/imu', 'ground_truth/imu_bias'),
+               imu_data__enabled=True, imu_data__rate=77.0) == alone
 
 
 def test_noise_that_was_read_is_not_kept():
     sensor = Sensor(parameters.checked(NOISY), 1_000_000)
-    exact = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    block = 512
-    sensor.read(exact, 10 * block)
+
+    def in_use_after(*blocks):
+        for block in blocks:
+            read(sensor, range(512 * block, 512 * block + 1))
+        gc.collect()
+        return tracemalloc.get_traced_memory()[0]
+
     tracemalloc.start()
     try:
-        sensor.read(exact, 100 * block)
-        gc.collect()
-        before, _ = tracemalloc.get_traced_memory()
-        sensor.read(exact, 500 * block)
-        gc.collect()
-        after, _ = tracemalloc.get_traced_memory()
+        before = in_use_after(10, 99, 100)
+        after = in_use_after(499, 500)
     finally:
         tracemalloc.stop()
     # Six numbers of each block in between would be this; Python and numpy keep some at hand.
     assert after - before < 400 * 6 * 8
-
-
-def test_noise_is_the_same_read_forwards_backwards_and_at_random():
-    noise = Sensor(parameters.checked(NOISY), 1_000_000)
-    indices = list(range(0, 20_000, 173))
-    forwards = {k: list(noise.bias(k)) for k in indices}
-    for order in (indices[::-1], random.Random(1).sample(indices, len(indices))):
-        assert {k: list(noise.bias(k)) for k in order} == forwards
-        many = noise.bias(range(7_000, 9_000))
-        assert [[float(axis[k]) for axis in many[0]] for k in range(3)] == [
-            list(noise.bias(7_000 + k)[0]) for k in range(3)]

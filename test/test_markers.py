@@ -7,36 +7,39 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from reference import SCENES, scene_parameters
+from simulations import EPOCH_NS, SECOND, record, simulate, stream
 
 from spinning_top_sim import Top, solve
 from spinning_top_sim.physics.shape import LARGEST, SMALLEST, THINNEST, shape_of
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.pipeline import Simulation
 
-SECOND = 1_000_000_000
 PERIOD_NS = 50_000_000
 CUSP = {'mass': 2.0, 'com_distance': 0.15, 'lambda1': 0.123, 'lambda3': 0.15, 'gravity': 9.8}
 TRACE = {'markers.trace_length': 1.0, 'markers.trace_points': 40}
 
 
-def markers_of(values=None, commands=(), duration_ns=3 * SECOND, *, listening=(0, math.inf)):
+def markers_of(values=None, commands=(), duration_ns=3 * SECOND, *, recorded=(0, math.inf)):
     """
     Return {t: message} of a run; commands: (t, l3, lz).
 
-    listening: between these times [ns] somebody takes the markers
+    recorded: the markers are recorded between these times [ns]
     """
-    simulation = Simulation(parameters.checked({**TRACE, **(values or {})}))
-    stream = next(s for s in simulation.streams if s.topic == 'markers')
+    simulation = simulate({**TRACE, **(values or {})})
     sent = {}
+
+    def write(numbers, stamp_ns, messages, size):
+        sent[stamp_ns - EPOCH_NS] = bytes(messages[0])
+
     stops = {(t, l3, lz) for t, l3, lz in commands}
-    stops |= {(t, None, None) for t in (*listening, duration_ns) if t < math.inf}
+    stops |= {(t, None, None) for t in (*recorded, duration_ns) if t < math.inf}
     for t, l3, lz in sorted(stops, key=lambda stop: stop[0]):
         if t > 0:
             simulation.advance(t)
         if l3 is not None:
             simulation.command(l3, lz)
-        stream.record = sent.__setitem__ if listening[0] <= t < listening[1] else None
-    return SimpleNamespace(sent=sent, stream=stream, simulation=simulation)
+        simulation.log_to(write, [stream(simulation, 'markers')]
+                          if recorded[0] <= t < recorded[1] else [])
+    return SimpleNamespace(sent=sent, stream=stream(simulation, 'markers'), simulation=simulation)
 
 
 def decoded(run, t_ns):
@@ -98,13 +101,13 @@ def test_every_top_can_be_drawn(changed, expected):
 @pytest.mark.parametrize('values', [{}, {'top.com_distance': -0.2}, {'solver.method': 'exact'}])
 def test_the_body_is_where_the_pose_is(values):
     run = markers_of(values)
-    simulation = Simulation(parameters.checked(values))
+    simulation = simulate(values)
     for k in (0, 7, 60):
         simulation.advance(k * PERIOD_NS)
-        state = simulation.state()
+        (attitude,) = simulation.state().quaternion
         position, body, axis, points = decoded(run, k * PERIOD_NS)
-        assert tuple(body) == tuple(axis) == tuple(state.quaternion)
-        arm, shape = axis_of(state.quaternion), shape_of(simulation.top)
+        assert tuple(body) == tuple(axis) == tuple(attitude)
+        arm, shape = axis_of(attitude), shape_of(simulation.top)
         assert position == pytest.approx(shape.centre * arm, abs=1e-15)
         assert points[-1] == pytest.approx(shape.tip * arm, abs=1e-15)
 
@@ -135,14 +138,13 @@ def test_a_coarse_solver_leaves_the_trace():
 def test_the_trace_goes_on_through_commands():
     commands = ((700_000_000, 2.0, 1.5), (1_234_567_890, 0.5, -0.3), (1_240_000_000, 1.6, 1.0))
     run = markers_of(commands=commands)
-    pose = Simulation(parameters.checked({'pose.rate': 40.0}))
-    stream = next(s for s in pose.streams if s.topic == 'pose')
-    poses = {}
-    stream.record = poses.__setitem__
+    pose = simulate(pose__rate=40.0)
+    taken = record(pose, 'pose')
     for t, l3, lz in commands:
         pose.advance(t)
         pose.command(l3, lz)
     pose.advance(3 * SECOND)
+    poses = {t_ns: data for _, t_ns, data in taken}
     tip = run.stream.template.decode(run.sent[0])[3][0][-3:]
     for t_ns in (750_000_000, 1_250_000_000, 1_500_000_000, 2_200_000_000):
         points = decoded(run, t_ns)[3]
@@ -150,31 +152,31 @@ def test_the_trace_goes_on_through_commands():
             range((t_ns - 1) // 25_000_000 - 39, (t_ns - 1) // 25_000_000 + 1), points,
             strict=False)}
         for time, point in found.items():
-            (q,) = stream.template.decode(poses[max(time, 0)])
+            (q,) = stream(pose, 'pose').template.decode(poses[max(time, 0)])
             assert point == pytest.approx(np.linalg.norm(tip) * axis_of(q[0]), abs=1e-8)
 
 
 @pytest.mark.parametrize('method', ['rk45', 'exact'])
-def test_who_listens_late_sees_the_same(method):
-    """Bytes depend on the sample alone: not on when the stream began to be wanted."""
+def test_who_comes_late_sees_the_same(method):
+    """Bytes depend on the sample alone: not on when the stream began to have sinks."""
     values = {'solver.method': method}
     commands = ((700_000_000, 2.0, 1.5), (725_000_000, 1.9, 1.4), (1_600_000_001, 0.5, -0.3))
     early = markers_of(values, commands)
     for begin in (1, 710_000_000, 1_650_000_000, 2_900_000_000):
-        late = markers_of(values, commands, listening=(begin, math.inf))
+        late = markers_of(values, commands, recorded=(begin, math.inf))
         assert late.sent == {t: data for t, data in early.sent.items() if t > begin}
         assert late.sent
-    interrupted = markers_of(values, commands, listening=(1, 800_000_000))
+    interrupted = markers_of(values, commands, recorded=(1, 800_000_000))
     assert interrupted.sent == {t: data for t, data in early.sent.items()
                                 if 1 < t <= 800_000_000}
 
 
 def test_commands_for_hours_are_not_kept():
-    simulation = Simulation(parameters.checked(TRACE))
+    simulation = simulate(TRACE)
     for k in range(200):
         simulation.advance(k * 100_000_000)
         simulation.command(1.6, 1.3 + 0.001 * (k % 2))
-    assert len(simulation._past._motions) < 15
+    assert len(stream(simulation, 'markers').past._references) < 15
 
 
 @pytest.mark.parametrize(('length', 'points'), [(0.0, 200), (1e-9, 1), (3e-9, 200), (0.1, 1)])
@@ -231,9 +233,9 @@ def test_the_message_is_what_ros_serializes(frame, count):
     size, lines = (0.75, 0.75, 0.125), tuple(range(12))
     template = messages.markers(frame, size, lines, 0.0625, count)
     dice = numbers(11 + 3 * count)
-    runs = [dice[:3], dice[3:7], dice[7:11], *([dice[11:]] if count else [])]
+    fields = [dice[:3], dice[3:7], dice[7:11], *([dice[11:]] if count else [])]
     for stamp_ns in STAMPS:
-        ours = template.encode(stamp_ns, *runs)
+        ours = template.encode_one(stamp_ns, *fields)
         message = deserialize_message(ours, MarkerArray)
         assert_same(ours, message)
         body, axis, *trace = message.markers

@@ -24,89 +24,80 @@ Field = NDArray[np.float64] | Sequence[NDArray[np.float64] | float]
 
 
 class CdrWriter:
-    """Appends fields in the order of the message definition; remembers nothing but the bytes."""
+    """Appends fields in the order of the message definition; returns the offsets of numbers."""
 
     def __init__(self) -> None:
         self.buffer = bytearray(ENCAPSULATION)
 
-    def _align(self, size: int) -> int:
-        """Pad to a multiple of `size`; return where the next field begins."""
-        self.buffer += bytes(-(len(self.buffer) - len(ENCAPSULATION)) % size)
-        return len(self.buffer)
-
-    def end(self) -> None:
-        """Pad to four bytes, as RTPS does: what arrives is then what was sent."""
-        self._align(4)
-
-    def _append(self, code: str, size: int, value: float) -> int:
-        at = self._align(size)
-        self.buffer += struct.pack('<' + code, value)
+    def _append(self, code: str, *values: float) -> int:
+        """Append numbers of one type one after the other; return the first one's offset."""
+        if values:
+            size = struct.calcsize('<' + code)
+            self.buffer += bytes(-(len(self.buffer) - len(ENCAPSULATION)) % size)
+        at = len(self.buffer)
+        self.buffer += struct.pack(f'<{len(values)}{code}', *values)
         return at
 
     def uint32(self, value: int) -> int:
-        """Append a uint32; return its offset."""
-        return self._append('I', 4, value)
+        """Append a uint32."""
+        return self._append('I', value)
 
     def int32(self, value: int) -> int:
-        """Append an int32; return its offset."""
-        return self._append('i', 4, value)
+        """Append an int32."""
+        return self._append('i', value)
 
     def flag(self, value: bool) -> int:
-        """Append a bool; return its offset."""
-        return self._append('?', 1, value)
+        """Append a bool."""
+        return self._append('?', value)
 
     def floats(self, values: Iterable[float]) -> int:
-        """Append single precision floats one after the other; return the first one's offset."""
-        at = self._align(4)
-        for value in values:
-            self._append('f', 4, value)
-        return at
-
-    def stamp(self) -> int:
-        """Append a builtin_interfaces/Time of zero; return its offset."""
-        at = self._append('i', 4, 0)
-        self._append('I', 4, 0)
-        return at
-
-    def string(self, text: str) -> int:
-        """Append a string; return its offset."""
-        data = text.encode() + b'\0'
-        at = self.uint32(len(data))
-        self.buffer += data
-        return at
-
-    def strings(self, texts: Sequence[str]) -> int:
-        """Append a sequence of strings; return its offset."""
-        at = self.uint32(len(texts))
-        for text in texts:
-            self.string(text)
-        return at
+        """Append single precision floats (a fixed array)."""
+        return self._append('f', *values)
 
     def doubles(self, values: Iterable[float]) -> int:
-        """Append doubles one after the other (a fixed array); return the first one's offset."""
-        at = self._align(8)
-        for value in values:
-            self._append('d', 8, value)
-        return at
+        """Append doubles (a fixed array)."""
+        return self._append('d', *values)
 
     def double_sequence(self, values: Sequence[float]) -> int:
-        """Append a sequence of doubles; return the first one's offset."""
+        """Append a sequence of doubles."""
         self.uint32(len(values))
-        return self.doubles(values) if values else len(self.buffer)
+        return self.doubles(values)
+
+    def stamp(self) -> int:
+        """Append a builtin_interfaces/Time of zero."""
+        return self._append('I', 0, 0)
+
+    def string(self, text: str) -> None:
+        """Append a string."""
+        data = text.encode() + b'\0'
+        self.uint32(len(data))
+        self.buffer += data
+
+    def strings(self, texts: Sequence[str]) -> None:
+        """Append a sequence of strings."""
+        self.uint32(len(texts))
+        for text in texts:
+            self.string(text)
+
+    def end(self) -> None:
+        """Pad to four bytes, as RTPS does: what arrives is then what was sent."""
+        self.buffer += bytes(-len(self.buffer) % 4)
 
 
 class Template:
     """
     A serialized message whose stamp and numbers are replaced, many messages at a time.
 
+    Bytes outside of stamps and fields stay as they are.
+
     Parameters
     ----------
     writer : CdrWriter
         The message.
-    stamps_at : offsets of its stamps: none, one, or one of each part of an array
-    fields : (offset, count) of each run of doubles that is replaced
-
-    Bytes outside of stamps and fields stay as they are.
+    stamps_at : sequence of int
+        Offsets of its stamps: none, one, or one of each part of an array.
+    fields : sequence of (int, int)
+        Offset and number of the doubles of each field.
     """
 
     def __init__(self, writer: CdrWriter, stamps_at: Sequence[int],
@@ -121,30 +112,25 @@ class Template:
         """Return the size of every message [bytes]."""
         return len(self._buffer)
 
-    def with_fixed(self, *values: Field) -> Template:
-        """Return the message with these numbers for good: `encode` takes no fields then."""
-        writer = CdrWriter()
-        writer.buffer[:] = self.encode_one(0, *values)
-        template = Template(writer, self._stamps_at, ())
-        template._fields, template._row_type = self._fields, self._row_type
-        template._rows = np.empty(0, self._row_type)
-        return template
-
     def encode(self, stamps_ns: NDArray[np.int64], *values: Field) -> NDArray[np.uint8]:
         """
-        Return n messages of equal length as rows of bytes (n, size).
+        Return n messages as rows of bytes, valid until the next call.
 
         Parameters
         ----------
-        stamps_ns : (n,) [ns]
-        values : one for each field: an array (n, count), or `count` columns (n,) or numbers
+        stamps_ns : (n,) int64
+            Stamps [ns].
+        *values : Field
+            The numbers of each field.
 
-        The rows are valid until the next call.
+        Returns
+        -------
+        (n, size) uint8
         """
         count = len(stamps_ns)
         if len(self._rows) < count:
             self._rows = np.empty(count, self._row_type)
-            self._rows.view(np.uint8).reshape(count, -1)[:] = np.frombuffer(
+            self._rows.view(np.uint8).reshape(count, len(self))[:] = np.frombuffer(
                 self._buffer, np.uint8)
         rows = self._rows[:count]
         for at in self._stamps_at:
@@ -156,7 +142,7 @@ class Template:
             else:
                 for column, numbers in enumerate(value):
                     field[:, column] = numbers
-        return rows.view(np.uint8).reshape(count, -1)
+        return rows.view(np.uint8).reshape(count, len(self))
 
     def encode_one(self, stamp_ns: int, *values: Field) -> bytes:
         """Return one message; see `encode`."""

@@ -21,7 +21,6 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Quaternion, Vector
 from spinning_top_sim.physics.states import States
 
-Matrix = tuple[Vector, Vector, Vector]
 Rows = NDArray[np.float64]
 ZERO = (0.0, 0.0, 0.0)
 NO_NOISE = np.zeros((12, 1))
@@ -37,14 +36,15 @@ class Imu:
 
     Parameters
     ----------
-    values : checked parameters, see `parameters.checked`
+    values : mapping
+        Checked parameters, see `parameters.checked`.
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self._values = values
         self._lever_arm: tuple[float, float, float] = values['imu.lever_arm']
         self._turned = values['imu.rpy'] != ZERO
-        self._to_sensor = _transposed(_rotation(*values['imu.rpy']))
+        self._to_sensor = _rotation(*values['imu.rpy']).T
         self._mounting = _quaternion(*values['imu.rpy'])
         self._sensors: dict[int, Sensor] = {}
 
@@ -68,7 +68,7 @@ class Imu:
             return orientation, rates
         x, y, z, w = self._mounting
         return (attitude.product(orientation, (-x, -y, -z, w)),
-                _apply(_transposed(self._to_sensor), rates))
+                _apply(self._to_sensor.T, rates))
 
     def true(self, states: States) -> tuple[Vector, Vector]:
         """Return angular velocity [rad/s] and specific force [m/s^2] in the IMU's frame."""
@@ -134,7 +134,9 @@ class Sensor:
     """
     What the IMU reads at a rate: noise of sample k depends on the seed and on k alone.
 
-    gyroscope, accelerometer: their `Axes`;  is_random: whether anything is drawn for them
+    Attributes
+    ----------
+    gyroscope, accelerometer : Axes
     """
 
     def __init__(self, values: Mapping[str, Any], period_ns: int) -> None:
@@ -143,8 +145,7 @@ class Sensor:
         self.accelerometer = Axes.of(values, 'accelerometer', period)
         self._perfect = self.gyroscope == self.accelerometer == PERFECT
         self._noise: Noise | None = None
-        self.is_random = self.gyroscope.is_random or self.accelerometer.is_random
-        if self.is_random:
+        if self.gyroscope.is_random or self.accelerometer.is_random:
             self._noise = Noise(values['seed'], self.gyroscope, self.accelerometer)
 
     def read(self, exact: tuple[Vector, Vector], indices: range) -> tuple[Vector, Vector]:
@@ -153,8 +154,10 @@ class Sensor:
 
         Parameters
         ----------
-        exact : what an ideal sensor reads there
-        indices : numbers k of the samples
+        exact : pair of Vector
+            What an ideal sensor reads there.
+        indices : range
+            Numbers k of the samples.
         """
         if self._perfect:
             return exact
@@ -177,8 +180,8 @@ class Noise:
 
     Block b of 512 samples is drawn from a generator keyed by seed and b (Philox, counter-based:
     Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC11), so that samples can be
-    read from anywhere.  The bias at the start of a block is the sum over the blocks before it; it is
-    kept for the newest few blocks, and older blocks are summed again from 0.
+    read from anywhere.  The bias at the start of a block is the sum over the blocks before it.
+    It is kept for the newest few blocks; older blocks are summed again from 0.
     """
 
     BLOCK = 512
@@ -238,31 +241,24 @@ class Noise:
         return generator.standard_normal((1 if turn_on else self.BLOCK, columns))
 
 
-def _rotation(roll: float, pitch: float, yaw: float) -> Matrix:
-    """Return R(body <- IMU) = Rz(yaw) Ry(pitch) Rx(roll)."""
-    cr, sr = math.cos(roll), math.sin(roll)
-    cp, sp = math.cos(pitch), math.sin(pitch)
-    cy, sy = math.cos(yaw), math.sin(yaw)
-    return ((cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-            (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-            (-sp, cp * sr, cp * cr))
+def _rotation(roll: float, pitch: float, yaw: float) -> Rows:
+    """Return R(body <- IMU) = Rz(yaw) Ry(pitch) Rx(roll), (3, 3)."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos((roll, pitch, yaw)), np.sin((roll, pitch, yaw))
+    return np.array(((cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+                     (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+                     (-sp, cp * sr, cp * cr)))
 
 
 def _quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Return the same rotation as x, y, z, w."""
-    none = np.zeros(1)
-    (xr, wr), (yp, wp), (zy, wy) = ((np.sin(half), np.cos(half))
-                                    for half in 0.5 * np.array([[roll], [pitch], [yaw]]))
-    return attitude.product(attitude.product((none, none, zy, wy), (none, yp, none, wp)),
-                            (xr, none, none, wr))
+    """Return the same rotation as columns x, y, z, w of one row."""
+    half = 0.5 * np.array([[roll], [pitch], [yaw]])
+    (cr, cp, cy), (sr, sp, sy) = np.cos(half), np.sin(half)
+    return (cy * cp * sr - sy * sp * cr, cy * sp * cr + sy * cp * sr,
+            sy * cp * cr - cy * sp * sr, cy * cp * cr + sy * sp * sr)
 
 
-def _transposed(m: Matrix) -> Matrix:
-    (a, b, c), (d, e, f), (g, h, i) = m
-    return (a, d, g), (b, e, h), (c, f, i)
-
-
-def _apply(m: Matrix, v: Vector) -> Vector:
+def _apply(m: Rows, v: Vector) -> Vector:
+    """Return the product m v, without matrix products: their order of summation may vary."""
     x, y, z = v
-    (a, b, c), (d, e, f), (g, h, i) = m
-    return (a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z)
+    first, second, third = (a * x + b * y + c * z for a, b, c in m)
+    return first, second, third

@@ -25,34 +25,30 @@ class PastAxis:
 
     Each segment is followed from its start to the command that ended it, that instant included.
 
-    Attributes
+    Parameters
     ----------
-    now : Reference
-        Of the present segment.
+    length_ns : int
+        How far back the trace goes [ns].
     """
 
     def __init__(self, length_ns: int) -> None:
         self._length_ns = length_ns
-        self._past: deque[Reference] = deque()
-        self.now: Reference | None = None
+        self._references: deque[Reference] = deque()
 
     def begin(self, reference: Reference) -> None:
         """Begin a new segment; forget those that the trace does not reach any more."""
-        if self.now is not None:
-            self._past.append(self.now)
-        self.now = reference
-        oldest = reference.start_ns - self._length_ns
-        while len(self._past) > 1 and self._past[1].start_ns < oldest:
-            self._past.popleft()
+        self._references.append(reference)
+        oldest_ns = reference.start_ns - self._length_ns
+        while len(self._references) > 1 and self._references[1].start_ns < oldest_ns:
+            self._references.popleft()
 
     def axis(self, times_ns: NDArray[np.int64]) -> Axis:
         """Return the axis in the world at ascending simulated times (n,) [ns]."""
-        assert self.now is not None
-        segments = [*self._past, self.now]
+        begins = [reference.start_ns for reference in self._references]
         # A segment ends with the command that begins the next one.
-        ends = np.searchsorted(times_ns, [one.start_ns for one in segments[1:]], 'right')
-        parts = [one.axis(times) for one, times in zip(
-            segments, np.split(times_ns, ends), strict=True) if len(times)]
+        ends = np.searchsorted(times_ns, begins[1:], 'right')
+        parts = [reference.axis(times) for reference, times in zip(
+            self._references, np.split(times_ns, ends), strict=True) if len(times)]
         x, y, z = (np.concatenate(rows) for rows in zip(*parts, strict=True))
         return x, y, z
 
@@ -99,13 +95,16 @@ class Markers(Stream):
 
     def _traces(self, times: range, axis: Axis) -> NDArray[np.float64]:
         """Return the points of the traces (n, 3 (count + 1)) that end at these times."""
+        count = self._count
         newest = (np.arange(times.start, times.stop, times.step) - 1) // self._spacing_ns
-        first = int(newest[0]) - self._count + 1
-        grid = np.arange(first, int(newest[-1]) + 1)
+        # A trace shares points with the one before it; there they are computed once.
+        fresh = np.minimum(np.diff(newest, prepend=newest[0] - count), count)
+        ends = np.cumsum(fresh)
+        grid = np.repeat(newest + 1 - ends, fresh) + np.arange(ends[-1])
         points = np.stack(self.past.axis(np.maximum(grid * self._spacing_ns, 0)), axis=-1)
-        traces = np.empty((len(times), self._count + 1, 3))
-        for row, begin in zip(traces, (newest - self._count + 1 - first).tolist(), strict=True):
-            row[:-1] = points[begin:begin + self._count]
+        traces = np.empty((len(times), count + 1, 3))
+        for row, end in zip(traces, ends.tolist(), strict=True):
+            row[:-1] = points[end - count:end]
         traces[:, -1] = np.stack(axis, axis=-1)
         traces *= self._shape.tip
         return traces.reshape(len(times), -1)

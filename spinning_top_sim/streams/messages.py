@@ -149,7 +149,7 @@ def _marker(writer: CdrWriter, frame_id: str, namespace: str, kind: int, scale: 
     writer.stamp()                                          # lifetime: for ever
     writer.flag(False)                                      # frame_locked
     writer.uint32(len(points) // 3)
-    points_at = writer.doubles(points) if points else len(writer.buffer)
+    points_at = writer.doubles(points)
     writer.uint32(0)                                        # colors
     writer.string('')                                       # texture_resource
     writer.stamp()                                          # texture: header, format, data

@@ -46,11 +46,14 @@ class Simulation:
 
     Parameters
     ----------
-    values : checked parameters, see `parameters.checked`
-    epoch_ns : stamp of t = 0 [ns]
+    values : mapping
+        Checked parameters, see `parameters.checked`.
+    epoch_ns : int
+        Stamp of t = 0 [ns].
 
     Attributes
     ----------
+    values, top : parameters of the run, and the top that they describe
     streams : every stream; the caller sets `publish` of each, and records them with `log_to`
     now_ns : simulated time up to which every sample has been sent (-1: not even that of t = 0)
     l3, lz : as last commanded [kg m^2/s]
@@ -100,8 +103,7 @@ class Simulation:
         self.segment = segment
         self.l3, self.lz = segment.l3, segment.lz
         self._schedule.follow(segment)
-        self._invariants.start = segment.energy, segment.l3, segment.lz
-        self._invariants.orientation_error = segment.orientation_error
+        self._invariants.segment = segment
         self._markers.past.begin(segment.reference)
 
     # -------------------------------------------------------------------------- the present
@@ -114,6 +116,7 @@ class Simulation:
     @epoch_ns.setter
     def epoch_ns(self, epoch_ns: int) -> None:
         self._schedule.epoch_ns = epoch_ns
+        self._schedule.invalidate()
 
     @property
     def steps(self) -> int:
@@ -157,7 +160,10 @@ class Simulation:
 
         Parameters
         ----------
-        write : see `Log`; a stream has the number that it has in `streams`
+        write : Log
+            A stream has the number there that it has in `streams`.
+        streams : sequence of Stream
+            Those to record.
         """
         self._log = write
         for stream in self.streams:
@@ -175,9 +181,12 @@ class Simulation:
 
         Parameters
         ----------
-        target_ns : simulated time [ns]
-        publish_from_ns : earlier samples are recorded, not published: they are too late
-        give_way : asked between samples, and within long integrations; True ends the call early.
+        target_ns : int
+            Simulated time [ns].
+        publish_from_ns : int
+            Earlier samples are recorded, not published: they are too late.
+        give_way : callable
+            Asked between samples, and within long integrations; True ends the call early.
             Nothing is lost: the next call goes on there.
 
         Raises
@@ -193,20 +202,16 @@ class Simulation:
         ready = schedule.ready
         sent = False
         while True:
-            if not ready:
-                due_ns = schedule.next_due(self.now_ns)
-                if due_ns > target_ns:
-                    break
-                if due_ns > schedule.reached_ns and not self._reach(due_ns, give_way):
-                    return False
-                schedule.compute(self.now_ns, target_ns)
-            instant = ready[0]
-            if instant[0] > target_ns:
+            due_ns = ready[0][0] if ready else schedule.next_due(self.now_ns)
+            if due_ns > target_ns:
                 break
             if sent and give_way():
                 return False
-            ready.popleft()
-            self._send(instant, instant[0] >= publish_from_ns)
+            if not ready:
+                if due_ns > schedule.reached_ns and not self._reach(due_ns, give_way):
+                    return False
+                schedule.compute(self.now_ns, target_ns)
+            self._send(ready.popleft(), due_ns >= publish_from_ns)
             sent = True
         if target_ns > schedule.reached_ns and not self._reach(target_ns, give_way):
             return False

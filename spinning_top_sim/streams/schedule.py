@@ -60,13 +60,14 @@ class Schedule:
 
     Attributes
     ----------
+    epoch_ns : stamp of t = 0 [ns]; after a change, call `invalidate`
     ready : instants that are computed and not yet sent
     computed_ns : every sample before this simulated time is sent or in `ready` [ns]
     reached_ns : the solver needs no further steps up to this time [ns]
     """
 
     def __init__(self, streams: Sequence[Stream], segment: Segment, epoch_ns: int) -> None:
-        self._streams, self._epoch_ns = streams, epoch_ns
+        self._streams, self.epoch_ns = streams, epoch_ns
         self.ready: deque[Instant] = deque()
         # Streams with sinks, and the first sample of each that is not computed.
         self._active: list[Stream] = []
@@ -81,16 +82,6 @@ class Schedule:
         """Go on with another segment."""
         self._segment = segment
         self.reached_ns = segment.start_ns
-        self.invalidate()
-
-    @property
-    def epoch_ns(self) -> int:
-        """Stamp of t = 0 [ns]."""
-        return self._epoch_ns
-
-    @epoch_ns.setter
-    def epoch_ns(self, epoch_ns: int) -> None:
-        self._epoch_ns = epoch_ns
         self.invalidate()
 
     def invalidate(self) -> None:
@@ -119,9 +110,12 @@ class Schedule:
 
         Parameters
         ----------
-        now_ns : simulated time up to which everything is sent [ns]
-        until_ns : simulated time [ns]
-        budget_ns : processor time after which to stop; the next call goes on there
+        now_ns : int
+            Simulated time up to which everything is sent [ns].
+        until_ns : int
+            Simulated time [ns].
+        budget_ns : int, optional
+            Time after which to stop [ns]; the next call goes on there.
 
         Returns
         -------
@@ -186,7 +180,7 @@ class Schedule:
             if key not in states:
                 states[key] = segment.states(times)
             yield
-            data = stream.encode(states[key], self._epoch_ns, times).tobytes()
+            data = stream.encode(states[key], self.epoch_ns, times).tobytes()
             size = len(stream.template)
             for number, t_ns in enumerate(times):
                 places, messages = instants.setdefault(t_ns, ([], []))

@@ -8,7 +8,6 @@ parameters.STREAM_DEFAULTS.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -19,6 +18,7 @@ from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams import messages
 from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
 from spinning_top_sim.streams.imu import Imu
+from spinning_top_sim.streams.segment import Segment
 
 JOINTS = ('precession_joint', 'nutation_joint', 'spin_joint')
 INVARIANTS = ('energy', 'l3', 'lz', 'energy_drift', 'l3_drift', 'lz_drift',
@@ -98,13 +98,20 @@ class Stream:
 
     def encode(self, states: States, epoch_ns: int, times: range) -> NDArray[np.uint8]:
         """
-        Return the messages at sample times as rows of bytes (n, size), valid until the next call.
+        Return the messages at sample times as rows of bytes, valid until the next call.
 
         Parameters
         ----------
-        states : the states at `times`
-        epoch_ns : stamp of t = 0 [ns]
-        times : of samples [ns]; see `times`
+        states : States
+            The states at `times`.
+        epoch_ns : int
+            Stamp of t = 0 [ns].
+        times : range
+            Times of n samples [ns]; see `times`.
+
+        Returns
+        -------
+        (n, size) uint8
         """
         stamps_ns = np.arange(epoch_ns + times.start, epoch_ns + times.stop, times.step)
         return self.template.encode(stamps_ns, *self.fields(states, times))
@@ -210,14 +217,7 @@ class ImuBias(ImuStream):
 
     parameter, topic, has_orientation = 'imu', 'ground_truth/imu_bias', False
 
-    def set_rate(self, rate: float) -> None:
-        super().set_rate(rate)
-        if not self._sensor.is_random:
-            self.template = self.template.with_fixed(IDENTITY, *self._sensor.bias(range(1)))
-
     def fields(self, states: States, times: range) -> Sequence[Field]:
-        if not self._sensor.is_random:
-            return ()
         return (IDENTITY, *self._sensor.bias(self.indices(times)))
 
 
@@ -239,24 +239,23 @@ class Invariants(Stream):
 
     Attributes
     ----------
-    start : energy, L3 and Lz that drifts are measured from
-    orientation_error : takes states and their times [ns]; returns the errors (n,) [rad]
+    segment : Segment
+        The present motion; the simulation sets it.
     """
 
     parameter, topic, type_name = 'invariants', '~/invariants', 'std_msgs/msg/Float64MultiArray'
+    segment: Segment
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         super().__init__(values)
         self.template = messages.float64_multi_array(INVARIANTS)
-        self.start = (0.0, 0.0, 0.0)
-        self.orientation_error: Callable[[States, range], NDArray[np.float64]] = (
-            lambda states, times: np.full(len(times), math.nan))
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
+        segment = self.segment
         now = (states.energy, states.l3, states.lz)
-        drifts = [(values - start) / (abs(start) or 1.0)
-                  for values, start in zip(now, self.start, strict=True)]
-        return ((*now, *drifts, states.norm_error, self.orientation_error(states, times)),)
+        drifts = [(values - start) / (abs(start) or 1.0) for values, start in zip(
+            now, (segment.energy, segment.l3, segment.lz), strict=True)]
+        return ((*now, *drifts, states.norm_error, segment.orientation_error(states, times)),)
 
 
 class Clock(Stream):
