@@ -133,8 +133,9 @@ def test_a_tick_that_finds_a_block_under_way_finishes_it():
 
 # ------------------------------------------------------------------------------------ the cost
 
-def test_ticks_that_find_all_computed_compute_nothing():
-    simulation = simulate(pose__rate=1000.0)
+@pytest.mark.parametrize('method', ['rk45', 'exact'])
+def test_ticks_that_find_all_computed_compute_nothing(method):
+    simulation = simulate(pose__rate=1000.0, solver__method=method)
     taken = record(simulation, 'pose')
     simulation.advance(0)
     simulation.prepare(MILLISECOND)
