@@ -12,7 +12,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from spinning_top_sim.physics.regimes import describe
+from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import inspect, simulate

@@ -179,16 +179,23 @@ def test_commands_for_hours_are_not_kept():
     assert len(stream(simulation, 'markers').past._references) < 15
 
 
-@pytest.mark.parametrize(('length', 'points'), [(0.0, 200), (1e-9, 1), (3e-9, 200), (0.1, 1)])
+@pytest.mark.parametrize(('length', 'points'), [(0.0, 200), (1e-9, 1), (3e-9, 200), (0.1, 1),
+                                                (0.04, 5), (0.06, 7)])
 def test_short_traces_and_none(length, points):
     run = markers_of({'markers.trace_length': length, 'markers.trace_points': points},
                      duration_ns=SECOND)
     found = decoded(run, SECOND)[3]
     if length == 0.0:
         assert found is None
-    else:
-        assert len(found) == 1 + min(points, round(length * SECOND))
-        assert np.isfinite(found).all()
+        return
+    count = min(points, round(length * SECOND))
+    spacing_ns = round(length * SECOND) // count
+    newest = (SECOND - 1) // spacing_ns
+    grid_ns = spacing_ns * np.arange(newest - count + 1, newest + 1)
+    top, start = run.simulation.top, parameters.start_state(run.simulation.values)
+    axis = axis_of(solve(top, start, grid_ns * 1e-9, method='exact').quaternion)
+    assert found.shape == (count + 1, 3)
+    assert np.abs(found[:-1] - shape_of(top).tip * axis).max() < 1e-12
 
 
 def test_a_reset_begins_the_trace_anew():

@@ -133,8 +133,9 @@ def test_a_tick_that_finds_a_block_under_way_finishes_it():
 
 # ------------------------------------------------------------------------------------ the cost
 
-def test_ticks_that_find_all_computed_compute_nothing():
-    simulation = simulate(pose__rate=1000.0)
+@pytest.mark.parametrize('method', ['rk45', 'exact'])
+def test_ticks_that_find_all_computed_compute_nothing(method):
+    simulation = simulate(pose__rate=1000.0, solver__method=method)
     taken = record(simulation, 'pose')
     simulation.advance(0)
     simulation.prepare(MILLISECOND)
@@ -223,7 +224,7 @@ def test_however_far_is_computed_ahead_the_present_state_can_be_read(l3):
     """Also where a tick takes many steps, and where the clock stands still meanwhile."""
     simulation, beside = simulate(spin__l3=l3), simulate(spin__l3=l3)
     record(simulation)
-    for tick in range(1, 41):
+    for tick in range(1, 25):
         now = tick // 4 * MILLISECOND
         simulation.advance(now)
         simulation.prepare(now + 8 * MILLISECOND)

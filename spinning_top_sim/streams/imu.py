@@ -213,29 +213,28 @@ class Noise:
         if block not in self._blocks:
             while len(self._blocks) >= self.BLOCKS_KEPT:
                 del self._blocks[next(iter(self._blocks))]
-            self._blocks[block] = np.hstack(self._drawn(block))
+            self._blocks[block] = self._drawn(block)
         return self._blocks[block]
 
-    def _drawn(self, block: int) -> tuple[Rows, Rows]:
-        """Return white noise and bias of a block, (512, 6) each, by way of those before it."""
+    def _drawn(self, block: int) -> Rows:
+        """Draw a block, by way of those before it whose last bias is not kept."""
         starts = self._bias_starts
-        at = max(b for b in starts if b <= block)
-        start = starts[at]
-        while True:
+        nearest = max(b for b in starts if b <= block)
+        start = starts[nearest]
+        for at in range(nearest, block + 1):
             normal = self._normal(at, 12)
             steps = normal[:, 6:] * self._walk
             if at == 0:
                 steps[0] = 0.0          # sample 0 has the turn-on bias itself
             bias = start + np.cumsum(steps, axis=0)
-            at, start = at + 1, bias[-1].copy()         # not a view that keeps all
-            if at > block:
-                break
-        starts[at] = starts.pop(at, start)
+            start = bias[-1].copy()     # not a view that keeps all
+        starts[block + 1] = starts.pop(block + 1, start)
         if len(starts) > self.STARTS_KEPT:
             del starts[list(starts)[1]]                 # the oldest; that of block 0 stays
-        return normal[:, :6] * self._white, bias
+        return np.hstack((normal[:, :6] * self._white, bias))
 
     def _normal(self, block: int, columns: int, turn_on: bool = False) -> Rows:
+        """Draw the normal numbers of a block (512, columns), or the turn-on bias (1, columns)."""
         generator = np.random.Generator(np.random.Philox(
             key=self._seed, counter=[0, 0, int(turn_on), block]))
         return generator.standard_normal((1 if turn_on else self.BLOCK, columns))

@@ -60,14 +60,8 @@ class Parameter:
         return f'{self.text}{unit}{allowed}{unset}; a change takes effect {self.effect.value}'
 
     def _bounds(self) -> str:
-        parts = []
-        if self.above is not None:
-            parts.append(f'> {self.above:g}')
-        if self.minimum is not None:
-            parts.append(f'>= {self.minimum:g}')
-        if self.maximum is not None:
-            parts.append(f'<= {self.maximum:g}')
-        return ' and '.join(parts)
+        bounds = ('>', self.above), ('>=', self.minimum), ('<=', self.maximum)
+        return ' and '.join(f'{sign} {bound:g}' for sign, bound in bounds if bound is not None)
 
     @property
     def allowed(self) -> str:
@@ -79,8 +73,7 @@ class Parameter:
         if isinstance(self.default, tuple):
             kind = ('a list of strings' if isinstance(self.default[0], str)
                     else f'a list of {len(self.default)} numbers')
-        bounds = self._bounds()
-        return f'must be {kind} {bounds}'.rstrip()
+        return f'must be {kind} {self._bounds()}'.rstrip()
 
     def check(self, value: Value) -> Value:
         """Return the value in its own type.  Raises ValueError with name, value, allowed."""
@@ -92,13 +85,12 @@ class Parameter:
         return checked
 
     def _convert(self, value: Value) -> Value:
+        """Return the value in the type of the default, or None where it is not allowed."""
         default = self.default
         if isinstance(default, tuple):
             return self._convert_list(value)
-        if isinstance(default, bool):
-            return value if isinstance(value, bool) else None
-        if isinstance(default, str):
-            good = isinstance(value, str) and (not self.choices or value in self.choices)
+        if isinstance(default, bool | str):
+            good = isinstance(value, type(default)) and (not self.choices or value in self.choices)
             return value if good else None
         kinds = (int, float) if self.is_double else (int,)
         if isinstance(value, bool) or not isinstance(value, kinds):

@@ -92,7 +92,11 @@ class Schedule:
         self._block = SMALLEST_BLOCK
 
     def next_due(self, now_ns: int) -> int:
-        """Return the time of the first sample after `now_ns` that is not computed [ns]."""
+        """
+        Return the time of the first sample after `now_ns` that is not computed [ns].
+
+        Where nothing is computed up to `now_ns`, the streams that have sinks begin there.
+        """
         if self.computed_ns <= now_ns:
             self._active = [stream for stream in self._streams if stream.has_sinks]
             self._next_ns = [stream.first_after(now_ns) for stream in self._active]
@@ -120,7 +124,7 @@ class Schedule:
         Returns
         -------
         bool
-            Whether nothing is left to do.
+            False if the time ended before the block was complete.
         """
         if self._work is None:
             due_ns = self.next_due(now_ns)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,39 +24,34 @@ class Reference:
 
     Setting it up takes milliseconds and may run in another thread than the simulation.
 
-    Attributes
+    Parameters
     ----------
     top : Top
     start : State
-        Of the motion.
-    start_ns : when it begins, in simulated time [ns]
+        Where the motion begins.
+    start_ns : int
+        When it begins, in simulated time [ns].
+    solution : ExactSolution, optional
+        If it is set up already.
     """
 
     def __init__(self, top: Top, start: State, start_ns: int,
                  solution: ExactSolution | None = None) -> None:
         self.top, self.start, self.start_ns = top, start, start_ns
-        self._solution = solution
-        self._is_known = solution is not None
+        if solution is not None:
+            self.solution = solution
 
-    @property
+    @cached_property
     def solution(self) -> ExactSolution | None:
         """The exact solution; None for a motion whose constants it cannot hold."""
-        if not self._is_known:
-            try:
-                self._solution = ExactSolution(self.top, self.start)
-            except ValueError:
-                self._solution = None
-            self._is_known = True
-        return self._solution
+        try:
+            return ExactSolution(self.top, self.start)
+        except ValueError:
+            return None
 
     def prepare(self) -> None:
         """Set up the solution if it is not there yet."""
         _ = self.solution
-
-    def states(self, times_ns: NDArray[np.int64]) -> States | None:
-        """Return the exact states at simulated times (n,) [ns], or None without a solution."""
-        solution = self.solution
-        return None if solution is None else solution.states(times_ns - self.start_ns)
 
     def axis(self, times_ns: NDArray[np.int64]) -> Axis:
         """
@@ -63,9 +59,8 @@ class Reference:
 
         Without an exact solution it stands as it does at the start.
         """
-        states = self.states(times_ns)
-        if states is not None:
-            return states.rows_axis
+        if self.solution is not None:
+            return self.solution.states(times_ns - self.start_ns).rows_axis
         theta, phi, ones = self.start.theta, self.start.phi, np.ones(len(times_ns))
         return (math.sin(theta) * math.cos(phi) * ones, math.sin(theta) * math.sin(phi) * ones,
                 math.cos(theta) * ones)
@@ -93,8 +88,10 @@ class Segment:
 
     def states(self, times: range) -> States:
         """Return the states at ascending simulated times [ns]."""
-        start = self.start_ns
-        return self.solver.states(range(times.start - start, times.stop - start, times.step))
+        return self.solver.states(self._since_start(times))
+
+    def _since_start(self, times: range) -> range:
+        return range(times.start - self.start_ns, times.stop - self.start_ns, times.step)
 
     def orientation_error(self, states: States, times: range) -> NDArray[np.float64]:
         """
@@ -107,6 +104,5 @@ class Segment:
             return np.full(len(times), math.nan)
         if exact is self.solver:
             return np.zeros(len(times))
-        start = self.start_ns
-        local = range(times.start - start, times.stop - start, times.step)
-        return attitude.angle_between(states.rows_quaternion, exact.states(local).rows_quaternion)
+        return attitude.angle_between(states.rows_quaternion,
+                                      exact.states(self._since_start(times)).rows_quaternion)
