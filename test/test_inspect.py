@@ -331,6 +331,13 @@ def test_offline_logs_verify(name, capsys, request):
     assert verdict['compared'] == counts
 
 
+@pytest.mark.parametrize('method', ['rk45', 'exact'])
+def test_a_command_exactly_at_the_end_verifies(tmp_path, capsys, method):
+    verdict = verified(capsys, log_of(tmp_path / 'run.mcap', '--duration', 1, '--command',
+                                      '1:2.0:1.5', '-p', f'solver.method:={method}'))
+    assert verdict['identical'] and verdict['compared']['/spinning_top/commands'] == 1
+
+
 @pytest.mark.parametrize('name', ['stepped', 'columns'])
 def test_a_changed_bit_is_found_wherever_it_is(name, tmp_path, capsys, request):
     source = request.getfixturevalue(name)
