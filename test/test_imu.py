@@ -10,7 +10,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from reference import SCENES, scene_parameters
+from helpers.reference import SCENES, scene_parameters
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 

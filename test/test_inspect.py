@@ -14,9 +14,9 @@ import sys
 
 import numpy as np
 import pytest
+from helpers.reference import ROOT, SCENES, scene_parameters
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from reference import ROOT, SCENES, scene_parameters
 
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
@@ -403,7 +403,7 @@ def test_live_logs_verify(tmp_path, capsys):
     """From the start, and from the middle with commands before; rates change, resets happen."""
     pytest.importorskip('rclpy')
     from geometry_msgs.msg import PoseStamped
-    from node_harness import Peer, SimNode
+    from helpers.node_harness import Peer, SimNode
 
     whole, part = tmp_path / 'whole.mcap', tmp_path / 'part.mcap'
     options = {'status_period': 0.0, 'record.uri': str(whole), 'start_paused': True,

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from reference import SCENES, scene_parameters
+from helpers.reference import SCENES, scene_parameters
 
 from spinning_top_sim import Top, solve
 from spinning_top_sim.physics.shape import LARGEST, SMALLEST, THINNEST, shape_of

@@ -8,8 +8,8 @@ import pytest
 pytest.importorskip('rclpy')
 
 import rclpy
-from node_harness import SimNode, wait_for
-from node_logs import QUIET, assert_clean_end
+from helpers.node_harness import SimNode, wait_for
+from helpers.node_logs import QUIET, assert_clean_end
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node

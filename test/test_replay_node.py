@@ -15,7 +15,7 @@ import time
 from fractions import Fraction
 
 import pytest
-from node_harness import PATIENCE_S, Peer, SimNode, Topic
+from helpers.node_harness import PATIENCE_S, Peer, SimNode, Topic
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import (

@@ -11,8 +11,8 @@ import pytest
 pytest.importorskip('rclpy')
 
 from geometry_msgs.msg import PoseStamped
-from node_harness import SimNode, wait_for
-from node_logs import (
+from helpers.node_harness import SimNode, wait_for
+from helpers.node_logs import (
     PERIODS_NS,
     QUIET,
     SECOND,

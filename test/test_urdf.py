@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from reference import ROOT, SCENES, scene_parameters
+from helpers.reference import ROOT, SCENES, scene_parameters
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.physics.shape import shape_of
