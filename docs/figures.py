@@ -13,7 +13,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import inspect, simulate
 from spinning_top_sim.tools.plots import INK, draw_sphere, draw_tip
@@ -41,7 +40,7 @@ def motions(path):
     for axes, (caption, name, nutations) in zip(panels, PANELS, strict=True):
         top, start = scene(name)
         solution = ExactSolution(top, start)
-        facts = describe(top, start, solution)
+        facts = solution.describe()
         t = np.linspace(0.0, nutations * facts.nutation_period, 4000)
         draw_sphere(axes, (facts.theta_min, facts.theta_max, np.pi / 2))
         x, y, z = solution.states_at_seconds(t).rows_axis

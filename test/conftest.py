@@ -6,7 +6,7 @@ import pytest
 
 @pytest.fixture(scope='module')
 def peer():
-    from node_harness import Peer
+    from helpers.node_harness import Peer
 
     with Peer() as peer:
         yield peer
@@ -14,6 +14,6 @@ def peer():
 
 @pytest.fixture(scope='module')
 def diagnostics(peer):
-    from node_harness import Diagnostics
+    from helpers.node_harness import Diagnostics
 
     return Diagnostics(peer)

@@ -22,9 +22,9 @@ import numpy as np
 if __name__ == '__main__':
     sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
 
-import taylor
-from random_tops import random_case
-from taylor import LONG
+from helpers import taylor
+from helpers.random_tops import random_case
+from helpers.taylor import LONG
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.solvers.exact import ExactSolution

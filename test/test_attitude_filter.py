@@ -9,7 +9,7 @@ import subprocess
 import sys
 
 import pytest
-from reference import ROOT
+from helpers.reference import ROOT
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.tools.inspect import main as inspect
@@ -152,7 +152,7 @@ def test_as_a_command_it_tells_and_draws(example, logs, tmp_path):
 # -------------------------------------------------------------------------------------------- live
 
 def test_live_it_follows_a_node_with_a_preset_and_ends_by_itself(example, peer, tmp_path):
-    from node_harness import SimNode
+    from helpers.node_harness import SimNode
 
     files = [item for name in ('wavy', 'imu/bmi088')
              for item in ('--params-file', str(ROOT / f'config/{name}.yaml'))]
@@ -176,7 +176,7 @@ def test_live_it_follows_a_node_with_a_preset_and_ends_by_itself(example, peer, 
 
 
 def test_live_it_ends_by_sigint_and_tells(example, tmp_path):
-    from node_harness import SimNode, wait_for
+    from helpers.node_harness import SimNode, wait_for
 
     follower = [str(EXAMPLE), '--settle', '0']
     with (SimNode(tmp_path / 'top', namespace='/signalled'),

@@ -12,8 +12,8 @@ import random
 
 import numpy as np
 import pytest
-from reference import scene_parameters
-from simulations import EPOCH_NS, MILLISECOND, simulate
+from helpers.reference import scene_parameters
+from helpers.simulations import EPOCH_NS, MILLISECOND, simulate
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.solvers.exact import ExactSolution

@@ -4,7 +4,7 @@
 import re
 import runpy
 
-from reference import ROOT, SCENES
+from helpers.reference import ROOT, SCENES
 
 
 def test_the_interface_page_is_written_from_the_present_code():

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from reference import start_of, top_of
+from helpers.reference import start_of, top_of
 
 from spinning_top_sim import solve
 

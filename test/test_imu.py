@@ -8,10 +8,10 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from reference import SCENES, scene_parameters
+from helpers.reference import SCENES, scene_parameters
+from helpers.simulations import doubles, record, simulate, stream
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from simulations import doubles, record, simulate, stream
 
 from spinning_top_sim import solve
 from spinning_top_sim.solvers.exact import ExactSolution

@@ -5,7 +5,7 @@ import json
 import math
 
 import pytest
-from reference import ROOT, scene_parameters
+from helpers.reference import ROOT, scene_parameters
 
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters

@@ -14,14 +14,14 @@ import sys
 
 import numpy as np
 import pytest
+from helpers.reference import ROOT, SCENES, scene_parameters
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from reference import ROOT, SCENES, scene_parameters
 
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import analysis, cli, inspect, simulate
-from spinning_top_sim.tools.survey import survey
+from spinning_top_sim.tools.survey import Series, survey
 
 RUN_S = 20
 NAMES = {'cusp': 'cusps', 'fast_gyroscope': 'cusps', 'free_top': 'free top', 'heavy_top': 'loops',
@@ -275,6 +275,40 @@ def test_missing_samples_are_told_where_they_are(stepped, tmp_path, capsys):
                if topic['stream'] and name != '/a/b/pose')
 
 
+@pytest.mark.parametrize(('kept', 'gaps'), [
+    (range(3, 301), [[1_000_000_000, 1_020_000_000]]),
+    (range(296), [[3_960_000_000, 4_000_000_000]]),
+    (range(5, 290), [[1_000_000_000, 1_040_000_000], [3_900_000_000, 4_000_000_000]]),
+    ((), [[1_000_000_000, 2_000_000_000], [2_010_000_000, 3_000_000_000],
+          [3_010_000_000, 4_000_000_000]])])
+def test_missing_samples_at_the_ends_are_found_too(folder, tmp_path, capsys, kept, gaps):
+    """Of a topic without any, each part between two commands is a gap."""
+    whole = folder / 'ends.mcap'
+    if not whole.exists():
+        log_of(whole, '--duration', 3, '--command', '1:2.0:1.5', '--command', '2:1.7:1.4')
+    path = rewritten(whole, tmp_path / 'gap.mcap', lambda topic, number, data: (
+        None if topic == '/pose' and number not in kept else data))
+    _, content = as_json(capsys, path)
+    pose = content['topics']['/pose']
+    assert (pose['missing'], pose['count']) == (301 - len(kept), len(kept))
+    assert pose['gaps_ns'] == gaps
+
+
+def test_a_long_series_keeps_its_peaks():
+    series, rng = Series(), np.random.default_rng(3)
+    values = rng.normal(size=100_001)
+    values[[7, 50_001, 99_999]] = 9.0, -10.0, 8.0
+    values[20_000] = np.nan
+    times = 10 * np.arange(len(values))
+    for first in range(0, len(values), 4096):
+        series.add(times[first:first + 4096], values[first:first + 4096])
+    stamps, points = series.points()
+    assert 5_000 < len(points) <= 20_000 and np.all(np.diff(stamps) > 0)
+    assert {9.0, -10.0, 8.0} <= set(points) and np.array_equal(points, values[stamps // 10])
+    assert series.largest == 10.0
+    assert series.rms == pytest.approx(np.sqrt(np.nanmean(values ** 2)))
+
+
 # ---------------------------------------------------------------------------------- verifying
 
 
@@ -295,6 +329,13 @@ def test_offline_logs_verify(name, capsys, request):
             counts[message.topic] = counts.get(message.topic, 0) + 1
     counts.pop(next(name for name in counts if name.endswith('/events')))
     assert verdict['compared'] == counts
+
+
+@pytest.mark.parametrize('method', ['rk45', 'exact'])
+def test_a_command_exactly_at_the_end_verifies(tmp_path, capsys, method):
+    verdict = verified(capsys, log_of(tmp_path / 'run.mcap', '--duration', 1, '--command',
+                                      '1:2.0:1.5', '-p', f'solver.method:={method}'))
+    assert verdict['identical'] and verdict['compared']['/spinning_top/commands'] == 1
 
 
 @pytest.mark.parametrize('name', ['stepped', 'columns'])
@@ -362,7 +403,7 @@ def test_live_logs_verify(tmp_path, capsys):
     """From the start, and from the middle with commands before; rates change, resets happen."""
     pytest.importorskip('rclpy')
     from geometry_msgs.msg import PoseStamped
-    from node_harness import Peer, SimNode
+    from helpers.node_harness import Peer, SimNode
 
     whole, part = tmp_path / 'whole.mcap', tmp_path / 'part.mcap'
     options = {'status_period': 0.0, 'record.uri': str(whole), 'start_paused': True,

@@ -16,8 +16,8 @@ import pytest
 pytest.importorskip('rclpy')
 
 from geometry_msgs.msg import PoseStamped
-from node_harness import SimNode
-from node_logs import SECOND, log_of, stamp_of, the_log
+from helpers.node_harness import SimNode
+from helpers.node_logs import SECOND, log_of, stamp_of, the_log
 
 from spinning_top_sim.tools.recover import main as recover
 

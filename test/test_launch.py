@@ -17,7 +17,7 @@ from types import SimpleNamespace
 
 import pytest
 import yaml  # type: ignore[import-untyped]
-from reference import ROOT, SCENES
+from helpers.reference import ROOT, SCENES
 
 from spinning_top_sim import nodes
 from spinning_top_sim.streams import parameters
@@ -310,7 +310,8 @@ def launch(tmp_path):
         share = Path(get_package_share_directory('spinning_top_sim'))
     except PackageNotFoundError:
         pytest.skip('spinning_top_sim is not installed here, only importable')
-    import node_harness  # puts this process and its children into a domain of their own
+    # Puts this process and its children into a domain of their own.
+    from helpers import node_harness
 
     assert os.environ['ROS_DOMAIN_ID'] == str(node_harness.DOMAIN_ID)
 
@@ -332,7 +333,7 @@ def launch(tmp_path):
 
 
 def test_two_tops_are_launched_recorded_and_replayed(launch, tmp_path):
-    from node_logs import decoded
+    from helpers.node_logs import decoded
 
     names = {'left': 'cusp', 'right': 'looping'}
     for said in launch(*(('sim', f'namespace:={name}', f'scene:={scene}', f'record:={name}.mcap',

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from reference import SCENES, scene_parameters
-from simulations import EPOCH_NS, SECOND, record, simulate, stream
+from helpers.reference import SCENES, scene_parameters
+from helpers.simulations import EPOCH_NS, SECOND, record, simulate, stream
 
 from spinning_top_sim import Top, solve
 from spinning_top_sim.physics.shape import LARGEST, SMALLEST, THINNEST, shape_of

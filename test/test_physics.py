@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from reference import CASES, SCENES, scene_parameters, start_of, top_of
+from helpers.reference import CASES, SCENES, scene_parameters, start_of, top_of
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top, solve

@@ -10,7 +10,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from simulations import (
+from helpers.simulations import (
     EPOCH_NS,
     MILLISECOND,
     SECOND,

@@ -10,8 +10,8 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from node_harness import PATIENCE_S
-from node_logs import events_in, log_of
+from helpers.node_harness import PATIENCE_S
+from helpers.node_logs import events_in, log_of
 from rclpy.qos import QoSProfile
 
 from spinning_top_sim.nodes.recording_session import RecordingSession

@@ -16,7 +16,7 @@ import time
 from fractions import Fraction
 
 import pytest
-from node_harness import PATIENCE_S, Peer, SimNode, Topic
+from helpers.node_harness import PATIENCE_S, Peer, SimNode, Topic
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import (
@@ -220,7 +220,7 @@ def test_what_reading_raises_comes_after_what_was_read(count):
     found = []
     with pytest.raises(OSError, match='gone'):
         for message in ReadAhead(broken()):
-            found.append(message)       # noqa: PERF402 - extend() would lose what came before
+            found.append(message)
     assert found == [(number, 0, b'a') for number in range(count)]
 
 

@@ -11,7 +11,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from reference import CASES, angle, quaternion_of, scene_parameters, start_of, top_of
+from helpers.reference import CASES, angle, quaternion_of, scene_parameters, start_of, top_of
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.solvers.dormand_prince import (

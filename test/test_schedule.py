@@ -2,7 +2,7 @@
 """The schedule: what is computed ahead, how far, and when it no longer holds."""
 
 import pytest
-from simulations import (
+from helpers.simulations import (
     MILLISECOND,
     SECOND,
     Counting,

@@ -16,8 +16,8 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from node_harness import LIFETIME_S, SimNode
-from node_logs import (
+from helpers.node_harness import LIFETIME_S, SimNode
+from helpers.node_logs import (
     GRAVITY,
     KINDS,
     PERIODS_NS,

@@ -10,9 +10,8 @@ import pytest
 pytest.importorskip('rclpy')
 
 from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry
-from node_harness import SimNode, wait_for
-from node_logs import (
+from helpers.node_harness import SimNode, wait_for
+from helpers.node_logs import (
     GRAVITY,
     QUIET,
     SECOND,
@@ -26,6 +25,7 @@ from node_logs import (
     the_log,
     xyzw,
 )
+from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 

@@ -13,8 +13,8 @@ import pytest
 pytest.importorskip('rclpy')
 
 from geometry_msgs.msg import PoseStamped
-from node_harness import Diagnostics, SimNode, wait_for
-from node_logs import (
+from helpers.node_harness import Diagnostics, SimNode, wait_for
+from helpers.node_logs import (
     KINDS,
     PERIODS_NS,
     QUIET,

@@ -7,8 +7,8 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from node_harness import SimNode, wait_for
-from node_logs import (
+from helpers.node_harness import SimNode, wait_for
+from helpers.node_logs import (
     QUIET,
     SECOND,
     assert_clean_end,

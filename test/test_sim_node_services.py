@@ -12,8 +12,8 @@ import pytest
 pytest.importorskip('rclpy')
 
 from geometry_msgs.msg import PoseStamped
-from node_harness import SimNode, wait_for
-from node_logs import (
+from helpers.node_harness import SimNode, wait_for
+from helpers.node_logs import (
     PERIODS_NS,
     QUIET,
     SECOND,
@@ -28,9 +28,9 @@ from node_logs import (
     stamps_of,
     the_log,
 )
+from helpers.recorded import recorded
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
-from recorded import recorded
 from rosbags.highlevel import AnyReader
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu

@@ -9,9 +9,9 @@ import sys
 
 import numpy as np
 import pytest
+from helpers.reference import ROOT, SCENES, scene_parameters
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from reference import ROOT, SCENES, scene_parameters
 from rosbags.highlevel import AnyReader
 
 from spinning_top_sim import solve

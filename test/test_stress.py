@@ -14,8 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from random_tops import random_case
-from reference import scene_parameters
+from helpers.random_tops import random_case
+from helpers.reference import scene_parameters
 from stress import (
     COLUMNS,
     EXACT,

@@ -6,8 +6,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from recorded import recorded
-from reference import ROOT, SCENES, scene_parameters
+from helpers.recorded import recorded
+from helpers.reference import ROOT, SCENES, scene_parameters
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.physics.shape import shape_of

@@ -12,11 +12,11 @@ from geometry_msgs.msg import PoseStamped
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from nav_msgs.msg import Odometry
-from node_harness import LIFETIME_S
-from recorded import recorded
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import Imu, JointState
 
+from helpers.node_harness import LIFETIME_S
+from helpers.recorded import recorded
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.pipeline import Simulation
 

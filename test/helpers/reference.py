@@ -9,7 +9,7 @@ import yaml
 
 from spinning_top_sim import State, Top
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 CASES = {case['name']: case for case in json.loads(
     (ROOT / 'test/data/reference_cases.json').read_text())['cases']}
 SCENES = sorted(path.stem for path in (ROOT / 'config').glob('*.yaml'))
