@@ -50,13 +50,7 @@ class Times:
         ValueError
             If `ns` is not one-dimensional, not of integers, or beyond int64.
         """
-        if isinstance(ns, range):
-            try:
-                count = np.arange(ns.start, ns.stop, ns.step, dtype=np.int64)
-            except OverflowError as error:
-                raise ValueError(f'times_ns = {ns!r}: must be within int64') from error
-        else:
-            count = np.asarray(ns)
+        count = _integers(ns) if isinstance(ns, range) else np.asarray(ns)
         if count.ndim != 1 or (count.size and count.dtype.kind not in 'iu'):
             raise ValueError(f'times_ns has shape {count.shape} and type {count.dtype}: must be '
                              '(n,) integer nanoseconds')
@@ -84,6 +78,14 @@ class Times:
     def __getitem__(self, block: slice) -> Times:
         """Return a part of the times."""
         return Times(self.high[block], self.low[block])
+
+
+def _integers(times: range) -> NDArray[np.int64]:
+    """Return a range as an array; `numpy.arange` takes its length from doubles."""
+    if any(not -2 ** 63 <= ns < 2 ** 63 for ns in (*times[:1], *times[-1:], times.step)):
+        raise ValueError(f'times_ns = {times!r}: must be within int64')
+    start = times.start if times else 0
+    return start + times.step * np.arange(len(times), dtype=np.int64)
 
 
 class Rate:
