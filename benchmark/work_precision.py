@@ -225,8 +225,8 @@ def _section(case: Case, duration: int, rate: int, rows: list[Row]) -> str:
 COLOURS = {'ours': '#D55E00', 'SciPy': '#0072B2', 'heyoka': '#009E73', 'diffrax': '#CC79A7',
            'MuJoCo': '#666666'}
 EXACT = '#000000'
-STYLES = {'exact, state by state': ('*', '-'), 'exact, array': ('P', '-'),
-          'exact, grid': ('X', '-'), 'rk45 transport': ('o', '-'), 'rk45 euler': ('o', ':'),
+STYLES = {'exact, any times': ('P', '-'), 'exact, grid': ('X', '-'),
+          'rk45 transport': ('o', '-'), 'rk45 euler': ('o', ':'),
           'SciPy RK45': ('s', '-'), 'SciPy DOP853': ('^', '-'), 'SciPy LSODA': ('v', '-'),
           'heyoka Euler': ('D', ':'), 'heyoka quadratic': ('D', '-'),
           'diffrax Dopri8 quadratic': ('h', '-'), 'MuJoCo RK4': ('<', '-'),

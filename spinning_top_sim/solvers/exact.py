@@ -178,8 +178,9 @@ class ExactSolution:
         times = Times.from_ns(times_ns)
         if len(times):
             latest = max(float(times.high.max()), -float(times.high.min()))
-            if latest > self.ns_limit:
-                raise self._too_far(f'{latest:.0f} ns')
+            if latest > float(self.ns_limit):       # as rounded as the times
+                raise ValueError(f't = {latest:.0f} ns: must be within {self.ns_limit} ns, where a '
+                                 f'phase of this motion reaches 2^52 turns or int64 ends')
         return self._states(times)
 
     def states_at_seconds(self, t: Column) -> States:
@@ -194,17 +195,15 @@ class ExactSolution:
         if len(t):
             latest = max(float(t.max()), -float(t.min()))
             if not latest <= self.time_limit:       # catches NaN too
-                raise self._too_far(f'{latest!r} s')
+                raise ValueError(f't = {latest!r} s: must be finite and within '
+                                 f'{self.time_limit:.6g} s, where a phase of this motion reaches '
+                                 f'2^52 turns')
         return self._states(Times.from_seconds(t), t.copy())
 
     def _states(self, times: Times, seconds: Column | None = None) -> States:
         """Return the states at times within the limits; `seconds` are the same times [s]."""
         return States(self.top, self.start.l3, self.start.lz, len(times),
                       _ExactSamples(self, times, seconds))
-
-    def _too_far(self, time: str) -> ValueError:
-        return ValueError(f't = {time}: must be finite and within {self.time_limit:.6g} s, '
-                          f'where a phase of this motion reaches 2^52 turns')
 
     def quaternion(self, times: Times, nutation: NutationColumns | None) -> Quaternion:
         """Return x, y, z, w at n times, from the series or, where there are none, `nutation`."""

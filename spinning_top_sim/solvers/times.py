@@ -13,8 +13,11 @@ from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.solvers.decimal_math import double_double
 
 NANOSECONDS = 1_000_000_000
-# The largest time [ns] that is taken as an integer: the end of int64 lies a second behind it.
-LATEST_NS = 2 ** 63 - NANOSECONDS
+# The largest time [ns] that is taken as an integer: the end of int64 lies 104 days behind it, so
+# that a row of a grid (`Rotations.on_grid`) may begin before the first time.
+LATEST_NS = 2 ** 63 - 2 ** 53
+# The longest step of a grid, 2.4 hours.
+LONGEST_STEP_NS = 2 ** 43
 # 2^27 + 1: the factor that splits a double into two halves (Dekker, Numer. Math. 18, 1971, 224).
 SPLITTER = 134217729.0
 
@@ -35,7 +38,8 @@ class Times:
     ----------
     high : (n,) nearest doubles [ns]
     low : (n,) what they leave out [ns]
-    grid : the same times, where they are given as a range of integers [ns]
+    grid : the same times, where they are given as a range of integers [ns] of no longer step than
+        LONGEST_STEP_NS
     """
 
     high: Column
@@ -52,12 +56,8 @@ class Times:
         ValueError
             If `ns` is not one-dimensional, not of integers, or beyond int64.
         """
-        grid = ns if isinstance(ns, range) else None
-        try:
-            count = np.asarray(ns) if grid is None else np.arange(
-                grid.start, grid.stop, grid.step, dtype=np.int64)
-        except OverflowError as error:
-            raise ValueError(f'times_ns = {ns!r}: must be within int64') from error
+        grid = ns if isinstance(ns, range) and abs(ns.step) <= LONGEST_STEP_NS else None
+        count = _integers(ns) if isinstance(ns, range) else np.asarray(ns)
         if count.ndim != 1 or (count.size and count.dtype.kind not in 'iu'):
             raise ValueError(f'times_ns has shape {count.shape} and type {count.dtype}: must be '
                              '(n,) integer nanoseconds')
@@ -88,6 +88,14 @@ class Times:
         """Return a part of the times."""
         return Times(self.high[block], self.low[block],
                      None if self.grid is None else self.grid[block])
+
+
+def _integers(times: range) -> NDArray[np.int64]:
+    """Return a range as an array; `numpy.arange` takes its length from doubles."""
+    if any(not -2 ** 63 <= ns < 2 ** 63 for ns in (*times[:1], *times[-1:], times.step)):
+        raise ValueError(f'times_ns = {times!r}: must be within int64')
+    start = times.start if times else 0
+    return start + times.step * np.arange(len(times), dtype=np.int64)
 
 
 class Rate:
