@@ -179,8 +179,8 @@ class ExactSolution:
         if len(times):
             latest = max(float(times.high.max()), -float(times.high.min()))
             if latest > float(self.ns_limit):       # as rounded as the times
-                raise ValueError(f't = {latest:.0f} ns: must be within {self.ns_limit} ns, where a '
-                                 f'phase of this motion reaches 2^52 turns or int64 ends')
+                raise ValueError(f't = {latest:.0f} ns: must be within {self.ns_limit} ns, where '
+                                 f'a phase of this motion reaches 2^52 turns or int64 ends')
         return self._states(times)
 
     def states_at_seconds(self, t: Column) -> States:
