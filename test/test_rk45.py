@@ -471,8 +471,8 @@ def test_phases_are_followed_past_the_poles(l3, lz, rtol, bound):
     start = State(theta=1.0 if l3 * lz > 0.0 else 2.0, theta_dot=-4.0, phi=0.4, psi=-0.7, l3=l3,
                   lz=lz)
     equations = TransportEquations(top, start, rtol, 0.0)
-    line_rate = -0.5 * equations.spin_carried / top.lambda1
-    integrator, phases = Integrator(equations), PhaseUnwrapper(start, line_rate)
+    spin_rate = -0.5 * equations.spin_carried / top.lambda1
+    integrator, phases = Integrator(equations), PhaseUnwrapper(start, spin_rate)
     steps = [integrator.step()]
     while steps[-1].t1 < 20.0:
         steps.append(integrator.step())
@@ -481,7 +481,7 @@ def test_phases_are_followed_past_the_poles(l3, lz, rtol, bound):
         phases.extend(np.array([step.t0 for step in part]), y[:, 0], y[:, 1])
     t = np.array([0.0] + [step.t0 for step in steps])
     exact = ExactSolution(top, start).states_at_seconds(t)
-    spin = (0.5 * equations.spin_rate + line_rate) * t
+    spin = (0.5 * equations.spin_rate + spin_rate) * t
     assert phases.begins[0] == pytest.approx(0.5 * (exact.phi + exact.psi) - spin, abs=bound)
     assert phases.begins[1] == pytest.approx(0.5 * (exact.phi - exact.psi) + spin, abs=bound)
     assert phases.begins[2] == pytest.approx(0.5 * exact.theta, abs=bound)

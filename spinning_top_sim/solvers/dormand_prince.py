@@ -127,7 +127,11 @@ class Step(NamedTuple):
     """
     One accepted step.
 
-    t0, t1: the ends [s];  y0, y1: the unknowns there;  derivative0, derivative1: their derivatives
+    Attributes
+    ----------
+    t0, t1 : its ends [s]
+    y0, y1 : the unknowns there
+    derivative0, derivative1 : their derivatives there
     """
 
     t0: float
@@ -142,8 +146,16 @@ class Integrator:
     """
     Takes steps forward from t = 0.
 
-    newest: the latest step (one of no length before the first);  steps, rejected, evaluations:
-    counts
+    Parameters
+    ----------
+    equations : Equations
+
+    Attributes
+    ----------
+    newest : Step
+        The latest one; before the first, one of no length.
+    steps, rejected : accepted and rejected steps so far
+    evaluations : evaluations of the right-hand side so far
     """
 
     def __init__(self, equations: Equations) -> None:
@@ -192,8 +204,10 @@ class Interpolants(NamedTuple):
     """
     The quintic Hermite polynomials of n steps in s = (t - begin)/length.
 
-    begin, length: (n,) [s];  coefficients: (6, k, n) by power and component, real and imaginary
-    parts apart
+    Attributes
+    ----------
+    begin, length : (n,) [s]
+    coefficients : (6, k, n) by power and component, real and imaginary parts apart
     """
 
     begin: Rows

@@ -49,7 +49,7 @@ class SteppedMotion(ABC):
     def __init__(self, top: Top, start: State, equations: Equations) -> None:
         self.top, self.start, self._equations = top, start, equations
         self._integrator = Integrator(equations)
-        # Those that can still be read, in order.
+        # The steps that can still be read, in order.
         self._kept = [self._integrator.newest]
 
     @property
@@ -223,7 +223,7 @@ class TransportMotion(SteppedMotion):
         equations = TransportEquations(top, start, rtol, atol)
         super().__init__(top, start, equations)
         self._transport = equations
-        # The stepped frame lacks the spin of `TransportEquations.spin_rate`: so does its line.
+        # The stepped frame lacks `TransportEquations.spin_rate`; what is left of the spin:
         self._phases = PhaseUnwrapper(start, -0.5 * equations.spin_carried / top.lambda1)
 
     def _forget(self, count: int) -> None:
@@ -262,7 +262,7 @@ class _TransportSamples:
         self._alpha, self._beta, self._crosses = phases.alpha, phases.beta, phases.crosses
         self._stepped = Unknowns(*rows[:6])
         self._begins = rows[6:]
-        self._line = 0.5 * spin_excess(top, start.l3) * t
+        self._spin_phase = 0.5 * spin_excess(top, start.l3) * t
 
     @cached_property
     def _projected(self) -> Unknowns:
@@ -270,10 +270,10 @@ class _TransportSamples:
         spin = 0.5 * self._equations.spin_rate * self.t
         stepped = self._stepped
         if self._crosses:
-            cosine, sine, alpha_phase, beta_phase = self._on_lines(
+            cosine, sine, alpha_phase, beta_phase = self._moduli_and_phases(
                 stepped, -0.5 * self._equations.spin_carried / self._top.lambda1 * self.t)
-            projected = self._equations.project_on_lines(stepped, cosine, sine, alpha_phase,
-                                                         beta_phase)
+            projected = self._equations.project_through_poles(
+                stepped, cosine, sine, alpha_phase, beta_phase)
         else:
             projected = self._equations.project_columns(stepped)
         a, b, c, d, m_real, m_imag = projected
@@ -281,12 +281,13 @@ class _TransportSamples:
         return Unknowns(a * cosine - b * sine, b * cosine + a * sine,
                         c * cosine + d * sine, d * cosine - c * sine, m_real, m_imag)
 
-    def _on_lines(self, y: Unknowns, line: Column) -> tuple[Column, Column, Column, Column]:
+    def _moduli_and_phases(self, y: Unknowns, spin_phase: Column,
+                           ) -> tuple[Column, Column, Column, Column]:
         """Return signed moduli and phases of alpha and beta."""
-        return (self._alpha.modulus(y.alpha_real, y.alpha_imag, line),
-                self._beta.modulus(y.beta_real, y.beta_imag, -line),
-                self._alpha.phase(y.alpha_real, y.alpha_imag, self._begins[0], line),
-                self._beta.phase(y.beta_real, y.beta_imag, self._begins[1], -line))
+        return (self._alpha.modulus(y.alpha_real, y.alpha_imag, spin_phase),
+                self._beta.modulus(y.beta_real, y.beta_imag, -spin_phase),
+                self._alpha.phase(y.alpha_real, y.alpha_imag, self._begins[0], spin_phase),
+                self._beta.phase(y.beta_real, y.beta_imag, self._begins[1], -spin_phase))
 
     @property
     def quaternion(self) -> Quaternion:
@@ -299,7 +300,8 @@ class _TransportSamples:
 
     @cached_property
     def angles(self) -> tuple[Column, Column, Column]:
-        cosine, sine, half_sum, half_difference = self._on_lines(self._projected, self._line)
+        cosine, sine, half_sum, half_difference = self._moduli_and_phases(
+            self._projected, self._spin_phase)
         half = np.arctan2(sine, cosine)
         # theta/2 turns by less than half a turn within a step.
         half = half + math.tau * np.rint((self._begins[2] - half) / math.tau)

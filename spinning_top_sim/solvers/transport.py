@@ -186,8 +186,8 @@ class TransportEquations:
             where(at_pole, m_real, (u * axis_real - v * axis_imag) / divisor),
             where(at_pole, m_imag, (u * axis_imag + v * axis_real) / divisor))
 
-    def project_on_lines(self, y: Unknowns, cosine: Column, sine: Column, alpha_phase: Column,
-                         beta_phase: Column) -> Unknowns:
+    def project_through_poles(self, y: Unknowns, cosine: Column, sine: Column,
+                              alpha_phase: Column, beta_phase: Column) -> Unknowns:
         """
         Return what `project_columns` does, for a top that passes a pole: Lz = L3 or Lz = -L3.
 

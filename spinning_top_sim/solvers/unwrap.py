@@ -26,7 +26,7 @@ def spin_excess(top: Top, l3: float) -> float:
     return l3 * (1.0 / top.lambda3 - 1.0 / top.lambda1)
 
 
-def turns_onward(phase: Column, before: Column, momentum: float) -> Column:
+def turns_to_follow(phase: Column, before: Column, momentum: float) -> Column:
     """
     Return the whole turns to add to `phase` so that it follows `before` [rad].
 
@@ -45,11 +45,11 @@ def turns_onward(phase: Column, before: Column, momentum: float) -> Column:
 def unwrap(phases: Column, before: float, momentum: float) -> Column:
     """Return phases [rad], each a step after the one before it, unwrapped from `before` on."""
     previous = np.concatenate(([before], phases[:-1]))
-    return phases + math.tau * np.cumsum(turns_onward(phases, previous, momentum))
+    return phases + math.tau * np.cumsum(turns_to_follow(phases, previous, momentum))
 
 
 @dataclass(frozen=True)
-class Winding:
+class CayleyKleinPhase:
     """
     How one Cayley-Klein parameter turns.
 
@@ -69,14 +69,14 @@ class Winding:
         """Whether the parameter can vanish: it then moves on a line through zero."""
         return self.momentum == 0.0
 
-    def modulus(self, real: Column, imag: Column, line: Column) -> Column:
+    def modulus(self, real: Column, imag: Column, spin_phase: Column) -> Column:
         """
         Return the signed modulus of the parameter.
 
-        line : what the uniform spin adds to the phase [rad]
+        spin_phase : what the uniform spin adds to the phase [rad]
         """
         if self.crosses:
-            phase = self.start + line
+            phase = self.start + spin_phase
             return real * np.cos(phase) + imag * np.sin(phase)
         return self.sign * np.hypot(real, imag)
 
@@ -84,33 +84,43 @@ class Winding:
         """Return the phase [rad], less whole turns, of a parameter with this sign."""
         return np.arctan2(self.sign * imag, self.sign * real)
 
-    def phase(self, real: Column, imag: Column, before: Column, line: Column) -> Column:
-        """Return the unwrapped phase [rad]; `before` is that of its step's begin, less `line`."""
+    def phase(self, real: Column, imag: Column, before: Column, spin_phase: Column) -> Column:
+        """
+        Return the unwrapped phase [rad].
+
+        before : the phase at the begin of the step, less that of the spin there [rad]
+        spin_phase : what the uniform spin adds to the phase [rad]
+        """
         if self.crosses:
-            return self.start + line
+            return self.start + spin_phase
         argument = self.argument(real, imag)
-        return argument + math.tau * turns_onward(argument, before + line, self.momentum)
+        return argument + math.tau * turns_to_follow(argument, before + spin_phase, self.momentum)
 
 
 class PhaseUnwrapper:
     """
-    The windings of alpha and beta of a motion, and their phases at the begins of its steps.
+    The phases of alpha and beta of a motion at the begins of its steps.
 
     Parameters
     ----------
     start : State
-    line_rate : what the uniform spin of the stepped frame adds to the phase of alpha [rad/s], and
+    spin_rate : what the uniform spin of the stepped frame adds to the phase of alpha [rad/s], and
         takes from that of beta
+
+    Attributes
+    ----------
+    alpha, beta : CayleyKleinPhase
+    begins : (3, n) phases of alpha and beta, less that of the spin, and theta/2 [rad]
     """
 
-    def __init__(self, start: State, line_rate: float) -> None:
-        self.alpha = Winding(start.lz + start.l3, math.copysign(1.0, math.cos(0.5 * start.theta)),
-                             0.5 * (start.phi + start.psi))
-        self.beta = Winding(start.lz - start.l3, math.copysign(1.0, math.sin(0.5 * start.theta)),
-                            0.5 * (start.phi - start.psi))
-        self._line_rate = line_rate
-        # Phases of alpha and beta less the line, and theta/2 [rad], at the begins of steps.
-        self.begins = np.array([[self.alpha.start], [self.beta.start], [0.5 * start.theta]])
+    def __init__(self, start: State, spin_rate: float) -> None:
+        half = 0.5 * start.theta
+        self.alpha = CayleyKleinPhase(start.lz + start.l3, math.copysign(1.0, math.cos(half)),
+                                      0.5 * (start.phi + start.psi))
+        self.beta = CayleyKleinPhase(start.lz - start.l3, math.copysign(1.0, math.sin(half)),
+                                     0.5 * (start.phi - start.psi))
+        self._spin_rate = spin_rate
+        self.begins = np.array([[self.alpha.start], [self.beta.start], [half]])
 
     @property
     def crosses(self) -> bool:
@@ -120,16 +130,16 @@ class PhaseUnwrapper:
     def extend(self, t: Column, alpha: NDArray[np.complex128],
                beta: NDArray[np.complex128]) -> None:
         """Follow the phases over the begins of further steps at t [s]."""
-        line = self._line_rate * t
         more = np.empty((3, len(t)))
         moduli = []
-        for row, before, winding, z, its_line in zip(
-                more, self.begins[:, -1], (self.alpha, self.beta), (alpha, beta), (line, -line),
-                strict=False):
+        turned = self._spin_rate * t
+        for k, (parameter, z, spin_phase) in enumerate((
+                (self.alpha, alpha, turned), (self.beta, beta, -turned))):
             real, imag = z.real.copy(), z.imag.copy()
-            row[:] = winding.start if winding.crosses else unwrap(
-                winding.argument(real, imag) - its_line, before, winding.momentum)
-            moduli.append(winding.modulus(real, imag, its_line))
+            more[k] = parameter.start if parameter.crosses else unwrap(
+                parameter.argument(real, imag) - spin_phase, self.begins[k, -1],
+                parameter.momentum)
+            moduli.append(parameter.modulus(real, imag, spin_phase))
         cosine, sine = moduli
         more[2] = unwrap(np.arctan2(sine, cosine), self.begins[2, -1], 0.0)
         self.begins = np.concatenate((self.begins, more), axis=1)
