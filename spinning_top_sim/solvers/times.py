@@ -35,12 +35,12 @@ class Times:
     ----------
     high : (n,) nearest doubles [ns]
     low : (n,) what they leave out [ns]
-    grid : the same times, where they are given as a range of integers [ns]
+    ns : the same times, where they are given as integers [ns]
     """
 
     high: Column
     low: Column
-    grid: range | None = None
+    ns: NDArray[np.int64] | range | None = None
 
     @classmethod
     def from_ns(cls, ns: NDArray[np.int64] | range) -> Times:
@@ -52,21 +52,20 @@ class Times:
         ValueError
             If `ns` is not one-dimensional, not of integers, or beyond int64.
         """
-        grid = ns if isinstance(ns, range) else None
         try:
-            count = np.asarray(ns) if grid is None else np.arange(
-                grid.start, grid.stop, grid.step, dtype=np.int64)
+            count = np.arange(ns.start, ns.stop, ns.step, dtype=np.int64) if isinstance(
+                ns, range) else np.asarray(ns)
         except OverflowError as error:
             raise ValueError(f'times_ns = {ns!r}: must be within int64') from error
         if count.ndim != 1 or (count.size and count.dtype.kind not in 'iu'):
             raise ValueError(f'times_ns has shape {count.shape} and type {count.dtype}: must be '
                              '(n,) integer nanoseconds')
         if not count.size or max(abs(int(count.min())), abs(int(count.max()))) <= 2 ** 53:
-            return cls(count.astype(np.float64), np.broadcast_to(0.0, len(count)), grid)
+            return cls(count.astype(np.float64), np.broadcast_to(0.0, len(count)), ns)
         upper = (count >> 20).astype(np.float64) * 2.0 ** 20
         lower = (count & (2 ** 20 - 1)).astype(np.float64)
         high = upper + lower
-        return cls(high, lower - (high - upper), grid)
+        return cls(high, lower - (high - upper), ns)
 
     @classmethod
     def from_seconds(cls, t: Column) -> Times:
@@ -87,7 +86,7 @@ class Times:
     def __getitem__(self, block: slice) -> Times:
         """Return a part of the times."""
         return Times(self.high[block], self.low[block],
-                     None if self.grid is None else self.grid[block])
+                     None if self.ns is None else self.ns[block])
 
 
 class Rate:
