@@ -160,7 +160,7 @@ def test_the_default_scene_imports_just_what_it_uses(finished):
     assert ours == {
         *(f'nodes.{name}' for name in (
             'executable', 'pacing', 'recording_session', 'reports', 'ros_parameters',
-            'simulator', 'tick_loop')), 'recording.errors',
+            'simulator', 'stream_publishers', 'tick_loop')), 'recording.errors',
         *(f'physics.{name}' for name in (
             'attitude', 'kinematics', 'pairs', 'regimes', 'shape', 'top')),
         *(f'solvers.{name}' for name in (
@@ -233,6 +233,18 @@ def test_a_reader_of_the_terminal_who_goes_away_does_not_end_the_motion(peer, tm
         peer.stop_listening(pose)
     assert code == 0, node.err
     assert TRACEBACK not in node.err
+
+
+def test_without_the_events_executor_the_node_works_too(peer, tmp_path):
+    program = ('import runpy, sys; sys.modules["rclpy.experimental"] = None\n'
+               'runpy.run_module("spinning_top_sim.nodes.sim_node", run_name="__main__")')
+    with SimNode(tmp_path, {**QUIET, 'record.enabled': True}, program=('-c', program)) as node:
+        pose = peer.listen(node.topic('pose'), PoseStamped).wait(30)
+        assert peer.switch(node, 'set_pause', True).success
+        by_parameters(peer, node, 2.0, 1.0)
+        assert_clean_end(node, node.end())
+        peer.stop_listening(pose)
+    log_of(the_log(node.folder))
 
 
 # ------------------------------------------------------------------- nobody listens, overload

@@ -8,13 +8,13 @@ import re
 import signal
 import sys
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, cast
 
 if TYPE_CHECKING:
     from types import FrameType
 
-    from rclpy.context import Context
     from rclpy.executors import Executor
+    from rclpy.node import Node
     from rclpy.task import Future
 
 # Longest wait of the executor [s]: Python answers SIGHUP and SIGQUIT between two waits.
@@ -33,7 +33,6 @@ class RunnableNode(Protocol):
     """
 
     finished: Future
-    context: Context
 
     def start(self) -> None:
         """Begin to work: the node is about to be spun."""
@@ -138,7 +137,7 @@ def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode],
         except (ValueError, RuntimeError, OSError, ParameterException) as error:
             return _cannot_start(name, error) if rclpy.ok() else 0
         executor = _executor()
-        executor.add_node(node)
+        executor.add_node(cast('Node', node))
         node.finished.add_done_callback(lambda _: executor.wake())
         gc.collect()
         gc.freeze()             # what there is now stays: no full collection in the middle of it

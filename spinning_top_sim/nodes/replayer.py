@@ -52,11 +52,8 @@ AMENT_INDEX = 'share/ament_index/resource_index/packages'
 SLOWEST, FASTEST = 1e-6, 1e9
 # Policies that tell nothing, and that no publisher can offer.
 UNKNOWN = {
-    'history': {QoSHistoryPolicy.UNKNOWN},
-    'reliability': {QoSReliabilityPolicy.UNKNOWN},
-    'durability': {QoSDurabilityPolicy.UNKNOWN},
-    'liveliness': {QoSLivelinessPolicy.UNKNOWN},
-}
+    'history': QoSHistoryPolicy.UNKNOWN, 'reliability': QoSReliabilityPolicy.UNKNOWN,
+    'durability': QoSDurabilityPolicy.UNKNOWN, 'liveliness': QoSLivelinessPolicy.UNKNOWN}
 # Longest wait for the last messages to be acknowledged: Fast DDS asks for it every 3 s.
 LAST_WORD_S = 5.0
 # Wait for subscribers that acknowledge nothing: shared memory goes with its sender.
@@ -203,10 +200,10 @@ class Replayer(Node):
                                       'published as reliable, volatile')
             profiles = []
         recorded = {**DEFAULT_QOS, **(profiles[0] if profiles else {})}
-        policies = {key: _duration(value) if isinstance(value, Mapping) else value
-                    for key, value in recorded.items()}
-        for key in ('history', 'reliability', 'durability', 'liveliness'):
-            if policies[key] in UNKNOWN[key]:
+        policies: dict[str, Any] = {key: _duration(value) if isinstance(value, Mapping) else value
+                                    for key, value in recorded.items()}
+        for key, unknown in UNKNOWN.items():
+            if policies[key] == unknown:
                 policies[key] = DEFAULT_QOS[key]
         return QoSProfile(**{**policies, 'depth': policies['depth'] or DEFAULT_QOS['depth']})
 
@@ -285,7 +282,8 @@ class Replayer(Node):
     def _wait_to_begin(self) -> bool:
         """Wait for subscribers and the delay; return False when stopped meanwhile."""
         begin = time.monotonic() + self._options.delay
-        while (time.monotonic() < begin or self._subscribers() < self._options.wait_for_subscribers):
+        count = self._options.wait_for_subscribers
+        while time.monotonic() < begin or self._subscribers() < count:
             if not self._playback.rest(LOOK_S):
                 return False
         return True
