@@ -31,6 +31,8 @@ MOST_PENDING = 20_000
 
 # Messages of one stamp: indices of their topics, stamp [ns], CDR of each, size of all [bytes].
 Messages = tuple[Sequence[int], int, Sequence[bytes], int]
+# What `provenance` takes; the present values come last.
+Run = tuple[Mapping[str, Any], int, int, tuple[tuple[int, float, float], ...], Mapping[str, Any]]
 
 
 class RecordingSession:
@@ -86,7 +88,6 @@ class RecordingSession:
             By the topics of streams; their QoS is recorded too.
 
         """
-        from spinning_top_sim.recording.provenance import provenance  # noqa: PLC0415
         from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
 
         with self._lock:
@@ -97,9 +98,9 @@ class RecordingSession:
                       for stream in streams]
             topics += [RecordedTopic(self._resolve(name), type_name)
                        for name, type_name in journal.TOPICS]
-            metadata = provenance(simulation.values, simulation.epoch_ns, simulation.now_ns,
-                                  simulation.history, values)
-            self._open_log = functools.partial(_open, topics, metadata, values)
+            run = (simulation.values, simulation.epoch_ns, simulation.now_ns,
+                   tuple(simulation.history), values)
+            self._open_log = functools.partial(_open, topics, run)
             self._journal_topics = {name: len(streams) + i
                                     for i, (name, _) in enumerate(journal.TOPICS)}
             self._pending, self._streams = [], streams
@@ -213,11 +214,13 @@ class RecordingSession:
                 'longest flush [s]': f'{counters.longest_flush:.3f}'}
 
 
-def _open(topics: Sequence[RecordedTopic], metadata: Mapping[str, str],
-          values: Mapping[str, Any]) -> McapRecorder:
+def _open(topics: Sequence[RecordedTopic], run: Run) -> McapRecorder:
     """Open the log that `record.uri` asks for, under the first name that is free in a folder."""
+    from spinning_top_sim.recording.provenance import provenance  # noqa: PLC0415
     from spinning_top_sim.recording.writer import McapRecorder  # noqa: PLC0415
 
+    values = run[-1]
+    metadata = provenance(*run)
     path = Path(values['record.uri']).expanduser().absolute()
     names_itself = values['record.uri'] and not path.is_dir()
     for free in (path,) if names_itself else _dated(path):
