@@ -140,12 +140,12 @@ def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode],
         executor.add_node(cast('Node', node))
         node.finished.add_done_callback(lambda _: executor.wake())
         gc.collect()
-        gc.freeze()             # what there is now stays: no full collection in the middle of it
-        # Which waits until there is a quarter more than the one before has found: of nothing now,
-        # so that cyclic garbage (rclpy makes some with every service call) does not pile up.
+        gc.freeze()             # no full collection goes through what is there from the start
+        # A full collection waits until there is a quarter more than the one before has found.
+        # This one finds nothing, so the cyclic garbage of service calls does not pile up.
         gc.collect()
         node.start()
-        # rclpy ends the spin at any signal; an exception in the midst of its code only does harm.
+        # From here on rclpy ends the spin at a signal; KeyboardInterrupt would interrupt its code.
         signals.told = True
         # Without a timeout, the EventsExecutor of Jazzy hangs.
         while rclpy.ok() and not node.finished.done():
@@ -155,7 +155,7 @@ def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode],
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except Exception:
-        # What was in the middle of a call when the context went down raises whatever it likes.
+        # A call that the end of the context interrupts may raise anything.
         if rclpy.ok():
             raise
     finally:

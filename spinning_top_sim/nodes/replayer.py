@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `replay`: publishes the messages of a log with their recorded distances."""
+"""The node `replay`: publishes the messages of a log with their recorded spacing."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ TYPE_NAME = re.compile(
     r'(?P<package>[a-z][a-z0-9_]*)/((?P<folder>msg|srv|action)/)?(?P<name>[A-Z][A-Za-z0-9_]*)')
 AMENT_INDEX = 'share/ament_index/resource_index/packages'
 SLOWEST, FASTEST = 1e-6, 1e9
-# Policies that tell nothing, and that no publisher can offer.
+# Policies that no publisher can offer.
 UNKNOWN = {
     'history': QoSHistoryPolicy.UNKNOWN, 'reliability': QoSReliabilityPolicy.UNKNOWN,
     'durability': QoSDurabilityPolicy.UNKNOWN, 'liveliness': QoSLivelinessPolicy.UNKNOWN}
@@ -191,7 +191,7 @@ class Replayer(Node):
         if topic.metadata.get('topic_type_hash', installed) not in {'', installed}:
             self.get_logger().warning(
                 f'{topic.name} was recorded with another {topic.type_name} than is installed: '
-                'who listens may misread it')
+                'subscribers may misread it')
 
     def _profile(self, name: str, profiles: list[Mapping[str, Any]]) -> QoSProfile:
         """Return the recorded QoS; the default where publishers had different ones."""
@@ -210,7 +210,7 @@ class Replayer(Node):
     # ---------------------------------------------------------------------- start and stop
 
     def start(self) -> None:
-        """Begin to play, after what the options say to wait for."""
+        """Begin to play: after `delay`, and when there are enough subscribers."""
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         self._ahead = ReadAhead(
             rounds(self._messages, self._span_ns, self._options.loop))

@@ -199,10 +199,13 @@ class Simulator(Node):
 
     # ------------------------------------------------------------------------------- ticks
 
-    @guarded
     def _tick(self) -> bool:
-        with self._lock:
-            return self._loop.tick()
+        try:
+            with self._lock:
+                return self._loop.tick()
+        except Exception as error:
+            self.fail(error)
+            return False
 
     @guarded
     def _idle(self) -> None:
