@@ -62,6 +62,7 @@ class RecordingSession:
         self._simulation, self._lock, self._resolve = simulation, lock, resolve
         self._recorder: McapRecorder | None = None
         self._pending: list[Messages] | None = None     # while a log is being opened
+        # What `attach` leaves to `open`.
         self._open_log: Callable[[], McapRecorder]
         self._streams: list[Stream] = []
         self._journal_topics: dict[str, int] = {}
@@ -130,6 +131,7 @@ class RecordingSession:
                     recorder.write_all(*messages)
                 self._recorder, self._pending, self.error = recorder, None, None
                 self._simulation.log_to(recorder.write_all, self._streams)
+                self._streams = []
             return f'recording to {recorder.path}'
 
     def _keep(self, indices: Sequence[int], stamp_ns: int, messages: Sequence[bytes],
@@ -179,10 +181,11 @@ class RecordingSession:
         self._write(journal.EVENTS, at_ns, journal.event(event, at_ns, sent_ns, **details))
 
     def _write(self, topic: str, at_ns: int, data: bytes) -> None:
-        write = self._keep if self._recorder is None else self._recorder.write_all
-        if self._recorder is not None or self._pending is not None:
-            write((self._journal_topics[topic],), self._simulation.epoch_ns + at_ns, (data,),
-                  len(data))
+        stamp_ns = self._simulation.epoch_ns + at_ns
+        if self._recorder is not None:
+            self._recorder.write(self._journal_topics[topic], stamp_ns, data)
+        elif self._pending is not None:
+            self._keep((self._journal_topics[topic],), stamp_ns, (data,), len(data))
 
     def has_room(self) -> bool:
         """Return whether more messages can be taken without losing any."""

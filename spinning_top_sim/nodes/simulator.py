@@ -49,9 +49,10 @@ def guarded(callback: Callable) -> Callable:
             return callback(self, *arguments)
         except Exception as error:
             self.fail(error)
-            response = arguments[-1] if len(arguments) == 2 else None
-            if response is not None:
-                response.success, response.message = False, f'{type(error).__name__}: {error}'
+            if len(arguments) != 2:
+                return None
+            _, response = arguments         # of a service
+            response.success, response.message = False, f'{type(error).__name__}: {error}'
             return response
     return call
 
