@@ -156,6 +156,17 @@ def test_a_file_that_is_named_is_never_overwritten_and_nothing_is_kept(tmp_path)
     assert recorded.session.numbers() == {'recorder': 'off'}
 
 
+def test_topics_of_one_name_are_refused_and_nothing_is_kept(tmp_path):
+    """As two topics are that were remapped to the same name."""
+    recorded = Recorded(tmp_path)
+    recorded.publishers['joint_states'].topic_name = '/ns/pose'
+    with pytest.raises(RecordingError, match="'/ns/pose' is listed twice"):
+        recorded.start()
+    assert list(tmp_path.iterdir()) == []
+    assert not any(stream.recorded for stream in recorded.simulation.streams)
+    assert recorded.session.stop() is None
+
+
 def test_a_second_start_and_a_second_stop_do_nothing(tmp_path):
     recorded = Recorded(tmp_path / 'one.mcap')
     recorded.start()

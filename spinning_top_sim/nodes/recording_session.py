@@ -23,7 +23,6 @@ from spinning_top_sim.streams.topics import Stream
 
 # Opening a log imports and loads libraries, so that is done where a log is opened.
 if TYPE_CHECKING:
-    from spinning_top_sim.recording.rosbag2 import RecordedTopic
     from spinning_top_sim.recording.writer import McapRecorder
 
 # Stamps whose messages wait at most for the file that is being opened.
@@ -89,16 +88,12 @@ class RecordingSession:
             By the topics of streams; their QoS is recorded too.
 
         """
-        from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
-
         with self._lock:
             simulation = self._simulation
             streams = journal.recorded_streams(simulation.streams, values)
-            topics = [RecordedTopic(publishers[stream.topic].topic_name, stream.type_name,
-                                    _offered_qos(publishers[stream.topic].qos_profile))
-                      for stream in streams]
-            topics += [RecordedTopic(self._resolve(name), type_name)
-                       for name, type_name in journal.TOPICS]
+            topics = [(publishers[stream.topic].topic_name, stream.type_name,
+                       _offered_qos(publishers[stream.topic].qos_profile)) for stream in streams]
+            topics += [(self._resolve(name), type_name, {}) for name, type_name in journal.TOPICS]
             run = (simulation.values, simulation.epoch_ns, simulation.now_ns,
                    tuple(simulation.history), values)
             self._open_log = functools.partial(_open, topics, run)
@@ -115,17 +110,17 @@ class RecordingSession:
         Raises
         ------
         RecordingError
-            If it cannot be opened; then nothing is recorded.
+            If it cannot be opened, for whatever reason; then nothing is recorded.
 
         """
         with self._file_lock:
             try:
                 recorder = self._open_log()
-            except BaseException:
+            except Exception as error:
                 with self._lock:
                     self._pending = None
                     self._simulation.log_to(self._keep, ())
-                raise
+                raise RecordingError(str(error)) from error
             with self._lock:
                 for messages in self._pending or ():
                     recorder.write_all(*messages)
@@ -217,19 +212,20 @@ class RecordingSession:
                 'longest flush [s]': f'{counters.longest_flush:.3f}'}
 
 
-def _open(topics: Sequence[RecordedTopic], run: Run) -> McapRecorder:
+def _open(topics: Sequence[tuple[str, str, dict[str, int]]], run: Run) -> McapRecorder:
     """Open the log that `record.uri` asks for, under the first name that is free in a folder."""
     from spinning_top_sim.recording.provenance import provenance  # noqa: PLC0415
+    from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
     from spinning_top_sim.recording.writer import McapRecorder  # noqa: PLC0415
 
-    values = run[-1]
-    metadata = provenance(*run)
+    values, metadata = run[-1], provenance(*run)
+    recorded = [RecordedTopic(*topic) for topic in topics]
     path = Path(values['record.uri']).expanduser().absolute()
     names_itself = values['record.uri'] and not path.is_dir()
     for free in (path,) if names_itself else _dated(path):
         try:
             return McapRecorder.open(
-                free, topics, metadata, max_loss=values['record.max_loss'],
+                free, recorded, metadata, max_loss=values['record.max_loss'],
                 compression=values['record.compression'],
                 min_free_bytes=values['record.min_free_bytes'])
         except RecordingError as error:
