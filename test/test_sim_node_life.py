@@ -223,6 +223,25 @@ def test_a_signal_while_it_starts_ends_it_quietly(tmp_path, number):
     assert 0 in seen
 
 
+def test_a_sigint_that_python_drops_ends_it_all_the_same(tmp_path):
+    """One that comes in a weak reference's callback, of which imports have many."""
+    program = """
+import signal, sys, weakref
+from spinning_top_sim.nodes import executable
+def prepare(argv):
+    class Thing:
+        pass
+    thing = Thing()
+    reference = weakref.ref(thing, lambda _: signal.raise_signal(signal.SIGINT))
+    del thing
+    return lambda: print('made')
+sys.exit(executable.run('program', sys.argv, prepare))
+"""
+    with SimNode(tmp_path, program=('-c', program)) as node:
+        assert node.wait() == 130
+    assert node.out == node.err == ''
+
+
 def test_a_reader_of_the_terminal_who_goes_away_does_not_end_the_motion(peer, tmp_path):
     """As in `sim_node | head -1`: the status line has no reader, the topics have."""
     with SimNode(tmp_path, {'status_period': 0.05}, program=(

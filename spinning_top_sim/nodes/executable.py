@@ -54,6 +54,8 @@ class _Signals:
 
     def __init__(self) -> None:
         self.told = False
+        self._lost = False
+        sys.unraisablehook = self._keep_interrupt
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
             signal.signal(signal.SIGINT, self._interrupt)
         for number in (signal.SIGHUP, signal.SIGQUIT):
@@ -63,6 +65,18 @@ class _Signals:
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
         if not self.told:
             self.told = True
+            raise KeyboardInterrupt
+
+    def _keep_interrupt(self, error: sys.UnraisableHookArgs) -> None:
+        """Keep a KeyboardInterrupt that Python drops, as in a weak reference's callback."""
+        if issubclass(error.exc_type, KeyboardInterrupt):
+            self._lost = True
+        else:
+            sys.__unraisablehook__(error)
+
+    def check(self) -> None:
+        """Raise a KeyboardInterrupt that Python has dropped."""
+        if self._lost:
             raise KeyboardInterrupt
 
     def off(self) -> None:
@@ -94,6 +108,7 @@ def run(name: str, argv: list[str],
             make_node = prepare(argv)
         except (ValueError, RuntimeError, OSError) as error:
             return _cannot_start(name, error)
+        signals.check()
         return 0 if make_node is None else _run(name, argv, make_node, signals)
     except KeyboardInterrupt:           # before the node was there
         return 130
@@ -144,6 +159,7 @@ def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode],
         # A full collection waits until there is a quarter more than the one before has found.
         # This one finds nothing, so the cyclic garbage of service calls does not pile up.
         gc.collect()
+        signals.check()
         node.start()
         # From here on rclpy ends the spin at a signal; KeyboardInterrupt would interrupt its code.
         signals.told = True
