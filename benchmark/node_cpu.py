@@ -8,7 +8,8 @@ Processor time of `sim_node`, beside an ordinary rclpy node and beside one that 
 
 Three streams (pose, joint_states, imu/data_raw) at the same rate, for 0, 1 and 3 other processes
 that subscribe to all three.  `sim_node` runs with a tick a sample, and with the 200 ticks a second
-that it has by default, so above that samples come several at a time.  Beside it `straightforward_node.py` (a timer, scipy's RK45, message objects) and
+that it has by default, so above that samples come several at a time.  Beside it
+`straightforward_node.py` (a timer, scipy's RK45, message objects) and
 `bare_node.py` (the floor: constant bytes, a tick a sample, by timer and by thread).  Everything
 takes turns, in every round; what is reported are medians of rounds and of ratios within a round.
 Processor time is that of the whole process, its DDS threads too, over the time measured; arrivals

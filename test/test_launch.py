@@ -52,7 +52,7 @@ def installed(monkeypatch):
     monkeypatch.setattr(packages, 'get_package_prefix', prefix)
     monkeypatch.setattr(packages, 'get_package_share_directory', lambda name: str(ROOT))
     for module, names in {
-            'launch': ('Action', 'LaunchContext', 'LaunchDescription'),
+            'launch': ('LaunchContext', 'LaunchDescription'), 'launch.action': ('Action',),
             'launch.actions': ('DeclareLaunchArgument', 'EmitEvent', 'LogInfo', 'OpaqueFunction',
                                'RegisterEventHandler'),
             'launch.event_handlers': ('OnProcessExit',), 'launch.events': ('Shutdown',),

@@ -136,7 +136,7 @@ def test_giving_way_goes_on_without_listeners_too():
     while not simulation.advance(2_000_000, give_way=lambda: True):
         found.append(simulation.now_ns)
         simulation.state()
-        # One step holds less than a microsecond: what is kept are not the steps before.
+        # Steps are 2 us long: those of the time before are not kept.
         assert simulation.now_ns - 10_000 < simulation.segment.solver.earliest_ns
     assert len(found) > 2
     assert found[-1] > 0

@@ -14,7 +14,9 @@ from helpers.node_harness import PATIENCE_S
 from helpers.node_logs import events_in, log_of
 from rclpy.qos import QoSProfile
 
+from spinning_top_sim.nodes.pacing import FairLock
 from spinning_top_sim.nodes.recording_session import RecordingSession
+from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.writer import McapRecorder
 from spinning_top_sim.streams import parameters
@@ -36,7 +38,7 @@ class Recorded:
             stream.topic: SimpleNamespace(topic_name=f'/ns/{stream.topic.lstrip("~/")}',
                                           qos_profile=QoSProfile(depth=10))
             for stream in self.simulation.streams}
-        self.lock = threading.RLock()
+        self.lock = FairLock()
         self.session = RecordingSession(self.simulation, self.lock,
                                         lambda name: f'/ns/top/{name.lstrip("~/")}')
 
@@ -71,13 +73,12 @@ def test_ticks_and_commands_go_on_while_a_log_is_being_opened_and_are_in_it(tmp_
     opening = threading.Thread(target=lambda: answers.append(recorded.start()), daemon=True)
     opening.start()
     assert slow_disk.opening.wait(PATIENCE_S)
-    # This thread gets the lock though the other one waits for the disk.
-    assert recorded.lock.acquire(timeout=PATIENCE_S)
-    simulation.advance(2 * SECOND)
-    simulation.command(2.0, 1.0)
-    session.write_command(2 * SECOND, 2.0, 1.0)
-    simulation.advance(3 * SECOND)
-    recorded.lock.release()
+    assert recorded.lock._owner is None             # the other thread waits for the disk
+    with recorded.lock:
+        simulation.advance(2 * SECOND)
+        simulation.command(2.0, 1.0)
+        session.write_command(2 * SECOND, 2.0, 1.0)
+        simulation.advance(3 * SECOND)
     assert session.has_room() and session.size is None
     slow_disk.go_on.set()
     opening.join(PATIENCE_S)
@@ -90,6 +91,17 @@ def test_ticks_and_commands_go_on_while_a_log_is_being_opened_and_are_in_it(tmp_
     assert json.loads(metadata['spinning_top_sim']['history']) == []
     assert [event['event'] for event in events_in(log)] == ['start', 'command']
     assert len(log['/ns/top/commands']) == 1
+
+
+def test_what_reads_files_is_done_without_the_lock(tmp_path, monkeypatch):
+    recorded = Recorded(tmp_path)
+    owners = []
+    ordinary = provenance.surroundings
+    monkeypatch.setattr(provenance, 'surroundings',
+                        lambda: owners.append(recorded.lock._owner) or ordinary())
+    recorded.start()
+    recorded.stop()
+    assert owners == [None]
 
 
 def test_what_waits_for_the_file_is_bounded(tmp_path, slow_disk, monkeypatch):
@@ -142,6 +154,17 @@ def test_a_file_that_is_named_is_never_overwritten_and_nothing_is_kept(tmp_path)
     recorded.simulation.advance(SECOND)
     assert recorded.session.stop() is None
     assert recorded.session.numbers() == {'recorder': 'off'}
+
+
+def test_topics_of_one_name_are_refused_and_nothing_is_kept(tmp_path):
+    """As two topics are that were remapped to the same name."""
+    recorded = Recorded(tmp_path)
+    recorded.publishers['joint_states'].topic_name = '/ns/pose'
+    with pytest.raises(RecordingError, match="'/ns/pose' is listed twice"):
+        recorded.start()
+    assert list(tmp_path.iterdir()) == []
+    assert not any(stream.recorded for stream in recorded.simulation.streams)
+    assert recorded.session.stop() is None
 
 
 def test_a_second_start_and_a_second_stop_do_nothing(tmp_path):

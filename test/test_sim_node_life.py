@@ -26,6 +26,7 @@ from helpers.node_logs import (
     decoded,
     log_of,
     settled,
+    stamp_of,
     the_log,
 )
 from sensor_msgs.msg import JointState
@@ -160,7 +161,7 @@ def test_the_default_scene_imports_just_what_it_uses(finished):
     assert ours == {
         *(f'nodes.{name}' for name in (
             'executable', 'pacing', 'recording_session', 'reports', 'ros_parameters',
-            'simulator', 'tick_loop')), 'recording.errors',
+            'simulator', 'stream_publishers', 'tick_loop')), 'recording.errors',
         *(f'physics.{name}' for name in (
             'attitude', 'kinematics', 'pairs', 'regimes', 'shape', 'top')),
         *(f'solvers.{name}' for name in (
@@ -222,6 +223,25 @@ def test_a_signal_while_it_starts_ends_it_quietly(tmp_path, number):
     assert 0 in seen
 
 
+def test_a_sigint_that_python_drops_ends_it_all_the_same(tmp_path):
+    """One that comes in a weak reference's callback, of which imports have many."""
+    program = """
+import signal, sys, weakref
+from spinning_top_sim.nodes import executable
+def prepare(argv):
+    class Thing:
+        pass
+    thing = Thing()
+    reference = weakref.ref(thing, lambda _: signal.raise_signal(signal.SIGINT))
+    del thing
+    return lambda: print('made')
+sys.exit(executable.run('program', sys.argv, prepare))
+"""
+    with SimNode(tmp_path, program=('-c', program)) as node:
+        assert node.wait() == 130
+    assert node.out == node.err == ''
+
+
 def test_a_reader_of_the_terminal_who_goes_away_does_not_end_the_motion(peer, tmp_path):
     """As in `sim_node | head -1`: the status line has no reader, the topics have."""
     with SimNode(tmp_path, {'status_period': 0.05}, program=(
@@ -233,6 +253,18 @@ def test_a_reader_of_the_terminal_who_goes_away_does_not_end_the_motion(peer, tm
         peer.stop_listening(pose)
     assert code == 0, node.err
     assert TRACEBACK not in node.err
+
+
+def test_without_the_events_executor_the_node_works_too(peer, tmp_path):
+    program = ('import runpy, sys; sys.modules["rclpy.experimental"] = None\n'
+               'runpy.run_module("spinning_top_sim.nodes.sim_node", run_name="__main__")')
+    with SimNode(tmp_path, {**QUIET, 'record.enabled': True}, program=('-c', program)) as node:
+        pose = peer.listen(node.topic('pose'), PoseStamped).wait(30)
+        assert peer.switch(node, 'set_pause', True).success
+        by_parameters(peer, node, 2.0, 1.0)
+        assert_clean_end(node, node.end())
+        peer.stop_listening(pose)
+    log_of(the_log(node.folder))
 
 
 # ------------------------------------------------------------------- nobody listens, overload
@@ -338,61 +370,73 @@ def test_the_euler_form_at_a_pole_stands_still_and_says_why(peer, diagnostics, t
     assert 'leapt over a pole' in node.err
 
 
-# A method that raises as long as there is a file `broken`.
-BREAKABLE = """
+# In a tick, in idle work, in reports, in a service, by a topic, in a parameter's change.
+BREAKABLE = (
+    'tick_loop.TickLoop.tick', 'tick_loop.TickLoop.idle', 'reports.MotionReport.diagnostics',
+    'reports.MotionReport.status_line', 'tick_loop.TickLoop.pause', 'tick_loop.TickLoop.command',
+    'simulator.Simulator._put_into_effect')
+# Each of these methods raises as long as there is a file of its name.
+BREAKING = f"""
 import importlib, os, sys
 from spinning_top_sim.nodes.sim_node import main
-module, kind, name = {method!r}.rsplit('.', 2)
-kind = getattr(importlib.import_module('spinning_top_sim.nodes.' + module), kind)
-ordinary = getattr(kind, name)
-def method(*arguments):
-    if os.path.exists('broken'):
-        raise ZeroDivisionError('nobody expected this')
-    return ordinary(*arguments)
-setattr(kind, name, method)
+def break_(path):
+    module, kind, name = path.rsplit('.', 2)
+    kind = getattr(importlib.import_module('spinning_top_sim.nodes.' + module), kind)
+    ordinary = getattr(kind, name)
+    def method(*arguments):
+        if os.path.exists(path):
+            raise ZeroDivisionError('nobody expected this')
+        return ordinary(*arguments)
+    setattr(kind, name, method)
+for path in {BREAKABLE!r}:
+    break_(path)
 sys.exit(main())
 """
 
 
-@pytest.mark.parametrize('method', [
-    'tick_loop.TickLoop.tick', 'tick_loop.TickLoop.idle', 'reports.MotionReport.diagnostics',
-    'reports.MotionReport.status_line', 'tick_loop.TickLoop.pause', 'tick_loop.TickLoop.command',
-    'simulator.Simulator._put_into_effect'])
-def test_an_error_that_nobody_expects_stops_the_motion_loudly_until_a_reset(
-        peer, diagnostics, tmp_path, method):
-    """In a tick, in idle work, in a report, in a service, in a topic, in a parameter's change."""
-    with SimNode(tmp_path, {'record.enabled': True, 'status_period': 0.2},
-                 program=('-c', BREAKABLE.format(method=method))) as node:
-        pose = peer.listen(node.topic('pose'), PoseStamped).wait(20)
-        if method.endswith('command'):
-            peer.introduce(node, diagnostics)
-        (node.folder / 'broken').touch()
-        if method.endswith('pause'):
-            answer = peer.switch(node, 'set_pause', True)
-            assert not answer.success and 'nobody expected this' in answer.message
-        elif method.endswith('command'):
-            peer.send_command(node, 1.0, 1.0)
-        elif method.endswith('effect'):
-            answer = peer.set_together(node, pose__rate=50.0)
-            assert not answer.successful and 'nobody expected this' in answer.reason
-        wait_for('an error', lambda: 'the motion stands still until ~/reset' in node.err)
-        (node.folder / 'broken').unlink()
-        status = diagnostics.wait_for(node, 'an error', lambda s: s.level == b'\x02')
-        assert 'unexpected ZeroDivisionError: nobody expected this' in status.message
-        wait_for('the status line', lambda: ' FAILED |' in node.out.splitlines()[-1])
-        count = settled(pose)
-        logged = [data for _, data in log_of(the_log(node.folder))[0][node.topic('pose')]]
-        assert_received_from(pose.raw, logged)
-        assert peer.trigger(node, 'reset').success
-        pose.wait(count + 50)
-        diagnostics.wait_for(node, 'the recording that ended', lambda s: 'recording: unexpected'
-                             in s.message)
-        assert peer.set_together(node, record__uri='second.mcap').successful is True
-        assert peer.switch(node, 'record', True).success
-        diagnostics.wait_for(node, 'no error', lambda s: s.level == b'\x00')
+@pytest.fixture(scope='module')
+def breakable(peer, diagnostics, tmp_path_factory):
+    with SimNode(tmp_path_factory.mktemp('breakable'), {'status_period': 0.2},
+                 program=('-c', BREAKING)) as node:
+        pose = peer.listen(node.topic('pose'), PoseStamped)
+        peer.introduce(node, diagnostics)
+        yield SimpleNamespace(node=node, pose=pose)
         assert node.end() == 0, node.err
         peer.stop_listening(pose)
-    log_of(node.folder / 'second.mcap')
+
+
+@pytest.mark.parametrize('method', BREAKABLE)
+def test_an_error_that_nobody_expects_stops_the_motion_loudly_until_a_reset(
+        peer, diagnostics, breakable, method):
+    node, pose = breakable.node, breakable.pose
+    log = node.folder / f'{method}.mcap'
+    assert peer.set_together(node, record__uri=str(log)).successful
+    assert peer.switch(node, 'record', True).success
+    before, said = len(pose.raw), node.err.count('until ~/reset')
+    pose.wait(before + 20)
+    (node.folder / method).touch()
+    if method.endswith('pause'):
+        answer = peer.switch(node, 'set_pause', True)
+        assert not answer.success and 'nobody expected this' in answer.message
+    elif method.endswith('command'):
+        peer.send_command(node, 1.0, 1.0)
+    elif method.endswith('effect'):
+        answer = peer.set_together(node, pose__rate=50.0)
+        assert not answer.successful and 'nobody expected this' in answer.reason
+    wait_for('an error', lambda: node.err.count('until ~/reset') > said)
+    (node.folder / method).unlink()
+    status = diagnostics.wait_for(node, 'an error', lambda s: s.level == b'\x02')
+    assert 'unexpected ZeroDivisionError: nobody expected this' in status.message
+    wait_for('the status line', lambda: ' FAILED |' in node.out.splitlines()[-1])
+    count = settled(pose)
+    logged = [data for _, data in log_of(log)[0][node.topic('pose')]]
+    assert_received_from([data for data in pose.raw if stamp_of(data) >= stamp_of(logged[0])],
+                         logged)
+    assert peer.trigger(node, 'reset').success
+    pose.wait(count + 50)
+    status = diagnostics.wait_for(node, 'the recording that ended',
+                                  lambda s: 'recording: unexpected' in s.message)
+    assert status.level == b'\x02'
 
 
 SMALL_FILES = """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a tick does on clocks of its own: due samples, lateness, overload, pause, step, reset."""
+"""What a tick does, on a clock of its own: late ticks, overload, pause, step, reset."""
 
 import pytest
 
@@ -43,8 +43,7 @@ class Run:
             self.simulation, self.values, Hooks(
                 update_subscribers=lambda: self.told.append('subscribers'),
                 has_room=room, clock_started=lambda at: self.told.append(('began', at)),
-                overloaded=self.told.append,
-                failed=lambda why: self.told.append(f'failed: {why}'),
+                warn=self.told.append, error=self.told.append,
                 duration_passed=lambda: self.told.append('passed')),
             source=self.clock, steady=self.clock)
 
@@ -207,7 +206,7 @@ def test_what_is_too_late_is_recorded_but_not_published_and_warned_about_once():
     assert run.stamps == grid(run.simulation.now_ns)
     assert len(run.published) - sent == 2 * 50
     assert run.pose.skipped > 0
-    assert [what for what in run.told if 'skip' in what] == ['live topics skip samples']
+    assert sum('live topics skip samples' in told for told in run.told) == 1
 
 
 def test_a_clock_too_far_ahead_slips():
@@ -226,7 +225,7 @@ def test_a_clock_too_far_ahead_slips():
     run.ticks(4)
     assert run.loop.now_ns == 8 * TICK_NS
     assert run.stamps == grid(8 * TICK_NS)
-    assert 'the clock slips' in run.told
+    assert sum('the clock slips' in told for told in run.told) == 1
 
 
 def test_a_tick_gives_way_when_its_time_is_up(monkeypatch):
@@ -274,7 +273,7 @@ def test_equations_that_cannot_go_on_stop_the_motion_until_a_reset():
     run.ticks(400)
     stands_at = run.loop.now_ns
     assert 'pole' in run.loop.failure
-    assert sum('failed' in told for told in run.told) == 1
+    assert sum('until ~/reset' in told for told in run.told) == 1
     with pytest.raises(ValueError, match='stands still'):
         run.loop.command(1.0, 1.0)
     run.ticks(5)

@@ -8,13 +8,13 @@ import re
 import signal
 import sys
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, cast
 
 if TYPE_CHECKING:
     from types import FrameType
 
-    from rclpy.context import Context
     from rclpy.executors import Executor
+    from rclpy.node import Node
     from rclpy.task import Future
 
 # Longest wait of the executor [s]: Python answers SIGHUP and SIGQUIT between two waits.
@@ -33,7 +33,6 @@ class RunnableNode(Protocol):
     """
 
     finished: Future
-    context: Context
 
     def start(self) -> None:
         """Begin to work: the node is about to be spun."""
@@ -55,6 +54,8 @@ class _Signals:
 
     def __init__(self) -> None:
         self.told = False
+        self._lost = False
+        sys.unraisablehook = self._keep_interrupt
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
             signal.signal(signal.SIGINT, self._interrupt)
         for number in (signal.SIGHUP, signal.SIGQUIT):
@@ -64,6 +65,18 @@ class _Signals:
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
         if not self.told:
             self.told = True
+            raise KeyboardInterrupt
+
+    def _keep_interrupt(self, error: sys.UnraisableHookArgs) -> None:
+        """Keep a KeyboardInterrupt that Python drops, as in a weak reference's callback."""
+        if issubclass(error.exc_type, KeyboardInterrupt):
+            self._lost = True
+        else:
+            sys.__unraisablehook__(error)
+
+    def check(self) -> None:
+        """Raise a KeyboardInterrupt that Python has dropped."""
+        if self._lost:
             raise KeyboardInterrupt
 
     def off(self) -> None:
@@ -95,6 +108,7 @@ def run(name: str, argv: list[str],
             make_node = prepare(argv)
         except (ValueError, RuntimeError, OSError) as error:
             return _cannot_start(name, error)
+        signals.check()
         return 0 if make_node is None else _run(name, argv, make_node, signals)
     except KeyboardInterrupt:           # before the node was there
         return 130
@@ -138,15 +152,16 @@ def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode],
         except (ValueError, RuntimeError, OSError, ParameterException) as error:
             return _cannot_start(name, error) if rclpy.ok() else 0
         executor = _executor()
-        executor.add_node(node)
+        executor.add_node(cast('Node', node))
         node.finished.add_done_callback(lambda _: executor.wake())
         gc.collect()
-        gc.freeze()             # what there is now stays: no full collection in the middle of it
-        # Which waits until there is a quarter more than the one before has found: of nothing now,
-        # so that cyclic garbage (rclpy makes some with every service call) does not pile up.
+        gc.freeze()             # no full collection goes through what is there from the start
+        # A full collection waits until there is a quarter more than the one before has found.
+        # This one finds nothing, so the cyclic garbage of service calls does not pile up.
         gc.collect()
+        signals.check()
         node.start()
-        # rclpy ends the spin at any signal; an exception in the midst of its code only does harm.
+        # From here on rclpy ends the spin at a signal; KeyboardInterrupt would interrupt its code.
         signals.told = True
         # Without a timeout, the EventsExecutor of Jazzy hangs.
         while rclpy.ok() and not node.finished.done():
@@ -156,7 +171,7 @@ def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode],
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except Exception:
-        # What was in the middle of a call when the context went down raises whatever it likes.
+        # A call that the end of the context interrupts may raise anything.
         if rclpy.ok():
             raise
     finally:

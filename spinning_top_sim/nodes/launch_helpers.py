@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the launch files share: switches, the frames of a top, and who shows them."""
+"""What the launch files share: arguments, robot_state_publisher and RViz."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
-from launch import Action
+from launch.action import Action
 from launch.actions import EmitEvent, LogInfo, RegisterEventHandler
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
@@ -20,13 +20,13 @@ from spinning_top_sim.tools.names import resolve_topic
 from spinning_top_sim.tools.urdf import inertia_warning, robot_description
 
 STATE_PUBLISHER = 'robot_state_publisher'
-# The highest it takes [Hz].
+# The highest rate that it accepts [Hz].
 HIGHEST_PUBLISH_FREQUENCY = 1000.0
 SWITCHES = {'true': True, 'false': False}
 
 
 def switch(name: str, text: str) -> bool:
-    """Return whether an argument is true.  Raises ValueError where it is neither."""
+    """Return whether an argument is 'true'.  Raises ValueError unless it is 'true' or 'false'."""
     if text.lower() not in SWITCHES:
         raise ValueError(f'{name} = {text!r}: must be true or false')
     return SWITCHES[text.lower()]
@@ -46,10 +46,24 @@ def number(name: str, text: str, *, zero: bool = False) -> float:
 def state_publisher(share: Path, values: Mapping[str, Any], namespace: str, joint_states: str,
                     use_sim_time: bool) -> list[Action]:
     """
-    Return what puts joint states (the topic's full name) into TF.
+    Return robot_state_publisher, or a line that says why there is no TF.
 
-    share: of this package;  values: checked parameters.  Raises ValueError for impossible frames.
-    Where robot_state_publisher is not installed there is no TF, and a line that says so.
+    Parameters
+    ----------
+    share
+        Share folder of this package.
+    values
+        Checked parameters of the top.
+    namespace, joint_states
+        Namespace of the node, and full name of the topic.
+    use_sim_time
+        Whether it follows /clock.
+
+    Raises
+    ------
+    ValueError
+        If the frames are impossible.
+
     """
     try:
         get_package_prefix(STATE_PUBLISHER)
@@ -60,8 +74,8 @@ def state_publisher(share: Path, values: Mapping[str, Any], namespace: str, join
     except ImportError:
         return [LogInfo(msg='no TF: the package xacro is not installed')]
     warning = inertia_warning(values)
-    said: list[Action] = [LogInfo(msg=f'WARNING: {warning}')] if warning else []
-    return [*said, Node(
+    warnings: list[Action] = [LogInfo(msg=f'WARNING: {warning}')] if warning else []
+    return [*warnings, Node(
         package=STATE_PUBLISHER, executable=STATE_PUBLISHER, namespace=namespace,
         remappings=[('joint_states', joint_states)], parameters=[{
             'robot_description': ParameterValue(description, value_type=str),
@@ -70,7 +84,7 @@ def state_publisher(share: Path, values: Mapping[str, Any], namespace: str, join
 
 
 def rviz(share: Path, world_frame: str, namespace: str, use_sim_time: bool) -> Node:
-    """Return RViz, looking at the top of a namespace.  Raises LookupError without rviz2."""
+    """Return RViz with the topics of a namespace.  Raises LookupError if it is not installed."""
     get_package_prefix('rviz2')     # before anything is started
     return Node(
         package='rviz2', executable='rviz2', namespace=namespace,
@@ -81,6 +95,6 @@ def rviz(share: Path, world_frame: str, namespace: str, use_sim_time: bool) -> N
 
 
 def until_it_ends(node: Node) -> list[Action]:
-    """Return a node, and the end of everything when it ends."""
+    """Return a node, and an action that shuts everything down when it ends."""
     return [node, RegisterEventHandler(OnProcessExit(
         target_action=node, on_exit=[EmitEvent(event=Shutdown(reason='it has ended'))]))]

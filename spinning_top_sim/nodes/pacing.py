@@ -70,24 +70,24 @@ class MonotonicClock:
     source
         Returns the time of the clock to follow [ns].
 
-    Attributes
-    ----------
-    stepped_back_ns : int
-        Sum of all steps back [ns].
-
     """
 
     def __init__(self, source: Callable[[], int]) -> None:
         self._source = source
         self._newest: int | None = None
-        self.stepped_back_ns = 0
+        self._stepped_back_ns = self._taken_ns = 0
 
     def __call__(self) -> int:
         reading = self._source()
         if self._newest is not None and reading < self._newest:
-            self.stepped_back_ns += self._newest - reading
+            self._stepped_back_ns += self._newest - reading
         self._newest = reading
-        return reading + self.stepped_back_ns
+        return reading + self._stepped_back_ns
+
+    def take_step_back(self) -> int:
+        """Return by how much the clock has stepped back since this was last asked [ns]."""
+        before, self._taken_ns = self._taken_ns, self._stepped_back_ns
+        return self._taken_ns - before
 
 
 class FairLock:

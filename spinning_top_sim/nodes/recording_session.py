@@ -23,7 +23,6 @@ from spinning_top_sim.streams.topics import Stream
 
 # Opening a log imports and loads libraries, so that is done where a log is opened.
 if TYPE_CHECKING:
-    from spinning_top_sim.recording.rosbag2 import RecordedTopic
     from spinning_top_sim.recording.writer import McapRecorder
 
 # Stamps whose messages wait at most for the file that is being opened.
@@ -31,6 +30,8 @@ MOST_PENDING = 20_000
 
 # Messages of one stamp: indices of their topics, stamp [ns], CDR of each, size of all [bytes].
 Messages = tuple[Sequence[int], int, Sequence[bytes], int]
+# What `provenance` takes; the present values come last.
+Run = tuple[Mapping[str, Any], int, int, tuple[tuple[int, float, float], ...], Mapping[str, Any]]
 
 
 class RecordingSession:
@@ -60,6 +61,7 @@ class RecordingSession:
         self._simulation, self._lock, self._resolve = simulation, lock, resolve
         self._recorder: McapRecorder | None = None
         self._pending: list[Messages] | None = None     # while a log is being opened
+        # What `attach` leaves to `open`.
         self._open_log: Callable[[], McapRecorder]
         self._streams: list[Stream] = []
         self._journal_topics: dict[str, int] = {}
@@ -86,20 +88,15 @@ class RecordingSession:
             By the topics of streams; their QoS is recorded too.
 
         """
-        from spinning_top_sim.recording.provenance import provenance  # noqa: PLC0415
-        from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
-
         with self._lock:
             simulation = self._simulation
             streams = journal.recorded_streams(simulation.streams, values)
-            topics = [RecordedTopic(publishers[stream.topic].topic_name, stream.type_name,
-                                    _offered_qos(publishers[stream.topic].qos_profile))
-                      for stream in streams]
-            topics += [RecordedTopic(self._resolve(name), type_name)
-                       for name, type_name in journal.TOPICS]
-            metadata = provenance(simulation.values, simulation.epoch_ns, simulation.now_ns,
-                                  simulation.history, values)
-            self._open_log = functools.partial(_open, topics, metadata, values)
+            topics = [(publishers[stream.topic].topic_name, stream.type_name,
+                       _offered_qos(publishers[stream.topic].qos_profile)) for stream in streams]
+            topics += [(self._resolve(name), type_name, {}) for name, type_name in journal.TOPICS]
+            run = (simulation.values, simulation.epoch_ns, simulation.now_ns,
+                   tuple(simulation.history), values)
+            self._open_log = functools.partial(_open, topics, run)
             self._journal_topics = {name: len(streams) + i
                                     for i, (name, _) in enumerate(journal.TOPICS)}
             self._pending, self._streams = [], streams
@@ -113,22 +110,23 @@ class RecordingSession:
         Raises
         ------
         RecordingError
-            If it cannot be opened; then nothing is recorded.
+            If it cannot be opened, for whatever reason; then nothing is recorded.
 
         """
         with self._file_lock:
             try:
                 recorder = self._open_log()
-            except BaseException:
+            except Exception as error:
                 with self._lock:
                     self._pending = None
                     self._simulation.log_to(self._keep, ())
-                raise
+                raise RecordingError(str(error)) from error
             with self._lock:
                 for messages in self._pending or ():
                     recorder.write_all(*messages)
                 self._recorder, self._pending, self.error = recorder, None, None
                 self._simulation.log_to(recorder.write_all, self._streams)
+                self._streams = []
             return f'recording to {recorder.path}'
 
     def _keep(self, indices: Sequence[int], stamp_ns: int, messages: Sequence[bytes],
@@ -178,10 +176,11 @@ class RecordingSession:
         self._write(journal.EVENTS, at_ns, journal.event(event, at_ns, sent_ns, **details))
 
     def _write(self, topic: str, at_ns: int, data: bytes) -> None:
-        write = self._keep if self._recorder is None else self._recorder.write_all
-        if self._recorder is not None or self._pending is not None:
-            write((self._journal_topics[topic],), self._simulation.epoch_ns + at_ns, (data,),
-                  len(data))
+        stamp_ns = self._simulation.epoch_ns + at_ns
+        if self._recorder is not None:
+            self._recorder.write(self._journal_topics[topic], stamp_ns, data)
+        elif self._pending is not None:
+            self._keep((self._journal_topics[topic],), stamp_ns, (data,), len(data))
 
     def has_room(self) -> bool:
         """Return whether more messages can be taken without losing any."""
@@ -213,17 +212,20 @@ class RecordingSession:
                 'longest flush [s]': f'{counters.longest_flush:.3f}'}
 
 
-def _open(topics: Sequence[RecordedTopic], metadata: Mapping[str, str],
-          values: Mapping[str, Any]) -> McapRecorder:
+def _open(topics: Sequence[tuple[str, str, dict[str, int]]], run: Run) -> McapRecorder:
     """Open the log that `record.uri` asks for, under the first name that is free in a folder."""
+    from spinning_top_sim.recording.provenance import provenance  # noqa: PLC0415
+    from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
     from spinning_top_sim.recording.writer import McapRecorder  # noqa: PLC0415
 
+    values, metadata = run[-1], provenance(*run)
+    recorded = [RecordedTopic(*topic) for topic in topics]
     path = Path(values['record.uri']).expanduser().absolute()
     names_itself = values['record.uri'] and not path.is_dir()
     for free in (path,) if names_itself else _dated(path):
         try:
             return McapRecorder.open(
-                free, topics, metadata, max_loss=values['record.max_loss'],
+                free, recorded, metadata, max_loss=values['record.max_loss'],
                 compression=values['record.compression'],
                 min_free_bytes=values['record.min_free_bytes'])
         except RecordingError as error:

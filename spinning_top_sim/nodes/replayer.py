@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `replay`: publishes the messages of a log with their recorded distances."""
+"""The node `replay`: publishes the messages of a log with their recorded spacing."""
 
 from __future__ import annotations
 
@@ -50,13 +50,10 @@ TYPE_NAME = re.compile(
     r'(?P<package>[a-z][a-z0-9_]*)/((?P<folder>msg|srv|action)/)?(?P<name>[A-Z][A-Za-z0-9_]*)')
 AMENT_INDEX = 'share/ament_index/resource_index/packages'
 SLOWEST, FASTEST = 1e-6, 1e9
-# Policies that tell nothing, and that no publisher can offer.
+# Policies that no publisher can offer.
 UNKNOWN = {
-    'history': {QoSHistoryPolicy.UNKNOWN},
-    'reliability': {QoSReliabilityPolicy.UNKNOWN},
-    'durability': {QoSDurabilityPolicy.UNKNOWN},
-    'liveliness': {QoSLivelinessPolicy.UNKNOWN},
-}
+    'history': QoSHistoryPolicy.UNKNOWN, 'reliability': QoSReliabilityPolicy.UNKNOWN,
+    'durability': QoSDurabilityPolicy.UNKNOWN, 'liveliness': QoSLivelinessPolicy.UNKNOWN}
 # Longest wait for the last messages to be acknowledged: Fast DDS asks for it every 3 s.
 LAST_WORD_S = 5.0
 # Wait for subscribers that acknowledge nothing: shared memory goes with its sender.
@@ -194,7 +191,7 @@ class Replayer(Node):
         if topic.metadata.get('topic_type_hash', installed) not in {'', installed}:
             self.get_logger().warning(
                 f'{topic.name} was recorded with another {topic.type_name} than is installed: '
-                'who listens may misread it')
+                'subscribers may misread it')
 
     def _profile(self, name: str, profiles: list[Mapping[str, Any]]) -> QoSProfile:
         """Return the recorded QoS; the default where publishers had different ones."""
@@ -203,17 +200,17 @@ class Replayer(Node):
                                       'published as reliable, volatile')
             profiles = []
         recorded = {**DEFAULT_QOS, **(profiles[0] if profiles else {})}
-        policies = {key: _duration(value) if isinstance(value, Mapping) else value
-                    for key, value in recorded.items()}
-        for key in ('history', 'reliability', 'durability', 'liveliness'):
-            if policies[key] in UNKNOWN[key]:
+        policies: dict[str, Any] = {key: _duration(value) if isinstance(value, Mapping) else value
+                                    for key, value in recorded.items()}
+        for key, unknown in UNKNOWN.items():
+            if policies[key] == unknown:
                 policies[key] = DEFAULT_QOS[key]
         return QoSProfile(**{**policies, 'depth': policies['depth'] or DEFAULT_QOS['depth']})
 
     # ---------------------------------------------------------------------- start and stop
 
     def start(self) -> None:
-        """Begin to play, after what the options say to wait for."""
+        """Begin to play: after `delay`, and when there are enough subscribers."""
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         self._ahead = ReadAhead(
             rounds(self._messages, self._span_ns, self._options.loop))
@@ -285,7 +282,8 @@ class Replayer(Node):
     def _wait_to_begin(self) -> bool:
         """Wait for subscribers and the delay; return False when stopped meanwhile."""
         begin = time.monotonic() + self._options.delay
-        while (time.monotonic() < begin or self._subscribers() < self._options.wait_for_subscribers):
+        count = self._options.wait_for_subscribers
+        while time.monotonic() < begin or self._subscribers() < count:
             if not self._playback.rest(LOOK_S):
                 return False
         return True

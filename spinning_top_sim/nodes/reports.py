@@ -26,7 +26,7 @@ OK, WARN, ERROR = 0, 1, 2
 class Speedometer:
     """Measures the real-time factor, simulated over real time between two readings."""
 
-    # Reports that were held up follow each other at once: less time than this [s] is not measured.
+    # Shortest time to measure [s]: reports that were held up follow each other at once.
     SHORTEST = 0.1
 
     def __init__(self) -> None:

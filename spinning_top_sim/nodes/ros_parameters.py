@@ -112,6 +112,8 @@ class ParameterChanges:
         refuse.
     refused
         Takes the names of a refused change.
+    failed
+        Takes any other error of `apply`.
 
     Attributes
     ----------
@@ -121,9 +123,10 @@ class ParameterChanges:
     """
 
     def __init__(self, node: Node, values: Mapping[str, Any], start_spin: Mapping[str, Any],
-                 apply: Callable[[dict[str, Any], set[str]], None],
-                 refused: Callable[[set[str]], None]) -> None:
-        self._node, self._apply, self._refused = node, apply, refused
+                 *, apply: Callable[[dict[str, Any], set[str]], None],
+                 refused: Callable[[set[str]], None],
+                 failed: Callable[[Exception], None]) -> None:
+        self._node, self._apply, self._refused, self._failed = node, apply, refused, failed
         self.values = dict(values)
         self.start_spin = dict(start_spin)
         self._following = False
@@ -153,6 +156,9 @@ class ParameterChanges:
         except (ValueError, RuntimeError) as error:
             self._refused(set(ours))
             return SetParametersResult(successful=False, reason=str(error))
+        except Exception as error:
+            self._failed(error)
+            return SetParametersResult(successful=False, reason=f'{type(error).__name__}: {error}')
         self.values = values
         return SetParametersResult(successful=True)
 

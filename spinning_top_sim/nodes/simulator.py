@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import functools
-import importlib
 import sys
 import time
 import traceback
@@ -13,11 +12,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
-from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.task import Future
 from rclpy.timer import Timer
 from std_msgs.msg import Float64MultiArray
@@ -27,6 +22,7 @@ from spinning_top_sim.nodes import reports
 from spinning_top_sim.nodes.pacing import DeadlineThread, FairLock, MonotonicClock
 from spinning_top_sim.nodes.recording_session import RecordingSession
 from spinning_top_sim.nodes.ros_parameters import SPIN, ParameterChanges, declare, start_values
+from spinning_top_sim.nodes.stream_publishers import StreamPublishers
 from spinning_top_sim.nodes.tick_loop import Hooks, TickLoop
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
@@ -46,16 +42,17 @@ NO_CLOCK = 'waiting for the first /clock (use_sim_time is set)'
 
 
 def guarded(callback: Callable) -> Callable:
-    """Have an exception that nobody expects stop the motion, and not the node or a thread."""
+    """Make a callback whose unexpected exceptions stop the motion, not the node or a thread."""
     @functools.wraps(callback)
     def call(self: Simulator, *arguments: Any) -> Any:
         try:
             return callback(self, *arguments)
         except Exception as error:
             self.fail(error)
-            response = arguments[-1] if len(arguments) == 2 else None
-            if response is not None:
-                response.success, response.message = False, f'{type(error).__name__}: {error}'
+            if len(arguments) != 2:
+                return None
+            _, response = arguments         # of a service
+            response.success, response.message = False, f'{type(error).__name__}: {error}'
             return response
     return call
 
@@ -88,28 +85,27 @@ class Simulator(Node):
         start_spin = {name: values[name] for name in SPIN}
         values = {**values, 'spin.lz': self._simulation.lz}
         declare(self, values)
-        self._changes = ParameterChanges(self, values, start_spin, self._apply,
-                                         self._count_refusal)
+        self._changes = ParameterChanges(self, values, start_spin, apply=self._apply,
+                                         refused=self._count_refusal, failed=self.fail)
         # Another node's /clock is followed, but not one that this node publishes.
         self._follows = (self.get_parameter('use_sim_time').value
                          and not journal.is_enabled('clock', values))
         self._date = self.get_clock() if self._follows else Clock(clock_type=ClockType.SYSTEM_TIME)
         self._followed = MonotonicClock(lambda: self._date.now().nanoseconds)
-        self._stepped_back_ns = 0               # as far as a warning has said so
         self._lock = FairLock()
         self._session = RecordingSession(self._simulation, self._lock, self.resolve_topic_name)
-        self._loop = TickLoop(
-            self._simulation, values,
-            Hooks(update_subscribers=self._update_subscribers, has_room=self._session.has_room,
-                  wait_for_room=self._session.wait_for_room,
-                  stopping=lambda: not self.context.ok(), clock_started=self._align_ticks,
-                  overloaded=self._warn_overload, failed=self._tell_failure,
-                  duration_passed=self._finish),
-            source=self._followed if self._follows else time.monotonic_ns)
+        self._outputs = StreamPublishers(self)
+        hooks = Hooks(
+            update_subscribers=lambda: self._outputs.update_subscribers(self._simulation.streams),
+            has_room=self._session.has_room, wait_for_room=self._session.wait_for_room,
+            stopping=lambda: not self.context.ok(), clock_started=self._align_ticks,
+            duration_passed=self._finish,
+            warn=self.get_logger().warning, error=self.get_logger().error)
+        self._loop = TickLoop(self._simulation, values, hooks, source=(
+            self._followed if self._follows else time.monotonic_ns))
         self._pacer = DeadlineThread(self._tick, values['tick_rate'], self._idle)
         self._report = reports.MotionReport(self._simulation, self._loop, self._session)
         self._terminal = reports.Terminal()
-        self._outputs: dict[str, Publisher] = {}        # by the topics of streams
         self._open_publishers()
         self._make_interface()
         if not self._simulation.top.is_realizable:
@@ -122,26 +118,11 @@ class Simulator(Node):
         return self._changes.values
 
     def _open_publishers(self) -> None:
-        """Have a publisher for each enabled stream, and for no other."""
-        for stream in self._simulation.streams:
-            wanted = journal.is_enabled(stream.parameter, self._values)
-            there = stream.topic in self._outputs
-            if wanted and not there:
-                package, _, name = stream.type_name.split('/')
-                message_class = getattr(importlib.import_module(f'{package}.msg'), name)
-                self._outputs[stream.topic] = self._publisher(message_class, stream.topic)
-            elif there and not wanted:
-                stream.publish = None
-                self.destroy_publisher(self._outputs.pop(stream.topic))
+        self._outputs.open(self._simulation.streams, self._values)
         self._loop.look_for_subscribers()
 
-    def _publisher(self, message_class: type, topic: str) -> Publisher:
-        return self.create_publisher(
-            message_class, topic, QoSProfile(depth=10),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies())
-
     def _make_interface(self) -> None:
-        self._diagnostics = self._publisher(DiagnosticArray, '/diagnostics')
+        self._diagnostics = self._outputs.create(DiagnosticArray, '/diagnostics')
         self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
         for name, kind, callback in (
                 ('set_pause', SetBool, self._on_pause), ('step', Trigger, self._on_step),
@@ -151,8 +132,8 @@ class Simulator(Node):
         self._status_timer: Timer | None = None
         self._restart_status()
 
-    def _steady_timer(self, period: float, callback: Callable[[], None]) -> Timer:
-        """Make a timer that no step of the date and no /clock holds up."""
+    def _steady_timer(self, period: float, callback: Callable[[], object]) -> Timer:
+        """Create a timer that neither a step of the date nor /clock can hold up."""
         return self.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _restart_status(self) -> None:
@@ -188,7 +169,7 @@ class Simulator(Node):
         with self._lock:
             self._loop.start()
         if self._values['record.enabled']:
-            self._session.attach(self._values, self._outputs)
+            self._session.attach(self._values, self._outputs.by_topic)
         self._pacer.start()
         if self._values['record.enabled']:
             try:
@@ -199,7 +180,7 @@ class Simulator(Node):
         return True
 
     def _align_ticks(self, origin_ns: int) -> None:
-        """Have ticks just after samples are due, and not now before and now after."""
+        """Have ticks just after samples are due."""
         if not self._follows:
             self._pacer.align(origin_ns / NANOSECONDS)
 
@@ -213,39 +194,24 @@ class Simulator(Node):
 
     def _finish(self) -> None:
         """Let the last messages arrive, then end the spin."""
-        give_up = time.monotonic() + ACKNOWLEDGED_S
-        for publisher in self._outputs.values():
-            if publisher.get_subscription_count():
-                left = max(0.0, give_up - time.monotonic())
-                publisher.wait_for_all_acked(Duration(nanoseconds=int(left * NANOSECONDS)))
+        self._outputs.wait_for_all_acked(ACKNOWLEDGED_S)
         if not self.finished.done():
             self.finished.set_result(None)
 
     # ------------------------------------------------------------------------------- ticks
 
-    @guarded
     def _tick(self) -> bool:
-        with self._lock:
-            return self._loop.tick()
+        try:
+            with self._lock:
+                return self._loop.tick()
+        except Exception as error:
+            self.fail(error)
+            return False
 
     @guarded
     def _idle(self) -> None:
         with self._lock:
             self._loop.idle()
-
-    def _update_subscribers(self) -> None:
-        for stream in self._simulation.streams:
-            publisher = self._outputs.get(stream.topic)
-            heard = publisher is not None and publisher.get_subscription_count() > 0
-            stream.publish = publisher.publish if publisher and heard else None
-
-    def _warn_overload(self, consequence: str) -> None:
-        self.get_logger().warning(
-            f'this machine cannot keep up with these rates: {consequence}; a recording stays '
-            'complete, and /diagnostics counts')
-
-    def _tell_failure(self, reason: str) -> None:
-        self.get_logger().error(f'{reason}; the motion stands still until ~/reset')
 
     def fail(self, error: Exception) -> None:
         """Stop the motion after an unexpected error, and close the log while it is whole."""
@@ -276,16 +242,7 @@ class Simulator(Node):
             self._session.write_command(self._loop.command(l3, lz), l3, lz)
 
     def _apply(self, values: dict[str, Any], changed: set[str]) -> None:
-        """Put a validated change into effect.  Raises ValueError or RuntimeError to refuse."""
-        try:
-            self._apply_together(values, changed)
-        except (ValueError, RuntimeError):
-            raise
-        except Exception as error:
-            self.fail(error)
-            raise RuntimeError(f'{type(error).__name__}: {error}') from error
-
-    def _apply_together(self, values: dict[str, Any], changed: set[str]) -> None:
+        """Put a validated change into effect.  Raises ValueError to refuse it."""
         with self._lock:
             if changed & set(SPIN):
                 self._command(values['spin.l3'], values['spin.lz'])
@@ -328,12 +285,8 @@ class Simulator(Node):
                 self._loop.resume()
             response.success = True
             state = 'paused' if self._loop.paused else 'running'
-            response.message = f'{state} {self._at()}'
+            response.message = f'{state} {self._loop.time_text}'
         return response
-
-    def _at(self) -> str:
-        seconds, nanoseconds = divmod(self._loop.now_ns, NANOSECONDS)
-        return f'at t = {seconds}.{nanoseconds:09d} s'
 
     @guarded
     def _on_step(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -345,7 +298,7 @@ class Simulator(Node):
             else:
                 left_ns = self._loop.step(self._values['step.count'], self._values['step.dt'])
                 response.success = left_ns == 0
-                response.message = self._loop.failure or self._at()
+                response.message = self._loop.failure or self._loop.time_text
                 if left_ns and not self._loop.failure:
                     response.message += (f': this takes too long, {left_ns / NANOSECONDS:.9g} s '
                                          'are left')
@@ -384,7 +337,7 @@ class Simulator(Node):
             response.message = f'not recording: {NO_CLOCK}'
         else:
             try:
-                response.message = self._session.start(self._values, self._outputs)
+                response.message = self._session.start(self._values, self._outputs.by_topic)
                 response.success = True
             except RecordingError as error:
                 response.message = f'not recording: {error}'
@@ -410,12 +363,11 @@ class Simulator(Node):
 
     def _check_clock(self) -> None:
         """Warn of a followed /clock that has stepped back, as in a log played in a loop."""
-        back_ns = self._followed.stepped_back_ns
-        if back_ns > self._stepped_back_ns:
+        back_ns = self._followed.take_step_back()
+        if back_ns:
             self.get_logger().warning(
-                f'/clock stepped back by {(back_ns - self._stepped_back_ns) / NANOSECONDS:g} s: '
-                'the motion and its stamps go on from where they are')
-            self._stepped_back_ns = back_ns
+                f'/clock stepped back by {back_ns / NANOSECONDS:g} s: the motion and its stamps '
+                'go on from where they are')
 
     def _prepare_reference(self) -> None:
         """Set up the exact solution of the present motion without keeping ticks waiting."""

@@ -59,10 +59,9 @@ class Hooks:
     stopping: Callable[[], bool] = lambda: False
     # Takes the source's time [ns] of simulated time 0, whenever simulated time begins to run.
     clock_started: Callable[[int], None] = _nothing
-    # Takes what happens because the machine cannot keep up; called once.
-    overloaded: Callable[[str], None] = _nothing
-    # Takes the reason why the motion cannot go on.
-    failed: Callable[[str], None] = _nothing
+    # Take a text for the log.
+    warn: Callable[[str], object] = _nothing
+    error: Callable[[str], object] = _nothing
     # Called when all samples of `duration` are sent.
     duration_passed: Callable[[], None] = _nothing
 
@@ -119,6 +118,12 @@ class TickLoop:
     def now_ns(self) -> int:
         """Simulated time up to which samples are sent [ns], >= 0."""
         return max(self._simulation.now_ns, 0)
+
+    @property
+    def time_text(self) -> str:
+        """Simulated time, exact, for people."""
+        seconds, nanoseconds = divmod(self.now_ns, NANOSECONDS)
+        return f'at t = {seconds}.{nanoseconds:09d} s'
 
     @property
     def started(self) -> bool:
@@ -225,7 +230,9 @@ class TickLoop:
     def _warn_overload(self, consequence: str) -> None:
         if not self._warned_overload:
             self._warned_overload = True
-            self._hooks.overloaded(consequence)
+            self._hooks.warn(
+                f'this machine cannot keep up with these rates: {consequence}; a recording stays '
+                'complete, and /diagnostics counts')
 
     # ------------------------------------------------------------------- what others ask for
 
@@ -322,13 +329,18 @@ class TickLoop:
         """Hold the motion until `reset`."""
         self.failure = reason
         self._hold()
-        self._hooks.failed(reason)
+        self._hooks.error(f'{reason}; the motion stands still until ~/reset')
 
     def _start_clock(self, simulated_ns: int) -> None:
         """Let simulated time run from here on; the first tick after this is never late."""
         self._late_from_ns = NEVER_NS
         self._clock.start(simulated_ns)
-        self._hooks.clock_started(self._clock.when(0))
+        self._tell_origin()
+
+    def _tell_origin(self) -> None:
+        origin_ns = self._clock.when(0)
+        if origin_ns is not None:
+            self._hooks.clock_started(origin_ns)
 
     def _hold(self) -> None:
         """Let simulated time stand exactly where samples are sent up to."""
@@ -353,8 +365,7 @@ class TickLoop:
         self._latest_ns = int(LATEST_NS * time_scale)
         self._longest_lag_ns = int(LONGEST_LAG_NS * time_scale)
         self._clock.set_scale(time_scale)
-        if self._clock.running:
-            self._hooks.clock_started(self._clock.when(0))
+        self._tell_origin()
 
     def look_for_subscribers(self) -> None:
         """Have the next tick count subscribers, as when publishers have come or gone."""

@@ -54,18 +54,15 @@ class AttitudeSeries:
     def quaternion(self, times: Times) -> Quaternion:
         """Return x, y, z, w at n times."""
         out = np.empty((4, len(times)))
-        grid = times.grid
-        # Blocks of a grid consist of whole rows.
-        before = 0 if grid is None else grid.start // grid.step % BLOCK
-        for first in range(-before, len(times), BLOCK):
-            block = slice(max(first, 0), first + BLOCK)
+        for first in range(0, len(times), BLOCK):
+            block = slice(first, first + BLOCK)
             self._fill(out[:, block], times[block])
         x, y, z, w = out
         return x, y, z, w
 
     def _fill(self, out: NDArray[np.float64], times: Times) -> None:
-        cosines, sines = (self._rotations.cosines_and_sines(times) if times.grid is None
-                          else self._rotations.on_grid(times.grid))
+        cosines, sines = (self._rotations.cosines_and_sines(times) if times.ns is None
+                          else self._rotations.at_ns(times.ns))
         cos_v, sin_v = cosines[2], sines[2]
         square = sin_v * sin_v
         series = self._coefficients[-1] * square

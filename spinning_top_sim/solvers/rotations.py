@@ -9,7 +9,7 @@ from decimal import Decimal
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.solvers.times import SPLITTER, Rate, Times, halves
+from spinning_top_sim.solvers.times import NANOSECONDS, SPLITTER, Rate, Times, halves
 
 Rows = NDArray[np.float64]
 
@@ -17,8 +17,8 @@ STEPS = 2048                # of a turn; within half a step the fifth power of t
 STEP_ANGLE = 2.0 * np.pi / STEPS
 # Within so many turns the first product of halves is exact to a small share of a step.
 SHORT_TURNS = 2.0 ** 22
-# Times of a row of a grid, and steps whose rows are kept.
-ROW, STEPS_KEPT = 512, 16
+# Grids of shorter steps have too many times in a second to keep.
+SHORTEST_STEP_NS, GRIDS_KEPT = 50_000, 16
 # 1.5 * 2^52: doubles of its size are whole numbers, whose last bits are those of the mantissa.
 WHOLE = 1.5 * 2.0 ** 52
 
@@ -65,39 +65,56 @@ class Rotations:
         self._rates = [Rate(rate) for rate, _ in angles]
         fastest = max(abs(rate.high) for rate in self._rates)
         self._short_ns = SHORT_TURNS / fastest if fastest else np.inf
-        # By step [ns]: cos and sin of the angles within a row of a grid, without the starts.
-        self._within_row: dict[int, tuple[Rows, Rows]] = {}
+        # By step and offset [ns]: `_within_second` of uniform grids.
+        self._grids: dict[tuple[int, int], tuple[Rows, Rows]] = {}
 
     def cosines_and_sines(self, times: Times) -> tuple[Rows, Rows]:
         """Return cos and sin of the angles, (k, n) each."""
         return self._of_steps(*self._in_steps(times, self._start), self._whole)
 
-    def on_grid(self, grid: range) -> tuple[Rows, Rows]:
+    def at_ns(self, ns: NDArray[np.int64] | range) -> tuple[Rows, Rows]:
         """
-        Return cos and sin of the angles, (k, n) each, at uniform times [ns].
+        Return cos and sin of the angles, (k, n) each, at integer nanoseconds.
 
-        A third of the time of `cosines_and_sines`: by the addition theorem from the begin of a
-        row of ROW times and the angle within the row.  Rows begin at multiples of ROW steps,
-        wherever the grid begins, so a value depends on its own time and the step only.
+        By the addition theorem from the begin of the time's second and the angle within the
+        second.  A uniform grid that divides the second needs the latter once: it takes half the
+        time of `cosines_and_sines`, and a value depends on its own time only.
         """
-        step = grid.step
-        first, offset = divmod(grid.start, step)
-        rows = range(first // ROW, (first + len(grid) - 1) // ROW + 1)
-        begins = Times.from_ns(offset + step * ROW * np.arange(rows.start, rows.stop))
-        row_cosine, row_sine = (x[:, :, np.newaxis] for x in self.cosines_and_sines(begins))
-        if step not in self._within_row:
-            while len(self._within_row) >= STEPS_KEPT:
-                del self._within_row[next(iter(self._within_row))]
-            self._within_row[step] = self._of_steps(*self._in_steps(
-                Times.from_ns(range(0, ROW * step, step)), np.zeros_like(self._start)), WHOLE)
-        cosine, sine = (x[:, np.newaxis, :] for x in self._within_row[step])
-        count, begin = len(self._start), first - rows.start * ROW
-        part = slice(begin, begin + len(grid))
+        if isinstance(ns, range) and NANOSECONDS % ns.step == 0 and ns.step >= SHORTEST_STEP_NS:
+            return self._on_grid(ns)
+        times = np.asarray(ns, dtype=np.int64)
+        seconds, inverse = np.unique(times // NANOSECONDS, return_inverse=True)
+        row_cosine, row_sine = (x.take(inverse, axis=1) for x in self._at_seconds(seconds))
+        cosine, sine = self._within_second(times % NANOSECONDS)
+        return row_cosine * cosine - row_sine * sine, row_sine * cosine + row_cosine * sine
+
+    def _on_grid(self, grid: range) -> tuple[Rows, Rows]:
+        step, offset = grid.step, grid.start % grid.step
+        key = step, offset
+        if key not in self._grids:
+            while len(self._grids) >= GRIDS_KEPT:
+                del self._grids[next(iter(self._grids))]
+            self._grids[key] = self._within_second(np.arange(offset, NANOSECONDS, step))
+        first = grid.start // NANOSECONDS
+        seconds = np.arange(first, grid[-1] // NANOSECONDS + 1)
+        row_cosine, row_sine = (x[:, :, np.newaxis] for x in self._at_seconds(seconds))
+        cosine, sine = (x[:, np.newaxis, :] for x in self._grids[key])
         cosines = row_cosine * cosine
         cosines -= row_sine * sine
         sines = row_sine * cosine
         sines += row_cosine * sine
+        begin = (grid.start - first * NANOSECONDS) // step
+        part = slice(begin, begin + len(grid))
+        count = len(self._start)
         return cosines.reshape(count, -1)[:, part], sines.reshape(count, -1)[:, part]
+
+    def _at_seconds(self, seconds: NDArray[np.int64]) -> tuple[Rows, Rows]:
+        return self.cosines_and_sines(Times.from_ns(seconds * NANOSECONDS))
+
+    def _within_second(self, ns: NDArray[np.int64]) -> tuple[Rows, Rows]:
+        """Return cos and sin of what the angles grow by in less than a second."""
+        return self._of_steps(*self._in_steps(Times.from_ns(ns), np.zeros_like(self._start)),
+                              WHOLE)
 
     def _of_steps(self, major: Rows, minor: Rows, start: Rows | float) -> tuple[Rows, Rows]:
         """

@@ -13,11 +13,8 @@ from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.solvers.decimal_math import double_double
 
 NANOSECONDS = 1_000_000_000
-# The largest time [ns] that is taken as an integer: the end of int64 lies 104 days behind it, so
-# that a row of a grid (`Rotations.on_grid`) may begin before the first time.
-LATEST_NS = 2 ** 63 - 2 ** 53
-# The longest step of a grid, 2.4 hours.
-LONGEST_STEP_NS = 2 ** 43
+# The largest time [ns] that is taken as an integer: the end of int64 lies a second behind it.
+LATEST_NS = 2 ** 63 - NANOSECONDS
 # 2^27 + 1: the factor that splits a double into two halves (Dekker, Numer. Math. 18, 1971, 224).
 SPLITTER = 134217729.0
 
@@ -38,13 +35,12 @@ class Times:
     ----------
     high : (n,) nearest doubles [ns]
     low : (n,) what they leave out [ns]
-    grid : the same times, where they are given as a range of integers [ns] of no longer step than
-        LONGEST_STEP_NS
+    ns : the same times, where they are given as integers [ns]
     """
 
     high: Column
     low: Column
-    grid: range | None = None
+    ns: NDArray[np.int64] | range | None = None
 
     @classmethod
     def from_ns(cls, ns: NDArray[np.int64] | range) -> Times:
@@ -56,17 +52,16 @@ class Times:
         ValueError
             If `ns` is not one-dimensional, not of integers, or beyond int64.
         """
-        grid = ns if isinstance(ns, range) and abs(ns.step) <= LONGEST_STEP_NS else None
         count = _integers(ns) if isinstance(ns, range) else np.asarray(ns)
         if count.ndim != 1 or (count.size and count.dtype.kind not in 'iu'):
             raise ValueError(f'times_ns has shape {count.shape} and type {count.dtype}: must be '
                              '(n,) integer nanoseconds')
         if not count.size or max(abs(int(count.min())), abs(int(count.max()))) <= 2 ** 53:
-            return cls(count.astype(np.float64), np.broadcast_to(0.0, len(count)), grid)
+            return cls(count.astype(np.float64), np.broadcast_to(0.0, len(count)), ns)
         upper = (count >> 20).astype(np.float64) * 2.0 ** 20
         lower = (count & (2 ** 20 - 1)).astype(np.float64)
         high = upper + lower
-        return cls(high, lower - (high - upper), grid)
+        return cls(high, lower - (high - upper), ns)
 
     @classmethod
     def from_seconds(cls, t: Column) -> Times:
@@ -87,7 +82,7 @@ class Times:
     def __getitem__(self, block: slice) -> Times:
         """Return a part of the times."""
         return Times(self.high[block], self.low[block],
-                     None if self.grid is None else self.grid[block])
+                     None if self.ns is None else self.ns[block])
 
 
 def _integers(times: range) -> NDArray[np.int64]:

@@ -10,8 +10,9 @@ kalibr's model, with its names and units.  Conventions: REP-145
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -38,23 +39,19 @@ class Imu:
     ----------
     values : mapping
         Checked parameters, see `parameters.checked`.
+
+    Attributes
+    ----------
+    sensor : callable
+        Takes a sampling period [ns]; returns the `Sensor`, the same for all streams of that rate.
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        self._values = values
         self._lever_arm: tuple[float, float, float] = values['imu.lever_arm']
         self._turned = values['imu.rpy'] != ZERO
         self._to_sensor = _rotation(*values['imu.rpy']).T
         self._mounting = _quaternion(*values['imu.rpy'])
-        self._sensors: dict[int, Sensor] = {}
-
-    def sensor(self, period_ns: int) -> Sensor:
-        """Return the sensor at a sampling period [ns]: one for all streams of that rate."""
-        if period_ns not in self._sensors:
-            while len(self._sensors) >= SENSORS_KEPT:
-                del self._sensors[next(iter(self._sensors))]
-            self._sensors[period_ns] = Sensor(self._values, period_ns)
-        return self._sensors[period_ns]
+        self.sensor: Callable[[int], Sensor] = lru_cache(SENSORS_KEPT)(partial(Sensor, values))
 
     def orientation(self, states: States) -> Quaternion:
         """Return q(world <- IMU): columns x, y, z, w."""
@@ -186,7 +183,6 @@ class Noise:
 
     BLOCK = 512
     STARTS_KEPT = 4
-    BLOCKS_KEPT = 2
 
     def __init__(self, seed: int, gyroscope: Axes, accelerometer: Axes) -> None:
         self._seed = seed
@@ -196,7 +192,7 @@ class Noise:
         # Where the bias of block b begins; that of block 0 is the turn-on bias.
         self._bias_starts = {0: np.repeat([kind.turn_on for kind in kinds], 3)
                              * self._normal(0, 6, turn_on=True)[0]}
-        self._blocks: dict[int, Rows] = {}
+        self._block: tuple[int, Rows] = -1, np.empty((0, 12))
         self._newest: tuple[range, Rows] = range(0), np.empty((12, 0))
 
     def samples(self, indices: range) -> Rows:
@@ -210,11 +206,9 @@ class Noise:
 
     def _of_block(self, block: int) -> Rows:
         """Return white noise and bias of a block, (512, 12)."""
-        if block not in self._blocks:
-            while len(self._blocks) >= self.BLOCKS_KEPT:
-                del self._blocks[next(iter(self._blocks))]
-            self._blocks[block] = self._drawn(block)
-        return self._blocks[block]
+        if self._block[0] != block:
+            self._block = block, self._drawn(block)
+        return self._block[1]
 
     def _drawn(self, block: int) -> Rows:
         """Draw a block, by way of those before it whose last bias is not kept."""

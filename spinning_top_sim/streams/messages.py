@@ -100,9 +100,20 @@ def markers(frame_id: str, size: Sequence[float], lines: Sequence[float], line_w
     """
     visualization_msgs/MarkerArray: a cylinder, lines on it, and the trace if it has points.
 
-    size: of the cylinder, diameters and height [m];  lines: x, y, z of begin and end of each, in
-    the body frame [m];  trace_points: how many
-    fields: position and orientation of the cylinder, orientation of the lines, the trace's points
+    Fields: position and orientation of the cylinder, orientation of the lines, the trace's points.
+
+    Parameters
+    ----------
+    frame_id : str
+        Of the world.
+    size : (3,) sequence of float
+        Diameters and height of the cylinder [m].
+    lines : sequence of float
+        x, y and z of begin and end of each line, in the body frame [m].
+    line_width : float
+        [m]; the trace is half as wide.
+    trace_points : int
+        How many, 0 for no trace.
     """
     writer = CdrWriter()
     writer.uint32(3 if trace_points else 2)
