@@ -340,6 +340,30 @@ def test_stamps_need_no_order(tmp_path):
         assert (reader.start_time, reader.end_time) == (3, 10)
 
 
+def test_chunks_with_falling_stamps_give_the_whole_span(tmp_path):
+    """Statistics and bag metadata tell the earliest and the latest stamp of all chunks."""
+    path = tmp_path / 'run.mcap'
+    file = create_file(path, TOPICS, METADATA, compression='none')
+    for chunk in ((50, 40), (20, 30)):
+        for stamp in chunk:
+            file.append(0, stamp, pose_cdr(stamp))
+        file.write_chunk()
+    file.finish()
+    with path.open('rb') as stream:
+        reader = make_reader(stream)
+        summary = reader.get_summary()
+        bag = yaml.safe_load(next(
+            item.metadata['serialized_metadata'] for item in reader.iter_metadata()
+            if item.name == 'rosbag2'))
+    assert [(index.message_start_time, index.message_end_time)
+            for index in summary.chunk_indexes] == [(40, 50), (20, 30)]
+    assert summary.statistics.message_start_time == 20
+    assert summary.statistics.message_end_time == 50
+    for times in (bag, bag['files'][0]):
+        assert times['starting_time']['nanoseconds_since_epoch'] == 20
+        assert times['duration']['nanoseconds'] == 30
+
+
 # Definitions
 
 def test_a_schema_is_the_text_of_rosbag2(tmp_path, monkeypatch):
@@ -493,6 +517,20 @@ def test_what_is_written_reaches_the_disk_without_being_closed(tmp_path, monkeyp
     assert recorder.counters.bytes == (tmp_path / 'run.mcap').stat().st_size
     assert recorder.counters.longest_flush > 0.0
     recorder.close()
+
+
+def test_a_file_and_its_name_are_on_the_disk_when_it_is_closed(tmp_path, monkeypatch):
+    """First the content, then the directory: a name without content would be a broken log."""
+    synced = []
+    monkeypatch.setattr(os, 'fsync', lambda fd: synced.append(os.readlink(f'/proc/self/fd/{fd}')))
+    path = tmp_path / 'run.mcap'
+    file = create_file(path, TOPICS, METADATA, compression='zstd')
+    assert synced == [str(path), str(tmp_path)]
+    synced.clear()
+    file.append(0, 1, pose_cdr(1))
+    file.write_chunk()
+    file.finish()
+    assert synced == [str(path), str(tmp_path)]
 
 
 def test_a_torn_file_tells_its_topics_and_its_run(tmp_path):

@@ -16,6 +16,7 @@ import struct
 import subprocess
 import sys
 import tracemalloc
+import zlib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,7 +24,7 @@ import pytest
 import zstandard
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Chunk, Header
+from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
 from mcap_ros2.decoder import DecoderFactory
@@ -443,6 +444,21 @@ def test_a_wild_length_that_seems_to_lead_to_a_record_takes_no_other_chunk(tmp_p
     assert [data for _, _, data in seen_by_us(path)] == [decoy, b'third']
 
 
+def test_whole_indexes_tell_what_a_damaged_last_chunk_held(tmp_path, log):
+    """No later message shows a gap, and a truncated file has no statistics."""
+    data_end = next(start for opcode, start, _ in log.records if opcode == Opcode.DATA_END)
+    bag = next(start for opcode, start, _ in log.records
+               if opcode == Opcode.METADATA and start > log.chunks[-1][1])
+    assert bag < data_end
+    broken = tmp_path / 'broken.mcap'
+    broken.write_bytes(flipped(log.content[:bag], log.chunks[-1][2] - 8, 3))
+    with LogReader(broken) as reader:
+        damage = reader.damage
+    assert damage.missing == {'/top/point': 8, '/top/number': 4}
+    assert not damage.missing_exactly
+    assert damage.losses[0].messages == MESSAGES_PER_CHUNK
+
+
 def test_gaps_in_our_numbers_tell_what_a_wild_length_took(tmp_path, log):
     """A chunk whose length is wrong takes its indexes with it, which would tell its messages."""
     _, start, _ = log.chunks[1]
@@ -516,13 +532,13 @@ def test_a_topic_tells_all_that_its_channel_says(log, tmp_path):
 def test_messages_can_be_chosen(log, tmp_path):
     (tmp_path / 'run.mcap').write_bytes(log.content)
     (tmp_path / 'torn.mcap').write_bytes(log.content[:log.chunks[-1][2]])
-    start, end = log.messages[10][1], log.messages[31][1]
+    start, end = log.messages[9][1], log.messages[30][1]    # both of the topic that is chosen
     for name in ('run.mcap', 'torn.mcap'):
         with LogReader(tmp_path / name) as reader:
             chosen = list(reader.messages(topics=['/top/number'], start=start, end=end))
             assert [(message.topic, message.log_time, message.data) for message in chosen] == [
-                message for message in log.messages[10:31] if message[0] == '/top/number']
-            assert [message.sequence for message in chosen] == list(range(4, 11))
+                message for message in log.messages[9:30] if message[0] == '/top/number']
+            assert [message.sequence for message in chosen] == list(range(3, 10))
             assert not list(reader.messages(topics=[]))
             assert not list(reader.messages(start=end, end=start))
 
@@ -695,6 +711,32 @@ def test_what_rosbag2_wrote_of_the_distribution_stays(tmp_path):
     assert 'message_count: 7' not in text
     with Reader(tmp_path / 'whole.mcap') as reader:
         assert reader.message_count == 1
+
+
+def test_messages_in_and_out_of_chunks_keep_their_order(tmp_path):
+    """All have one stamp, so that only their places in the file order them."""
+    def message(data: bytes) -> bytes:
+        return record_bytes(Message(channel_id=1, log_time=5, publish_time=5, sequence=0,
+                                    data=data))
+
+    plain = message(b'b') + message(b'c')
+    path, output = tmp_path / 'a.mcap', tmp_path / 'whole.mcap'
+    path.write_bytes(b''.join([
+        MCAP0_MAGIC, record_bytes(Header(profile='', library='a stranger')),
+        record_bytes(Channel(id=1, topic='/raw', message_encoding='x', metadata={}, schema_id=0)),
+        message(b'a'),
+        record_bytes(Chunk(compression='', data=plain, uncompressed_size=len(plain),
+                           uncompressed_crc=zlib.crc32(plain), message_start_time=5,
+                           message_end_time=5)),
+        message(b'd'), record_bytes(DataEnd(0)),
+        record_bytes(Footer(summary_start=0, summary_offset_start=0, summary_crc=0)),
+        MCAP0_MAGIC]))
+    assert run(path, '-o', output)[0] == ALL_KEPT
+    for file in (path, output):
+        assert [data for _, _, data in seen_by_us(file)] == [b'a', b'b', b'c', b'd']
+    with open(output, 'rb') as file:
+        assert [message.data for _, _, message in make_reader(file).iter_messages(
+            log_time_order=False)] == [b'a', b'b', b'c', b'd']
 
 
 def test_a_damaged_attachment_is_left_out(tmp_path):
