@@ -35,10 +35,10 @@ from spinning_top_sim.nodes import reports
 from spinning_top_sim.nodes.message_types import message_type
 from spinning_top_sim.nodes.pacing import DeadlineThread
 from spinning_top_sim.nodes.playback import ROUND_GAP_NS, Message, Playback, ReadAhead, rounds
+from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import DefinitionNotFoundError
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
-from spinning_top_sim.recording.schemas import find_definition
 
 NANOSECONDS = 1_000_000_000
 SLOWEST, FASTEST = 1e-6, 1e9

@@ -16,6 +16,7 @@ class Loss:
     what: the kind of record it was, as far as that is known;  reason: why it is lost
     start_ns, end_ns: between which log times its messages lay, None where nothing tells
     messages: how many it held, None where nothing tells
+    refused: it may be right, but is larger than what is read into memory
     """
 
     offset: int
@@ -25,6 +26,7 @@ class Loss:
     start_ns: int | None = None
     end_ns: int | None = None
     messages: int | None = None
+    refused: bool = False
 
     def __str__(self) -> str:
         text = f'{self.what} at byte {self.offset} ({self.bytes} bytes): {self.reason}'
@@ -40,7 +42,7 @@ class Damage:
     """
     What a look at every byte of a file found.
 
-    torn: the file does not end as an MCAP file ends
+    truncated: the file does not end as an MCAP file ends
     losses: what cannot be used, in file order
     defects: what is wrong but told by other parts of the file too (indexes, summary): nothing lost
     messages: whole messages by topic
@@ -50,7 +52,7 @@ class Damage:
     start_ns, end_ns: earliest and latest log time of the whole messages; both 0 without any
     """
 
-    torn: bool
+    truncated: bool
     losses: tuple[Loss, ...] = ()
     defects: tuple[str, ...] = ()
     messages: Mapping[str, int] = field(default_factory=dict)

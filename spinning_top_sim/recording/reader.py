@@ -23,20 +23,18 @@ from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.errors import NotMcapError
-from spinning_top_sim.recording.parsing import (
+from spinning_top_sim.recording.mcap_writer import time_span
+from spinning_top_sim.recording.records import (
     HEAD,
-    Damaged,
+    MAX_BYTES,
+    DamagedError,
     StoredMessage,
     open_chunk,
     parse_message,
 )
-from spinning_top_sim.recording.rosbag2 import parse_offered_qos
-from spinning_top_sim.recording.walk import (
-    MAGIC_SIZE,
-    Reading,
-    Walk,
-    read_summary,
-)
+from spinning_top_sim.recording.rosbag2 import Qos, parse_offered_qos
+from spinning_top_sim.recording.scanner import Scanner
+from spinning_top_sim.recording.summary import MAGIC_SIZE, McapSource, read_summary
 
 _RUN_BYTES = 1 << 20  # of messages outside of chunks that are read at a time
 
@@ -58,7 +56,7 @@ class LogTopic:
     schema: str
     schema_encoding: str
     encoding: str
-    qos: tuple[Mapping[str, Any], ...]
+    qos: tuple[Qos, ...]
     metadata: Mapping[str, str]
     channel_id: int
 
@@ -101,25 +99,25 @@ class LogReader:
     left_out: pieces of the file that `messages` came upon and left out, damaged
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> None:
         self.path = Path(path)
         self.left_out = 0
-        self._reading = Reading(self.path)
+        self._source = McapSource(self.path, max_bytes)
         try:
             self._header = self._check_beginning()
-            self._summary = read_summary(self._reading)
+            self._summary = read_summary(self._source)
         except BaseException:
             self.close()
             raise
 
     def close(self) -> None:
         """Close the file."""
-        self._reading.close()
+        self._source.close()
 
     @property
     def size(self) -> int:
         """Bytes in the file when it was opened."""
-        return self._reading.size
+        return self._source.size
 
     def __enter__(self) -> LogReader:
         return self
@@ -129,6 +127,11 @@ class LogReader:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+    @property
+    def mode(self) -> int:
+        """Permission bits of the file."""
+        return self._source.mode
 
     @property
     def profile(self) -> str:
@@ -147,7 +150,7 @@ class LogReader:
 
         Chunks may be damaged all the same: `damage` tells.
         """
-        return not self._summary.missing
+        return self._summary.closed and not self._summary.problem
 
     @property
     def topics(self) -> tuple[LogTopic, ...]:
@@ -172,8 +175,8 @@ class LogReader:
         found = {}
         for index in self._summary.metadata:
             try:
-                record = self._reading.record(index.offset, self._summary.data_end)
-            except Damaged:
+                record = self._source.record(index.offset, self._summary.data_limit)
+            except DamagedError:
                 continue
             if isinstance(record, Metadata):
                 found[record.name] = record.metadata
@@ -226,29 +229,29 @@ class LogReader:
                 heapq.heappush(pending, (chosen[0].log_time, span.offset, 0, plain, chosen))
         yield from _merge(pending, channels, None)
 
-    def walk(self) -> Walk:
-        """Begin a walk through all usable records in file order, for who rewrites the file."""
-        return Walk(self._reading, self._summary)
+    def scan(self) -> Scanner:
+        """Begin a scan of all usable records in file order."""
+        return Scanner(self._source, self._summary)
 
     def blocks(self, offset: int, length: int) -> Iterator[bytes]:
         """Yield bytes of the file, in blocks."""
-        return self._reading.blocks(offset, length)
+        return self._source.blocks(offset, length)
 
     @functools.cached_property
     def _survey(self) -> _Survey:
         """What a walk through the whole file found, done at the first use."""
-        walk = self.walk()
+        scanner = self.scan()
         spans: list[_Span] = []
         metadata = {}
-        run: _Span | None = None  # loose messages, one after the other
-        for piece in walk:
-            if isinstance(piece.record, Metadata):
-                metadata[piece.record.name] = piece.record.metadata
-            if piece.contents is None or not piece.contents.messages:
+        run: _Span | None = None  # adjacent messages outside of chunks
+        for scanned in scanner:
+            if isinstance(scanned.record, Metadata):
+                metadata[scanned.record.name] = scanned.record.metadata
+            if scanned.contents is None or not scanned.contents.messages:
                 continue
-            times = [message.log_time for message in piece.contents.messages]
-            span = _Span(min(times), piece.offset, piece.length, max(times))
-            if piece.record is not None:
+            start_ns, end_ns = time_span(scanned.contents.entries)
+            span = _Span(start_ns, scanned.offset, scanned.length, end_ns)
+            if scanned.record is not None:
                 spans.append(span)
             elif (run is not None and run.offset + run.length == span.offset
                     and run.length < _RUN_BYTES):
@@ -258,19 +261,19 @@ class LogReader:
             else:
                 run = span
                 spans.append(run)
-        return _Survey(walk, metadata, sorted(spans), walk.damage())
+        return _Survey(scanner, metadata, sorted(spans), scanner.damage())
 
     def _check_beginning(self) -> Header:
         """Return the header; raises NotMcapError where neither magic nor header is there."""
         if not self.size:
             raise NotMcapError(f'cannot read {self.path}: it is empty')
-        magic = self._reading.at(0, MAGIC_SIZE)
+        magic = self._source.read(0, MAGIC_SIZE)
         if magic != MCAP0_MAGIC and len(magic) < MAGIC_SIZE and MCAP0_MAGIC.startswith(magic):
             raise NotMcapError(
                 f'cannot read {self.path}: it ends after {self.size} bytes of an MCAP file')
         try:
-            header = self._reading.record(MAGIC_SIZE, self.size)
-        except Damaged:
+            header = self._source.record(MAGIC_SIZE, self.size)
+        except DamagedError:
             header = None
         if isinstance(header, Header):
             return header
@@ -281,7 +284,7 @@ class LogReader:
     @property
     def _declared(self) -> tuple[dict[int, Any], dict[int, Channel]]:
         """Return schemas and channels by number."""
-        source = self._survey.walk if self._survey_is_needed else self._summary
+        source = self._survey.scanner if self._survey_is_needed else self._summary
         return source.schemas, source.channels
 
     @property
@@ -290,7 +293,7 @@ class LogReader:
             return self._survey.spans
         return sorted(_Span(index.message_start_time, index.chunk_start_offset,
                             index.chunk_length, index.message_end_time)
-                      for index in self._summary.chunks)
+                      for index in self._summary.chunks.values())
 
     @functools.cached_property
     def _survey_is_needed(self) -> bool:
@@ -300,7 +303,7 @@ class LogReader:
         if statistics is None:
             return True
         return (
-            not summary.all_in_chunks
+            not summary.indexes_all_messages
             or len(summary.metadata) != statistics.metadata_count
             or len(summary.channels) != statistics.channel_count
             or any(channel.schema_id not in {0, *summary.schemas}
@@ -308,15 +311,15 @@ class LogReader:
 
     def _read(self, span: _Span) -> tuple[bytes, list[StoredMessage]]:
         """Return the messages of a span and the bytes they are in; none where it is damaged."""
-        content = self._reading.at(span.offset, span.length)
+        content = self._source.read(span.offset, span.length)
         try:
             if content[:1] == bytes([Opcode.MESSAGE]):
                 return content, list(_loose_messages(content))
-            chunk = self._reading.record(span.offset, span.offset + span.length)
+            chunk = self._source.record(span.offset, span.offset + span.length)
             if isinstance(chunk, Chunk):
-                contents = open_chunk(chunk)
+                contents = open_chunk(chunk, self._source.max_bytes)
                 return contents.plain, contents.messages
-        except Damaged:
+        except DamagedError:
             pass
         self.left_out += 1
         return b'', []
@@ -326,7 +329,7 @@ class LogReader:
 class _Survey:
     """What a walk through a file found."""
 
-    walk: Walk
+    scanner: Scanner
     metadata: dict[str, dict[str, str]]
     spans: list[_Span]
     damage: Damage
@@ -360,11 +363,10 @@ def _loose_messages(records: bytes) -> Iterator[StoredMessage]:
     while offset < len(records):
         _, length = HEAD.unpack_from(records, offset)
         offset += HEAD.size
-        message = parse_message(records[offset:offset + length])
-        yield message._replace(start=offset + message.start, end=offset + message.end)
+        yield parse_message(records, offset, offset + length)
         offset += length
 
 
-def qos_profiles(channel: Channel) -> tuple[Mapping[str, Any], ...]:
+def qos_profiles(channel: Channel) -> tuple[Qos, ...]:
     """Return what a channel says its publishers offer; nothing where that cannot be read."""
     return tuple(parse_offered_qos(channel.metadata.get('offered_qos_profiles', '')))

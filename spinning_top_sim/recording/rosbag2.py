@@ -15,6 +15,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+# A profile: the keys of DEFAULT_QOS, integer policies as in rmw, durations as {'sec', 'nsec'}.
+Qos = Mapping[str, Any]
+
+BAG_METADATA = 'rosbag2'  # name of the metadata record
+
 _METADATA_VERSION = 9  # of rosbag2_storage::BagMetadata in jazzy
 _NEVER = {'sec': 9223372036, 'nsec': 854775807}  # RMW_DURATION_INFINITE
 

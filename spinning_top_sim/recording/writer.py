@@ -20,21 +20,19 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Literal
 
+from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import RecordingError
-from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.schemas import find_definition
+from spinning_top_sim.recording.rosbag2 import RecordedTopic, offered_qos_yaml
 
 if TYPE_CHECKING:
-    from spinning_top_sim.recording.mcap_file import McapFile
+    from spinning_top_sim.recording.mcap_writer import McapWriter, Messages
 
 COMPRESSIONS = ('zstd', 'lz4', 'none')
 METADATA_NAME = 'spinning_top_sim'
+OUR_LIBRARY = 'spinning_top_sim '      # what the header of our files begins with
 
 _ENTRY_BYTES = 128  # what a queued message costs besides its data, about
 _CLOSE_AT_EXIT_S = 10.0
-
-# Messages of one stamp: indices of their topics, stamp [ns], CDR of each, size of all [bytes].
-Messages = tuple[Sequence[int], int, Sequence[bytes], int]
 
 
 @dataclass(frozen=True)
@@ -84,7 +82,7 @@ class McapRecorder:
     """
 
     def __init__(
-        self, path: Path, topics: Sequence[RecordedTopic], file: McapFile, *,
+        self, path: Path, topics: Sequence[RecordedTopic], file: McapWriter, *,
         max_loss: float, min_free_bytes: int, queue_bytes: int,
     ) -> None:
         """For `open`, which checks the arguments."""
@@ -321,16 +319,27 @@ class McapRecorder:
 
 
 def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[str, str], *,
-                compression: str, min_free_bytes: int = 0) -> McapFile:
+                compression: str, min_free_bytes: int = 0) -> McapWriter:
     """
-    Create a log with its head, for one thread to write; see `McapRecorder.open`.
+    Create a log and bring its head to the disk; the parameters are those of `McapRecorder.open`.
 
-    Raises RecordingError, naming path or type and the reason.
+    All topics stand before the first chunk, so that a truncated file tells them in any case.
+
+    Raises
+    ------
+    RecordingError
+        Naming path or type and the reason.
+
     """
     definitions = {
-        name: find_definition(name) for name in {topic.type_name for topic in topics}}
+        name: find_definition(name) for name in dict.fromkeys(topic.type_name for topic in topics)}
     try:
-        from spinning_top_sim.recording.mcap_file import McapFile  # noqa: PLC0415
+        from mcap.records import Channel, Metadata, Schema  # noqa: PLC0415
+
+        from spinning_top_sim.recording.mcap_writer import (  # noqa: PLC0415
+            McapWriter,
+            sync_directory,
+        )
     except ImportError as error:
         raise RecordingError(
             f'recording needs the Python package mcap with zstandard and lz4: {error}'
@@ -340,9 +349,24 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
         free = disk.f_bavail * disk.f_frsize
         if free < min_free_bytes:
             raise OSError(_too_little_space(free, min_free_bytes))
-        file = McapFile(
-            path, topics, definitions, {METADATA_NAME: metadata},
-            library=f'spinning_top_sim {_version()}', compression=compression)
+        file = McapWriter(path, profile='ros2', library=f'{OUR_LIBRARY}{_version()}',
+                          compression=compression)
+        with file.discarded_on_failure():
+            file.write_metadata(Metadata(METADATA_NAME, dict(metadata)))
+            schema_ids = {}
+            for number, (name, definition) in enumerate(definitions.items(), start=1):
+                schema_ids[name] = number
+                file.write_schema(Schema(
+                    id=number, name=name, encoding='ros2msg', data=definition.text.encode()))
+            for number, topic in enumerate(topics, start=1):
+                file.write_channel(Channel(
+                    id=number, topic=topic.name, message_encoding='cdr',
+                    schema_id=schema_ids[topic.type_name],
+                    metadata={'offered_qos_profiles': offered_qos_yaml(topic),
+                              'topic_type_hash': definitions[topic.type_name].type_hash}),
+                    qos_profiles=(topic.qos,))
+            file.sync()
+            sync_directory(path.parent)
     except FileExistsError as error:
         raise RecordingError(
             f'cannot record to {path}: it exists, and a recording overwrites nothing'

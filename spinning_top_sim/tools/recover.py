@@ -49,7 +49,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from spinning_top_sim.recording.damage import count  # noqa: PLC0415
     from spinning_top_sim.recording.errors import LogError  # noqa: PLC0415
     from spinning_top_sim.recording.reader import LogReader  # noqa: PLC0415
-    from spinning_top_sim.recording.recovery import recover  # noqa: PLC0415
+    from spinning_top_sim.recording.salvage import recover  # noqa: PLC0415
 
     log: Path = arguments.log
     output: Path = arguments.output or log.with_name(f'{log.stem}_recovered.mcap')

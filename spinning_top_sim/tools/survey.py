@@ -188,7 +188,7 @@ class Survey:
 def survey(reader: LogReader) -> Survey:
     """Return what a log tells.  Raises LogError."""
     damage = reader.damage
-    found = Survey(damage, reader.whole and not damage.torn and damage.lossless,
+    found = Survey(damage, reader.whole and not damage.truncated and damage.lossless,
                    {topic.name: TopicReport(topic.type_name) for topic in reader.topics})
     try:
         found.account = read_account(reader)

@@ -94,7 +94,7 @@ class _Comparison:
             topics.append(account.commands_topic)
             self._names[journal.COMMANDS] = account.commands_topic
         self._waiting: dict[str, deque[tuple[int, bytes]]] = {name: deque() for name in topics}
-        self._verdict = Verdict(not reader.damage.torn and reader.damage.lossless,
+        self._verdict = Verdict(not reader.damage.truncated and reader.damage.lossless,
                                 dict.fromkeys(topics, 0), warnings=_warnings(account))
 
     def run(self) -> Verdict:
