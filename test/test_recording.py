@@ -834,6 +834,34 @@ def test_a_disk_that_runs_short_stops_the_recording_in_good_order(tmp_path, monk
         assert [stamp for _, stamp, _ in reader.messages()] == [7]
 
 
+def test_an_interrupted_write_shifts_nothing(tmp_path, monkeypatch):
+    """An interrupt in the middle of a chunk; the chunk is written again, and all places hold."""
+    path = tmp_path / 'run.mcap'
+    file = create_file(path, TOPICS, METADATA, compression='none')
+    size = file.size
+    pwrite = os.pwrite
+
+    def interrupted(descriptor, data, offset):
+        pwrite(descriptor, data[:len(data) // 2], offset)
+        if offset > size:
+            raise KeyboardInterrupt
+        return len(data) // 2
+
+    for index, stamp, data in some_messages(100):
+        file.append(index, stamp, data)
+    monkeypatch.setattr(os, 'pwrite', interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        file.write_chunk()
+    monkeypatch.setattr(os, 'pwrite', pwrite)
+    assert file.size == path.stat().st_size == size
+    file.write_chunk()
+    file.finish()
+    with path.open('rb') as stream:
+        list(StreamReader(stream, validate_crcs=True).records)
+        assert len(list(make_reader(stream, validate_crcs=True).iter_messages())) == 100
+    assert len(complete_messages(path)) == 100
+
+
 def test_a_message_that_cannot_be_packed_is_no_exception_for_the_simulation(tmp_path):
     recorder = McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
     recorder.write(0, -1, b'')

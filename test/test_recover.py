@@ -21,7 +21,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import zstandard
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Message
@@ -753,24 +752,6 @@ def test_a_damaged_attachment_is_left_out(tmp_path):
 
 # Hostile
 
-def test_a_chunk_that_would_fill_the_memory_does_not(tmp_path):
-    bomb = zstandard.ZstdCompressor().compress(bytes(300_000_000))
-    chunks = [Chunk(compression='zstd', data=bomb, uncompressed_size=size, uncompressed_crc=1,
-                    message_start_time=1, message_end_time=2) for size in (100, 1 << 62)]
-    path = tmp_path / 'bomb.mcap'
-    path.write_bytes(b''.join([MCAP0_MAGIC, record_bytes(Header(profile='', library='')),
-                               *map(record_bytes, chunks[:1])]))
-    tracemalloc.start()
-    try:
-        with LogReader(path) as reader:
-            assert not list(reader.messages())
-            assert reader.damage.lost_chunks == 1
-        _, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    assert peak < 10_000_000
-
-
 def test_memory_does_not_grow_with_the_file(tmp_path):
     """Twenty times as many chunks: no more than their index, less than a fifth of the file."""
     peaks = []
@@ -988,7 +969,7 @@ def test_reading_and_recovering_import_no_ros(tmp_path, log):
         [sys.executable, '-c',
          'import sys; from spinning_top_sim.tools.recover import main\n'
          f'assert main([{str(tmp_path / "run.mcap")!r}]) == 0\n'
-         'print([name for name in ("rclpy", "numpy", "yaml", "scipy") if name in sys.modules])'],
+         'print([name for name in ("rclpy", "numpy", "scipy") if name in sys.modules])'],
         env=os.environ | {'PYTHONPATH': str(ROOT)}, capture_output=True, text=True, timeout=60,
         check=True)
     assert done.stdout.endswith('\n[]\n')

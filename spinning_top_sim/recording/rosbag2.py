@@ -3,7 +3,7 @@
 The two YAML texts that rosbag2 (jazzy) expects in a log: offered QoS and bag metadata.
 
 Sources: rosbag2_storage, qos.cpp and yaml.hpp; rosbag2_storage_mcap, mcap_storage.cpp.  They are
-few fixed lines, written by hand so that a recording needs no YAML package.
+few fixed lines, written by hand so that a recording imports no YAML package.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeGuard
 
 # A profile: the keys of DEFAULT_QOS, integer policies as in rmw, durations as {'sec', 'nsec'}.
 Qos = Mapping[str, Any]
@@ -43,10 +43,6 @@ _POLICY_NAMES = {
     'liveliness': ('system_default', 'automatic', 'manual_by_node', 'manual_by_topic', 'unknown',
                    'best_available'),
 }
-
-
-_INTEGER = re.compile(r'-?[0-9]+')
-_QOS_LINE = re.compile(r'(- | {2,})(\w+): *(\S*) *', re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -102,47 +98,44 @@ def offered_qos_yaml(topic: RecordedTopic) -> str:
     return '\n'.join(_qos_lines(topic.qos, as_names=False))
 
 
-def parse_offered_qos(text: str) -> list[dict[str, Any]]:
+def parse_offered_qos(text: str) -> list[Qos]:
     """
-    Return the profiles of an `offered_qos_profiles`: the keys of DEFAULT_QOS, policies as in rmw.
+    Parse the `offered_qos_profiles` of a channel, with policies by number or name.
 
-    Understands what rosbag2 and this package write, in block style, policies by number or name.
     A policy that is missing or not understood is as in DEFAULT_QOS; a text that is no list of
     profiles has none.
     """
-    profiles: list[dict[str, Any]] = []
-    key = ''
-    for line in text.splitlines():
-        match = _QOS_LINE.fullmatch(line)
-        if match is None or not (profiles or match[1] == '- '):
-            return []
-        indent, name, word = match.groups()
-        if indent == '- ':
-            profiles.append({})
-        value: Any = {'': {}, 'true': True, 'false': False}.get(word, word)
-        if isinstance(value, str) and _INTEGER.fullmatch(value):
-            value = int(value)
-        nested = profiles[-1].get(key) if len(indent) > 2 else None
-        if isinstance(nested, dict):
-            nested[name] = value
-        else:
-            key = name
-            profiles[-1][key] = value
+    if not text:
+        return []
+    import yaml  # noqa: PLC0415 - a recording needs none
+
+    try:
+        profiles = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, TypeError, OverflowError, RecursionError):
+        return []
+    if not isinstance(profiles, list) or not all(isinstance(one, dict) for one in profiles):
+        return []
     return [{key: _parsed_policy(key, profile.get(key)) for key in DEFAULT_QOS}
             for profile in profiles]
 
 
-def _parsed_policy(key: str, value: Any) -> Any:
+def _parsed_policy(key: str, value: object) -> int | bool | Mapping[str, int]:
     default, names = DEFAULT_QOS[key], _POLICY_NAMES.get(key)
     if isinstance(default, Mapping):
         parts = value if isinstance(value, Mapping) else {}
-        return value if all(isinstance(parts.get(part), int) for part in default) else default
-    if names is not None:
-        if value in names:
-            value = names.index(value)
-        known = type(value) is int and 0 <= value < len(names) and names[value] != 'unknown'
-        return value if known else default
-    return value if type(value) is type(default) else default
+        right = all(_is_int64(parts.get(part)) for part in default)
+        return {part: parts[part] for part in default} if right else default
+    if names is not None and value in names:
+        value = names.index(value)
+    if names is not None and not (
+            _is_int64(value) and 0 <= value < len(names) and names[value] != 'unknown'):
+        return default
+    right = type(value) is type(default) and (isinstance(value, bool) or _is_int64(value))
+    return value if right else default
+
+
+def _is_int64(value: object) -> TypeGuard[int]:
+    return type(value) is int and -1 << 63 <= value < 1 << 63
 
 
 def bag_metadata_yaml(

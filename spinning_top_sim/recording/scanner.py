@@ -576,6 +576,13 @@ class Scanner:
         """Return whether nothing but the end record fits in before the summary."""
         return self._has_limit and self._limit - offset <= _DATA_END_SIZE
 
+    def _stored_crc(self, end: int) -> int:
+        """Return the checksum of the data section as it stands in the file."""
+        crc = 0
+        for block in self._source.blocks(0, end):
+            crc = zlib.crc32(block, crc)
+        return crc
+
     def _check_end(self, offset: int) -> None:
         """Look at what ends the data section."""
         if self._summary.problem:
@@ -585,7 +592,8 @@ class Scanner:
         except DamagedError:
             end = None
         if isinstance(end, DataEnd):
-            if self._crc is not None and end.data_section_crc not in (0, self._crc):
+            stored = end.data_section_crc
+            if self._crc is not None and stored not in (0, self._crc, self._stored_crc(offset)):
                 self._losses.append(Loss(
                     0, 0, 'something besides the messages',
                     'the checksum of the data section is wrong'))

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ ALL_KEPT = 0
 FAILED = 1
 SOME_LOST = 3
 INTERRUPTED = 130
+TERMINATED = 143
 
 _PROGRESS_BYTES = 50_000_000  # smaller files are through before one could read it
 
@@ -19,10 +21,14 @@ _PROGRESS_BYTES = 50_000_000  # smaller files are through before one could read 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
     arguments = _parser().parse_args(argv)
+    # An exception, so that the unfinished output is removed.
+    previous = signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     try:
         return _run(arguments)
     except KeyboardInterrupt:
         return INTERRUPTED
+    finally:
+        signal.signal(signal.SIGTERM, previous)
 
 
 def _parser() -> argparse.ArgumentParser:
