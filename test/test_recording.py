@@ -858,6 +858,7 @@ def test_an_interrupted_write_shifts_nothing(tmp_path, monkeypatch):
     file.finish()
     with path.open('rb') as stream:
         list(StreamReader(stream, validate_crcs=True).records)
+        stream.seek(0)
         assert len(list(make_reader(stream, validate_crcs=True).iter_messages())) == 100
     assert len(complete_messages(path)) == 100
 

@@ -273,6 +273,7 @@ class McapWriter:
         log_time_ns : int
             Log and publish time [ns].
         data : bytes
+            The message.
 
         Returns
         -------
@@ -306,7 +307,8 @@ class McapWriter:
 
         Parameters
         ----------
-        batch : sequence of (topic indices, log time [ns], CDR of each, size of all [bytes])
+        batch : sequence of Messages
+            Topic indices, log time [ns], CDR of each, size of all [bytes].
 
         """
         import numpy as np  # noqa: PLC0415 - rclpy's messages have imported it

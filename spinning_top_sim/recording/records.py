@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import struct
+import sys
 import zlib
 from array import array
 from dataclasses import dataclass, field
@@ -45,14 +46,7 @@ MAX_BYTES = 256 << 20               # of one record or one uncompressed chunk in
 HEAD = struct.Struct('<BQ')         # of every record: opcode, length of what follows
 CHUNK_HEAD = struct.Struct('<QQQI')  # start and end time, uncompressed size and checksum
 
-LOOK_BYTES = 64     # of a record's content, for `looks_right`
-# Where the length of the name is in the content.
-TEXT_OFFSETS: dict[int, int] = {Opcode.SCHEMA: 2, Opcode.CHANNEL: 4, Opcode.METADATA: 0}
-
 _BLOCK = 1 << 20    # bytes decompressed at a time
-_MAX_NAME = 1 << 12
-_MAX_DECLARATION = 1 << 24
-_MAX_EXTRA = 1 << 10
 _FIELDS = struct.Struct('<HIQQ')    # of a message: channel, sequence, log and publish time
 _INDEX_FIELDS = struct.Struct('<HI')  # of a message index: channel, length of the entries
 
@@ -122,11 +116,11 @@ class ChunkContents:
             if numbers is None:
                 numbers = found[channel_id] = array('Q')
             numbers.append(log_time)
-            numbers.append(max(start - MESSAGE.size, 0))    # of no use outside of chunks
+            numbers.append(start - MESSAGE.size)
         return found
 
 
-class _StrictStream(ReadDataStream):
+class StrictStream(ReadDataStream):
     """A stream of one record's content that gives what is asked for or raises EndOfFile."""
 
     def __init__(self, content: bytes) -> None:
@@ -134,9 +128,7 @@ class _StrictStream(ReadDataStream):
 
     def read(self, length: int) -> bytes:
         """Return exactly `length` bytes."""
-        if length > 1 << 62:  # more than BytesIO can be asked for
-            raise EndOfFile()
-        data: bytes = super().read(length)
+        data: bytes = super().read(min(length, sys.maxsize))
         if len(data) != length:
             raise EndOfFile()
         return data
@@ -161,7 +153,7 @@ def parse(opcode: int, content: bytes) -> tuple[McapRecord, int]:
     kind = _KINDS.get(opcode)
     if kind is None:
         raise DamagedError('there is no such kind of record')
-    stream = _StrictStream(content)
+    stream = StrictStream(content)
     try:
         record: McapRecord = kind.read(stream)  # type: ignore[attr-defined]
     except McapError:
@@ -172,21 +164,6 @@ def parse(opcode: int, content: bytes) -> tuple[McapRecord, int]:
     if opcode != Opcode.CHUNK and not content.startswith(record_bytes(record)[HEAD.size:]):
         raise DamagedError('its length is not that of its content')
     return record, len(content) - stream.count
-
-
-def looks_right(opcode: int, length: int, start: bytes) -> bool:
-    """Return whether a chunk, schema, channel or metadata of this length may start so."""
-    if opcode == Opcode.CHUNK:
-        stream = _StrictStream(start[CHUNK_HEAD.size:])
-        try:
-            stream.read_prefixed_string()
-            data_size = stream.read8()
-        except (McapError, UnicodeDecodeError):
-            return False
-        return 0 <= length - (CHUNK_HEAD.size + stream.count + data_size) <= _MAX_EXTRA
-    offset = TEXT_OFFSETS[opcode]
-    name_size = int.from_bytes(start[offset:offset + 4], 'little')
-    return 0 < name_size < _MAX_NAME and length <= _MAX_DECLARATION
 
 
 def _parse_message_index(content: bytes) -> tuple[MessageIndex, int]:
@@ -208,29 +185,6 @@ def parse_message(content: bytes, start: int, end: int) -> StoredMessage:
     channel_id, sequence, log_time, publish_time = _FIELDS.unpack_from(content, start)
     return StoredMessage(
         log_time, channel_id, sequence, publish_time, start + MESSAGE_FIELDS, end)
-
-
-def parse_attachment_head(head: bytes, length: int) -> tuple[AttachmentIndex, int]:
-    """
-    Return what the summary says of an attachment, without its place, and where its checksum is.
-
-    `head` is the beginning of its content, which is `length` bytes long.  Raises DamagedError.
-    """
-    stream = _StrictStream(head)
-    try:
-        log_time = stream.read8()
-        create_time = stream.read8()
-        name = stream.read_prefixed_string()
-        media_type = stream.read_prefixed_string()
-        data_size = stream.read8()
-    except (McapError, UnicodeDecodeError):
-        raise DamagedError('its name or its type cannot be read') from None
-    crc_offset = stream.count + data_size
-    if crc_offset + 4 > length:
-        raise DamagedError('its length is not that of its content')
-    return AttachmentIndex(
-        offset=0, length=HEAD.size + length, log_time=log_time, create_time=create_time,
-        data_size=data_size, name=name, media_type=media_type), crc_offset
 
 
 def open_chunk(chunk: Chunk, max_bytes: int = MAX_BYTES) -> ChunkContents:

@@ -130,8 +130,9 @@ def _parsed_policy(key: str, value: object) -> int | bool | Mapping[str, int]:
     if names is not None and not (
             _is_int64(value) and 0 <= value < len(names) and names[value] != 'unknown'):
         return default
-    right = type(value) is type(default) and (isinstance(value, bool) or _is_int64(value))
-    return value if right else default
+    if isinstance(default, bool):
+        return value if isinstance(value, bool) else default
+    return value if _is_int64(value) else default
 
 
 def _is_int64(value: object) -> TypeGuard[int]:

@@ -58,6 +58,7 @@ def recover(
     Parameters
     ----------
     reader : LogReader
+        The log.
     output : path
         The new file.  It appears when it is complete and on the disk, never before.
     progress : callable

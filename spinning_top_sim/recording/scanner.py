@@ -2,11 +2,8 @@
 """
 Scans an MCAP file sequentially and skips damaged records.
 
-- A record with wrong content whose length leads to another record is skipped alone.
-- Elsewhere the scan goes on at the next record that the summary indexes; if there is no summary,
-  at the next chunk that proves itself by its inner lengths and its checksum.  Schemas, channels
-  and metadata on the way are used if all their lengths fit.  Single messages are not: nothing in
-  them tells them from chance.
+- A damaged record whose length leads to another record is skipped alone.  Elsewhere the scan goes
+  on at the next record that the summary indexes, or that `RecordFinder` finds.
 - Schemas and channels of a summary with a right checksum go before those in the data section.
 - The checksum of the data section is taken over the records as they should be, where something
   else tells that (magic, schemas, channels, message indexes, times of chunks).  If it is right
@@ -18,10 +15,9 @@ Scans an MCAP file sequentially and skips damaged records.
 from __future__ import annotations
 
 import bisect
-import re
 import struct
 import zlib
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from mcap.opcode import Opcode
@@ -38,40 +34,26 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording.damage import Damage, Loss
-from spinning_top_sim.recording.mcap_writer import (
-    MESSAGE_FIELDS,
-    message_indexes,
-    record_bytes,
-    time_span,
-)
+from spinning_top_sim.recording.mcap_writer import message_indexes, record_bytes, time_span
 from spinning_top_sim.recording.records import (
     CHUNK_HEAD,
     HEAD,
-    LOOK_BYTES,
-    TEXT_OFFSETS,
     ChunkContents,
     DamagedError,
-    StoredMessage,
     TooLargeError,
-    looks_right,
     name_of,
     open_chunk,
     parse,
-    parse_attachment_head,
     parse_message,
 )
+from spinning_top_sim.recording.resync import RecordFinder
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA
 from spinning_top_sim.recording.summary import MAGIC_SIZE, McapSource, Summary
+from spinning_top_sim.recording.tally import MessageTally
 from spinning_top_sim.recording.writer import OUR_LIBRARY
 
 _DATA_END_SIZE = HEAD.size + 4
 _INDEX_HEAD = HEAD.size + 2 + 4     # of a message index, before its entries
-_ATTACHMENT_HEAD = 1 << 16  # bytes; more than any name and media type
-_SEARCH_BLOCK = 1 << 20
-_SEARCH_EFFORT = 4  # bytes of candidates read, as a multiple of the size of the file
-
-# What may begin a chunk, a schema, a channel or metadata: opcode and a length below 2^40.
-_CANDIDATE = re.compile(rb'[\x03\x04\x06\x0c](?=.{5}\x00\x00\x00)', re.DOTALL)
 _SUMMARY_KINDS = (Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.METADATA_INDEX,
                   Opcode.ATTACHMENT_INDEX, Opcode.SUMMARY_OFFSET, Opcode.FOOTER)
 
@@ -84,15 +66,15 @@ class ScannedRecord:
     Attributes
     ----------
     opcode : int
-        0x10 and above: of an application, or of a later version of the format.
+        Above Opcode.DATA_END: of an application, or of a later version of the format.
     offset, length : int
         Its place in the file, and its size with its head [bytes].
     record : McapRecord or None
         As it should be.  The index of an attachment; None for a message outside of chunks and
         for unknown kinds.
     raw : bytes
-        The record as it stands in the file; b'' where `record` was corrected.  Only for schemas,
-        channels and metadata.
+        The record as it stands in the file; b'' if `record` was corrected, if it is a chunk, an
+        attachment or of an unknown kind.
     extra : bytes
         What stands behind the known fields of a chunk.
     contents : ChunkContents or None
@@ -113,7 +95,7 @@ class ScannedRecord:
 
 
 class _EndOfDataError(Exception):
-    """A record of the summary comes before the end of the data section."""
+    """The data section ends, or a record of the summary comes before its end."""
 
 
 class Scanner:
@@ -123,7 +105,9 @@ class Scanner:
     Parameters
     ----------
     source : McapSource
+        The file.
     summary : Summary
+        Its summary.
 
     Attributes
     ----------
@@ -134,25 +118,21 @@ class Scanner:
     """
 
     def __init__(self, source: McapSource, summary: Summary) -> None:
-        self._source = source
-        self._summary = summary
-        self._limit = summary.data_limit
-        self._has_limit = summary.closed and not summary.problem    # and not that of the file
-        self._effort = _SEARCH_EFFORT * source.size
-        self._places = summary.places
-        self._place_offsets = sorted(self._places)
         self.header: Header | None = None
         self.schemas = dict(summary.schemas)
         self.channels = dict(summary.channels)
 
+        self._source = source
+        self._summary = summary
+        self._limit = summary.data_limit
+        self._has_limit = summary.closed and not summary.problem    # else that of the file
+        self._places = summary.places
+        self._place_offsets = sorted(self._places)
+        self._finder = RecordFinder(source, self._limit)
+
+        self._tally = MessageTally()
         self._losses: list[Loss] = []
         self._defects: list[str] = []
-        self._counts: dict[int, int] = {}        # whole messages by channel
-        self._indexed_lost: dict[int, int] = {}  # messages of lost chunks by channel, by indexes
-        self._unknown: dict[int, Loss] = {}      # by unknown channel
-        self._next_sequence: dict[int, int] = {}
-        self._gaps: dict[int, int] = {}          # missing by sequence numbers, by channel
-        self._times: list[int] = []              # earliest and latest
         # Over the records as they should be; None once bytes are lost.
         self._crc: int | None = zlib.crc32(MCAP0_MAGIC)
         # What should follow a chunk: its message indexes by channel; what a lost one held.
@@ -164,13 +144,14 @@ class Scanner:
         if self._source.read(0, MAGIC_SIZE) != MCAP0_MAGIC:
             self._defects.append('the first eight bytes are not those of an MCAP file')
         offset = MAGIC_SIZE
-        while offset < self._limit and not self._is_last(offset):
+        # The last bytes before a summary can only be the end record.
+        while offset < self._limit - (_DATA_END_SIZE if self._has_limit else 0):
             try:
                 scanned = self._scan(offset)
             except _EndOfDataError:
                 break
             except DamagedError as damage:
-                offset = yield from self._skip(offset, damage)
+                offset = self._skip(offset, damage)
             else:
                 yield scanned
                 offset += scanned.length
@@ -179,84 +160,67 @@ class Scanner:
     def damage(self) -> Damage:
         """Return what was found; call it after the scan."""
         statistics = self._summary.statistics
-        losses = sorted([*self._losses, *self._unknown.values()], key=lambda loss: loss.offset)
-        missing: dict[int, int] = {}
-        if statistics is not None:
-            missing = {number: total - self._counts.get(number, 0)
-                       for number, total in statistics.channel_message_counts.items()}
-            if not losses:
-                # A whole file that was made of a truncated one still tells what that had lost.
-                for number, lost in self._gaps.items():
-                    missing[number] = missing.get(number, 0) + lost
-        else:
-            for number in {*self._gaps, *self._indexed_lost, *self._unknown}:
-                unknown = self._unknown.get(number)
-                missing[number] = max(self._gaps.get(number, 0), self._indexed_lost.get(number, 0)
-                                      ) + ((unknown and unknown.messages) or 0)
-        missing_by_topic: dict[str, int] = {}
-        for number, lost in sorted(missing.items()):
+        losses = sorted([*self._losses, *self._tally.unknown.values()],
+                        key=lambda loss: loss.offset)
+        missing: dict[str, int] = {}
+        for number, lost in sorted(self._tally.missing(statistics, lossless=not losses).items()):
             if lost > 0:
                 topic = self.channels[number].topic if self._knows(number) else ''
-                missing_by_topic[topic] = missing_by_topic.get(topic, 0) + lost
+                missing[topic] = missing.get(topic, 0) + lost
         messages: dict[str, int] = {}
         for number, channel in self.channels.items():
             messages[channel.topic] = (
-                messages.get(channel.topic, 0) + self._counts.get(number, 0))
+                messages.get(channel.topic, 0) + self._tally.found.get(number, 0))
+        start_ns, end_ns = self._tally.span
         return Damage(
             truncated=not self._summary.closed, losses=tuple(losses),
-            defects=tuple(self._defects), messages=messages, missing=missing_by_topic,
-            missing_exactly=statistics is not None,
-            start_ns=min(self._times, default=0), end_ns=max(self._times, default=0))
+            defects=tuple(self._defects), messages=messages, missing=missing,
+            missing_exactly=statistics is not None, start_ns=start_ns, end_ns=end_ns)
 
-    # Reading records
+    # Reading records.  All of these raise DamagedError.
 
     def _scan(self, offset: int) -> ScannedRecord:
-        """Return the record there.  Raises DamagedError, or _EndOfDataError at a summary's."""
+        """Return the record there.  Raises _EndOfDataError where the data section ends."""
         opcode, length = self._source.head(offset, self._limit)
         end = offset + HEAD.size + length
-        place = self._next_place(offset)
-        if self._places.get(offset, opcode) != opcode or (place is not None and end > place):
+        if self._places.get(offset, opcode) != opcode or end > self._next_place(offset):
             raise DamagedError('the summary tells of another record there')
         if opcode == Opcode.ATTACHMENT:
             return self._scan_attachment(offset, length)
         if opcode > Opcode.DATA_END:
             return self._scan_unknown_kind(opcode, offset, length)
         content = self._source.content(offset, length)
+        raw = HEAD.pack(opcode, length) + content
         if opcode == Opcode.MESSAGE:
-            return self._scan_message(offset, content)
+            return self._scan_message(offset, raw)
         record, extra = parse(opcode, content)
-        # Nothing proves that bytes behind the known fields belong to it but what follows.
-        if extra and (self._is_ours or not self._is_record(end)):
+        # Nothing but what follows proves that bytes behind the known fields belong to the record.
+        if extra and (self._is_ours or not self._finder.is_record(end)):
             raise DamagedError('its length is not that of its content')
-        if opcode in (*_SUMMARY_KINDS, Opcode.DATA_END):
+        if opcode == Opcode.DATA_END or opcode in _SUMMARY_KINDS:
             if self._has_limit and (opcode != Opcode.DATA_END or end != self._limit):
                 raise DamagedError('it has no place before the end of the data section')
             raise _EndOfDataError
-        raw = HEAD.pack(opcode, length) + content
         scanned = ScannedRecord(opcode, offset, len(raw), record, raw)
         if isinstance(record, MessageIndex):
             self._check_message_index(offset, record, raw)
             return scanned
         if isinstance(record, Chunk):
-            return self._scan_chunk(scanned, record, content[len(content) - extra:])
+            return self._scan_chunk(scanned, record, content[length - extra:])
         if isinstance(record, Schema | Channel):
             known = self._declare(offset, record)
             if known != record:
-                record = known
                 scanned = replace(scanned, record=known, raw=b'')
+                raw = record_bytes(known)
         elif isinstance(record, Header):
             if offset != MAGIC_SIZE:
                 raise DamagedError('it has no place but at the beginning')
             self.header = record
-        self._forget_chunk()
-        self._add_to_crc(scanned.raw or record_bytes(record))
+        self._accept([raw])
         return scanned
 
     def _scan_chunk(self, scanned: ScannedRecord, chunk: Chunk, extra: bytes) -> ScannedRecord:
         contents = open_chunk(chunk, self._source.max_bytes)
-        self._forget_chunk()
-        self._chunks_seen = True
-        self._expected = message_indexes(contents.entries)
         for record in contents.declared:
             self._declare(scanned.offset, record)
         raw = scanned.raw
@@ -266,57 +230,58 @@ class Scanner:
             self._defects.append(f'the chunk at byte {scanned.offset} has wrong times in its head')
             chunk = replace(chunk, message_start_time=start, message_end_time=end)
             raw = raw[:HEAD.size] + record_bytes(chunk)[HEAD.size:] + extra
-        self._add_to_crc(raw)
-        return self._take_messages(replace(
-            scanned, record=chunk, raw=b'', extra=extra, contents=contents))
+        self._accept([raw])
+        self._chunks_seen = True
+        self._expected = message_indexes(contents.entries)
+        return self._take_messages(
+            replace(scanned, record=chunk, raw=b'', extra=extra), contents)
 
-    def _scan_message(self, offset: int, content: bytes) -> ScannedRecord:
-        message = parse_message(content, 0, len(content))
+    def _scan_message(self, offset: int, raw: bytes) -> ScannedRecord:
+        message = parse_message(raw, HEAD.size, len(raw))
         if self._is_ours or self._summary.indexes_all_messages:
             raise DamagedError('all messages of the file are in chunks')
-        end = offset + HEAD.size + len(content)
+        end = offset + len(raw)
         # Nothing in a message proves its length but the record that follows.
         if end < self._limit and not 0 < self._source.read(end, 1)[0] <= Opcode.DATA_END:
             try:
                 self._source.head(end, self._limit)
             except DamagedError:
                 raise DamagedError('no record follows it') from None
-        self._forget_chunk()
-        self._add_to_crc(HEAD.pack(Opcode.MESSAGE, len(content)) + content)
-        return self._take_messages(ScannedRecord(
-            Opcode.MESSAGE, offset, HEAD.size + len(content),
-            contents=ChunkContents(content, [], [message])))
+        self._accept([raw])
+        return self._take_messages(
+            ScannedRecord(Opcode.MESSAGE, offset, len(raw)), ChunkContents(raw, [], [message]))
 
     def _scan_attachment(self, offset: int, length: int) -> ScannedRecord:
-        content = offset + HEAD.size
-        index, crc_offset = parse_attachment_head(
-            self._source.read(content, min(length, _ATTACHMENT_HEAD)), length)
-        if crc_offset + 4 < length and not self._is_record(content + length):
+        index, crc_offset = self._source.attachment(offset, length)
+        end = offset + HEAD.size + length
+        if crc_offset + 4 < end and not self._finder.is_record(end):
             raise DamagedError('its length is not that of its content')
-        crc = 0
-        for block in self._source.blocks(content, crc_offset):
-            crc = zlib.crc32(block, crc)
-        stored = int.from_bytes(self._source.read(content + crc_offset, 4), 'little')
-        if stored not in (0, crc):
+        start = offset + HEAD.size
+        crc = self._source.crc(start, crc_offset - start)
+        if int.from_bytes(self._source.read(crc_offset, 4), 'little') not in (0, crc):
             raise DamagedError('its checksum is wrong')
-        return self._scan_blocks(ScannedRecord(
-            Opcode.ATTACHMENT, offset, HEAD.size + length, index))
+        self._accept(self._source.blocks(offset, index.length))
+        return ScannedRecord(Opcode.ATTACHMENT, offset, index.length, index)
 
     def _scan_unknown_kind(self, opcode: int, offset: int, length: int) -> ScannedRecord:
         if self._is_ours:
             raise DamagedError('there is no such kind of record')
-        for expected in self._expected.values():
-            if len(expected) == HEAD.size + length and (
-                    self._source.read(offset + 1, len(expected) - 1) == expected[1:]):
-                raise DamagedError('it is a message index but for its kind')
-        return self._scan_blocks(ScannedRecord(opcode, offset, HEAD.size + length))
+        size = HEAD.size + length
+        if any(len(expected) == size and self._source.read(offset + 1, size - 1) == expected[1:]
+               for expected in self._expected.values()):
+            raise DamagedError('it is a message index but for its kind')
+        self._accept(self._source.blocks(offset, size))
+        return ScannedRecord(opcode, offset, size)
 
-    def _scan_blocks(self, scanned: ScannedRecord) -> ScannedRecord:
-        """Add a record of any size to the checksum."""
+    def _accept(self, blocks: Iterator[bytes] | list[bytes]) -> None:
+        """Note a record that is not about the chunk before it."""
         self._forget_chunk()
-        for block in self._source.blocks(scanned.offset, scanned.length):
+        for block in blocks:
             self._add_to_crc(block)
-        return scanned
+
+    def _add_to_crc(self, data: bytes) -> None:
+        if self._crc is not None:
+            self._crc = zlib.crc32(data, self._crc)
 
     def _declare(self, offset: int, record: Schema | Channel) -> Schema | Channel:
         """Make a schema or channel known, and return what is right about it."""
@@ -331,9 +296,25 @@ class Scanner:
                 'the file says elsewhere')
         return known
 
-    def _add_to_crc(self, data: bytes) -> None:
-        if self._crc is not None:
-            self._crc = zlib.crc32(data, self._crc)
+    def _take_messages(self, scanned: ScannedRecord, contents: ChunkContents) -> ScannedRecord:
+        """Count messages, and return the record with those of known channels."""
+        if not all(map(self._knows, contents.entries)):
+            known = []
+            for message in contents.messages:
+                if self._knows(message.channel_id):
+                    known.append(message)
+                else:
+                    self._tally.add_unknown(scanned.offset, message)
+            scanned = replace(scanned, unknown=len(contents.messages) - len(known))
+            contents = ChunkContents(contents.plain, contents.declared, known)
+        self._tally.add(contents, numbered=self._is_ours)
+        return replace(scanned, contents=contents)
+
+    def _knows(self, channel_id: int) -> bool:
+        """Return whether the channel and its schema are known."""
+        channel = self.channels.get(channel_id)
+        return channel is not None and (
+            channel.schema_id == 0 or channel.schema_id in self.schemas)
 
     @property
     def _is_ours(self) -> bool:
@@ -347,133 +328,62 @@ class Scanner:
         number = len(index.records)
         if self._lost_chunk is not None:
             self._lost_chunk.messages = (self._lost_chunk.messages or 0) + number
-            self._indexed_lost[index.channel_id] = (
-                self._indexed_lost.get(index.channel_id, 0) + number)
+            self._tally.add_lost(index.channel_id, number)
             return
         expected = self._expected.get(index.channel_id)
         # The entries may be in any order, and a channel without messages may have an index.
         if number and raw != expected and (expected is None or sorted(index.records) != sorted(
                 struct.iter_unpack('<QQ', expected[_INDEX_HEAD:]))):
-            if self._repair_indexes(offset):
+            if self._damaged_indexes(offset):
                 raise DamagedError('it does not agree with its chunk')
             self._defects.append(f'the message index at byte {offset} is wrong')
         self._expected.pop(index.channel_id, None)
         self._add_to_crc(raw)
 
-    def _repair_indexes(self, offset: int) -> int:
-        """Return the size of the expected indexes if damage there is inside of them, else 0."""
-        size = sum(map(len, self._expected.values()))
-        end = offset + size
+    def _damaged_indexes(self, offset: int) -> int:
+        """Return the size of the indexes that are expected there, 0 if something else is there."""
+        end = offset + sum(map(len, self._expected.values()))
         if end > self._limit and not self._summary.closed:
             # Truncated within an index, which tells nothing of its own.
             first = self._source.read(offset, 1)
             return self._limit - offset if first == bytes([Opcode.MESSAGE_INDEX]) else 0
-        return size if self._is_record(end) else 0
+        return end - offset if self._finder.is_record(end) else 0
 
     def _forget_chunk(self) -> None:
-        """Note that a record is not about the chunk before it."""
+        """Note that what follows is not about the chunk before it."""
         self._expected = {}
         self._lost_chunk = None
 
-    # Messages
-
-    def _knows(self, channel_id: int) -> bool:
-        """Return whether the channel and its schema are known."""
-        channel = self.channels.get(channel_id)
-        return channel is not None and (
-            channel.schema_id == 0 or channel.schema_id in self.schemas)
-
-    def _take_messages(self, scanned: ScannedRecord) -> ScannedRecord:
-        """Count the messages of a record, and return it with those of known channels."""
-        contents = scanned.contents
-        assert contents is not None
-        unknown = {number for number in contents.entries if not self._knows(number)}
-        if unknown:
-            for message in contents.messages:
-                if message.channel_id in unknown:
-                    self._lose_message(scanned.offset, message)
-            known = [message for message in contents.messages
-                     if message.channel_id not in unknown]
-            scanned = replace(scanned, unknown=len(contents.messages) - len(known),
-                              contents=ChunkContents(contents.plain, contents.declared, known))
-            return self._take_messages(scanned)
-        for number, entries in contents.entries.items():
-            self._counts[number] = self._counts.get(number, 0) + len(entries) // 2
-        if contents.messages:
-            times = [*self._times, *time_span(contents.entries)]
-            self._times = [min(times), max(times)]
-        if self._is_ours:
-            self._count_gaps(contents.messages)
-        return scanned
-
-    def _lose_message(self, offset: int, message: StoredMessage) -> None:
-        """Note a message of an unknown channel."""
-        number = message.channel_id
-        loss = self._unknown.setdefault(number, Loss(
-            offset, 0, f'messages of channel {number}',
-            'the record of their channel or schema is lost', messages=0))
-        loss.bytes += message.end - message.start
-        loss.messages = (loss.messages or 0) + 1
-
-    def _count_gaps(self, messages: list[StoredMessage]) -> None:
-        """Count what is missing between messages that were numbered without gaps."""
-        following = self._next_sequence
-        for _, number, sequence, _, _, _ in messages:
-            gap = (sequence - following.get(number, 0)) & 0xFFFFFFFF
-            if gap < 1 << 31:  # else it is out of order
-                if gap:
-                    self._gaps[number] = self._gaps.get(number, 0) + gap
-                following[number] = sequence + 1
-
     # Damage
 
-    def _skip(self, offset: int, damage: DamagedError) -> Generator[ScannedRecord, None, int]:
-        """Yield what is usable behind a damaged record, and return where the scan goes on."""
-        size = self._repair_indexes(offset)
+    def _skip(self, offset: int, damage: DamagedError) -> int:
+        """Note what is damaged, and return where the scan goes on."""
+        size = self._damaged_indexes(offset) if self._expected else 0
         if size:
             self._defects.append(f'the message index at byte {offset} is wrong')
-            for expected in self._expected.values():
-                self._add_to_crc(expected)
-            self._expected = {}
+            self._accept([*self._expected.values()])
             return offset + size
         opcode = self._source.read(offset, 1)[0]
-        place = self._next_place(offset)
         try:
-            end = offset + HEAD.size + self._source.head(offset, place or self._limit)[1]
+            _, length = self._source.head(offset, self._next_place(offset))
         except DamagedError:
             pass
         else:
-            if self._is_record(end):
+            end = offset + HEAD.size + length
+            if self._finder.is_record(end):
                 self._lose(offset, end, opcode, damage)
                 return end
-        return (yield from self._resynchronize(offset, opcode, damage))
-
-    def _resynchronize(
-        self, offset: int, opcode: int, damage: DamagedError,
-    ) -> Generator[ScannedRecord, None, int]:
-        """Go on behind a damaged record whose length is wrong; see `_skip`."""
-        end = self._limit
-        found = False
         if self._summary.indexes_all_chunks:
-            end = self._next_place(offset) or end
+            end = self._next_place(offset)
         else:
-            for place, record in self._search(offset + 1):
-                found = True
-                if isinstance(record, Chunk):
-                    end = place
-                    break
-                raw = record_bytes(record)
-                if isinstance(record, Schema | Channel):
-                    record = self._declare(place, record)   # noqa: PLW2901
-                yield ScannedRecord(raw[0], place, len(raw), record)
+            end = self._finder.find(offset + 1)
         if end == self._limit and not self._summary.closed:
-            if not found and self._is_redundant(offset, opcode):
+            if self._is_redundant(offset, opcode):
                 return end
             if 0 < opcode <= Opcode.DATA_END and type(damage) is DamagedError:
                 damage = DamagedError('the file ends within it')
         self._lose(offset, end, opcode, damage)
-        if end < self._limit:
-            self._lost_chunk = None     # the indexes that follow may be those of another chunk
+        self._lost_chunk = None     # the indexes that follow may be those of another chunk
         return end
 
     def _lose(self, offset: int, end: int, opcode: int, damage: DamagedError) -> None:
@@ -506,82 +416,10 @@ class Scanner:
             return start == name or (self._is_ours and self._chunks_seen)
         return opcode == Opcode.DATA_END or opcode in _SUMMARY_KINDS
 
-    def _next_place(self, offset: int) -> int | None:
-        """Return where the next record stands that the summary indexes."""
+    def _next_place(self, offset: int) -> int:
+        """Return where the next record stands that the summary indexes, or the limit."""
         i = bisect.bisect_right(self._place_offsets, offset)
-        return self._place_offsets[i] if i < len(self._place_offsets) else None
-
-    def _is_record(self, offset: int) -> bool:
-        """Return whether a record begins there for certain, or the data section ends."""
-        try:
-            while offset < self._limit:
-                opcode, length = self._source.head(offset, self._limit)
-                if opcode <= Opcode.DATA_END:
-                    break
-                offset += HEAD.size + length
-            else:
-                return offset == self._limit
-            if opcode == Opcode.CHUNK or opcode in TEXT_OFFSETS:
-                return self._proven(offset)[0] is not None
-            if opcode == Opcode.MESSAGE:
-                return length >= MESSAGE_FIELDS
-            if opcode == Opcode.ATTACHMENT:
-                start = self._source.read(offset + HEAD.size, min(length, _ATTACHMENT_HEAD))
-                parse_attachment_head(start, length)
-            else:
-                self._source.record(offset, self._limit)
-        except TooLargeError:
-            return opcode == Opcode.CHUNK
-        except DamagedError:
-            return False
-        return True
-
-    def _search(self, start: int) -> Iterator[tuple[int, McapRecord]]:
-        """Yield chunks, schemas, channels and metadata that prove themselves, and their places."""
-        size = HEAD.size
-        while start < self._limit:
-            size = min(2 * size + 4096, _SEARCH_BLOCK)
-            block = self._source.read(start, size + HEAD.size)
-            for match in _CANDIDATE.finditer(block, 0, size):
-                try:
-                    record, extra = self._proven(start + match.start())
-                except DamagedError:
-                    continue
-                if isinstance(record, Chunk) or (record is not None and not extra):
-                    yield start + match.start(), record
-            start += size
-
-    def _proven(self, offset: int) -> tuple[McapRecord | None, int]:
-        """
-        Return the record there if its own lengths and checksum prove it, and its extra bytes.
-
-        Raises DamagedError if it is none, TooLargeError if it might be one.
-        """
-        opcode, length = self._source.head(offset, self._limit)
-        # First what needs no more than a look: most candidates are none.
-        if not looks_right(opcode, length, self._source.read(offset + HEAD.size, LOOK_BYTES)):
-            return None, 0
-        self._effort -= length
-        if self._effort < 0:    # a file made to have a candidate everywhere
-            return None, 0
-        record, extra = parse(opcode, self._source.content(offset, length))
-        if isinstance(record, Chunk):
-            contents = open_chunk(record, self._source.max_bytes)
-            return record if contents.messages or contents.declared else None, extra
-        return record, extra
-
-    # The end
-
-    def _is_last(self, offset: int) -> bool:
-        """Return whether nothing but the end record fits in before the summary."""
-        return self._has_limit and self._limit - offset <= _DATA_END_SIZE
-
-    def _stored_crc(self, end: int) -> int:
-        """Return the checksum of the data section as it stands in the file."""
-        crc = 0
-        for block in self._source.blocks(0, end):
-            crc = zlib.crc32(block, crc)
-        return crc
+        return self._place_offsets[i] if i < len(self._place_offsets) else self._limit
 
     def _check_end(self, offset: int) -> None:
         """Look at what ends the data section."""
@@ -592,15 +430,17 @@ class Scanner:
         except DamagedError:
             end = None
         if isinstance(end, DataEnd):
-            stored = end.data_section_crc
-            if self._crc is not None and stored not in (0, self._crc, self._stored_crc(offset)):
+            crc = end.data_section_crc
+            # A writer may have been wrong: its checksum is that of what it wrote.
+            if self._crc is not None and crc not in (0, self._crc) and (
+                    crc != self._source.crc(0, offset)):
                 self._losses.append(Loss(
                     0, 0, 'something besides the messages',
                     'the checksum of the data section is wrong'))
         elif self._summary.closed:
             self._defects.append('the end of the data section is damaged')
         statistics = self._summary.statistics
-        if statistics is not None and not self._losses and not self._unknown and (
-                statistics.message_count > sum(self._counts.values())):
+        if statistics is not None and not self._losses and not self._tally.unknown and (
+                statistics.message_count > sum(self._tally.found.values())):
             self._losses.append(Loss(
                 0, 0, 'messages', 'the statistics count more than there are'))

@@ -33,6 +33,7 @@ from spinning_top_sim.recording.records import (
     HEAD,
     MAX_BYTES,
     DamagedError,
+    StrictStream,
     TooLargeError,
     parse,
 )
@@ -41,6 +42,7 @@ MAGIC_SIZE = len(MCAP0_MAGIC)
 FOOTER_SIZE = HEAD.size + 8 + 8 + 4
 
 _BLOCK = 1 << 20  # bytes read at a time where a record is not needed whole
+_ATTACHMENT_HEAD = 1 << 16  # bytes; more than any name and media type
 _INDEX_SIZE = HEAD.size + 2 + 4  # of a message index without its entries, 16 bytes each
 
 
@@ -130,6 +132,33 @@ class McapSource:
         record, _ = parse(opcode, self.content(offset, length))
         return record
 
+    def attachment(self, offset: int, length: int) -> tuple[AttachmentIndex, int]:
+        """
+        Return the index of the attachment there, and the offset of its checksum.
+
+        `length` is that of its content.  Raises DamagedError.
+        """
+        start = offset + HEAD.size
+        stream = StrictStream(self.read(start, min(length, _ATTACHMENT_HEAD)))
+        try:
+            index = AttachmentIndex(
+                offset=offset, length=HEAD.size + length, log_time=stream.read8(),
+                create_time=stream.read8(), name=stream.read_prefixed_string(),
+                media_type=stream.read_prefixed_string(), data_size=stream.read8())
+        except (McapError, UnicodeDecodeError):
+            raise DamagedError('its name or its type cannot be read') from None
+        crc_offset = start + stream.count + index.data_size
+        if crc_offset + 4 > start + length:
+            raise DamagedError('its length is not that of its content')
+        return index, crc_offset
+
+    def crc(self, offset: int, length: int) -> int:
+        """Return the checksum of a stretch of the file."""
+        crc = 0
+        for block in self.blocks(offset, length):
+            crc = zlib.crc32(block, crc)
+        return crc
+
 
 @dataclass
 class Summary:
@@ -197,7 +226,8 @@ def read_summary(source: McapSource) -> Summary:
         if not MAGIC_SIZE <= start <= footer_offset:
             raise DamagedError('the footer leads to no summary')
         if source.size - start > source.max_bytes:
-            raise DamagedError(f'the summary: {TooLargeError(source.size - start, source.max_bytes)}')
+            raise DamagedError(
+                f'the summary is not read: {TooLargeError(source.size - start, source.max_bytes)}')
         section = source.read(start, source.size - start)
         if footer.summary_crc not in (0, zlib.crc32(section[:-MAGIC_SIZE - 4])):
             raise DamagedError('the checksum of the summary is wrong')
