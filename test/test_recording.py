@@ -39,14 +39,10 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from spinning_top_sim.recording import mcap_writer
+from spinning_top_sim.recording.chunks import BUFFER_BYTES, CHUNK_BYTES, BufferPool
 from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import DefinitionNotFoundError, RecordingError
-from spinning_top_sim.recording.mcap_writer import (
-    BUFFER_BYTES,
-    CHUNK_BYTES,
-    BufferPool,
-    McapWriter,
-)
+from spinning_top_sim.recording.mcap_writer import McapWriter
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic
 from spinning_top_sim.recording.writer import COMPRESSIONS, McapRecorder, create_file
 
@@ -910,7 +906,7 @@ def test_a_file_that_is_closed_twice_leaves_the_next_one_alone(tmp_path, monkeyp
 def test_processes_that_fork_make_their_chunks_apart():
     script = textwrap.dedent("""
         import os
-        from spinning_top_sim.recording.mcap_writer import BufferPool
+        from spinning_top_sim.recording.chunks import BufferPool
         buffer = BufferPool('zstd').buffer(3)
         buffer[:] = b'one'
         if os.fork() == 0:

@@ -3,8 +3,7 @@
 Writes MCAP files that end after a whole record at any time, whatever happens to the disk.
 
 mcap's own Writer buffers what it cannot write, then reports success, and cannot go back.  So the
-file is laid out here, from mcap's record classes; only the records that grow with every message
-are packed by hand, for speed (MCAP specification, "Message", "Chunk" and "Message Index").
+file is laid out here, from mcap's record classes.
 
 Layout: header, metadata of the run, schemas, channels | chunk, its message indexes | ... |
 `rosbag2` metadata, data end | summary, footer.
@@ -14,20 +13,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import mmap
 import os
 import struct
-import sys
 import zlib
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from itertools import groupby
-from operator import itemgetter
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING
 
-import lz4.frame  # type: ignore[import-untyped]
-import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
@@ -47,112 +40,27 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
+from spinning_top_sim.recording.chunks import (
+    CHUNK_BYTES,
+    MESSAGE,
+    MESSAGE_FIELDS,
+    BufferPool,
+    Entries,
+    Messages,
+    PlainChunk,
+    Run,
+    chunk_of_runs,
+    message_indexes,
+    split_by_topic,
+    time_span,
+)
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA, BagTopic, Qos, bag_metadata_yaml
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-CHUNK_BYTES = 1 << 20   # uncompressed; a single larger message still makes a chunk of its own
-BUFFER_BYTES = 2 << 20  # larger chunks are not made in reused memory
-
-# Half the time of zstd's own default, 3, and less memory, for files that are 1 to 6 % larger:
-# `python benchmark/compression.py`.
-ZSTD_LEVEL = 1
-
-_JOIN_BYTES = 1 << 16   # joined at a time before they are copied: they stay in the cache
-
-# Message index entries of a chunk by channel id: log time, offset in the uncompressed chunk, log
-# time, offset, .. (uint64).
-Entries = Mapping[int, 'array[int]']
-
-# Messages of one stamp: topic indices, log time [ns], CDR of each, size of all [bytes].
-Messages = tuple[Sequence[int], int, Sequence[bytes], int]
-
-MESSAGE = struct.Struct('<BQHIQQ')  # opcode, length, channel, sequence, log and publish time
-MESSAGE_FIELDS = 2 + 4 + 8 + 8      # what `length` counts besides the data
-_MESSAGE_DTYPE = [('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
-                  ('log_time', '<u8'), ('publish_time', '<u8')]
 _CHUNK = struct.Struct('<BQQQQI')   # opcode, length, span, size and crc of the plain data
-_INDEX = struct.Struct('<BQHI')     # opcode, length, channel, length of the entries
-
-
-class PlainChunk(NamedTuple):
-    """
-    An uncompressed chunk.
-
-    Attributes
-    ----------
-    data : bytes or memoryview
-        The message records.  A memoryview of a `BufferPool` is recycled when it is written.
-    entries : mapping of int to array of uint64
-        The message index entries by channel id.
-    span : (int, int)
-        The earliest and the latest log time [ns].
-
-    """
-
-    data: bytes | memoryview
-    entries: Entries
-    span: tuple[int, int]
-
-
-class BufferPool:
-    """
-    A compressor and memory for chunks, both reused: per-thread heaps fragment otherwise.
-
-    Parameters
-    ----------
-    compression : {'zstd', 'lz4', 'none'}
-
-    """
-
-    _idle: ClassVar[list[BufferPool]] = []      # at most one, for the next file
-
-    def __init__(self, compression: str) -> None:
-        self.compression = compression
-        self._buffers: list[memoryview] = []
-        methods: dict[str, Callable[[bytes | memoryview], bytes]] = {
-            'zstd': self._compress_zstd, 'lz4': _compress_lz4, 'none': bytes}
-        self.compress = methods[compression]
-        if compression == 'zstd':
-            self._zstd = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
-            self._compressed = _new_buffer()
-
-    @classmethod
-    def acquire(cls, compression: str) -> BufferPool:
-        """Return the idle pool if its compression fits, else a new one."""
-        with contextlib.suppress(IndexError):
-            pool = cls._idle.pop()
-            if pool.compression == compression:
-                return pool
-        return cls(compression)
-
-    def release(self) -> None:
-        """Keep this pool for the next file unless another one is idle."""
-        if not self._idle:
-            self._idle.append(self)
-
-    def buffer(self, size: int) -> memoryview:
-        """Return `size` bytes of uninitialized memory; see `recycle`."""
-        if size > BUFFER_BYTES:
-            return memoryview(bytearray(size))
-        with contextlib.suppress(IndexError):
-            return self._buffers.pop()[:size]
-        return _new_buffer()[:size]
-
-    def recycle(self, buffer: memoryview) -> None:
-        """Take back a buffer that nobody reads any more."""
-        if isinstance(buffer.obj, mmap.mmap):
-            self._buffers.append(memoryview(buffer.obj))
-
-    def _compress_zstd(self, plain: bytes | memoryview) -> bytes:
-        # Incompressible data grow by 0.4 % at most, so half the buffer is a safe limit.
-        if len(plain) > BUFFER_BYTES // 2:
-            compressed: bytes = self._zstd.compress(plain)
-            return compressed
-        with self._zstd.stream_reader(plain, size=len(plain)) as reader:
-            return bytes(self._compressed[:reader.readinto(self._compressed)])
 
 
 class McapWriter:
@@ -311,75 +219,30 @@ class McapWriter:
             Topic indices, log time [ns], CDR of each, size of all [bytes].
 
         """
-        import numpy as np  # noqa: PLC0415 - rclpy's messages have imported it
-
         if not batch:
             return
         size = sum(size + MESSAGE.size * len(messages) for _, _, messages, size in batch)
         per_chunk = max(1, len(batch) * CHUNK_BYTES // size)
+        self.write_chunk()
         for first in range(0, len(batch), per_chunk):
-            times: dict[int, list[int]] = {}
-            messages: dict[int, list[bytes]] = {}
-            # Consecutive entries mostly have the same topics.
-            for topic_indices, alike in groupby(batch[first:first + per_chunk], itemgetter(0)):
-                _, alike_times, alike_messages, _ = zip(*alike, strict=True)
-                for topic_index, data in zip(topic_indices, zip(*alike_messages, strict=True),
-                                             strict=True):
-                    times.setdefault(topic_index, []).extend(alike_times)
-                    messages.setdefault(topic_index, []).extend(data)
-            parts: list[tuple[int, NDArray[np.uint64], list[bytes]]] = []
-            for topic_index, of_topic in messages.items():
-                stamps = np.frombuffer(array('Q', times[topic_index]), np.uint64)
-                start = 0
-                for _, run in groupby(of_topic, len):
-                    rows = list(run)
-                    parts.append((topic_index, stamps[start:start + len(rows)], rows))
-                    start += len(rows)
-            self.write_chunk()
-            self.put_plain_chunk(self.chunk_of_rows(parts))
+            self.put_plain_chunk(self.chunk_of_rows(
+                list(split_by_topic(batch[first:first + per_chunk]))))
 
     def chunk_of_rows(
         self, parts: Sequence[tuple[int, NDArray[np.integer], NDArray[np.uint8] | list[bytes]]],
     ) -> PlainChunk:
         """
-        Make a chunk of runs of messages that have one topic and one length.
-
-        A run is copied in a few numpy calls, in a tenth of the time that single messages take.
+        Make a chunk of the next messages of some topics.
 
         Parameters
         ----------
         parts : sequence of (topic index, log times, messages)
-            Log times of shape (n,) [ns], n >= 1; messages as n bytes or of shape (n, size).
-            Times need no order: the message indexes have it (MCAP specification, "Message
-            Index").
+            As in `Run`.
 
         """
-        import numpy as np  # noqa: PLC0415 - recovery needs none
-
-        sizes = [len(rows[0]) for _, _, rows in parts]
-        buffer = self._buffers.buffer(sum(
-            len(times) * (MESSAGE.size + size)
-            for (_, times, _), size in zip(parts, sizes, strict=True)))
-        data = np.frombuffer(buffer, 'u1')
-        entries: dict[int, array[int]] = {}
-        offset = 0
-        for (topic_index, times, rows), size in zip(parts, sizes, strict=True):
-            count, length = len(times), MESSAGE.size + size
-            records = data[offset:offset + count * length].reshape(count, length)
-            heads = records[:, :MESSAGE.size].view(np.dtype(_MESSAGE_DTYPE))[:, 0]
-            heads['opcode'] = Opcode.MESSAGE
-            heads['length'] = MESSAGE_FIELDS + size
-            heads['channel'] = topic_index + 1
-            heads['sequence'] = self._number(topic_index, count) + np.arange(count) & 0xFFFFFFFF
-            heads['log_time'] = heads['publish_time'] = times
-            _copy_rows(rows, records[:, MESSAGE.size:])
-            index = np.empty((count, 2), 'u8')
-            index[:, 0] = times
-            index[:, 1] = offset + length * np.arange(count)
-            entries.setdefault(topic_index + 1, array('Q')).frombytes(index.tobytes())
-            offset += count * length
-        return PlainChunk(buffer, entries, (min(int(times.min()) for _, times, _ in parts),
-                                            max(int(times.max()) for _, times, _ in parts)))
+        return chunk_of_runs(
+            [Run(topic_index + 1, self._number(topic_index, len(times)), times, messages)
+             for topic_index, times, messages in parts], self._buffers)
 
     def _number(self, topic_index: int, count: int) -> int:
         """Return the sequence number of the next of `count` messages of a topic."""
@@ -406,15 +269,15 @@ class McapWriter:
             self._buffers.recycle(plain.data)
 
     def copy_chunk(
-        self, chunk: Chunk, entries: Entries, span: tuple[int, int], extra: bytes = b'',
+        self, chunk: Chunk, entries: Entries, span: tuple[int, int], record: bytes = b'',
     ) -> None:
         """
         Write a compressed chunk and its message indexes.
 
-        `entries` and `span` are as in `PlainChunk`; `extra` stands behind the known fields.
+        `entries` and `span` are as in `PlainChunk`, `record` is as in `write_schema`.
         """
-        head = _chunk_head(chunk, len(extra))
-        chunk_length = len(head) + len(chunk.data) + len(extra)
+        blocks = [record] if record else [_chunk_head(chunk), chunk.data]
+        chunk_length = sum(map(len, blocks))
         indexes = message_indexes(entries)
         index_offsets = {}
         offset = self.size + chunk_length
@@ -429,7 +292,7 @@ class McapWriter:
             uncompressed_size=chunk.uncompressed_size,
             message_start_time=chunk.message_start_time, message_end_time=chunk.message_end_time))
 
-        self._write([head, chunk.data, extra, *indexes.values()])
+        self._write([*blocks, *indexes.values()])
         self._chunk_indexes += chunk_index
         self.chunk_count += 1
         if indexes:
@@ -551,21 +414,6 @@ def record_bytes(record: McapRecord) -> bytes:
     return written
 
 
-def message_indexes(entries: Entries) -> dict[int, bytes]:
-    """Return the message index records behind a chunk by channel id, in ascending order."""
-    return {
-        channel_id: _INDEX.pack(
-            Opcode.MESSAGE_INDEX, 2 + 4 + 8 * len(numbers), channel_id, 8 * len(numbers))
-        + _little_endian(numbers)
-        for channel_id, numbers in sorted(entries.items()) if numbers}
-
-
-def time_span(entries: Entries) -> tuple[int, int]:
-    """Return the earliest and the latest stamp in the entries of a chunk; (0, 0) in none."""
-    times = [time for numbers in entries.values() for time in numbers[::2]]
-    return min(times, default=0), max(times, default=0)
-
-
 def sync_directory(directory: Path) -> None:
     """Bring the names in a directory to the disk, if the file system can and lets us."""
     with contextlib.suppress(OSError):
@@ -576,45 +424,10 @@ def sync_directory(directory: Path) -> None:
             os.close(descriptor)
 
 
-def _chunk_head(chunk: Chunk, extra: int) -> bytes:
-    """Return what stands before the data in the record of a chunk."""
+def _chunk_head(chunk: Chunk) -> bytes:
+    """Return what stands before the data, which mcap's record class would copy."""
     compression = chunk.compression.encode()
     tail = struct.pack(f'<I{len(compression)}sQ', len(compression), compression, len(chunk.data))
     return _CHUNK.pack(
-        Opcode.CHUNK, _CHUNK.size - 9 + len(tail) + len(chunk.data) + extra,
-        chunk.message_start_time, chunk.message_end_time, chunk.uncompressed_size,
-        chunk.uncompressed_crc) + tail
-
-
-def _copy_rows(rows: NDArray[np.uint8] | list[bytes], to: NDArray[np.uint8]) -> None:
-    """Copy messages of equal length into the rows of an array."""
-    import numpy as np  # noqa: PLC0415
-
-    if not isinstance(rows, list):
-        to[:] = rows
-        return
-    size = to.shape[1]
-    if not size:
-        return
-    step = max(1, _JOIN_BYTES // size)
-    for first in range(0, len(rows), step):
-        joined = b''.join(rows[first:first + step])
-        to[first:first + step] = np.frombuffer(joined, 'u1').reshape(-1, size)
-
-
-def _little_endian(numbers: array[int]) -> bytes:
-    if sys.byteorder == 'big':
-        numbers = array('Q', numbers)
-        numbers.byteswap()
-    return numbers.tobytes()
-
-
-def _compress_lz4(plain: bytes | memoryview) -> bytes:
-    return bytes(lz4.frame.compress(plain))
-
-
-def _new_buffer() -> memoryview:
-    # Private: a process that forks would share it with its children.
-    private = ({'flags': mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS}
-               if hasattr(mmap, 'MAP_PRIVATE') else {})
-    return memoryview(mmap.mmap(-1, BUFFER_BYTES, **private))
+        Opcode.CHUNK, _CHUNK.size - 9 + len(tail) + len(chunk.data), chunk.message_start_time,
+        chunk.message_end_time, chunk.uncompressed_size, chunk.uncompressed_crc) + tail

@@ -21,9 +21,9 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Header, Metadata
 from mcap.writer import MCAP0_MAGIC
 
+from spinning_top_sim.recording.chunks import time_span
 from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.errors import NotMcapError
-from spinning_top_sim.recording.mcap_writer import time_span
 from spinning_top_sim.recording.records import (
     HEAD,
     MAX_BYTES,
@@ -212,22 +212,24 @@ class LogReader:
             if (names is None or channel.topic in names)
             and (channel.schema_id == 0 or channel.schema_id in schemas)}
 
-        # One chunk after the other, those that overlap in time together.
-        pending: list[_Cursor] = []
+        # Chunks that overlap in time are merged: log time, place in the file, message.
+        pending: list[tuple[int, int, int, LogMessage]] = []
         for span in self._spans:
             if (start is not None and span.end_ns < start) or (
                     end is not None and span.start_ns >= end):
                 continue
-            yield from _merge(pending, channels, span.start_ns)
+            while pending and pending[0][0] < span.start_ns:
+                yield heapq.heappop(pending)[-1]
             plain, stored = self._read(span)
-            chosen = [message for message in stored
-                      if message.channel_id in channels
-                      and (start is None or message.log_time >= start)
-                      and (end is None or message.log_time < end)]
-            if chosen:
-                chosen.sort(key=lambda message: message.log_time)
-                heapq.heappush(pending, (chosen[0].log_time, span.offset, 0, plain, chosen))
-        yield from _merge(pending, channels, None)
+            for number, message in enumerate(stored):
+                topic = channels.get(message.channel_id)
+                if (topic is not None and (start is None or message.log_time >= start)
+                        and (end is None or message.log_time < end)):
+                    heapq.heappush(pending, (message.log_time, span.offset, number, LogMessage(
+                        topic, message.log_time, message.publish_time, message.sequence,
+                        plain[message.start:message.end], message.channel_id)))
+        while pending:
+            yield heapq.heappop(pending)[-1]
 
     def scan(self) -> Scanner:
         """Begin a scan of all usable records in file order."""
@@ -333,28 +335,6 @@ class _Survey:
     metadata: dict[str, dict[str, str]]
     spans: list[_Span]
     damage: Damage
-
-
-# A chunk being read: next log time, where it is in the file, how many of its messages are
-# through, its bytes, its messages.
-_Cursor = tuple[int, int, int, bytes, list[StoredMessage]]
-
-
-def _merge(
-    cursors: list[_Cursor], names: Mapping[int, str], until_ns: int | None,
-) -> Iterator[LogMessage]:
-    """Yield messages of a heap of chunks, those before a log time or all."""
-    while cursors and (until_ns is None or cursors[0][0] < until_ns):
-        _, offset, number, plain, messages = cursors[0]
-        log_time, channel_id, sequence, publish_time, start, end = messages[number]
-        number += 1
-        if number < len(messages):
-            heapq.heapreplace(
-                cursors, (messages[number].log_time, offset, number, plain, messages))
-        else:
-            heapq.heappop(cursors)
-        yield LogMessage(names[channel_id], log_time, publish_time, sequence, plain[start:end],
-                         channel_id)
 
 
 def _loose_messages(records: bytes) -> Iterator[StoredMessage]:

@@ -40,7 +40,8 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from spinning_top_sim.recording.mcap_writer import MESSAGE, MESSAGE_FIELDS, Entries, record_bytes
+from spinning_top_sim.recording.chunks import MESSAGE, MESSAGE_FIELDS, Entries
+from spinning_top_sim.recording.mcap_writer import record_bytes
 
 MAX_BYTES = 256 << 20               # of one record or one uncompressed chunk in memory
 HEAD = struct.Struct('<BQ')         # of every record: opcode, length of what follows

@@ -9,7 +9,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Chunk
 
-from spinning_top_sim.recording.mcap_writer import MESSAGE_FIELDS
+from spinning_top_sim.recording.chunks import MESSAGE_FIELDS
 from spinning_top_sim.recording.records import (
     CHUNK_HEAD,
     HEAD,

@@ -12,9 +12,10 @@ from pathlib import Path
 
 from mcap.records import AttachmentIndex, Channel, Chunk, Metadata, Schema
 
+from spinning_top_sim.recording.chunks import time_span
 from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.errors import NothingToSaveError, OutputError
-from spinning_top_sim.recording.mcap_writer import McapWriter, sync_directory, time_span
+from spinning_top_sim.recording.mcap_writer import McapWriter, sync_directory
 from spinning_top_sim.recording.reader import LogReader, qos_profiles
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA
 from spinning_top_sim.recording.scanner import ScannedRecord, Scanner
@@ -158,7 +159,7 @@ class _Copy:
         if isinstance(scanned.record, Chunk) and not scanned.unknown:
             self._writer.write_chunk()  # what came before stays before
             self._writer.copy_chunk(
-                scanned.record, contents.entries, time_span(contents.entries), scanned.extra)
+                scanned.record, contents.entries, time_span(contents.entries), scanned.raw)
             return
         for message in contents.messages:
             if self._writer.add_message(

@@ -33,8 +33,9 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
+from spinning_top_sim.recording.chunks import message_indexes, time_span
 from spinning_top_sim.recording.damage import Damage, Loss
-from spinning_top_sim.recording.mcap_writer import message_indexes, record_bytes, time_span
+from spinning_top_sim.recording.mcap_writer import record_bytes
 from spinning_top_sim.recording.records import (
     CHUNK_HEAD,
     HEAD,
@@ -73,10 +74,8 @@ class ScannedRecord:
         As it should be.  The index of an attachment; None for a message outside of chunks and
         for unknown kinds.
     raw : bytes
-        The record as it stands in the file; b'' if `record` was corrected, if it is a chunk, an
-        attachment or of an unknown kind.
-    extra : bytes
-        What stands behind the known fields of a chunk.
+        The record as it should be, with its head and with what stands behind its known fields;
+        b'' for messages, attachments and unknown kinds.
     contents : ChunkContents or None
         Of a chunk, with the messages of known channels; of a message outside of chunks.
     unknown : int
@@ -89,7 +88,6 @@ class ScannedRecord:
     length: int
     record: McapRecord | None = None
     raw: bytes = b''
-    extra: bytes = b''
     contents: ChunkContents | None = None
     unknown: int = 0
 
@@ -210,13 +208,12 @@ class Scanner:
         if isinstance(record, Schema | Channel):
             known = self._declare(offset, record)
             if known != record:
-                scanned = replace(scanned, record=known, raw=b'')
-                raw = record_bytes(known)
+                scanned = replace(scanned, record=known, raw=record_bytes(known))
         elif isinstance(record, Header):
             if offset != MAGIC_SIZE:
                 raise DamagedError('it has no place but at the beginning')
             self.header = record
-        self._accept([raw])
+        self._accept([scanned.raw])
         return scanned
 
     def _scan_chunk(self, scanned: ScannedRecord, chunk: Chunk, extra: bytes) -> ScannedRecord:
@@ -233,8 +230,7 @@ class Scanner:
         self._accept([raw])
         self._chunks_seen = True
         self._expected = message_indexes(contents.entries)
-        return self._take_messages(
-            replace(scanned, record=chunk, raw=b'', extra=extra), contents)
+        return self._take_messages(replace(scanned, record=chunk, raw=raw), contents)
 
     def _scan_message(self, offset: int, raw: bytes) -> ScannedRecord:
         message = parse_message(raw, HEAD.size, len(raw))

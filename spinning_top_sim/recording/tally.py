@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from mcap.records import Statistics
 
+from spinning_top_sim.recording.chunks import time_span
 from spinning_top_sim.recording.damage import Loss
-from spinning_top_sim.recording.mcap_writer import time_span
 from spinning_top_sim.recording.records import ChunkContents, StoredMessage
 
 

@@ -25,7 +25,8 @@ from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.rosbag2 import RecordedTopic, offered_qos_yaml
 
 if TYPE_CHECKING:
-    from spinning_top_sim.recording.mcap_writer import McapWriter, Messages
+    from spinning_top_sim.recording.chunks import Messages
+    from spinning_top_sim.recording.mcap_writer import McapWriter
 
 COMPRESSIONS = ('zstd', 'lz4', 'none')
 METADATA_NAME = 'spinning_top_sim'
