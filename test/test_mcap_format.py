@@ -204,6 +204,24 @@ def test_an_index_with_more_entries_than_its_chunk_is_only_a_defect(tmp_path):
         recover(path).unlink()
 
 
+@pytest.mark.parametrize('kind', [Opcode.CHUNK, Opcode.METADATA, Opcode.ATTACHMENT])
+@pytest.mark.parametrize('bit', [4, 7])
+def test_an_indexed_record_does_not_become_one_of_unknown_kind(tmp_path, kind, bit):
+    """One bit makes its opcode that of an application, but the summary has it."""
+    path = tmp_path / 'a.mcap'
+    messages = write_stranger(path, {})
+    content = bytearray(path.read_bytes())
+    start, end = next((start, end) for opcode, start, end in records_of(content) if opcode == kind)
+    content[start] ^= 1 << bit
+    path.write_bytes(content)
+    with LogReader(path) as reader:
+        (loss,) = reader.damage.losses
+        assert (loss.offset, loss.bytes) == (start, end - start)
+    kept = seen_by_mcap(recover(path, SOME_LOST))
+    assert kept == seen_by_us(path)
+    assert kept == messages or kind == Opcode.CHUNK and kept == messages[-len(kept):] != messages
+
+
 def test_a_channel_without_its_schema_is_not_written(tmp_path):
     """Readers refuse the whole file for it; schema 0 means that there is none."""
     path = tmp_path / 'a.mcap'

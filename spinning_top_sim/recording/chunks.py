@@ -181,21 +181,23 @@ def chunk_of_runs(runs: Sequence[Run], pool: BufferPool) -> PlainChunk:
     buffer = pool.buffer(sum(
         len(run.times) * length for run, length in zip(runs, lengths, strict=True)))
     data = np.frombuffer(buffer, 'u1')
+    head = np.dtype(_MESSAGE_DTYPE)
     entries: dict[int, array[int]] = {}
     offset = 0
     for (channel_id, sequence, times, messages), length in zip(runs, lengths, strict=True):
         count = len(times)
+        numbers = np.arange(count)
         records = data[offset:offset + count * length].reshape(count, length)
-        heads = records[:, :MESSAGE.size].view(np.dtype(_MESSAGE_DTYPE))[:, 0]
+        heads = records[:, :MESSAGE.size].view(head)[:, 0]
         heads['opcode'] = Opcode.MESSAGE
         heads['length'] = length - MESSAGE.size + MESSAGE_FIELDS
         heads['channel'] = channel_id
-        heads['sequence'] = np.arange(sequence, sequence + count) & 0xFFFFFFFF
+        heads['sequence'] = sequence + numbers & 0xFFFFFFFF
         heads['log_time'] = heads['publish_time'] = times
         _copy_rows(messages, records[:, MESSAGE.size:])
         index = np.empty((count, 2), 'u8')
         index[:, 0] = times
-        index[:, 1] = offset + length * np.arange(count)
+        index[:, 1] = offset + length * numbers
         entries.setdefault(channel_id, array('Q')).frombytes(index.tobytes())
         offset += count * length
     return PlainChunk(buffer, entries, (min(int(run.times.min()) for run in runs),
