@@ -219,7 +219,8 @@ def test_an_indexed_record_does_not_become_one_of_unknown_kind(tmp_path, kind, b
         assert (loss.offset, loss.bytes) == (start, end - start)
     kept = seen_by_mcap(recover(path, SOME_LOST))
     assert kept == seen_by_us(path)
-    assert kept == messages or kind == Opcode.CHUNK and kept == messages[-len(kept):] != messages
+    assert kept == messages or (
+        kind == Opcode.CHUNK and kept == messages[-len(kept):] != messages)
 
 
 def test_a_channel_without_its_schema_is_not_written(tmp_path):
@@ -234,6 +235,17 @@ def test_a_channel_without_its_schema_is_not_written(tmp_path):
     with open(output, 'rb') as file:
         assert [channel.topic for channel in make_reader(file).get_summary().channels.values()
                 ] == ['/raw']
+
+
+def test_a_channel_that_stands_behind_its_messages_is_enough(tmp_path):
+    """As when the first one is damaged, and so is the summary that repeats it."""
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(MCAP0_MAGIC + HEADER + chunk_of(message(5, b'x')) + RAW_CHANNEL)
+    output = recover(path)
+    assert seen_by_us(path) == seen_by_us(output) == seen_by_mcap(output) == [('/a', 5, b'x')]
+    with LogReader(path) as reader:
+        assert reader.damage.lossless
+        assert reader.damage.messages == {'/a': 1}
 
 
 @pytest.mark.parametrize('kind', STRANGERS)

@@ -231,9 +231,13 @@ class LogReader:
         while pending:
             yield heapq.heappop(pending)[-1]
 
-    def scan(self) -> Scanner:
-        """Begin a scan of all usable records in file order."""
-        return Scanner(self._source, self._summary)
+    def scan(self, former: Scanner | None = None) -> Scanner:
+        """Begin a scan of all usable records in file order, with what a former scan knows."""
+        scanner = Scanner(self._source, self._summary)
+        if former is not None:
+            scanner.schemas.update(former.schemas)
+            scanner.channels.update(former.channels)
+        return scanner
 
     def blocks(self, offset: int, length: int) -> Iterator[bytes]:
         """Yield bytes of the file, in blocks."""
@@ -241,8 +245,13 @@ class LogReader:
 
     @functools.cached_property
     def _survey(self) -> _Survey:
-        """What a walk through the whole file found, done at the first use."""
-        scanner = self.scan()
+        """What a scan of the whole file found, done at the first use."""
+        survey = self._scan_all(self.scan())
+        if survey.scanner.found_late:
+            survey = self._scan_all(self.scan(survey.scanner))
+        return survey
+
+    def _scan_all(self, scanner: Scanner) -> _Survey:
         spans: list[_Span] = []
         metadata = {}
         run: _Span | None = None  # adjacent messages outside of chunks

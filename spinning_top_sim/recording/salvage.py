@@ -80,7 +80,10 @@ def recover(
         raise OutputError(_exists(output))
     draft = output.with_name(f'.recover-{secrets.token_hex(8)}.tmp')
     try:
-        return _recover(reader, output, draft, progress)
+        try:
+            return _recover(reader, reader.scan(), output, draft, progress)
+        except _FoundLateError as late:
+            return _recover(reader, reader.scan(late.scanner), output, draft, progress)
     except FileNotFoundError as error:
         raise OutputError(
             f'cannot write {output}: there is no directory {output.parent}') from error
@@ -88,10 +91,18 @@ def recover(
         raise OutputError(f'cannot write {output}: {error.strerror or error}') from error
 
 
+class _FoundLateError(Exception):
+    """Channels were found behind their messages: with what the scanner knows, scan again."""
+
+    def __init__(self, scanner: Scanner) -> None:
+        super().__init__()
+        self.scanner = scanner
+
+
 def _recover(
-    reader: LogReader, output: Path, draft: Path, progress: Callable[[int, int], None],
+    reader: LogReader, scanner: Scanner, output: Path, draft: Path,
+    progress: Callable[[int, int], None],
 ) -> Recovered:
-    scanner = reader.scan()
     writer = McapWriter(
         draft, profile=reader.profile, library=reader.library, compression=_COMPRESSION)
     with writer.discarded_on_failure():
@@ -99,6 +110,8 @@ def _recover(
         for scanned in scanner:
             copy.put(scanned)
             progress(scanned.offset, reader.size)
+        if scanner.found_late:
+            raise _FoundLateError(scanner)
         copy.put_rest()
         messages = sum(writer.message_counts.values())
         damage = scanner.damage()

@@ -155,6 +155,11 @@ class Scanner:
                 offset += scanned.length
         self._check_end(offset)
 
+    @property
+    def found_late(self) -> bool:
+        """Whether a channel became known behind messages of it, so that another scan helps."""
+        return any(map(self._knows, self._tally.unknown))
+
     def damage(self) -> Damage:
         """Return what was found; call it after the scan."""
         statistics = self._summary.statistics
