@@ -8,23 +8,33 @@ import platform
 import sys
 from collections.abc import Iterable, Mapping
 from importlib import metadata
-from typing import Any
 
 # Version of these keys.
 FORMAT = '1'
 LIBRARIES = ('numpy', 'mcap', 'rclpy')
 
 
-def provenance(values: Mapping[str, Any], epoch_ns: int, begun_ns: int,
-               history: Iterable[tuple[int, float, float]], now: Mapping[str, Any],
+def provenance(values: Mapping[str, object], epoch_ns: int, begun_ns: int,
+               history: Iterable[tuple[int, float, float]], now: Mapping[str, object],
                evaluation: str = 'one state at a time') -> dict[str, str]:
     """
     Return the `spinning_top_sim` metadata record.
 
-    values: parameters at the start of the motion (the last reset);  now: as they are, with later
-    changes;  epoch_ns: stamp of t = 0;  begun_ns: simulated time at which the recording begins;
-    history: commands applied before, as (t_ns, l3, lz);  evaluation: how states were computed,
-    which decides their last bits.
+    Parameters
+    ----------
+    values : mapping
+        The parameters at the start of the motion (the last reset).
+    epoch_ns : int
+        The stamp of t = 0 [ns].
+    begun_ns : int
+        The simulated time at which the recording begins [ns].
+    history : iterable of (t_ns, l3, lz)
+        The commands applied before.
+    now : mapping
+        The parameters with later changes.
+    evaluation : str
+        How states were computed, which decides their last bits.
+
     """
     return {
         'format': FORMAT,
@@ -40,7 +50,7 @@ def provenance(values: Mapping[str, Any], epoch_ns: int, begun_ns: int,
 
 
 def surroundings() -> dict[str, str]:
-    """Return what else decides the last bits: this package's version, machine, libraries."""
+    """Return what else decides the last bits: versions of this package and libraries, machine."""
     return {
         'version': _version('spinning_top_sim'),
         'platform': f'{platform.machine()} {platform.system()} '

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Reading MCAP logs: ours or a stranger's, whole, torn or with wrong bytes.
+Reads MCAP logs of any writer, also truncated and damaged ones.
 
-Everything that can be proven whole is read (`walk.py` says how damage is met), and `damage` says
-what is not.  Memory holds the chunks that overlap in time, one in a log written in order.
+Everything that is provably whole is read (see `scanner.py`), and `damage` reports the rest.
+Memory holds the chunks that overlap in time: one in a log that was written in order.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Header, Metadata
+from mcap.records import Channel, Chunk, Header, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording.chunks import time_span
@@ -44,11 +44,23 @@ class LogTopic:
     """
     A channel of a log.
 
-    name: such as '/imu/data_raw';  type_name: such as 'sensor_msgs/msg/Imu', '' without schema
-    schema: its text, with those of the types it is made of;  schema_encoding: such as 'ros2msg'
-    encoding: of its messages, such as 'cdr'
-    qos: profiles offered, each as the `qos` of RecordedTopic; empty where none can be read
-    metadata: of the channel, as it stands;  channel_id: its number in the file
+    Attributes
+    ----------
+    name : str
+        Such as '/imu/data_raw'.
+    type_name : str
+        Such as 'sensor_msgs/msg/Imu'; '' without schema.
+    schema, schema_encoding : str
+        The definition with its dependencies, and its format, such as 'ros2msg'.
+    encoding : str
+        Of the messages, such as 'cdr'.
+    qos : tuple of mappings
+        Offered profiles, each as the `qos` of RecordedTopic; empty if there are none.
+    metadata : mapping of str to str
+        As it stands in the channel.
+    channel_id : int
+        Its number in the file.
+
     """
 
     name: str
@@ -62,12 +74,7 @@ class LogTopic:
 
 
 class LogMessage(NamedTuple):
-    """
-    A message of a log.
-
-    topic: its name;  log_time, publish_time: [ns];  sequence: its number in the channel, as the
-    writer counts;  data: as `LogTopic.encoding` says;  channel_id: of its LogTopic
-    """
+    """A message of a log; times in ns."""
 
     topic: str
     log_time: int
@@ -78,7 +85,7 @@ class LogMessage(NamedTuple):
 
 
 class _Span(NamedTuple):
-    """A stretch of the file with messages between two log times: a chunk or loose messages."""
+    """A chunk, or adjacent messages outside of chunks, in the order of the log times."""
 
     start_ns: int
     offset: int
@@ -90,13 +97,28 @@ class LogReader:
     """
     An MCAP file, open for reading; also a context manager.
 
-    A file whose summary is right opens at once.  Any other is read through before its topics,
-    metadata or messages are told, and so is every file for its `damage`.
+    A file with a usable summary opens at once.  Any other is scanned before its topics, metadata
+    or messages are returned, and so is every file for its `damage`.  Damage raises nothing.
 
-    Raises LogAccessError when the file cannot be opened or read, at any call, and NotMcapError
-    when it is none.  Damage raises nothing.
+    Parameters
+    ----------
+    path : path
+        The file.
+    max_bytes : int
+        Largest record, and largest uncompressed chunk, that is read into memory.
 
-    left_out: pieces of the file that `messages` came upon and left out, damaged
+    Attributes
+    ----------
+    left_out : int
+        Damaged chunks that `messages` has skipped.
+
+    Raises
+    ------
+    LogAccessError
+        If the file cannot be opened or read; any method may raise it.
+    NotMcapError
+        If it is no MCAP file.
+
     """
 
     def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> None:
@@ -116,7 +138,7 @@ class LogReader:
 
     @property
     def size(self) -> int:
-        """Bytes in the file when it was opened."""
+        """Size of the file when it was opened [bytes]."""
         return self._source.size
 
     def __enter__(self) -> LogReader:
@@ -135,26 +157,22 @@ class LogReader:
 
     @property
     def profile(self) -> str:
-        """What the header says of the content; 'ros2' where it cannot be read."""
+        """The profile in the header; 'ros2' if the header is damaged."""
         return self._header.profile
 
     @property
     def library(self) -> str:
-        """What the header says of the program that wrote the file; '' where it cannot be read."""
+        """The library in the header; '' if the header is damaged."""
         return self._header.library
 
     @property
     def whole(self) -> bool:
-        """
-        Whether the file was closed: its summary is there, is right and fits the file.
-
-        Chunks may be damaged all the same: `damage` tells.
-        """
+        """Whether the file was closed and its summary, if any, is right; see also `damage`."""
         return self._summary.closed and not self._summary.problem
 
     @property
     def topics(self) -> tuple[LogTopic, ...]:
-        """The channels of the log, in the order of their numbers."""
+        """The channels of the log, in the order of their ids."""
         schemas, channels = self._declared
         found = []
         for number, channel in sorted(channels.items()):
@@ -169,7 +187,7 @@ class LogReader:
 
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
-        """The metadata records by name; the last where a name stands for several."""
+        """The metadata records by name; of several with one name, the last."""
         if self._survey_is_needed or '_survey' in self.__dict__:
             return dict(self._survey.metadata)
         found = {}
@@ -184,12 +202,12 @@ class LogReader:
 
     @property
     def damage(self) -> Damage:
-        """What is wrong with the file; reads all of it at the first use."""
+        """What is wrong with the file; scans all of it at the first use."""
         return self._survey.damage
 
     @property
     def span(self) -> tuple[int, int]:
-        """Log times of the first and of the last message [ns]; both 0 without any."""
+        """The earliest and the latest log time [ns]; both 0 without messages."""
         spans = [span for span in self._spans if span.end_ns]
         return (min((span.start_ns for span in spans), default=0),
                 max((span.end_ns for span in spans), default=0))
@@ -201,9 +219,13 @@ class LogReader:
         """
         Yield the whole messages in the order of their log times, equal ones in file order.
 
-        topics: names, None for all;  start, end: log times [ns], from and up to but without
+        Parameters
+        ----------
+        topics : iterable of str or None
+            Names; None for all.
+        start, end : int or None
+            Log times [ns]; `end` is exclusive.
 
-        What is damaged is left out, counted in `left_out`, and told by `damage`.
         """
         schemas, known = self._declared
         names = None if topics is None else frozenset(topics)
@@ -240,7 +262,7 @@ class LogReader:
         return scanner
 
     def blocks(self, offset: int, length: int) -> Iterator[bytes]:
-        """Yield bytes of the file, in blocks."""
+        """Yield a stretch of the file in blocks."""
         return self._source.blocks(offset, length)
 
     @functools.cached_property
@@ -275,7 +297,7 @@ class LogReader:
         return _Survey(scanner, metadata, sorted(spans), scanner.damage())
 
     def _check_beginning(self) -> Header:
-        """Return the header; raises NotMcapError where neither magic nor header is there."""
+        """Return the header; raises NotMcapError if neither magic nor header is there."""
         if not self.size:
             raise NotMcapError(f'cannot read {self.path}: it is empty')
         magic = self._source.read(0, MAGIC_SIZE)
@@ -293,7 +315,7 @@ class LogReader:
         return Header(profile='ros2', library='')
 
     @property
-    def _declared(self) -> tuple[dict[int, Any], dict[int, Channel]]:
+    def _declared(self) -> tuple[dict[int, Schema], dict[int, Channel]]:
         """Return schemas and channels by number."""
         source = self._survey.scanner if self._survey_is_needed else self._summary
         return source.schemas, source.channels
@@ -321,10 +343,10 @@ class LogReader:
                    for channel in summary.channels.values()))
 
     def _read(self, span: _Span) -> tuple[bytes, list[StoredMessage]]:
-        """Return the messages of a span and the bytes they are in; none where it is damaged."""
-        content = self._source.read(span.offset, span.length)
+        """Return the messages of a span and the bytes they are in; none if it is damaged."""
         try:
-            if content[:1] == bytes([Opcode.MESSAGE]):
+            if self._source.read(span.offset, 1) == bytes([Opcode.MESSAGE]):
+                content = self._source.read(span.offset, span.length)
                 return content, list(_loose_messages(content))
             chunk = self._source.record(span.offset, span.offset + span.length)
             if isinstance(chunk, Chunk):
@@ -338,7 +360,7 @@ class LogReader:
 
 @dataclass(frozen=True)
 class _Survey:
-    """What a walk through a file found."""
+    """What a scan of a file found."""
 
     scanner: Scanner
     metadata: dict[str, dict[str, str]]
@@ -357,5 +379,5 @@ def _loose_messages(records: bytes) -> Iterator[StoredMessage]:
 
 
 def qos_profiles(channel: Channel) -> tuple[Qos, ...]:
-    """Return what a channel says its publishers offer; nothing where that cannot be read."""
+    """Return the QoS profiles in the metadata of a channel."""
     return tuple(parse_offered_qos(channel.metadata.get('offered_qos_profiles', '')))

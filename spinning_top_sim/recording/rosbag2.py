@@ -24,7 +24,7 @@ _METADATA_VERSION = 9  # of rosbag2_storage::BagMetadata in jazzy
 _NEVER = {'sec': 9223372036, 'nsec': 854775807}  # RMW_DURATION_INFINITE
 
 # What a reliable publisher with a queue of ten offers, rmw's enum values.
-DEFAULT_QOS: Mapping[str, Any] = {
+DEFAULT_QOS: Qos = {
     'history': 1,                        # keep last
     'depth': 10,
     'reliability': 1,                    # reliable
@@ -50,16 +50,25 @@ class RecordedTopic:
     """
     One topic of a recording.
 
-    name: resolved, such as '/imu/data_raw';  type_name: 'package/msg/Type'
-    qos: what the publisher offers, with the keys of DEFAULT_QOS, integer policies as in rmw and
-        durations as {'sec': ..., 'nsec': ...}; what is left out is as in DEFAULT_QOS
+    Parameters
+    ----------
+    name : str
+        Resolved, such as '/imu/data_raw'.
+    type_name : str
+        'package/msg/Type'.
+    qos : mapping
+        What the publisher offers; a policy that is left out is as in DEFAULT_QOS.
 
-    Raises ValueError naming the key, its value and what is allowed.
+    Raises
+    ------
+    ValueError
+        Naming the key, its value and what is allowed.
+
     """
 
     name: str
     type_name: str
-    qos: Mapping[str, Any] = field(default_factory=dict)
+    qos: Qos = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for key, value in self.qos.items():
@@ -76,15 +85,25 @@ class BagTopic:
     """
     What the bag metadata say of a topic.
 
-    name, type_name: as of RecordedTopic;  type_hash: 'RIHS01_...' or ''
-    profiles: what its publishers offer, each as the `qos` of a RecordedTopic
-    messages: how many there are;  encoding: of the messages
+    Attributes
+    ----------
+    name, type_name : str
+        As in RecordedTopic.
+    type_hash : str
+        'RIHS01_...' or ''.
+    profiles : sequence of mappings
+        What its publishers offer.
+    messages : int
+        Their number.
+    encoding : str
+        That of the messages.
+
     """
 
     name: str
     type_name: str
     type_hash: str
-    profiles: Sequence[Mapping[str, Any]]
+    profiles: Sequence[Qos]
     messages: int
     encoding: str = 'cdr'
 
@@ -150,10 +169,18 @@ def bag_metadata_yaml(
     """
     Return the `serialized_metadata` of the `rosbag2` record.
 
-    file_name: without its directory
-    start_ns, end_ns: earliest and latest stamp [ns since the epoch]; both 0 in an empty log
-    former: the metadata of the log that this one is made from, whose ROS distribution and custom
-        data stay
+    Parameters
+    ----------
+    topics : sequence of BagTopic
+        In the order of the file.
+    file_name : str
+        Without its directory.
+    start_ns, end_ns : int
+        The earliest and the latest stamp [ns since the epoch]; both 0 in an empty log.
+    former : str
+        The metadata of the log that this one is made from, whose ROS distribution and custom
+        data stay.
+
     """
     total = sum(topic.messages for topic in topics)
     lines = [
@@ -205,7 +232,7 @@ def _block(text: str, key: str) -> str:
     return match.group() if match else ''
 
 
-def _qos_lines(profile: Mapping[str, Any], *, as_names: bool) -> list[str]:
+def _qos_lines(profile: Qos, *, as_names: bool) -> list[str]:
     """Return a profile as a YAML list of one, line by line."""
     lines = []
     for key, default in DEFAULT_QOS.items():

@@ -39,12 +39,19 @@ _CLOSE_AT_EXIT_S = 10.0
 @dataclass(frozen=True)
 class RecorderCounters:
     """
-    Where a recording stands.
+    The progress of a recording.
 
-    messages: in the file;  queued: accepted, not yet in the file
-    lost: handed over after the recording stopped, or when it failed
-    bytes: size of the file
-    flushes: how often the file was brought to the disk;  longest_flush: [s]
+    Attributes
+    ----------
+    messages, queued : int
+        Messages in the file; accepted, but not yet in the file.
+    lost : int
+        Messages handed over after the recording stopped, or when it failed.
+    bytes : int
+        Size of the file.
+    flushes, longest_flush : int, float
+        How often the file was brought to the disk; the longest time that took [s].
+
     """
 
     messages: int
@@ -58,12 +65,23 @@ class RecorderCounters:
 @dataclass(frozen=True)
 class RecordingSummary:
     """
-    What a finished recording holds.
+    The result of a recording.
 
-    path: of the file;  bytes: its size
-    counts: messages in it by topic name;  lost: messages handed over that are not in it
-    error: why the recording stopped early, or None
-    indexed: whether the file has its summary; without, ordinary readers refuse it
+    Attributes
+    ----------
+    path : Path
+        The file.
+    bytes : int
+        Its size.
+    counts : dict of str to int
+        Messages in it by topic name.
+    lost : int
+        Messages handed over that are not in it.
+    error : str or None
+        Why the recording stopped early.
+    indexed : bool
+        Whether the file has its summary; ordinary readers refuse it without.
+
     """
 
     path: Path
@@ -131,17 +149,32 @@ class McapRecorder:
         queue_bytes: int = 32_000_000,
     ) -> McapRecorder:
         """
-        Create `path` and start recording into it.
+        Create a file and start recording into it.
 
-        topics: a message refers to them by index
-        metadata: what the `spinning_top_sim` record at the head of the file says
-        max_loss: most wall time whose messages a SIGKILL or a power loss may take [s], > 0
-        compression: one of COMPRESSIONS
-        min_free_bytes: recording stops when the disk has less left than this, >= 0
-        queue_bytes: `room` is False from here on; at most about twice this is in memory, > 0
+        Parameters
+        ----------
+        path : path
+            The file.  It must not exist.
+        topics : sequence of RecordedTopic
+            A message refers to them by index.
+        metadata : mapping of str to str
+            The `spinning_top_sim` record at the head of the file.
+        max_loss : float
+            Most wall time whose messages a SIGKILL or a power loss may take [s], > 0.
+        compression : str
+            One of COMPRESSIONS.
+        min_free_bytes : int
+            Recording stops if the disk has less left than this, >= 0.
+        queue_bytes : int
+            `room` is False from here on; about twice this is in memory at most, > 0.
 
-        Raises ValueError for an argument out of range, and RecordingError, naming path or type
-        and the reason, when the file exists or cannot be made, or a definition is not installed.
+        Raises
+        ------
+        ValueError
+            If an argument is out of range.
+        RecordingError
+            If the file exists or cannot be made, or a definition is not installed.
+
         """
         path = Path(path)
         topics = tuple(topics)
@@ -199,12 +232,20 @@ class McapRecorder:
         """
         Hand over messages of one stamp, from one thread at a time; they keep their order.
 
-        topic_indices: of the topic of each, in the `topics` of `open`
-        log_time_ns: their stamp [ns], >= 0, log and publish time alike
-        messages: CDR, each with its four bytes of header;  size: of all together [bytes]
-
         Never waits for the disk, never raises for its sake.  After the recording stopped the
         messages are only counted, as lost.
+
+        Parameters
+        ----------
+        topic_indices : sequence of int
+            The topic of each, an index of the `topics` of `open`.
+        log_time_ns : int
+            Log and publish time [ns], >= 0.
+        messages : sequence of bytes
+            CDR, each with its four bytes of header.
+        size : int
+            The size of all [bytes].
+
         """
         self._offered += len(messages)
         if self._accepting:
