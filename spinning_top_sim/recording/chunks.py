@@ -50,45 +50,20 @@ _INDEX = struct.Struct('<BQHI')     # opcode, length, channel, length of the ent
 
 
 class PlainChunk(NamedTuple):
-    """
-    An uncompressed chunk.
+    """An uncompressed chunk."""
 
-    Attributes
-    ----------
-    data : bytes or memoryview
-        The message records.  A memoryview of a `BufferPool` is recycled when it is written.
-    entries : mapping of int to array of uint64
-        The message index entries by channel id.
-    span : (int, int)
-        The earliest and the latest log time [ns].
-
-    """
-
-    data: bytes | memoryview
+    data: bytes | memoryview    # message records; a memoryview is of a `BufferPool`
     entries: Entries
-    span: tuple[int, int]
+    span: tuple[int, int]       # the earliest and the latest log time [ns]
 
 
 class Run(NamedTuple):
-    """
-    Consecutive messages of one channel and one length.
-
-    Attributes
-    ----------
-    channel_id : int
-    sequence : int
-        The sequence number of the first.
-    times : ndarray of int
-        Log times of shape (n,) [ns], n >= 1, in any order.
-    messages : ndarray of uint8 or list of bytes
-        Of shape (n, size), or n of one length.
-
-    """
+    """Consecutive messages of one channel and one length."""
 
     channel_id: int
-    sequence: int
-    times: NDArray[np.integer]
-    messages: NDArray[np.uint8] | list[bytes]
+    sequence: int                               # of the first message
+    times: NDArray[np.integer]                  # log times (n,) [ns], n >= 1, in any order
+    messages: NDArray[np.uint8] | list[bytes]   # (n, size), or n of one length
 
 
 class BufferPool:

@@ -91,22 +91,11 @@ class StoredMessage(NamedTuple):
 
 @dataclass
 class ChunkContents:
-    """
-    The content of a chunk whose checksum is right, or of a single message.
+    """The content of a chunk whose checksum is right, or a single message."""
 
-    Attributes
-    ----------
-    plain : bytes
-        Uncompressed.
-    declared : list of Schema or Channel
-    messages : list of StoredMessage
-        In the order of the file.
-
-    """
-
-    plain: bytes
+    plain: bytes    # uncompressed
     declared: list[Schema | Channel] = field(default_factory=list)
-    messages: list[StoredMessage] = field(default_factory=list)
+    messages: list[StoredMessage] = field(default_factory=list)     # in the order of the file
 
     @functools.cached_property
     def entries(self) -> Entries:

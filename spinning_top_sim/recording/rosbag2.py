@@ -82,28 +82,12 @@ class RecordedTopic:
 
 @dataclass(frozen=True)
 class BagTopic:
-    """
-    What the bag metadata say of a topic.
-
-    Attributes
-    ----------
-    name, type_name : str
-        As in RecordedTopic.
-    type_hash : str
-        'RIHS01_...' or ''.
-    profiles : sequence of mappings
-        What its publishers offer.
-    messages : int
-        Their number.
-    encoding : str
-        That of the messages.
-
-    """
+    """What the bag metadata say of a topic."""
 
     name: str
     type_name: str
-    type_hash: str
-    profiles: Sequence[Qos]
+    type_hash: str              # 'RIHS01_...' or ''
+    profiles: Sequence[Qos]     # what its publishers offer
     messages: int
     encoding: str = 'cdr'
 

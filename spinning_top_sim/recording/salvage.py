@@ -25,25 +25,13 @@ _COMPRESSION = 'zstd'  # of messages that were in no chunk
 
 @dataclass(frozen=True)
 class Recovered:
-    """
-    What a recovery wrote.
-
-    Attributes
-    ----------
-    path : Path
-        The new file.
-    bytes, messages, chunks : int
-        Its size, and what is in it.
-    damage : Damage
-        Of the old file.
-
-    """
+    """What a recovery wrote."""
 
     path: Path
     bytes: int
     messages: int
     chunks: int
-    damage: Damage
+    damage: Damage  # of the old file
 
 
 def recover(

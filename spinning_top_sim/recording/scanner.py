@@ -61,35 +61,18 @@ _SUMMARY_KINDS = (Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.METADATA_INDEX,
 
 @dataclass(frozen=True)
 class ScannedRecord:
-    """
-    A usable record of the data section.
+    """A usable record of the data section."""
 
-    Attributes
-    ----------
-    opcode : int
-        Above Opcode.DATA_END: of an application, or of a later version of the format.
-    offset, length : int
-        Its place in the file, and its size with its head [bytes].
-    record : McapRecord or None
-        As it should be.  The index of an attachment; None for a message outside of chunks and
-        for unknown kinds.
-    raw : bytes
-        The record as it should be, with its head and with what stands behind its known fields;
-        b'' for messages, attachments and unknown kinds.
-    contents : ChunkContents or None
-        Of a chunk, with the messages of known channels; of a message outside of chunks.
-    unknown : int
-        Messages that were left out because their channel or its schema is unknown.
-
-    """
-
-    opcode: int
-    offset: int
-    length: int
+    opcode: int             # above DATA_END: of an application, or of a later version of MCAP
+    offset: int             # in the file
+    length: int             # with its head
+    # As it should be.  The index of an attachment; None for single messages and unknown kinds.
     record: McapRecord | None = None
+    # `record` with its head and its extra fields; only what fits into memory.
     raw: bytes = b''
+    # Messages of known channels, of a chunk or a single one.
     contents: ChunkContents | None = None
-    unknown: int = 0
+    unknown: int = 0        # messages left out, whose channel or its schema is unknown
 
 
 class _EndOfDataError(Exception):
@@ -100,19 +83,7 @@ class Scanner:
     """
     One scan through the data section.  Iterate once; `damage` is complete afterwards.
 
-    Parameters
-    ----------
-    source : McapSource
-        The file.
-    summary : Summary
-        Its summary.
-
-    Attributes
-    ----------
-    header : Header or None
-    schemas, channels : dict
-        By id, as far as they are known at the time.
-
+    `schemas` and `channels` (by id) are those that are known at the time.
     """
 
     def __init__(self, source: McapSource, summary: Summary) -> None:

@@ -162,23 +162,11 @@ class McapSource:
 
 @dataclass
 class Summary:
-    """
-    The summary section of a file, empty unless its checksum is right and it fits the file.
+    """The summary section of a file, empty unless its checksum is right and it fits the file."""
 
-    Attributes
-    ----------
-    data_limit : int
-        No record of the data section ends behind this offset.
-    closed : bool
-        Whether the file ends with a footer and the closing magic.
-    problem : str
-        Why the summary cannot be used; '' also if the file was written without one.
-
-    """
-
-    data_limit: int
-    closed: bool = False
-    problem: str = ''
+    data_limit: int         # no record of the data section ends behind this offset
+    closed: bool = False    # the file ends with a footer and the closing magic
+    problem: str = ''       # why there is no summary, '' also if the file was written without one
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     statistics: Statistics | None = None

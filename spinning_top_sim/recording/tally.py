@@ -11,24 +11,12 @@ from spinning_top_sim.recording.records import ChunkContents, StoredMessage
 
 
 class MessageTally:
-    """
-    Messages by channel id.
-
-    Attributes
-    ----------
-    found : dict of int to int
-        Whole messages.
-    span : (int, int)
-        The earliest and the latest log time of the whole messages [ns]; 0 without any.
-    unknown : dict of int to Loss
-        Messages of channels that are unknown or whose schema is.
-
-    """
+    """Messages by channel id."""
 
     def __init__(self) -> None:
-        self.found: dict[int, int] = {}
-        self.span = 0, 0
-        self.unknown: dict[int, Loss] = {}
+        self.found: dict[int, int] = {}     # whole messages
+        self.span = 0, 0                    # their earliest and latest log time [ns]
+        self.unknown: dict[int, Loss] = {}  # of channels that are unknown, or whose schema is
         self._in_lost_chunks: dict[int, int] = {}
         self._next_sequence: dict[int, int] = {}
         self._gaps: dict[int, int] = {}     # by sequence numbers

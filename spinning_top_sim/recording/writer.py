@@ -38,58 +38,26 @@ _CLOSE_AT_EXIT_S = 10.0
 
 @dataclass(frozen=True)
 class RecorderCounters:
-    """
-    The progress of a recording.
+    """The progress of a recording."""
 
-    Attributes
-    ----------
-    messages, queued : int
-        Messages in the file; accepted, but not yet in the file.
-    lost : int
-        Messages handed over after the recording stopped, or when it failed.
-    bytes : int
-        Size of the file.
-    flushes, longest_flush : int, float
-        How often the file was brought to the disk; the longest time that took [s].
-
-    """
-
-    messages: int
-    queued: int
-    lost: int
-    bytes: int
-    flushes: int
-    longest_flush: float
+    messages: int           # in the file
+    queued: int             # accepted, not yet in the file
+    lost: int               # handed over after the recording stopped, or when it failed
+    bytes: int              # size of the file
+    flushes: int            # how often the file was brought to the disk
+    longest_flush: float    # [s]
 
 
 @dataclass(frozen=True)
 class RecordingSummary:
-    """
-    The result of a recording.
-
-    Attributes
-    ----------
-    path : Path
-        The file.
-    bytes : int
-        Its size.
-    counts : dict of str to int
-        Messages in it by topic name.
-    lost : int
-        Messages handed over that are not in it.
-    error : str or None
-        Why the recording stopped early.
-    indexed : bool
-        Whether the file has its summary; ordinary readers refuse it without.
-
-    """
+    """The result of a recording."""
 
     path: Path
-    bytes: int
-    counts: dict[str, int]
-    lost: int
-    error: str | None
-    indexed: bool
+    bytes: int              # size of the file
+    counts: dict[str, int]  # messages in it by topic name
+    lost: int               # messages handed over that are not in it
+    error: str | None       # why the recording stopped early
+    indexed: bool           # whether the file has its summary; ordinary readers refuse it without
 
 
 class McapRecorder:
