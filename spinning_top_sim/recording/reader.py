@@ -8,11 +8,12 @@ Memory holds the chunks that overlap in time: one in a log that was written in o
 
 from __future__ import annotations
 
+import bisect
 import functools
-import heapq
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
@@ -240,18 +241,19 @@ class LogReader:
             if (start is not None and span.end_ns < start) or (
                     end is not None and span.start_ns >= end):
                 continue
-            while pending and pending[0][0] < span.start_ns:
-                yield heapq.heappop(pending)[-1]
+            pending.sort()
+            ready = bisect.bisect_left(pending, span.start_ns, key=itemgetter(0))
+            yield from map(itemgetter(3), pending[:ready])
+            del pending[:ready]
             plain, stored = self._read(span)
-            for number, message in enumerate(stored):
-                topic = channels.get(message.channel_id)
-                if (topic is not None and (start is None or message.log_time >= start)
-                        and (end is None or message.log_time < end)):
-                    heapq.heappush(pending, (message.log_time, span.offset, number, LogMessage(
-                        topic, message.log_time, message.publish_time, message.sequence,
-                        plain[message.start:message.end], message.channel_id)))
-        while pending:
-            yield heapq.heappop(pending)[-1]
+            for number, (time_ns, channel, sequence, publish_ns, begin, stop) in enumerate(stored):
+                if (channel in channels and (start is None or time_ns >= start)
+                        and (end is None or time_ns < end)):
+                    pending.append((time_ns, span.offset, number, LogMessage(
+                        channels[channel], time_ns, publish_ns, sequence, plain[begin:stop],
+                        channel)))
+        pending.sort()
+        yield from map(itemgetter(3), pending)
 
     def scan(self, former: Scanner | None = None) -> Scanner:
         """Begin a scan of all usable records in file order, with what a former scan knows."""

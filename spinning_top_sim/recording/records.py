@@ -48,6 +48,7 @@ HEAD = struct.Struct('<BQ')         # of every record: opcode, length of what fo
 CHUNK_HEAD = struct.Struct('<QQQI')  # start and end time, uncompressed size and checksum
 
 _BLOCK = 1 << 20    # bytes decompressed at a time
+_MESSAGE_OPCODE = int(Opcode.MESSAGE)   # compares faster
 _FIELDS = struct.Struct('<HIQQ')    # of a message: channel, sequence, log and publish time
 _INDEX_FIELDS = struct.Struct('<HI')  # of a message index: channel, length of the entries
 
@@ -199,6 +200,7 @@ def open_chunk(chunk: Chunk, max_bytes: int = MAX_BYTES) -> ChunkContents:
     if chunk.uncompressed_crc and zlib.crc32(plain) != chunk.uncompressed_crc:
         raise DamagedError('its checksum is wrong')
     contents = ChunkContents(plain)
+    messages = contents.messages
     size = len(plain)
     offset = 0
     while offset < size:
@@ -209,8 +211,8 @@ def open_chunk(chunk: Chunk, max_bytes: int = MAX_BYTES) -> ChunkContents:
         offset = start + length
         if offset > size:
             raise DamagedError('a record in it leads beyond its end')
-        if opcode == Opcode.MESSAGE:
-            contents.messages.append(parse_message(plain, start, offset))
+        if opcode == _MESSAGE_OPCODE:
+            messages.append(parse_message(plain, start, offset))
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             record, _ = parse(opcode, plain[start:offset])
             assert isinstance(record, Schema | Channel)
