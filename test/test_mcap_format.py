@@ -126,6 +126,7 @@ def test_extra_fields_and_unknown_kinds_are_read_and_kept(tmp_path):
     assert seen_by_mcap(output) == seen_by_us(output)
     content = output.read_bytes()
     found = [content[start:end] for _, start, end in records_of(content)]
+    assert found[0] == padded(HEADER, b'new')
     assert [record for record in found if record in kept][:len(kept)] == kept
     with open(output, 'rb') as file:
         (attachment,) = make_reader(file).iter_attachments()

@@ -78,6 +78,8 @@ class McapWriter:
         What the header says.
     compression : {'zstd', 'lz4', 'none'}
         How chunks that are made here are compressed.
+    header : bytes
+        The header as another file has it, default: made from `profile` and `library`.
 
     Raises
     ------
@@ -88,7 +90,8 @@ class McapWriter:
 
     """
 
-    def __init__(self, path: Path, *, profile: str, library: str, compression: str) -> None:
+    def __init__(self, path: Path, *, profile: str, library: str, compression: str,
+                 header: bytes = b'') -> None:
         self._path = path
         self._compression = '' if compression == 'none' else compression
 
@@ -109,7 +112,7 @@ class McapWriter:
         self._file = open(path, 'xb', buffering=0)  # noqa: SIM115
         with self.discarded_on_failure():
             self._buffers = BufferPool.acquire(compression)
-            self._write([MCAP0_MAGIC, record_bytes(Header(profile=profile, library=library))])
+            self._write([MCAP0_MAGIC, header or record_bytes(Header(profile, library))])
 
     @property
     def size(self) -> int:
@@ -388,7 +391,7 @@ class McapWriter:
         self._chunk_entries: dict[int, array[int]] = {}
 
     def _write(self, blocks: Iterable[bytes]) -> None:
-        """Write whole records that come in pieces, or none of them."""
+        """Write whole records that come in blocks, or none of them."""
         offset, crc = self._end
         descriptor = self._file.fileno()
         try:

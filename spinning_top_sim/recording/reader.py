@@ -349,7 +349,7 @@ class LogReader:
         try:
             if self._source.read(span.offset, 1) == bytes([Opcode.MESSAGE]):
                 content = self._source.read(span.offset, span.length)
-                return content, list(_loose_messages(content))
+                return content, list(_single_messages(content))
             chunk = self._source.record(span.offset, span.offset + span.length)
             if isinstance(chunk, Chunk):
                 contents = open_chunk(chunk, self._source.max_bytes)
@@ -370,7 +370,7 @@ class _Survey:
     damage: Damage
 
 
-def _loose_messages(records: bytes) -> Iterator[StoredMessage]:
+def _single_messages(records: bytes) -> Iterator[StoredMessage]:
     """Yield the messages of message records that stand one after the other."""
     offset = 0
     while offset < len(records):

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import secrets
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from mcap.records import AttachmentIndex, Channel, Chunk, Metadata, Schema
+from mcap.records import AttachmentIndex, Channel, Chunk, Header, Metadata, Schema
 
 from spinning_top_sim.recording.chunks import time_span
 from spinning_top_sim.recording.damage import Damage
@@ -91,11 +92,14 @@ def _recover(
     reader: LogReader, scanner: Scanner, output: Path, draft: Path,
     progress: Callable[[int, int], None],
 ) -> Recovered:
-    writer = McapWriter(
-        draft, profile=reader.profile, library=reader.library, compression=_COMPRESSION)
+    records = iter(scanner)
+    first = next(records, None)
+    header = first.raw if first is not None and isinstance(first.record, Header) else b''
+    writer = McapWriter(draft, profile=reader.profile, library=reader.library,
+                        compression=_COMPRESSION, header=header)
     with writer.discarded_on_failure():
         copy = _Copy(reader, scanner, writer)
-        for scanned in scanner:
+        for scanned in itertools.chain([first] if first is not None else [], records):
             copy.put(scanned)
             progress(scanned.offset, reader.size)
         if scanner.found_late:

@@ -322,7 +322,7 @@ class McapRecorder:
             self._error = error
             self._state = 'failed'
         self._take()
-        # Little space is left, or none: cutting off the torn chunk may have made enough of it.
+        # Cutting off the truncated chunk may have freed enough space for the summary.
         with contextlib.suppress(Exception):
             self._file.finish()
             self._indexed = True
