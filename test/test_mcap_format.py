@@ -224,6 +224,49 @@ def test_an_indexed_record_does_not_become_one_of_unknown_kind(tmp_path, kind, b
         kind == Opcode.CHUNK and kept == messages[-len(kept):] != messages)
 
 
+@pytest.mark.parametrize('has_summary', [True, False])
+@pytest.mark.parametrize('bit', range(8))
+def test_a_message_index_of_another_kind_is_made_anew(tmp_path, bit, has_summary):
+    path = tmp_path / 'a.mcap'
+    messages = write_stranger(path, {})
+    content = bytearray(path.read_bytes())
+    records = records_of(content)
+    start = next(start for opcode, start, _ in records if opcode == Opcode.MESSAGE_INDEX)
+    content[start] ^= 1 << bit
+    last = max(end for opcode, _, end in records if opcode == Opcode.MESSAGE_INDEX)
+    path.write_bytes(content if has_summary else content[:last])
+    with LogReader(path) as reader:
+        assert reader.damage.lossless
+        assert f'found: the message index at byte {start} is wrong' in reader.damage.lines()
+    assert seen_by_mcap(recover(path)) == messages
+
+
+@pytest.mark.parametrize('bit', range(8))
+def test_a_record_of_another_kind_costs_no_other_chunk(tmp_path, bit):
+    """In a truncated file of a stranger: no kind may pass for the end of the data."""
+    path = tmp_path / 'a.mcap'
+    messages = write_stranger(path, {})
+    content = path.read_bytes()
+    records = records_of(content)
+    last = max(end for opcode, _, end in records if opcode == Opcode.MESSAGE_INDEX)
+    chunks = [start for opcode, start, _ in records if opcode == Opcode.CHUNK]
+    first = [struct.unpack_from('<Q', content, start + 9)[0] for start in chunks]
+    first.append(messages[-1][1] + 1)
+    for opcode, start, _ in records:
+        if start >= last or start == chunks[0]:     # that chunk has the channels
+            continue
+        changed = bytearray(content[:last])
+        changed[start] ^= 1 << bit
+        path.write_bytes(changed)
+        lost = range(0)
+        if opcode == Opcode.CHUNK:
+            number = chunks.index(start)
+            lost = range(first[number], first[number + 1])
+        read = seen_by_us(path)
+        assert [message for message in read if message[1] not in lost] == [
+            message for message in messages if message[1] not in lost], (opcode, start)
+
+
 def test_a_channel_without_its_schema_is_not_written(tmp_path):
     """Readers refuse the whole file for it; schema 0 means that there is none."""
     path = tmp_path / 'a.mcap'

@@ -57,6 +57,8 @@ _DATA_END_SIZE = HEAD.size + 4
 _INDEX_HEAD = HEAD.size + 2 + 4     # of a message index, before its entries
 _SUMMARY_KINDS = (Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.METADATA_INDEX,
                   Opcode.ATTACHMENT_INDEX, Opcode.SUMMARY_OFFSET, Opcode.FOOTER)
+_DATA_KINDS = (Opcode.HEADER, Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX,
+               Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END)
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,7 @@ class Scanner:
         self._expected: dict[int, bytes] = {}
         self._lost_chunk: Loss | None = None
         self._chunks_seen = False
+        self._data_until = 0    # a record of the data section stands there
 
     def __iter__(self) -> Iterator[ScannedRecord]:
         if self._source.read(0, MAGIC_SIZE) != MCAP0_MAGIC:
@@ -159,6 +162,8 @@ class Scanner:
         end = offset + HEAD.size + length
         if self._places.get(offset, opcode) != opcode or end > self._next_place(offset):
             raise DamagedError('the summary tells of another record there')
+        if opcode != Opcode.MESSAGE_INDEX and self._is_index_but_for_its_kind(offset, end):
+            raise DamagedError('it is a message index but for its kind')
         if opcode == Opcode.ATTACHMENT:
             return self._scan_attachment(offset, length)
         if opcode > Opcode.DATA_END:
@@ -172,9 +177,11 @@ class Scanner:
         if extra and (self._is_ours or not self._finder.is_record(end)):
             raise DamagedError('its length is not that of its content')
         if opcode == Opcode.DATA_END or opcode in _SUMMARY_KINDS:
-            if self._has_limit and (opcode != Opcode.DATA_END or end != self._limit):
-                raise DamagedError('it has no place before the end of the data section')
-            raise _EndOfDataError
+            certain = opcode == Opcode.DATA_END and (
+                end == self._limit if self._has_limit else not extra)
+            if certain or (not self._has_limit and self._is_data_over(end)):
+                raise _EndOfDataError
+            raise DamagedError('it has no place before the end of the data section')
         scanned = ScannedRecord(opcode, offset, len(raw), record, raw)
         if isinstance(record, MessageIndex):
             self._check_message_index(offset, record, raw)
@@ -239,9 +246,6 @@ class Scanner:
         if self._is_ours:
             raise DamagedError('there is no such kind of record')
         size = HEAD.size + length
-        if any(len(expected) == size and self._source.read(offset + 1, size - 1) == expected[1:]
-               for expected in self._expected.values()):
-            raise DamagedError('it is a message index but for its kind')
         self._accept(self._source.blocks(offset, size))
         return ScannedRecord(opcode, offset, size)
 
@@ -321,6 +325,12 @@ class Scanner:
             return self._limit - offset if first == bytes([Opcode.MESSAGE_INDEX]) else 0
         return end - offset if self._finder.is_record(end) else 0
 
+    def _is_index_but_for_its_kind(self, offset: int, end: int) -> bool:
+        return any(
+            len(expected) == end - offset
+            and self._source.read(offset + 1, len(expected) - 1) == expected[1:]
+            for expected in self._expected.values())
+
     def _forget_chunk(self) -> None:
         """Note that what follows is not about the chunk before it."""
         self._expected = {}
@@ -387,6 +397,19 @@ class Scanner:
             # Files of this package have no other metadata behind their chunks.
             return start == name or (self._is_ours and self._chunks_seen)
         return opcode == Opcode.DATA_END or opcode in _SUMMARY_KINDS
+
+    def _is_data_over(self, offset: int) -> bool:
+        """Return whether no record of a data section follows, up to what is damaged."""
+        while self._data_until < offset < self._limit:
+            try:
+                opcode, length = self._source.head(offset, self._limit)
+            except DamagedError:
+                break
+            if opcode in _DATA_KINDS:
+                self._data_until = offset       # so that all looks together take linear time
+                return False
+            offset += HEAD.size + length
+        return offset > self._data_until
 
     def _next_place(self, offset: int) -> int:
         """Return where the next record stands that the summary indexes, or the limit."""
