@@ -29,8 +29,8 @@ from mcap.stream_reader import StreamReader
 from processes import median
 from report import preamble, table, write_section
 
+from spinning_top_sim.recording.chunks import ZSTD_LEVEL
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.scratch import ZSTD_LEVEL
 from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.pipeline import Simulation

@@ -209,7 +209,7 @@ def test_the_metadata_ask_for_little():
         pytest.skip(f'{NAME} is not installed here, only importable')
     always = [line for line in requirements if 'extra' not in line]
     names = sorted(line.split('<')[0].split('>')[0] for line in always)
-    assert names == ['mcap', 'numpy', 'scipy']
+    assert names == ['PyYAML', 'mcap', 'numpy', 'scipy', 'tqdm']
 
 
 def test_every_source_says_its_license():

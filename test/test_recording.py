@@ -38,11 +38,12 @@ from rosbags.interfaces import Qos, QosHistory, QosReliability
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from spinning_top_sim.recording import mcap_file, scratch
+from spinning_top_sim.recording import mcap_writer
+from spinning_top_sim.recording.chunks import BUFFER_BYTES, CHUNK_BYTES, BufferPool
+from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import DefinitionNotFoundError, RecordingError
-from spinning_top_sim.recording.mcap_file import CHUNK_BYTES, McapFile
+from spinning_top_sim.recording.mcap_writer import McapWriter
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic
-from spinning_top_sim.recording.schemas import find_definition
 from spinning_top_sim.recording.writer import COMPRESSIONS, McapRecorder, create_file
 
 ROOT = Path(__file__).parents[1]
@@ -340,6 +341,30 @@ def test_stamps_need_no_order(tmp_path):
         assert (reader.start_time, reader.end_time) == (3, 10)
 
 
+def test_chunks_with_falling_stamps_give_the_whole_span(tmp_path):
+    """Statistics and bag metadata tell the earliest and the latest stamp of all chunks."""
+    path = tmp_path / 'run.mcap'
+    file = create_file(path, TOPICS, METADATA, compression='none')
+    for chunk in ((50, 40), (20, 30)):
+        for stamp in chunk:
+            file.append(0, stamp, pose_cdr(stamp))
+        file.write_chunk()
+    file.finish()
+    with path.open('rb') as stream:
+        reader = make_reader(stream)
+        summary = reader.get_summary()
+        bag = yaml.safe_load(next(
+            item.metadata['serialized_metadata'] for item in reader.iter_metadata()
+            if item.name == 'rosbag2'))
+    assert [(index.message_start_time, index.message_end_time)
+            for index in summary.chunk_indexes] == [(40, 50), (20, 30)]
+    assert summary.statistics.message_start_time == 20
+    assert summary.statistics.message_end_time == 50
+    for times in (bag, bag['files'][0]):
+        assert times['starting_time']['nanoseconds_since_epoch'] == 20
+        assert times['duration']['nanoseconds'] == 30
+
+
 # Definitions
 
 def test_a_schema_is_the_text_of_rosbag2(tmp_path, monkeypatch):
@@ -417,7 +442,7 @@ def test_a_file_that_may_not_be_made_is_named(tmp_path, monkeypatch):
     def open_read_only(path, *_, **__):
         raise PermissionError(13, os.strerror(13), str(path))
 
-    monkeypatch.setattr(mcap_file, 'open', open_read_only, raising=False)
+    monkeypatch.setattr(mcap_writer, 'open', open_read_only, raising=False)
     with pytest.raises(RecordingError, match=r'run\.mcap: Permission denied$'):
         McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
 
@@ -435,7 +460,7 @@ def test_too_little_space_at_the_start_leaves_no_file(tmp_path):
 
 
 def test_a_head_that_cannot_be_written_leaves_no_file(tmp_path, monkeypatch):
-    monkeypatch.setattr(mcap_file.os, 'fsync', refuse_to_sync)
+    monkeypatch.setattr(os, 'fsync', refuse_to_sync)
     with pytest.raises(RecordingError, match=r'run\.mcap: Input/output error'):
         McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
     assert not list(tmp_path.iterdir())
@@ -480,7 +505,7 @@ def test_importing_the_recorder_imports_neither_mcap_nor_ros():
 def test_what_is_written_reaches_the_disk_without_being_closed(tmp_path, monkeypatch):
     synced = []
     fsync = os.fsync
-    monkeypatch.setattr(mcap_file.os, 'fsync', lambda fd: (fsync(fd), synced.append(fd)))
+    monkeypatch.setattr(os, 'fsync', lambda fd: (fsync(fd), synced.append(fd)))
     recorder = McapRecorder.open(
         tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02, min_free_bytes=0)
     before = len(synced)
@@ -493,6 +518,20 @@ def test_what_is_written_reaches_the_disk_without_being_closed(tmp_path, monkeyp
     assert recorder.counters.bytes == (tmp_path / 'run.mcap').stat().st_size
     assert recorder.counters.longest_flush > 0.0
     recorder.close()
+
+
+def test_a_file_and_its_name_are_on_the_disk_when_it_is_closed(tmp_path, monkeypatch):
+    """First the content, then the directory: a name without content would be a broken log."""
+    synced = []
+    monkeypatch.setattr(os, 'fsync', lambda fd: synced.append(os.readlink(f'/proc/self/fd/{fd}')))
+    path = tmp_path / 'run.mcap'
+    file = create_file(path, TOPICS, METADATA, compression='zstd')
+    assert synced == [str(path), str(tmp_path)]
+    synced.clear()
+    file.append(0, 1, pose_cdr(1))
+    file.write_chunk()
+    file.finish()
+    assert synced == [str(path), str(tmp_path)]
 
 
 def test_a_torn_file_tells_its_topics_and_its_run(tmp_path):
@@ -580,14 +619,14 @@ def test_few_and_many_keep_their_order_in_the_file(tmp_path):
 
 def test_a_full_queue_says_so_and_loses_nothing(tmp_path, monkeypatch):
     blocked, disk_is_back = threading.Event(), threading.Event()
-    append = McapFile.append_all
+    append = McapWriter.append_all
 
     def append_slowly(self, *message):
         blocked.set()
         disk_is_back.wait(PATIENCE_S)
         return append(self, *message)
 
-    monkeypatch.setattr(McapFile, 'append_all', append_slowly)
+    monkeypatch.setattr(McapWriter, 'append_all', append_slowly)
     recorder = McapRecorder.open(
         tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.01, min_free_bytes=0,
         queue_bytes=10_000)
@@ -609,9 +648,9 @@ def test_a_full_queue_says_so_and_loses_nothing(tmp_path, monkeypatch):
 
 def test_a_disk_that_hangs_does_not_hang_the_end(tmp_path, monkeypatch):
     disk_is_back = threading.Event()
-    write_chunk = McapFile.write_chunk
+    write_chunk = McapWriter.write_chunk
     monkeypatch.setattr(
-        McapFile, 'write_chunk', lambda self: (disk_is_back.wait(PATIENCE_S), write_chunk(self)))
+        McapWriter, 'write_chunk', lambda self: (disk_is_back.wait(PATIENCE_S), write_chunk(self)))
     recorder = McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
     recorder.write(0, 1, pose_cdr(1))
     summary = recorder.close(timeout=0.05)
@@ -763,7 +802,7 @@ def report(child: subprocess.Popen) -> dict:
 def test_a_failing_disk_stops_the_recording(tmp_path, monkeypatch):
     recorder = McapRecorder.open(
         tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02, min_free_bytes=0)
-    monkeypatch.setattr(mcap_file.os, 'fsync', refuse_to_sync)
+    monkeypatch.setattr(os, 'fsync', refuse_to_sync)
     for message in some_messages(50):
         recorder.write(*message)
     eventually(lambda: recorder.state == 'failed')
@@ -779,7 +818,7 @@ def test_a_failing_disk_stops_the_recording(tmp_path, monkeypatch):
 def test_a_disk_that_runs_short_stops_the_recording_in_good_order(tmp_path, monkeypatch):
     recorder = McapRecorder.open(
         tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02, min_free_bytes=1)
-    monkeypatch.setattr(McapFile, 'free_bytes', lambda self: 0)
+    monkeypatch.setattr(McapWriter, 'free_bytes', lambda self: 0)
     recorder.write(0, 7, pose_cdr(7))
     eventually(lambda: recorder.state == 'failed')
     assert recorder.error == (
@@ -791,18 +830,47 @@ def test_a_disk_that_runs_short_stops_the_recording_in_good_order(tmp_path, monk
         assert [stamp for _, stamp, _ in reader.messages()] == [7]
 
 
+def test_an_interrupted_write_shifts_nothing(tmp_path, monkeypatch):
+    """An interrupt in the middle of a chunk; the chunk is written again, and all places hold."""
+    path = tmp_path / 'run.mcap'
+    file = create_file(path, TOPICS, METADATA, compression='none')
+    size = file.size
+    pwrite = os.pwrite
+
+    def interrupted(descriptor, data, offset):
+        pwrite(descriptor, data[:len(data) // 2], offset)
+        if offset > size:
+            raise KeyboardInterrupt
+        return len(data) // 2
+
+    for index, stamp, data in some_messages(100):
+        file.append(index, stamp, data)
+    monkeypatch.setattr(os, 'pwrite', interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        file.write_chunk()
+    monkeypatch.setattr(os, 'pwrite', pwrite)
+    assert file.size == path.stat().st_size == size
+    file.write_chunk()
+    file.finish()
+    with path.open('rb') as stream:
+        list(StreamReader(stream, validate_crcs=True).records)
+        stream.seek(0)
+        assert len(list(make_reader(stream, validate_crcs=True).iter_messages())) == 100
+    assert len(complete_messages(path)) == 100
+
+
 def test_a_message_that_cannot_be_packed_is_no_exception_for_the_simulation(tmp_path):
     recorder = McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
     recorder.write(0, -1, b'')
     summary = recorder.close()
     assert recorder.state == 'failed'
-    assert 'stopped: error:' in (summary.error or '')
+    assert 'stopped: OverflowError:' in (summary.error or '')
     assert (summary.indexed, summary.lost) == (True, 1)
 
 
 def test_recordings_that_follow_one_another_share_what_makes_chunks(tmp_path, monkeypatch):
     """Two at a time do not; and the bytes are those of a new one."""
-    monkeypatch.setattr(scratch, '_kept', [])
+    monkeypatch.setattr(BufferPool, '_idle', [])
 
     def chunks(path):
         with path.open('rb') as file:
@@ -813,39 +881,39 @@ def test_recordings_that_follow_one_another_share_what_makes_chunks(tmp_path, mo
     used = []
     for name in ('a', 'b'):
         with McapRecorder.open(tmp_path / name, TOPICS, METADATA, **options) as recorder:
-            used.append(recorder._file._scratch)
+            used.append(recorder._file._buffers)
             for message in some_messages(300):
                 recorder.write(*message)
             if name == 'b':
                 with McapRecorder.open(tmp_path / 'c', TOPICS, METADATA, **options) as other:
-                    assert other._file._scratch is not recorder._file._scratch
+                    assert other._file._buffers is not recorder._file._buffers
     assert used[0] is used[1]
     assert chunks(tmp_path / 'a') == chunks(tmp_path / 'b') != []
 
 
 def test_a_file_that_is_closed_twice_leaves_the_next_one_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr(scratch, '_kept', [])
+    monkeypatch.setattr(BufferPool, '_idle', [])
     first = create_file(tmp_path / 'a', TOPICS, METADATA, compression='zstd')
     first.finish()
     second = create_file(tmp_path / 'b', TOPICS, METADATA, compression='zstd')
     with pytest.raises(ValueError, match='closed file'):
         first.finish()
-    assert scratch._kept == []
-    assert first._scratch is not second._scratch
+    assert BufferPool._idle == []
+    assert first._buffers is not second._buffers
     second.finish()
 
 
 def test_processes_that_fork_make_their_chunks_apart():
     script = textwrap.dedent("""
         import os
-        from spinning_top_sim.recording import scratch
-        room = scratch.Scratch('zstd').room(3)
-        room[:] = b'one'
+        from spinning_top_sim.recording.chunks import BufferPool
+        buffer = BufferPool('zstd').buffer(3)
+        buffer[:] = b'one'
         if os.fork() == 0:
-            room[:] = b'two'
+            buffer[:] = b'two'
             os._exit(0)
         os.wait()
-        print(bytes(room))
+        print(bytes(buffer))
         """)
     run = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True,
                          timeout=PATIENCE_S, check=True)
@@ -869,17 +937,17 @@ def test_chunks_are_made_in_memory_that_is_there(tmp_path):
 
 
 @pytest.mark.parametrize('compression', COMPRESSIONS)
-@pytest.mark.parametrize('size', [1, scratch.ROOM_BYTES // 2, scratch.ROOM_BYTES // 2 + 1,
-                                  scratch.ROOM_BYTES, scratch.ROOM_BYTES + 1])
+@pytest.mark.parametrize('size', [1, BUFFER_BYTES // 2, BUFFER_BYTES // 2 + 1,
+                                  BUFFER_BYTES, BUFFER_BYTES + 1])
 def test_a_chunk_of_noise_survives_whatever_its_size(compression, size):
     """It becomes longer by being compressed."""
     plain = random.Random(size).randbytes(size)
-    some = scratch.Scratch(compression)
+    pool = BufferPool(compression)
     for _ in range(2):
-        room = some.room(size)
-        room[:] = plain
-        packed = some.compress(room)
-        some.give_back(room)
+        buffer = pool.buffer(size)
+        buffer[:] = plain
+        packed = pool.compress(buffer)
+        pool.recycle(buffer)
         assert {'zstd': zstandard.decompress, 'lz4': lz4.frame.decompress,
                 'none': bytes}[compression](packed) == plain
-    assert len(some._rooms) == (size <= scratch.ROOM_BYTES)
+    assert len(pool._buffers) == (size <= BUFFER_BYTES)

@@ -34,8 +34,8 @@ from spinning_top_sim.nodes import playback
 from spinning_top_sim.nodes.playback import ROUND_GAP_NS, Playback, ReadAhead, rounds
 from spinning_top_sim.nodes.replayer import message_class
 from spinning_top_sim.recording import writer
+from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.schemas import find_definition
 from spinning_top_sim.recording.writer import McapRecorder
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)

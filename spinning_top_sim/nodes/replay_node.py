@@ -71,7 +71,7 @@ def _open(path: Path, *, partial: bool) -> LogReader:
         damage = None if log.whole else log.damage
     except LogError as error:
         raise ValueError(error) from error
-    if damage is not None and (damage.torn or damage.losses):
+    if damage is not None and (damage.truncated or damage.losses):
         if not partial:
             raise ValueError(f'{path} is torn: `recover` makes a whole log of it, --partial plays '
                              'what is whole')

@@ -39,10 +39,10 @@ from std_srvs.srv import SetBool
 from spinning_top_sim.nodes import reports
 from spinning_top_sim.nodes.pacing import DeadlineThread
 from spinning_top_sim.nodes.playback import ROUND_GAP_NS, Message, Playback, ReadAhead, rounds
+from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import DefinitionNotFoundError
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
-from spinning_top_sim.recording.schemas import find_definition
 
 NANOSECONDS = 1_000_000_000
 # REP-144 and the ROS 2 interface names.

@@ -10,12 +10,23 @@ from dataclasses import dataclass, field
 @dataclass
 class Loss:
     """
-    A piece of a file that cannot be used.
+    A part of a file that is not used.
 
-    offset, bytes: where it is and its size
-    what: the kind of record it was, as far as that is known;  reason: why it is lost
-    start_ns, end_ns: between which log times its messages lay, None where nothing tells
-    messages: how many it held, None where nothing tells
+    Attributes
+    ----------
+    offset, bytes : int
+        Where it is and its size.
+    what : str
+        The kind of record it was, as far as that is known.
+    reason : str
+        Why it is not used.
+    start_ns, end_ns : int or None
+        The earliest and the latest log time of its messages; None if unknown.
+    messages : int or None
+        How many it held; None if unknown.
+    refused : bool
+        It may be right, but it is larger than what is read into memory.
+
     """
 
     offset: int
@@ -25,6 +36,7 @@ class Loss:
     start_ns: int | None = None
     end_ns: int | None = None
     messages: int | None = None
+    refused: bool = False
 
     def __str__(self) -> str:
         text = f'{self.what} at byte {self.offset} ({self.bytes} bytes): {self.reason}'
@@ -38,19 +50,27 @@ class Loss:
 @dataclass(frozen=True)
 class Damage:
     """
-    What a look at every byte of a file found.
+    What a scan of a whole file found.
 
-    torn: the file does not end as an MCAP file ends
-    losses: what cannot be used, in file order
-    defects: what is wrong but told by other parts of the file too (indexes, summary): nothing lost
-    messages: whole messages by topic
-    missing: messages known to have been in the log that are not whole, by topic, none left out
-        where `missing_exactly`; by the statistics, else by gaps in the sequence numbers of our
-        own files and by the indexes of lost chunks ('' where the topic is unknown)
-    start_ns, end_ns: earliest and latest log time of the whole messages; both 0 without any
+    Attributes
+    ----------
+    truncated : bool
+        The file does not end as an MCAP file ends.
+    losses : tuple of Loss
+        What is not used, in the order of the file.
+    defects : tuple of str
+        What is wrong but known from other parts of the file (indexes, summary): nothing is lost.
+    messages : mapping of str to int
+        Whole messages per topic.
+    missing : mapping of str to int
+        Lost messages per topic ('' if unknown): exact if `missing_exactly`, else a lower bound
+        from gaps in sequence numbers and from the indexes of lost chunks.
+    start_ns, end_ns : int
+        The earliest and the latest log time of the whole messages; 0 without any.
+
     """
 
-    torn: bool
+    truncated: bool
     losses: tuple[Loss, ...] = ()
     defects: tuple[str, ...] = ()
     messages: Mapping[str, int] = field(default_factory=dict)
@@ -66,29 +86,29 @@ class Damage:
 
     @property
     def lost_bytes(self) -> int:
-        """Bytes of the file that cannot be used."""
+        """Bytes of the file that are not used."""
         return sum(loss.bytes for loss in self.losses)
 
     @property
     def lost_chunks(self) -> int:
-        """Chunks that cannot be used."""
+        """Chunks that are not used."""
         return sum(loss.what == 'chunk' for loss in self.losses)
 
     @property
     def missing_messages(self) -> int:
-        """Messages known to be missing: all of them where `missing_exactly`, else at least."""
+        """Lost messages: exact if `missing_exactly`, else a lower bound."""
         return sum(self.missing.values())
 
     @property
     def missing_spans(self) -> tuple[tuple[int, int], ...]:
-        """Log times [ns], from and to, between which lost chunks held messages."""
+        """The earliest and the latest log time of each lost chunk [ns]."""
         return tuple((loss.start_ns, loss.end_ns) for loss in self.losses
                      if loss.start_ns is not None and loss.end_ns is not None)
 
     def lines(self) -> list[str]:
-        """Return the report for people: a line of sums where something is lost, then each."""
+        """Return a human-readable report: the sums if something is lost, then each loss."""
         lines = []
-        if self.losses:
+        if any(not loss.refused for loss in self.losses):
             sums = [count(self.lost_bytes, 'byte')]
             if self.lost_chunks:
                 sums.append(count(self.lost_chunks, 'chunk'))
@@ -99,7 +119,8 @@ class Damage:
             else:
                 sums.append('an unknown number of messages')
             lines.append(f'lost: {", ".join(sums)}')
-            lines += [f'lost: {loss}' for loss in self.losses]
+        lines += [f'{"refused" if loss.refused else "lost"}: {loss}' for loss in self.losses]
+        if self.losses:
             lines += [f'lost: {count(number, "message")} of {topic or "unknown topics"}'
                       for topic, number in self.missing.items() if number]
         elif self.missing_messages:

@@ -16,7 +16,8 @@ LIBRARIES = ('numpy', 'mcap', 'rclpy')
 
 
 def provenance(values: Mapping[str, Any], epoch_ns: int, begun_ns: int,
-               history: Iterable[tuple[int, float, float]], now: Mapping[str, Any]) -> dict[str, str]:
+               history: Iterable[tuple[int, float, float]],
+               now: Mapping[str, Any]) -> dict[str, str]:
     """
     Return the `spinning_top_sim` metadata record.
 

@@ -1,42 +1,41 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Reading MCAP logs: ours or a stranger's, whole, torn or with wrong bytes.
+Reads MCAP logs of any writer, also truncated and damaged ones.
 
-Everything that can be proven whole is read (`walk.py` says how damage is met), and `damage` says
-what is not.  Memory holds the chunks that overlap in time, one in a log written in order.
+Everything that is provably whole is read (see `scanner.py`), and `damage` reports the rest.
+Memory holds the chunks that overlap in time: one in a log that was written in order.
 """
 
 from __future__ import annotations
 
+import bisect
 import functools
-import heapq
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Header, Metadata
+from mcap.records import Channel, Chunk, Header, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
+from spinning_top_sim.recording.chunks import time_span
 from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.errors import NotMcapError
-from spinning_top_sim.recording.parsing import (
+from spinning_top_sim.recording.records import (
     HEAD,
-    Damaged,
+    MAX_BYTES,
+    DamagedError,
     StoredMessage,
     open_chunk,
     parse_message,
 )
-from spinning_top_sim.recording.rosbag2 import parse_offered_qos
-from spinning_top_sim.recording.walk import (
-    MAGIC_SIZE,
-    Reading,
-    Walk,
-    read_summary,
-)
+from spinning_top_sim.recording.rosbag2 import Qos, parse_offered_qos
+from spinning_top_sim.recording.scanner import Scanner
+from spinning_top_sim.recording.summary import MAGIC_SIZE, McapSource, read_summary
 
 _RUN_BYTES = 1 << 20  # of messages outside of chunks that are read at a time
 
@@ -46,11 +45,23 @@ class LogTopic:
     """
     A channel of a log.
 
-    name: such as '/imu/data_raw';  type_name: such as 'sensor_msgs/msg/Imu', '' without schema
-    schema: its text, with those of the types it is made of;  schema_encoding: such as 'ros2msg'
-    encoding: of its messages, such as 'cdr'
-    qos: profiles offered, each as the `qos` of RecordedTopic; empty where none can be read
-    metadata: of the channel, as it stands;  channel_id: its number in the file
+    Attributes
+    ----------
+    name : str
+        Such as '/imu/data_raw'.
+    type_name : str
+        Such as 'sensor_msgs/msg/Imu'; '' without schema.
+    schema, schema_encoding : str
+        The definition with its dependencies, and its format, such as 'ros2msg'.
+    encoding : str
+        Of the messages, such as 'cdr'.
+    qos : tuple of mappings
+        Offered profiles, each as the `qos` of RecordedTopic; empty if there are none.
+    metadata : mapping of str to str
+        As it stands in the channel.
+    channel_id : int
+        Its number in the file.
+
     """
 
     name: str
@@ -58,18 +69,13 @@ class LogTopic:
     schema: str
     schema_encoding: str
     encoding: str
-    qos: tuple[Mapping[str, Any], ...]
+    qos: tuple[Qos, ...]
     metadata: Mapping[str, str]
     channel_id: int
 
 
 class LogMessage(NamedTuple):
-    """
-    A message of a log.
-
-    topic: its name;  log_time, publish_time: [ns];  sequence: its number in the channel, as the
-    writer counts;  data: as `LogTopic.encoding` says;  channel_id: of its LogTopic
-    """
+    """A message of a log; times in ns."""
 
     topic: str
     log_time: int
@@ -80,7 +86,7 @@ class LogMessage(NamedTuple):
 
 
 class _Span(NamedTuple):
-    """A stretch of the file with messages between two log times: a chunk or loose messages."""
+    """A chunk, or adjacent messages outside of chunks, in the order of the log times."""
 
     start_ns: int
     offset: int
@@ -92,34 +98,49 @@ class LogReader:
     """
     An MCAP file, open for reading; also a context manager.
 
-    A file whose summary is right opens at once.  Any other is read through before its topics,
-    metadata or messages are told, and so is every file for its `damage`.
+    A file with a usable summary opens at once.  Any other is scanned before its topics, metadata
+    or messages are returned, and so is every file for its `damage`.  Damage raises nothing.
 
-    Raises LogAccessError when the file cannot be opened or read, at any call, and NotMcapError
-    when it is none.  Damage raises nothing.
+    Parameters
+    ----------
+    path : path
+        The file.
+    max_bytes : int
+        Largest record, and largest uncompressed chunk, that is read into memory.
 
-    left_out: pieces of the file that `messages` came upon and left out, damaged
+    Attributes
+    ----------
+    left_out : int
+        Damaged chunks that `messages` has skipped.
+
+    Raises
+    ------
+    LogAccessError
+        If the file cannot be opened or read; any method may raise it.
+    NotMcapError
+        If it is no MCAP file.
+
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> None:
         self.path = Path(path)
         self.left_out = 0
-        self._reading = Reading(self.path)
+        self._source = McapSource(self.path, max_bytes)
         try:
             self._header = self._check_beginning()
-            self._summary = read_summary(self._reading)
+            self._summary = read_summary(self._source)
         except BaseException:
             self.close()
             raise
 
     def close(self) -> None:
         """Close the file."""
-        self._reading.close()
+        self._source.close()
 
     @property
     def size(self) -> int:
-        """Bytes in the file when it was opened."""
-        return self._reading.size
+        """Size of the file when it was opened [bytes]."""
+        return self._source.size
 
     def __enter__(self) -> LogReader:
         return self
@@ -131,27 +152,28 @@ class LogReader:
         self.close()
 
     @property
+    def mode(self) -> int:
+        """Permission bits of the file."""
+        return self._source.mode
+
+    @property
     def profile(self) -> str:
-        """What the header says of the content; 'ros2' where it cannot be read."""
+        """The profile in the header; 'ros2' if the header is damaged."""
         return self._header.profile
 
     @property
     def library(self) -> str:
-        """What the header says of the program that wrote the file; '' where it cannot be read."""
+        """The library in the header; '' if the header is damaged."""
         return self._header.library
 
     @property
     def whole(self) -> bool:
-        """
-        Whether the file was closed: its summary is there, is right and fits the file.
-
-        Chunks may be damaged all the same: `damage` tells.
-        """
-        return not self._summary.missing
+        """Whether the file was closed and its summary, if any, is right; see also `damage`."""
+        return self._summary.closed and not self._summary.problem
 
     @property
     def topics(self) -> tuple[LogTopic, ...]:
-        """The channels of the log, in the order of their numbers."""
+        """The channels of the log, in the order of their ids."""
         schemas, channels = self._declared
         found = []
         for number, channel in sorted(channels.items()):
@@ -166,14 +188,14 @@ class LogReader:
 
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
-        """The metadata records by name; the last where a name stands for several."""
+        """The metadata records by name; of several with one name, the last."""
         if self._survey_is_needed or '_survey' in self.__dict__:
             return dict(self._survey.metadata)
         found = {}
         for index in self._summary.metadata:
             try:
-                record = self._reading.record(index.offset, self._summary.data_end)
-            except Damaged:
+                record = self._source.record(index.offset, self._summary.data_limit)
+            except DamagedError:
                 continue
             if isinstance(record, Metadata):
                 found[record.name] = record.metadata
@@ -181,12 +203,12 @@ class LogReader:
 
     @property
     def damage(self) -> Damage:
-        """What is wrong with the file; reads all of it at the first use."""
+        """What is wrong with the file; scans all of it at the first use."""
         return self._survey.damage
 
     @property
     def span(self) -> tuple[int, int]:
-        """Log times of the first and of the last message [ns]; both 0 without any."""
+        """The earliest and the latest log time [ns]; both 0 without messages."""
         spans = [span for span in self._spans if span.end_ns]
         return (min((span.start_ns for span in spans), default=0),
                 max((span.end_ns for span in spans), default=0))
@@ -198,9 +220,13 @@ class LogReader:
         """
         Yield the whole messages in the order of their log times, equal ones in file order.
 
-        topics: names, None for all;  start, end: log times [ns], from and up to but without
+        Parameters
+        ----------
+        topics : iterable of str or None
+            Names; None for all.
+        start, end : int or None
+            Log times [ns]; `end` is exclusive.
 
-        What is damaged is left out, counted in `left_out`, and told by `damage`.
         """
         schemas, known = self._declared
         names = None if topics is None else frozenset(topics)
@@ -209,46 +235,58 @@ class LogReader:
             if (names is None or channel.topic in names)
             and (channel.schema_id == 0 or channel.schema_id in schemas)}
 
-        # One chunk after the other, those that overlap in time together.
-        pending: list[_Cursor] = []
+        # Chunks that overlap in time are merged: log time, place in the file, message.
+        pending: list[tuple[int, int, int, LogMessage]] = []
         for span in self._spans:
             if (start is not None and span.end_ns < start) or (
                     end is not None and span.start_ns >= end):
                 continue
-            yield from _merge(pending, channels, span.start_ns)
+            pending.sort()
+            ready = bisect.bisect_left(pending, span.start_ns, key=itemgetter(0))
+            yield from map(itemgetter(3), pending[:ready])
+            del pending[:ready]
             plain, stored = self._read(span)
-            chosen = [message for message in stored
-                      if message.channel_id in channels
-                      and (start is None or message.log_time >= start)
-                      and (end is None or message.log_time < end)]
-            if chosen:
-                chosen.sort(key=lambda message: message.log_time)
-                heapq.heappush(pending, (chosen[0].log_time, span.offset, 0, plain, chosen))
-        yield from _merge(pending, channels, None)
+            for number, (time_ns, channel, sequence, publish_ns, begin, stop) in enumerate(stored):
+                if (channel in channels and (start is None or time_ns >= start)
+                        and (end is None or time_ns < end)):
+                    pending.append((time_ns, span.offset, number, LogMessage(
+                        channels[channel], time_ns, publish_ns, sequence, plain[begin:stop],
+                        channel)))
+        pending.sort()
+        yield from map(itemgetter(3), pending)
 
-    def walk(self) -> Walk:
-        """Begin a walk through all usable records in file order, for who rewrites the file."""
-        return Walk(self._reading, self._summary)
+    def scan(self, former: Scanner | None = None) -> Scanner:
+        """Begin a scan of all usable records in file order, with what a former scan knows."""
+        scanner = Scanner(self._source, self._summary)
+        if former is not None:
+            scanner.schemas.update(former.schemas)
+            scanner.channels.update(former.channels)
+        return scanner
 
     def blocks(self, offset: int, length: int) -> Iterator[bytes]:
-        """Yield bytes of the file, in blocks."""
-        return self._reading.blocks(offset, length)
+        """Yield a stretch of the file in blocks."""
+        return self._source.blocks(offset, length)
 
     @functools.cached_property
     def _survey(self) -> _Survey:
-        """What a walk through the whole file found, done at the first use."""
-        walk = self.walk()
+        """What a scan of the whole file found, done at the first use."""
+        survey = self._scan_all(self.scan())
+        if survey.scanner.found_late:
+            survey = self._scan_all(self.scan(survey.scanner))
+        return survey
+
+    def _scan_all(self, scanner: Scanner) -> _Survey:
         spans: list[_Span] = []
         metadata = {}
-        run: _Span | None = None  # loose messages, one after the other
-        for piece in walk:
-            if isinstance(piece.record, Metadata):
-                metadata[piece.record.name] = piece.record.metadata
-            if piece.contents is None or not piece.contents.messages:
+        run: _Span | None = None  # adjacent messages outside of chunks
+        for scanned in scanner:
+            if isinstance(scanned.record, Metadata):
+                metadata[scanned.record.name] = scanned.record.metadata
+            if scanned.contents is None or not scanned.contents.messages:
                 continue
-            times = [message.log_time for message in piece.contents.messages]
-            span = _Span(min(times), piece.offset, piece.length, max(times))
-            if piece.record is not None:
+            start_ns, end_ns = time_span(scanned.contents.entries)
+            span = _Span(start_ns, scanned.offset, scanned.length, end_ns)
+            if scanned.record is not None:
                 spans.append(span)
             elif (run is not None and run.offset + run.length == span.offset
                     and run.length < _RUN_BYTES):
@@ -258,19 +296,19 @@ class LogReader:
             else:
                 run = span
                 spans.append(run)
-        return _Survey(walk, metadata, sorted(spans), walk.damage())
+        return _Survey(scanner, metadata, sorted(spans), scanner.damage())
 
     def _check_beginning(self) -> Header:
-        """Return the header; raises NotMcapError where neither magic nor header is there."""
+        """Return the header; raises NotMcapError if neither magic nor header is there."""
         if not self.size:
             raise NotMcapError(f'cannot read {self.path}: it is empty')
-        magic = self._reading.at(0, MAGIC_SIZE)
+        magic = self._source.read(0, MAGIC_SIZE)
         if magic != MCAP0_MAGIC and len(magic) < MAGIC_SIZE and MCAP0_MAGIC.startswith(magic):
             raise NotMcapError(
                 f'cannot read {self.path}: it ends after {self.size} bytes of an MCAP file')
         try:
-            header = self._reading.record(MAGIC_SIZE, self.size)
-        except Damaged:
+            header = self._source.record(MAGIC_SIZE, self.size)
+        except DamagedError:
             header = None
         if isinstance(header, Header):
             return header
@@ -279,9 +317,9 @@ class LogReader:
         return Header(profile='ros2', library='')
 
     @property
-    def _declared(self) -> tuple[dict[int, Any], dict[int, Channel]]:
+    def _declared(self) -> tuple[dict[int, Schema], dict[int, Channel]]:
         """Return schemas and channels by number."""
-        source = self._survey.walk if self._survey_is_needed else self._summary
+        source = self._survey.scanner if self._survey_is_needed else self._summary
         return source.schemas, source.channels
 
     @property
@@ -290,7 +328,7 @@ class LogReader:
             return self._survey.spans
         return sorted(_Span(index.message_start_time, index.chunk_start_offset,
                             index.chunk_length, index.message_end_time)
-                      for index in self._summary.chunks)
+                      for index in self._summary.chunks.values())
 
     @functools.cached_property
     def _survey_is_needed(self) -> bool:
@@ -300,23 +338,23 @@ class LogReader:
         if statistics is None:
             return True
         return (
-            not summary.all_in_chunks
+            not summary.indexes_all_messages
             or len(summary.metadata) != statistics.metadata_count
             or len(summary.channels) != statistics.channel_count
             or any(channel.schema_id not in {0, *summary.schemas}
                    for channel in summary.channels.values()))
 
     def _read(self, span: _Span) -> tuple[bytes, list[StoredMessage]]:
-        """Return the messages of a span and the bytes they are in; none where it is damaged."""
-        content = self._reading.at(span.offset, span.length)
+        """Return the messages of a span and the bytes they are in; none if it is damaged."""
         try:
-            if content[:1] == bytes([Opcode.MESSAGE]):
-                return content, list(_loose_messages(content))
-            chunk = self._reading.record(span.offset, span.offset + span.length)
+            if self._source.read(span.offset, 1) == bytes([Opcode.MESSAGE]):
+                content = self._source.read(span.offset, span.length)
+                return content, list(_single_messages(content))
+            chunk = self._source.record(span.offset, span.offset + span.length)
             if isinstance(chunk, Chunk):
-                contents = open_chunk(chunk)
+                contents = open_chunk(chunk, self._source.max_bytes)
                 return contents.plain, contents.messages
-        except Damaged:
+        except DamagedError:
             pass
         self.left_out += 1
         return b'', []
@@ -324,47 +362,24 @@ class LogReader:
 
 @dataclass(frozen=True)
 class _Survey:
-    """What a walk through a file found."""
+    """What a scan of a file found."""
 
-    walk: Walk
+    scanner: Scanner
     metadata: dict[str, dict[str, str]]
     spans: list[_Span]
     damage: Damage
 
 
-# A chunk being read: next log time, where it is in the file, how many of its messages are
-# through, its bytes, its messages.
-_Cursor = tuple[int, int, int, bytes, list[StoredMessage]]
-
-
-def _merge(
-    cursors: list[_Cursor], names: Mapping[int, str], until_ns: int | None,
-) -> Iterator[LogMessage]:
-    """Yield messages of a heap of chunks, those before a log time or all."""
-    while cursors and (until_ns is None or cursors[0][0] < until_ns):
-        _, offset, number, plain, messages = cursors[0]
-        log_time, channel_id, sequence, publish_time, start, end = messages[number]
-        number += 1
-        if number < len(messages):
-            heapq.heapreplace(
-                cursors, (messages[number].log_time, offset, number, plain, messages))
-        else:
-            heapq.heappop(cursors)
-        yield LogMessage(names[channel_id], log_time, publish_time, sequence, plain[start:end],
-                         channel_id)
-
-
-def _loose_messages(records: bytes) -> Iterator[StoredMessage]:
+def _single_messages(records: bytes) -> Iterator[StoredMessage]:
     """Yield the messages of message records that stand one after the other."""
     offset = 0
     while offset < len(records):
         _, length = HEAD.unpack_from(records, offset)
         offset += HEAD.size
-        message = parse_message(records[offset:offset + length])
-        yield message._replace(start=offset + message.start, end=offset + message.end)
+        yield parse_message(records, offset, offset + length)
         offset += length
 
 
-def qos_profiles(channel: Channel) -> tuple[Mapping[str, Any], ...]:
-    """Return what a channel says its publishers offer; nothing where that cannot be read."""
+def qos_profiles(channel: Channel) -> tuple[Qos, ...]:
+    """Return the QoS profiles in the metadata of a channel."""
     return tuple(parse_offered_qos(channel.metadata.get('offered_qos_profiles', '')))

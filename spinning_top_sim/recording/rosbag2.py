@@ -3,7 +3,7 @@
 The two YAML texts that rosbag2 (jazzy) expects in a log: offered QoS and bag metadata.
 
 Sources: rosbag2_storage, qos.cpp and yaml.hpp; rosbag2_storage_mcap, mcap_storage.cpp.  They are
-few fixed lines, written by hand so that a recording needs no YAML package.
+few fixed lines, written by hand so that a recording imports no YAML package.
 """
 
 from __future__ import annotations
@@ -13,13 +13,18 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeGuard
+
+# A profile: the keys of DEFAULT_QOS, integer policies as in rmw, durations as {'sec', 'nsec'}.
+Qos = Mapping[str, Any]
+
+BAG_METADATA = 'rosbag2'  # name of the metadata record
 
 _METADATA_VERSION = 9  # of rosbag2_storage::BagMetadata in jazzy
 _NEVER = {'sec': 9223372036, 'nsec': 854775807}  # RMW_DURATION_INFINITE
 
 # What a reliable publisher with a queue of ten offers, rmw's enum values.
-DEFAULT_QOS: Mapping[str, Any] = {
+DEFAULT_QOS: Qos = {
     'history': 1,                        # keep last
     'depth': 10,
     'reliability': 1,                    # reliable
@@ -40,25 +45,30 @@ _POLICY_NAMES = {
 }
 
 
-_INTEGER = re.compile(r'-?[0-9]+')
-_QOS_LINE = re.compile(r'(- | {2,})(\w+): *(\S*) *', re.ASCII)
-
-
 @dataclass(frozen=True)
 class RecordedTopic:
     """
     One topic of a recording.
 
-    name: resolved, such as '/imu/data_raw';  type_name: 'package/msg/Type'
-    qos: what the publisher offers, with the keys of DEFAULT_QOS, integer policies as in rmw and
-        durations as {'sec': ..., 'nsec': ...}; what is left out is as in DEFAULT_QOS
+    Parameters
+    ----------
+    name : str
+        Resolved, such as '/imu/data_raw'.
+    type_name : str
+        'package/msg/Type'.
+    qos : mapping
+        What the publisher offers; a policy that is left out is as in DEFAULT_QOS.
 
-    Raises ValueError naming the key, its value and what is allowed.
+    Raises
+    ------
+    ValueError
+        Naming the key, its value and what is allowed.
+
     """
 
     name: str
     type_name: str
-    qos: Mapping[str, Any] = field(default_factory=dict)
+    qos: Qos = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for key, value in self.qos.items():
@@ -72,18 +82,12 @@ class RecordedTopic:
 
 @dataclass(frozen=True)
 class BagTopic:
-    """
-    What the bag metadata say of a topic.
-
-    name, type_name: as of RecordedTopic;  type_hash: 'RIHS01_...' or ''
-    profiles: what its publishers offer, each as the `qos` of a RecordedTopic
-    messages: how many there are;  encoding: of the messages
-    """
+    """What the bag metadata say of a topic."""
 
     name: str
     type_name: str
-    type_hash: str
-    profiles: Sequence[Mapping[str, Any]]
+    type_hash: str              # 'RIHS01_...' or ''
+    profiles: Sequence[Qos]     # what its publishers offer
     messages: int
     encoding: str = 'cdr'
 
@@ -97,47 +101,45 @@ def offered_qos_yaml(topic: RecordedTopic) -> str:
     return '\n'.join(_qos_lines(topic.qos, as_names=False))
 
 
-def parse_offered_qos(text: str) -> list[dict[str, Any]]:
+def parse_offered_qos(text: str) -> list[Qos]:
     """
-    Return the profiles of an `offered_qos_profiles`: the keys of DEFAULT_QOS, policies as in rmw.
+    Parse the `offered_qos_profiles` of a channel, with policies by number or name.
 
-    Understands what rosbag2 and this package write, in block style, policies by number or name.
     A policy that is missing or not understood is as in DEFAULT_QOS; a text that is no list of
     profiles has none.
     """
-    profiles: list[dict[str, Any]] = []
-    key = ''
-    for line in text.splitlines():
-        match = _QOS_LINE.fullmatch(line)
-        if match is None or not (profiles or match[1] == '- '):
-            return []
-        indent, name, word = match.groups()
-        if indent == '- ':
-            profiles.append({})
-        value: Any = {'': {}, 'true': True, 'false': False}.get(word, word)
-        if isinstance(value, str) and _INTEGER.fullmatch(value):
-            value = int(value)
-        nested = profiles[-1].get(key) if len(indent) > 2 else None
-        if isinstance(nested, dict):
-            nested[name] = value
-        else:
-            key = name
-            profiles[-1][key] = value
+    if not text:
+        return []
+    import yaml  # noqa: PLC0415 - a recording needs none
+
+    try:
+        profiles = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, TypeError, OverflowError, RecursionError):
+        return []
+    if not isinstance(profiles, list) or not all(isinstance(one, dict) for one in profiles):
+        return []
     return [{key: _parsed_policy(key, profile.get(key)) for key in DEFAULT_QOS}
             for profile in profiles]
 
 
-def _parsed_policy(key: str, value: Any) -> Any:
+def _parsed_policy(key: str, value: object) -> int | bool | Mapping[str, int]:
     default, names = DEFAULT_QOS[key], _POLICY_NAMES.get(key)
     if isinstance(default, Mapping):
         parts = value if isinstance(value, Mapping) else {}
-        return value if all(isinstance(parts.get(part), int) for part in default) else default
-    if names is not None:
-        if value in names:
-            value = names.index(value)
-        known = type(value) is int and 0 <= value < len(names) and names[value] != 'unknown'
-        return value if known else default
-    return value if type(value) is type(default) else default
+        right = all(_is_int64(parts.get(part)) for part in default)
+        return {part: parts[part] for part in default} if right else default
+    if names is not None and value in names:
+        value = names.index(value)
+    if names is not None and not (
+            _is_int64(value) and 0 <= value < len(names) and names[value] != 'unknown'):
+        return default
+    if isinstance(default, bool):
+        return value if isinstance(value, bool) else default
+    return value if _is_int64(value) else default
+
+
+def _is_int64(value: object) -> TypeGuard[int]:
+    return type(value) is int and -1 << 63 <= value < 1 << 63
 
 
 def bag_metadata_yaml(
@@ -151,10 +153,18 @@ def bag_metadata_yaml(
     """
     Return the `serialized_metadata` of the `rosbag2` record.
 
-    file_name: without its directory
-    start_ns, end_ns: earliest and latest stamp [ns since the epoch]; both 0 in an empty log
-    former: the metadata of the log that this one is made from, whose ROS distribution and custom
-        data stay
+    Parameters
+    ----------
+    topics : sequence of BagTopic
+        In the order of the file.
+    file_name : str
+        Without its directory.
+    start_ns, end_ns : int
+        The earliest and the latest stamp [ns since the epoch]; both 0 in an empty log.
+    former : str
+        The metadata of the log that this one is made from, whose ROS distribution and custom
+        data stay.
+
     """
     total = sum(topic.messages for topic in topics)
     lines = [
@@ -206,7 +216,7 @@ def _block(text: str, key: str) -> str:
     return match.group() if match else ''
 
 
-def _qos_lines(profile: Mapping[str, Any], *, as_names: bool) -> list[str]:
+def _qos_lines(profile: Qos, *, as_names: bool) -> list[str]:
     """Return a profile as a YAML list of one, line by line."""
     lines = []
     for key, default in DEFAULT_QOS.items():

@@ -20,59 +20,44 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Literal
 
+from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import RecordingError
-from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.schemas import find_definition
+from spinning_top_sim.recording.rosbag2 import RecordedTopic, offered_qos_yaml
 
 if TYPE_CHECKING:
-    from spinning_top_sim.recording.mcap_file import McapFile
+    from spinning_top_sim.recording.chunks import Messages
+    from spinning_top_sim.recording.mcap_writer import McapWriter
 
 COMPRESSIONS = ('zstd', 'lz4', 'none')
 METADATA_NAME = 'spinning_top_sim'
+OUR_LIBRARY = 'spinning_top_sim '      # what the header of our files begins with
 
 _ENTRY_BYTES = 128  # what a queued message costs besides its data, about
 _CLOSE_AT_EXIT_S = 10.0
 
-# Messages of one stamp: indices of their topics, stamp [ns], CDR of each, size of all [bytes].
-Messages = tuple[Sequence[int], int, Sequence[bytes], int]
-
 
 @dataclass(frozen=True)
 class RecorderCounters:
-    """
-    Where a recording stands.
+    """The progress of a recording."""
 
-    messages: in the file;  queued: accepted, not yet in the file
-    lost: handed over after the recording stopped, or when it failed
-    bytes: size of the file
-    flushes: how often the file was brought to the disk;  longest_flush: [s]
-    """
-
-    messages: int
-    queued: int
-    lost: int
-    bytes: int
-    flushes: int
-    longest_flush: float
+    messages: int           # in the file
+    queued: int             # accepted, not yet in the file
+    lost: int               # handed over after the recording stopped, or when it failed
+    bytes: int              # size of the file
+    flushes: int            # how often the file was brought to the disk
+    longest_flush: float    # [s]
 
 
 @dataclass(frozen=True)
 class RecordingSummary:
-    """
-    What a finished recording holds.
-
-    path: of the file;  bytes: its size
-    counts: messages in it by topic name;  lost: messages handed over that are not in it
-    error: why the recording stopped early, or None
-    indexed: whether the file has its summary; without, ordinary readers refuse it
-    """
+    """The result of a recording."""
 
     path: Path
-    bytes: int
-    counts: dict[str, int]
-    lost: int
-    error: str | None
-    indexed: bool
+    bytes: int              # size of the file
+    counts: dict[str, int]  # messages in it by topic name
+    lost: int               # messages handed over that are not in it
+    error: str | None       # why the recording stopped early
+    indexed: bool           # whether the file has its summary; ordinary readers refuse it without
 
 
 class McapRecorder:
@@ -84,7 +69,7 @@ class McapRecorder:
     """
 
     def __init__(
-        self, path: Path, topics: Sequence[RecordedTopic], file: McapFile, *,
+        self, path: Path, topics: Sequence[RecordedTopic], file: McapWriter, *,
         max_loss: float, min_free_bytes: int, queue_bytes: int,
     ) -> None:
         """For `open`, which checks the arguments."""
@@ -132,17 +117,32 @@ class McapRecorder:
         queue_bytes: int = 32_000_000,
     ) -> McapRecorder:
         """
-        Create `path` and start recording into it.
+        Create a file and start recording into it.
 
-        topics: a message refers to them by index
-        metadata: what the `spinning_top_sim` record at the head of the file says
-        max_loss: most wall time whose messages a SIGKILL or a power loss may take [s], > 0
-        compression: one of COMPRESSIONS
-        min_free_bytes: recording stops when the disk has less left than this, >= 0
-        queue_bytes: `room` is False from here on; at most about twice this is in memory, > 0
+        Parameters
+        ----------
+        path : path
+            The file.  It must not exist.
+        topics : sequence of RecordedTopic
+            A message refers to them by index.
+        metadata : mapping of str to str
+            The `spinning_top_sim` record at the head of the file.
+        max_loss : float
+            Most wall time whose messages a SIGKILL or a power loss may take [s], > 0.
+        compression : str
+            One of COMPRESSIONS.
+        min_free_bytes : int
+            Recording stops if the disk has less left than this, >= 0.
+        queue_bytes : int
+            `room` is False from here on; about twice this is in memory at most, > 0.
 
-        Raises ValueError for an argument out of range, and RecordingError, naming path or type
-        and the reason, when the file exists or cannot be made, or a definition is not installed.
+        Raises
+        ------
+        ValueError
+            If an argument is out of range.
+        RecordingError
+            If the file exists or cannot be made, or a definition is not installed.
+
         """
         path = Path(path)
         topics = tuple(topics)
@@ -200,12 +200,20 @@ class McapRecorder:
         """
         Hand over messages of one stamp, from one thread at a time; they keep their order.
 
-        topic_indices: of the topic of each, in the `topics` of `open`
-        log_time_ns: their stamp [ns], >= 0, log and publish time alike
-        messages: CDR, each with its four bytes of header;  size: of all together [bytes]
-
         Never waits for the disk, never raises for its sake.  After the recording stopped the
         messages are only counted, as lost.
+
+        Parameters
+        ----------
+        topic_indices : sequence of int
+            The topic of each, an index of the `topics` of `open`.
+        log_time_ns : int
+            Log and publish time [ns], >= 0.
+        messages : sequence of bytes
+            CDR, each with its four bytes of header.
+        size : int
+            The size of all [bytes].
+
         """
         self._offered += len(messages)
         if self._accepting:
@@ -314,23 +322,34 @@ class McapRecorder:
             self._error = error
             self._state = 'failed'
         self._take()
-        # Little space is left, or none: cutting off the torn chunk may have made enough of it.
+        # Cutting off the truncated chunk may have freed enough space for the summary.
         with contextlib.suppress(Exception):
             self._file.finish()
             self._indexed = True
 
 
 def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[str, str], *,
-                compression: str, min_free_bytes: int = 0) -> McapFile:
+                compression: str, min_free_bytes: int = 0) -> McapWriter:
     """
-    Create a log with its head, for one thread to write; see `McapRecorder.open`.
+    Create a log and bring its head to the disk; the parameters are those of `McapRecorder.open`.
 
-    Raises RecordingError, naming path or type and the reason.
+    All topics stand before the first chunk, so that a truncated file tells them in any case.
+
+    Raises
+    ------
+    RecordingError
+        Naming path or type and the reason.
+
     """
     definitions = {
-        name: find_definition(name) for name in {topic.type_name for topic in topics}}
+        name: find_definition(name) for name in dict.fromkeys(topic.type_name for topic in topics)}
     try:
-        from spinning_top_sim.recording.mcap_file import McapFile  # noqa: PLC0415
+        from mcap.records import Channel, Metadata, Schema  # noqa: PLC0415
+
+        from spinning_top_sim.recording.mcap_writer import (  # noqa: PLC0415
+            McapWriter,
+            sync_directory,
+        )
     except ImportError as error:
         raise RecordingError(
             f'recording needs the Python package mcap with zstandard and lz4: {error}'
@@ -340,9 +359,24 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
         free = disk.f_bavail * disk.f_frsize
         if free < min_free_bytes:
             raise OSError(_too_little_space(free, min_free_bytes))
-        file = McapFile(
-            path, topics, definitions, {METADATA_NAME: metadata},
-            library=f'spinning_top_sim {_version()}', compression=compression)
+        file = McapWriter(path, profile='ros2', library=f'{OUR_LIBRARY}{_version()}',
+                          compression=compression)
+        with file.discarded_on_failure():
+            file.write_metadata(Metadata(METADATA_NAME, dict(metadata)))
+            schema_ids = {}
+            for number, (name, definition) in enumerate(definitions.items(), start=1):
+                schema_ids[name] = number
+                file.write_schema(Schema(
+                    id=number, name=name, encoding='ros2msg', data=definition.text.encode()))
+            for number, topic in enumerate(topics, start=1):
+                file.write_channel(Channel(
+                    id=number, topic=topic.name, message_encoding='cdr',
+                    schema_id=schema_ids[topic.type_name],
+                    metadata={'offered_qos_profiles': offered_qos_yaml(topic),
+                              'topic_type_hash': definitions[topic.type_name].type_hash}),
+                    qos_profiles=(topic.qos,))
+            file.sync()
+            sync_directory(path.parent)
     except FileExistsError as error:
         raise RecordingError(
             f'cannot record to {path}: it exists, and a recording overwrites nothing'

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ from pathlib import Path
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.tools.cli import OK, exit_code, print_line, progress
 
-SOME_LOST = 3
+SOME_LOST, TERMINATED = 3, 143
 # Smaller files are done before one could read the progress.
 PROGRESS_BYTES = 50_000_000
 
@@ -19,7 +20,12 @@ PROGRESS_BYTES = 50_000_000
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
     arguments = _parser().parse_args(argv)
-    return exit_code('recover', lambda: _run(arguments), (LogError,))
+    # An exception, so that the unfinished output is removed.
+    previous = signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
+    try:
+        return exit_code('recover', lambda: _run(arguments), (LogError,))
+    finally:
+        signal.signal(signal.SIGTERM, previous)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -46,7 +52,7 @@ def _run(arguments: argparse.Namespace) -> int:
     # Not before: --help needs none of it.
     from spinning_top_sim.recording.damage import count  # noqa: PLC0415
     from spinning_top_sim.recording.reader import LogReader  # noqa: PLC0415
-    from spinning_top_sim.recording.recovery import recover  # noqa: PLC0415
+    from spinning_top_sim.recording.salvage import recover  # noqa: PLC0415
 
     log: Path = arguments.log
     output: Path = arguments.output or log.with_name(f'{log.stem}_recovered.mcap')

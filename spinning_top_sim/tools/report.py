@@ -48,7 +48,7 @@ def as_json(path: Path, found: Survey, verdict: Verdict | None) -> dict[str, obj
     content: dict[str, object] = {
         'file': str(path),
         'whole': found.whole,
-        'damage': {'torn': damage.torn, 'lost_bytes': damage.lost_bytes,
+        'damage': {'torn': damage.truncated, 'lost_bytes': damage.lost_bytes,
                    'lost_chunks': damage.lost_chunks,
                    'missing_messages': damage.missing_messages,
                    'missing_exactly': damage.missing_exactly, 'report': damage.lines()},
@@ -118,7 +118,7 @@ def as_text(path: Path, found: Survey, verdict: Verdict | None) -> Iterator[str 
     """
     damage = found.damage
     state = ('whole' if found.whole and not damage.defects else
-             'torn' if damage.torn else 'damaged')
+             'torn' if damage.truncated else 'damaged')
     yield f'{path}: {state}, {(found.end_ns - found.begin_ns) / NANOSECONDS:.6g} s'
     yield from damage.lines()
     run = found.run

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from spinning_top_sim.recording.mcap_file import McapFile
+    from spinning_top_sim.recording.mcap_writer import McapWriter
     from spinning_top_sim.streams.topics import Stream
 
 # In ROS a stamp of 0 means "no time".
@@ -235,7 +235,7 @@ class _LogWriter:
     Compression and the file system leave Python to other threads while they work.
     """
 
-    def __init__(self, file: McapFile, streams: Sequence[Stream], epoch_ns: int) -> None:
+    def __init__(self, file: McapWriter, streams: Sequence[Stream], epoch_ns: int) -> None:
         self._file, self._epoch_ns = file, epoch_ns
         self._numbers = {stream.topic: number for number, stream in enumerate(streams)}
         self._commands_topic, self._events_topic = len(streams), len(streams) + 1

@@ -189,7 +189,7 @@ class Survey:
 def survey(reader: LogReader) -> Survey:
     """Return the findings about a log.  Raises LogError."""
     damage = reader.damage
-    found = Survey(damage, reader.whole and not damage.torn and damage.lossless,
+    found = Survey(damage, reader.whole and not damage.truncated and damage.lossless,
                    {topic.name: TopicReport(topic.type_name) for topic in reader.topics})
     sections: list[Section] = []
     try:

@@ -96,7 +96,7 @@ class _Comparison:
             self._topics[journal.COMMANDS] = run.commands_topic
         self._waiting: dict[str, deque[tuple[int, bytes]]] = {
             topic: deque() for topic in self._topics.values()}
-        self._verdict = Verdict(not reader.damage.torn and reader.damage.lossless,
+        self._verdict = Verdict(not reader.damage.truncated and reader.damage.lossless,
                                 dict.fromkeys(self._waiting, 0), warnings=_warnings(run))
 
     def run(self) -> Verdict:

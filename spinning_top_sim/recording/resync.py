@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finds where records begin in a file that does not tell it."""
+
+from __future__ import annotations
+
+import re
+
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Chunk
+
+from spinning_top_sim.recording.chunks import MESSAGE_FIELDS
+from spinning_top_sim.recording.records import (
+    CHUNK_HEAD,
+    HEAD,
+    DamagedError,
+    StrictStream,
+    TooLargeError,
+    open_chunk,
+    parse,
+)
+from spinning_top_sim.recording.summary import McapSource
+
+# What may begin a chunk, a schema, a channel or metadata: opcode and a length below 2^40.
+_CANDIDATE = re.compile(rb'[\x03\x04\x06\x0c](?=.{5}\x00\x00\x00)', re.DOTALL)
+# Where the length of the name is in the content.
+_NAME_OFFSETS: dict[int, int] = {Opcode.SCHEMA: 2, Opcode.CHANNEL: 4, Opcode.METADATA: 0}
+
+_LOOK_BYTES = 64                # of the content, enough for a chunk's fields before its data
+_MAX_NAME = 1 << 12
+_MAX_DECLARATION = 1 << 24
+_MAX_EXTRA = 1 << 10
+_FIRST_BLOCK, _MAX_BLOCK = 1 << 13, 1 << 20
+_MAX_EFFORT = 4                 # bytes of candidates read, as a multiple of the file's size
+
+
+class RecordFinder:
+    """
+    Finds records that prove themselves by their inner lengths and, if chunks, their checksum.
+
+    Parameters
+    ----------
+    source : McapSource
+    limit : int
+        Where the data section ends.
+
+    """
+
+    def __init__(self, source: McapSource, limit: int) -> None:
+        self._source = source
+        self._limit = limit
+        self._effort = _MAX_EFFORT * source.size    # so that the time is linear in the size
+
+    def is_record(self, offset: int) -> bool:
+        """Return whether a record of a known kind begins there, or the data section ends."""
+        opcode = 0
+        try:
+            while offset < self._limit:
+                opcode, length = self._source.head(offset, self._limit)
+                if opcode <= Opcode.DATA_END:
+                    break
+                offset += HEAD.size + length
+            if offset == self._limit:
+                return True
+            if opcode == Opcode.MESSAGE:
+                return length >= MESSAGE_FIELDS
+            if opcode == Opcode.ATTACHMENT:
+                self._source.attachment(offset, length)
+            elif opcode == Opcode.CHUNK or opcode in _NAME_OFFSETS:
+                self._prove(offset)
+            else:
+                self._source.record(offset, self._limit)
+        except TooLargeError:
+            return opcode == Opcode.CHUNK
+        except DamagedError:
+            return False
+        return True
+
+    def find(self, offset: int) -> int:
+        """
+        Return where the next chunk, schema, channel or metadata begins, or the limit.
+
+        Single messages are not looked for: nothing in them tells them from chance.
+        """
+        size = _FIRST_BLOCK
+        while offset < self._limit:
+            block = self._source.read(offset, size + HEAD.size)
+            for match in _CANDIDATE.finditer(block, 0, size + HEAD.size - 1):
+                place = offset + match.start()
+                try:
+                    if not self._prove(place):
+                        return place
+                except DamagedError:
+                    continue
+            offset += size
+            size = min(2 * size, _MAX_BLOCK)
+        return self._limit
+
+    def _prove(self, offset: int) -> int:
+        """
+        Return how many bytes the record has behind its known fields, 0 for a chunk.
+
+        Raises DamagedError if it is none, TooLargeError if it might be one.
+        """
+        opcode, length = self._source.head(offset, self._limit)
+        # First what needs no more than a look: most candidates are none.
+        if not _looks_right(opcode, length, self._source.read(offset + HEAD.size, _LOOK_BYTES)):
+            raise DamagedError('its lengths do not fit')
+        self._effort -= length
+        if self._effort < 0:
+            raise DamagedError('the file has candidates everywhere')
+        record, extra = parse(opcode, self._source.content(offset, length))
+        if not isinstance(record, Chunk):
+            return extra
+        contents = open_chunk(record, self._source.max_bytes)
+        if not contents.messages and not contents.declared:
+            raise DamagedError('it is empty')       # zeros in data look like that
+        return 0
+
+
+def _looks_right(opcode: int, length: int, start: bytes) -> bool:
+    """Return whether a chunk, schema, channel or metadata of this length may start so."""
+    if opcode == Opcode.CHUNK:
+        stream = StrictStream(start[CHUNK_HEAD.size:])
+        try:
+            stream.read_prefixed_string()
+            data_size = stream.read8()
+        except (McapError, UnicodeDecodeError):
+            return False
+        return 0 <= length - (CHUNK_HEAD.size + stream.count + data_size) <= _MAX_EXTRA
+    offset = _NAME_OFFSETS[opcode]
+    name_size = int.from_bytes(start[offset:offset + 4], 'little')
+    return 0 < name_size < _MAX_NAME and length <= _MAX_DECLARATION

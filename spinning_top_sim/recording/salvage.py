@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Writes what is whole of a damaged log into a new, indexed one."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import secrets
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from mcap.records import AttachmentIndex, Channel, Chunk, Header, Metadata, Schema
+
+from spinning_top_sim.recording.chunks import time_span
+from spinning_top_sim.recording.damage import Damage
+from spinning_top_sim.recording.errors import NothingToSaveError, OutputError
+from spinning_top_sim.recording.mcap_writer import McapWriter, sync_directory
+from spinning_top_sim.recording.reader import LogReader, qos_profiles
+from spinning_top_sim.recording.rosbag2 import BAG_METADATA
+from spinning_top_sim.recording.scanner import ScannedRecord, Scanner
+
+_COMPRESSION = 'zstd'  # of messages that were in no chunk
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """What a recovery wrote."""
+
+    path: Path
+    bytes: int
+    messages: int
+    chunks: int
+    damage: Damage  # of the old file
+
+
+def recover(
+    reader: LogReader, output: str | os.PathLike[str],
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Recovered:
+    """
+    Write everything that is whole in a log into a new file.
+
+    Chunks and records of unknown kinds are copied as they are, messages outside of chunks are put
+    into some; message indexes, statistics, summary and the `rosbag2` record are made anew.
+
+    Parameters
+    ----------
+    reader : LogReader
+        The log.
+    output : path
+        The new file.  It appears when it is complete and on the disk, never before.
+    progress : callable
+        Told how many bytes of how many are done.
+
+    Raises
+    ------
+    OutputError
+        If the output exists or cannot be written.
+    NothingToSaveError
+        If a file that was not closed holds no whole message.
+    LogAccessError
+        If the log cannot be read.
+
+    """
+    output = Path(output)
+    if os.path.lexists(output):
+        raise OutputError(_exists(output))
+    draft = output.with_name(f'.recover-{secrets.token_hex(8)}.tmp')
+    try:
+        try:
+            return _recover(reader, reader.scan(), output, draft, progress)
+        except _FoundLateError as late:
+            return _recover(reader, reader.scan(late.scanner), output, draft, progress)
+    except FileNotFoundError as error:
+        raise OutputError(
+            f'cannot write {output}: there is no directory {output.parent}') from error
+    except OSError as error:
+        raise OutputError(f'cannot write {output}: {error.strerror or error}') from error
+
+
+class _FoundLateError(Exception):
+    """Channels were found behind their messages: with what the scanner knows, scan again."""
+
+    def __init__(self, scanner: Scanner) -> None:
+        super().__init__()
+        self.scanner = scanner
+
+
+def _recover(
+    reader: LogReader, scanner: Scanner, output: Path, draft: Path,
+    progress: Callable[[int, int], None],
+) -> Recovered:
+    records = iter(scanner)
+    first = next(records, None)
+    header = first.raw if first is not None and isinstance(first.record, Header) else b''
+    writer = McapWriter(draft, profile=reader.profile, library=reader.library,
+                        compression=_COMPRESSION, header=header)
+    with writer.discarded_on_failure():
+        copy = _Copy(reader, scanner, writer)
+        for scanned in itertools.chain([first] if first is not None else [], records):
+            copy.put(scanned)
+            progress(scanned.offset, reader.size)
+        if scanner.found_late:
+            raise _FoundLateError(scanner)
+        copy.put_rest()
+        messages = sum(writer.message_counts.values())
+        damage = scanner.damage()
+        if not messages and not reader.whole:
+            raise NothingToSaveError(
+                f'nothing to save in {reader.path}: there is no whole message in it')
+        os.chmod(draft, reader.mode)
+        writer.finish(bag=reader.profile == 'ros2' or bool(copy.former_bag),
+                      file_name=output.name, former_bag=copy.former_bag)
+        _publish(draft, output)
+    progress(reader.size, reader.size)
+    return Recovered(output, writer.size, messages, writer.chunk_count, damage)
+
+
+class _Copy:
+    """Writes scanned records into a new file."""
+
+    def __init__(self, reader: LogReader, scanner: Scanner, writer: McapWriter) -> None:
+        self._reader = reader
+        self._scanner = scanner
+        self._writer = writer
+        self._declared: set[tuple[type, int]] = set()
+        self.former_bag = ''  # the `rosbag2` record of the log
+
+    def put(self, scanned: ScannedRecord) -> None:
+        """Write a record, as it is or as it should be."""
+        record = scanned.record
+        if scanned.contents is not None:
+            self._put_messages(scanned)
+        elif isinstance(record, Schema | Channel):
+            self._declare(record, scanned.raw)
+        elif isinstance(record, Metadata):
+            if record.name == BAG_METADATA:
+                self.former_bag = record.metadata.get('serialized_metadata', '')
+            else:
+                self._writer.write_metadata(record, scanned.raw)
+        elif isinstance(record, AttachmentIndex):
+            self._writer.copy_attachment(record, self._blocks(scanned))
+        elif record is None:
+            self._writer.copy_record(self._blocks(scanned))
+
+    def put_rest(self) -> None:
+        """Write what is left: messages, and channels that only the summary tells."""
+        self._writer.write_chunk()
+        for schema in self._scanner.schemas.values():
+            self._declare(schema)
+        for channel in self._scanner.channels.values():
+            self._declare(channel)
+
+    def _blocks(self, scanned: ScannedRecord) -> Iterator[bytes]:
+        return self._reader.blocks(scanned.offset, scanned.length)
+
+    def _put_messages(self, scanned: ScannedRecord) -> None:
+        contents = scanned.contents
+        assert contents is not None
+        for channel_id in contents.entries:
+            self._declare(self._scanner.channels[channel_id])
+        if isinstance(scanned.record, Chunk) and not scanned.unknown:
+            self._writer.write_chunk()  # what came before stays before
+            self._writer.copy_chunk(
+                scanned.record, contents.entries, time_span(contents.entries), scanned.raw)
+            return
+        for message in contents.messages:
+            if self._writer.add_message(
+                    message.channel_id, message.sequence, message.log_time,
+                    message.publish_time, contents.plain[message.start:message.end]):
+                self._writer.write_chunk()
+
+    def _declare(self, record: Schema | Channel, raw: bytes = b'') -> None:
+        """Write a schema or channel outside of chunks, once, a schema before its channels."""
+        key = type(record), record.id
+        if key in self._declared:
+            return
+        if isinstance(record, Schema):
+            self._writer.write_schema(record, raw)
+        else:
+            schema = self._scanner.schemas.get(record.schema_id)
+            if schema is not None:
+                self._declare(schema)
+            elif record.schema_id:
+                return      # no reader takes a channel without its schema
+            self._writer.write_channel(record, raw, qos_profiles(record))
+        self._declared.add(key)
+
+
+def _publish(draft: Path, output: Path) -> None:
+    """Give a file its name without taking that of another."""
+    try:
+        os.link(draft, output)
+    except FileExistsError:
+        raise OutputError(_exists(output)) from None
+    except OSError:
+        # A file system without links: between the look and the renaming nothing protects.
+        if os.path.lexists(output):
+            raise OutputError(_exists(output)) from None
+        os.rename(draft, output)
+    else:
+        with contextlib.suppress(OSError):
+            draft.unlink()
+    sync_directory(output.parent)
+
+
+def _exists(output: Path) -> str:
+    return f'{output} exists, and nothing is overwritten'

@@ -1,0 +1,458 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What the MCAP specification allows, and files that are made to harm a reader.
+
+The files are built record by record with mcap's record classes.
+"""
+
+import os
+import random
+import signal
+import struct
+import subprocess
+import sys
+import tracemalloc
+import zlib
+from pathlib import Path
+
+import lz4.frame  # type: ignore[import-untyped]
+import pytest
+import zstandard
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import (
+    Attachment,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    Message,
+    MessageIndex,
+    Metadata,
+    Schema,
+    Statistics,
+)
+from mcap.writer import MCAP0_MAGIC
+from test_recover import (
+    ALL_KEPT,
+    ROOT,
+    SOME_LOST,
+    STRANGERS,
+    metadata_of,
+    records_of,
+    run,
+    seen_by_mcap,
+    seen_by_us,
+    write_log,
+    write_stranger,
+)
+
+from spinning_top_sim.recording.mcap_writer import record_bytes
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.summary import McapSource
+
+HEADER = record_bytes(Header(profile='', library='a stranger'))
+SCHEMA = record_bytes(Schema(id=1, name='thing', encoding='jsonschema', data=b'{}'))
+CHANNEL = record_bytes(Channel(id=1, topic='/a', message_encoding='json', metadata={'k': 'v'},
+                               schema_id=1))
+RAW_CHANNEL = record_bytes(Channel(id=1, topic='/a', message_encoding='x', metadata={},
+                                   schema_id=0))
+
+
+def message(log_time: int, data: bytes, channel: int = 1) -> bytes:
+    return record_bytes(Message(channel_id=channel, log_time=log_time, publish_time=log_time,
+                                sequence=0, data=data))
+
+
+def chunk_of(plain: bytes, start: int = 5, end: int = 5, compression: str = '',
+             data: bytes | None = None) -> bytes:
+    return record_bytes(Chunk(
+        compression=compression, data=plain if data is None else data,
+        uncompressed_size=len(plain), uncompressed_crc=zlib.crc32(plain),
+        message_start_time=start, message_end_time=end))
+
+
+def padded(record: bytes, extra: bytes) -> bytes:
+    opcode, length = struct.unpack_from('<BQ', record)
+    return struct.pack('<BQ', opcode, length + len(extra)) + record[9:] + extra
+
+
+def unknown_kind(opcode: int, content: bytes) -> bytes:
+    return struct.pack('<BQ', opcode, len(content)) + content
+
+
+def closed(*records: bytes, data_end_extra: bytes = b'') -> bytes:
+    """Return a file without summary, with the checksum of its data section."""
+    content = MCAP0_MAGIC + b''.join(records)
+    return b''.join([
+        content, padded(record_bytes(DataEnd(zlib.crc32(content))), data_end_extra),
+        record_bytes(Footer(summary_start=0, summary_offset_start=0, summary_crc=0)), MCAP0_MAGIC])
+
+
+def recover(path: Path, expected: int = ALL_KEPT) -> Path:
+    output = path.with_name('whole.mcap')
+    code, out, err = run(path, '-o', output)
+    assert code == expected, (out, err)
+    return output
+
+
+# Allowed
+
+def test_extra_fields_and_unknown_kinds_are_read_and_kept(tmp_path):
+    """The specification lets records grow, and gives 0x80 and above to applications."""
+    path = tmp_path / 'a.mcap'
+    plain = message(5, b'1') + message(7, b'2')
+    kept = [
+        padded(SCHEMA, b'\x01\x02\x03'), padded(CHANNEL, b'more'),
+        unknown_kind(0x80, b'of an application'), unknown_kind(0x10, b'of the future'),
+        padded(chunk_of(plain, 5, 7), b'\x00' * 20),
+        padded(record_bytes(Metadata('note', {'a': 'b'})), b'\x06'),
+        padded(record_bytes(Attachment(1, 2, 'name', 'x/y', b'data')), b'behind the checksum'),
+        unknown_kind(0xff, b'')]
+    index = padded(record_bytes(MessageIndex(1, [(5, 0), (7, 32)])), b'??')
+    path.write_bytes(closed(padded(HEADER, b'new'), *kept[:5], index, *kept[5:],
+                            data_end_extra=b'!'))
+    with LogReader(path) as reader:
+        assert reader.whole
+        assert reader.damage.lines() == []
+        assert (reader.damage.truncated, reader.damage.missing) == (False, {})
+        assert reader.metadata == {'note': {'a': 'b'}}
+        (topic,) = reader.topics
+        assert (topic.name, topic.type_name, topic.metadata) == ('/a', 'thing', {'k': 'v'})
+    output = recover(path)
+    assert seen_by_us(path) == seen_by_us(output) == [('/a', 5, b'1'), ('/a', 7, b'2')]
+    assert seen_by_mcap(output) == seen_by_us(output)
+    content = output.read_bytes()
+    found = [content[start:end] for _, start, end in records_of(content)]
+    assert found[0] == padded(HEADER, b'new')
+    assert [record for record in found if record in kept][:len(kept)] == kept
+    with open(output, 'rb') as file:
+        (attachment,) = make_reader(file).iter_attachments()
+    assert attachment.data == b'data'
+    with LogReader(output) as reader:
+        assert reader.damage.lines() == []
+
+
+def test_extra_fields_inside_of_a_chunk_are_ignored(tmp_path):
+    path = tmp_path / 'a.mcap'
+    plain = padded(SCHEMA, b'more') + padded(CHANNEL, b'more') + message(5, b'1')
+    path.write_bytes(closed(HEADER, chunk_of(plain)))
+    output = recover(path)
+    assert seen_by_us(path) == seen_by_us(output) == [('/a', 5, b'1')]
+    assert chunk_of(plain) in output.read_bytes()
+
+
+@pytest.mark.parametrize('records', [[], [HEADER], [HEADER, SCHEMA, CHANNEL]])
+def test_a_closed_file_without_summary_and_messages_is_whole(tmp_path, records):
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(closed(*records or [HEADER]))
+    with LogReader(path) as reader:
+        assert reader.whole
+        assert reader.damage.lines() == []
+    assert seen_by_mcap(recover(path)) == []
+
+
+@pytest.mark.parametrize('compression', ['zstd', 'lz4'])
+def test_a_chunk_of_several_frames_is_read_to_its_end(tmp_path, compression):
+    compress = {'zstd': zstandard.compress, 'lz4': lz4.frame.compress}[compression]
+    first, second = message(5, b'first'), message(6, b'second' * 50)
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(closed(HEADER, RAW_CHANNEL, chunk_of(
+        first + second, 5, 6, compression, compress(first) + compress(second))))
+    assert [data for _, _, data in seen_by_us(path)] == [b'first', b'second' * 50]
+    with LogReader(path) as reader:
+        assert reader.damage.lossless
+
+
+def test_a_chunk_that_is_indexed_twice_is_read_once(tmp_path, monkeypatch):
+    """Also where the statistics count it twice."""
+    path = tmp_path / 'a.mcap'
+    for chunk_count in (1, 2):
+        start = MCAP0_MAGIC + HEADER + RAW_CHANNEL
+        chunk = chunk_of(message(5, b'x'))
+        index = record_bytes(MessageIndex(1, [(5, 0)]))
+        data = start + chunk + index
+        data += record_bytes(DataEnd(0))
+        chunk_index = record_bytes(ChunkIndex(
+            chunk_length=len(chunk), chunk_start_offset=len(start), compression='',
+            compressed_size=32, message_end_time=5, message_start_time=5,
+            message_index_length=len(index), uncompressed_size=32,
+            message_index_offsets={1: len(start) + len(chunk)}))
+        statistics = record_bytes(Statistics(
+            attachment_count=0, channel_count=1, channel_message_counts={1: 1},
+            chunk_count=chunk_count, message_count=1, message_end_time=5, message_start_time=5,
+            metadata_count=0, schema_count=0))
+        path.write_bytes(b''.join([
+            data, RAW_CHANNEL, statistics, chunk_index, chunk_index,
+            record_bytes(Footer(len(data), 0, 0)), MCAP0_MAGIC]))
+        assert seen_by_us(path) == [('/a', 5, b'x')]
+
+
+# Damage
+
+def test_an_index_with_more_entries_than_its_chunk_is_only_a_defect(tmp_path):
+    path = tmp_path / 'a.mcap'
+    for entries in ([(5, 0)] * 3, [(5, 0), (6, 0)], [(5, 7)]):
+        path.write_bytes(closed(
+            HEADER, RAW_CHANNEL, chunk_of(message(5, b'x')),
+            record_bytes(MessageIndex(1, entries)), record_bytes(MessageIndex(2, entries))))
+        with LogReader(path) as reader:
+            assert [message.data for message in reader.messages()] == [b'x']
+            assert reader.damage.lossless
+            assert any('message index' in line for line in reader.damage.lines())
+        recover(path).unlink()
+
+
+@pytest.mark.parametrize('kind', [Opcode.CHUNK, Opcode.METADATA, Opcode.ATTACHMENT])
+@pytest.mark.parametrize('bit', [4, 7])
+def test_an_indexed_record_does_not_become_one_of_unknown_kind(tmp_path, kind, bit):
+    """One bit makes its opcode that of an application, but the summary has it."""
+    path = tmp_path / 'a.mcap'
+    messages = write_stranger(path, {})
+    content = bytearray(path.read_bytes())
+    start, end = next((start, end) for opcode, start, end in records_of(content) if opcode == kind)
+    content[start] ^= 1 << bit
+    path.write_bytes(content)
+    with LogReader(path) as reader:
+        (loss,) = reader.damage.losses
+        assert (loss.offset, loss.bytes) == (start, end - start)
+    kept = seen_by_mcap(recover(path, SOME_LOST))
+    assert kept == seen_by_us(path)
+    assert kept == messages or (
+        kind == Opcode.CHUNK and kept == messages[-len(kept):] != messages)
+
+
+@pytest.mark.parametrize('has_summary', [True, False])
+@pytest.mark.parametrize('bit', range(8))
+def test_a_message_index_of_another_kind_is_made_anew(tmp_path, bit, has_summary):
+    path = tmp_path / 'a.mcap'
+    messages = write_stranger(path, {})
+    content = bytearray(path.read_bytes())
+    records = records_of(content)
+    start = next(start for opcode, start, _ in records if opcode == Opcode.MESSAGE_INDEX)
+    content[start] ^= 1 << bit
+    last = max(end for opcode, _, end in records if opcode == Opcode.MESSAGE_INDEX)
+    path.write_bytes(content if has_summary else content[:last])
+    with LogReader(path) as reader:
+        assert reader.damage.lossless
+        assert f'found: the message index at byte {start} is wrong' in reader.damage.lines()
+    assert seen_by_mcap(recover(path)) == messages
+
+
+@pytest.mark.parametrize('bit', range(8))
+def test_a_record_of_another_kind_costs_no_other_chunk(tmp_path, bit):
+    """In a truncated file of a stranger: no kind may pass for the end of the data."""
+    path = tmp_path / 'a.mcap'
+    messages = write_stranger(path, {})
+    content = path.read_bytes()
+    records = records_of(content)
+    last = max(end for opcode, _, end in records if opcode == Opcode.MESSAGE_INDEX)
+    chunks = [start for opcode, start, _ in records if opcode == Opcode.CHUNK]
+    first = [struct.unpack_from('<Q', content, start + 9)[0] for start in chunks]
+    first.append(messages[-1][1] + 1)
+    for opcode, start, _ in records:
+        if start >= last or start == chunks[0]:     # that chunk has the channels
+            continue
+        changed = bytearray(content[:last])
+        changed[start] ^= 1 << bit
+        path.write_bytes(changed)
+        lost = range(0)
+        if opcode == Opcode.CHUNK:
+            number = chunks.index(start)
+            lost = range(first[number], first[number + 1])
+        read = seen_by_us(path)
+        assert [message for message in read if message[1] not in lost] == [
+            message for message in messages if message[1] not in lost], (opcode, start)
+
+
+def test_a_channel_without_its_schema_is_not_written(tmp_path):
+    """Readers refuse the whole file for it; schema 0 means that there is none."""
+    path = tmp_path / 'a.mcap'
+    raw = record_bytes(Channel(id=2, topic='/raw', message_encoding='x', metadata={},
+                               schema_id=0))
+    path.write_bytes(closed(HEADER, CHANNEL, raw, chunk_of(
+        message(5, b'lost') + message(5, b'kept', channel=2))))
+    output = recover(path, SOME_LOST)
+    assert seen_by_mcap(output) == [('/raw', 5, b'kept')]
+    with open(output, 'rb') as file:
+        assert [channel.topic for channel in make_reader(file).get_summary().channels.values()
+                ] == ['/raw']
+
+
+def test_a_channel_that_stands_behind_its_messages_is_enough(tmp_path):
+    """As when the first one is damaged, and so is the summary that repeats it."""
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(MCAP0_MAGIC + HEADER + chunk_of(message(5, b'x')) + RAW_CHANNEL)
+    output = recover(path)
+    assert seen_by_us(path) == seen_by_us(output) == seen_by_mcap(output) == [('/a', 5, b'x')]
+    with LogReader(path) as reader:
+        assert reader.damage.lossless
+        assert reader.damage.messages == {'/a': 1}
+
+
+@pytest.mark.parametrize('kind', STRANGERS)
+def test_mutations_crash_nothing(tmp_path, kind, monkeypatch):
+    """Bytes changed, removed, repeated and exchanged, whatever they mean."""
+    monkeypatch.setattr(os, 'fsync', lambda descriptor: None)
+    path, broken, output = (tmp_path / name for name in ('a.mcap', 'broken.mcap', 'whole.mcap'))
+    write_stranger(path, STRANGERS[kind], count=40)
+    content = path.read_bytes()
+    records = records_of(content)
+    for seed in range(60):
+        choice = random.Random(seed)
+        changed = bytearray(content)
+        for _ in range(choice.randrange(1, 4)):
+            _, start, end = choice.choice(records)
+            length = choice.choice((1, 2, 8, 100))
+            place = choice.choice((start + choice.randrange(40), choice.randrange(start, end)))
+            changed[place:place + choice.choice((0, length))] = choice.choice((
+                choice.randbytes(length), b'\xff' * length, bytes(length), b'',
+                content[start:end]))
+        broken.write_bytes(changed)
+        with LogReader(broken) as reader:
+            list(reader.messages())
+            assert isinstance(reader.damage.lines(), list)
+            assert isinstance(reader.metadata, dict)
+            assert isinstance(reader.topics, tuple)
+        code, _, err = run(broken, '-o', output)
+        assert (code == 1) == err.startswith('recover: '), (seed, err)
+        if code != 1:
+            seen_by_mcap(output)
+            output.unlink()
+
+
+# Bounded memory and time
+
+@pytest.mark.parametrize(('stated_size', 'report'), [
+    (100, 'lost: chunk at byte 34'),
+    (1 << 62, f'refused: chunk at byte 34 ({{}} bytes): its {1 << 62} bytes are more than '
+              f'max_bytes = {256 << 20}')])
+def test_a_chunk_that_would_fill_the_memory_does_not(tmp_path, stated_size, report):
+    """What is refused for its size is not called lost."""
+    bomb = record_bytes(Chunk(
+        compression='zstd', data=zstandard.ZstdCompressor().compress(bytes(300_000_000)),
+        uncompressed_size=stated_size, uncompressed_crc=1, message_start_time=1,
+        message_end_time=2))
+    path = tmp_path / 'bomb.mcap'
+    header = record_bytes(Header(profile='', library=''))
+    path.write_bytes(closed(header, bomb))
+    tracemalloc.start()
+    try:
+        with LogReader(path) as reader:
+            assert not list(reader.messages())
+            assert reader.damage.lost_chunks == 1
+            lines = reader.damage.lines()
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 10_000_000
+    report = report.format(len(bomb)).replace('byte 34', f'byte {8 + len(header)}')
+    assert any(line.startswith(report) for line in lines), lines
+    assert any(line.startswith('lost') for line in lines) == report.startswith('lost')
+
+
+@pytest.mark.parametrize('kind', ['chunk', 'metadata'])
+def test_a_record_above_the_ceiling_is_refused_alone(tmp_path, kind):
+    path = tmp_path / 'a.mcap'
+    big = (chunk_of(message(5, bytes(5000))) if kind == 'chunk'
+           else record_bytes(Metadata('big', {'k': 'v' * 5000})))
+    path.write_bytes(closed(HEADER, RAW_CHANNEL, chunk_of(message(4, b'a'), 4, 4), big,
+                            record_bytes(MessageIndex(1, [(5, 0)])),
+                            chunk_of(message(6, b'c'), 6, 6)))
+    with LogReader(path, max_bytes=4000) as reader:
+        assert [message.data for message in reader.messages()] == [b'a', b'c']
+        (loss,) = reader.damage.losses
+        assert (loss.refused, loss.what, loss.bytes) == (True, kind, len(big))
+        assert any(line.startswith(f'refused: {kind}') for line in reader.damage.lines())
+    with LogReader(path) as reader:
+        assert len(list(reader.messages())) == (3 if kind == 'chunk' else 2)
+        assert reader.damage.lossless
+
+
+def test_the_search_behind_damage_takes_linear_time(tmp_path, monkeypatch):
+    """A file of heads of chunks that all seem to reach to its end."""
+    size = 300_000
+    head = struct.calcsize('<BQQQQIIQ')
+    content = bytearray()
+    while len(content) + head < size:
+        rest = size - len(content) - head
+        content += struct.pack('<BQQQQIIQ', Opcode.CHUNK, head - 9 + rest, 1, 2, rest, 1, 0, rest)
+    content += bytes(size - len(content))
+    path = tmp_path / 'a.mcap'
+    last = chunk_of(message(5, b'x'))
+    path.write_bytes(MCAP0_MAGIC + HEADER + b'\x00' + content)
+    bytes_read = 0
+    read = McapSource.read
+
+    def counting(self, offset, length):
+        nonlocal bytes_read
+        found = read(self, offset, length)
+        bytes_read += len(found)
+        return found
+
+    monkeypatch.setattr(McapSource, 'read', counting)
+    with LogReader(path) as reader:
+        assert reader.damage.lost_bytes == size + 1
+    assert bytes_read < 20 * size
+    # A true chunk behind a few of them is still found.
+    path.write_bytes(MCAP0_MAGIC + HEADER + RAW_CHANNEL + b'\x00' + content[:3 * head] + last)
+    assert seen_by_us(path) == [('/a', 5, b'x')]
+
+
+# The output
+
+def test_a_leftover_of_a_killed_recovery_blocks_nothing(tmp_path):
+    path = tmp_path / 'a.mcap'
+    write_log(path)
+    (tmp_path / f'.recover-{os.getpid()}.tmp').write_text('left over')
+    assert seen_by_us(recover(path)) == seen_by_us(path)
+
+
+@pytest.mark.parametrize('mode', [0o600, 0o444])
+def test_the_output_has_the_mode_of_the_log(tmp_path, mode):
+    path = tmp_path / 'a.mcap'
+    write_log(path)
+    path.chmod(mode)
+    assert recover(path).stat().st_mode & 0o777 == mode
+
+
+@pytest.mark.parametrize(('number', 'code'), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_leaves_nothing_behind(tmp_path, number, code):
+    path = tmp_path / 'a.mcap'
+    write_log(path)
+    child = subprocess.Popen(
+        [sys.executable, '-c',
+         'import sys, time\n'
+         'from spinning_top_sim.recording.mcap_writer import McapWriter\n'
+         'from spinning_top_sim.tools.recover import main\n'
+         'def finish(self, **options):\n'
+         '    print("ready", flush=True)\n'
+         '    time.sleep(60)\n'
+         'McapWriter.finish = finish\n'
+         f'sys.exit(main([{str(path)!r}]))'],
+        env=os.environ | {'PYTHONPATH': str(ROOT)}, stdout=subprocess.PIPE, text=True)
+    try:
+        assert child.stdout.readline() == 'ready\n'
+        assert len(list(tmp_path.iterdir())) == 2
+        child.send_signal(number)
+        assert child.wait(timeout=20) == code
+    finally:
+        child.kill()
+        child.communicate()
+    assert [item.name for item in tmp_path.iterdir()] == ['a.mcap']
+
+
+def test_application_records_are_kept_in_a_file_with_a_summary(tmp_path):
+    """A summary does not mention them."""
+    path = tmp_path / 'a.mcap'
+    messages = write_log(path)
+    private = unknown_kind(0x9a, b'private')
+    content = path.read_bytes().replace(b'spinning_top_sim 0', b'a stranger, maybe ')
+    (end,) = [start for opcode, start, _ in records_of(content) if opcode == Opcode.DATA_END]
+    assert metadata_of(path)
+    path.write_bytes(content[:end] + private)
+    output = recover(path)
+    assert seen_by_us(output) == seen_by_mcap(output) == messages
+    assert private in output.read_bytes()
