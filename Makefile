@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 # Runs, tests and checks the package on a machine that has Python >= 3.11 and make, ROS or not.
-# Everything is installed into $(VENV); what, and in which versions, says setup.py.
+# Everything is installed into $(VENV).  setup.py lists the dependencies and their versions.
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -16,13 +16,13 @@ MAKEFLAGS += --no-builtin-rules
 .PHONY: help run test stress performance benchmark docs dependencies lint build clean check-scene \
     FORCE
 
-# DDS stays on this machine: by default it would ask the whole network.
+# DDS stays on this machine.  Its default is to discover nodes in the whole network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 RUN_DOMAIN_ID := $(or $(ROS_DOMAIN_ID),77)
 
-# The ROS of the virtual environment is the one that runs, whatever shell this was started in.
-# The wheels set a guard and LD_LIBRARY_PATH for their own children; another environment's are
-# wrong here.  So are the paths of a sourced ROS installation.
+# The ROS of the virtual environment is used, whatever the shell has set.  The wheels set a guard
+# and LD_LIBRARY_PATH for their own child processes; those of another environment are wrong here,
+# and so are the paths of a sourced ROS installation.
 ifneq ($(_ROS_WHEELS_BOOTSTRAP_COMPLETE)$(AMENT_PREFIX_PATH),)
 unexport LD_LIBRARY_PATH
 endif
@@ -33,28 +33,29 @@ export PYTHONUNBUFFERED := 1
 
 PIP := '$(VENV)/bin/python' -m pip --disable-pip-version-check install --quiet --quiet
 SCENES := $(sort $(basename $(notdir $(wildcard config/*.yaml))))
-# Folders too: their time tells of a file that is gone.
+# Folders too: their modification time changes when a file is removed.
 SOURCES := $(shell find setup.py setup.cfg package.xml config launch resource rviz \
     scripts spinning_top_sim urdf -name __pycache__ -prune -o \( -type f -o -type d \) \
     ! -name '.*' ! -name '*~' -print 2>/dev/null)
 
 help:
-	@echo 'make run     simulate the scene config/SCENE.yaml until Ctrl-C, recording into $(LOGS)/'
-	@echo '             SCENE=$(SCENE)  (of: $(SCENES))'
+	@echo 'make run     simulate the scene config/SCENE.yaml until Ctrl-C and record into $(LOGS)/'
+	@echo '             SCENE=$(SCENE)  (one of: $(SCENES))'
 	@echo '             ARGS=...  more arguments, such as ARGS="-p time_scale:=0.5 -r __ns:=/top"'
-	@echo 'make test    run the tests;  TESTS=... picks some, ARGS=... is for pytest'
-	@echo 'make stress  200 recording nodes killed (KILLS=...), then 100 000 random tops (STRESS=...)'
-	@echo '             through both solvers: an hour'
-	@echo 'make performance  docs/performance.md: node, start, a long run, solvers, simulate (an hour'
-	@echo '             and a half, in an environment of its own, .venv-benchmark)'
-	@echo 'make benchmark  that, and accuracy, stability and cost beside other programs, and the'
-	@echo '             noise of the IMU, into docs/ (three hours)'
-	@echo 'make docs    write the interface page, the plain URDF and the pictures anew'
-	@echo 'make lint    ruff and mypy'
-	@echo 'make build   build with colcon in a temporary workspace, run and test what was installed'
-	@echo 'make clean   remove $(VENV) and caches; logs stay'
+	@echo 'make test    run the tests;  TESTS=... selects some, ARGS=... is passed to pytest'
+	@echo 'make stress  kill 200 recording nodes (KILLS=...), then run 100 000 random tops (STRESS=...)'
+	@echo '             with both solvers; takes an hour'
+	@echo 'make performance  measure node, start-up, a long run, solvers and simulate, and write'
+	@echo '             docs/performance.md; takes an hour and a half, in the environment'
+	@echo '             .venv-benchmark'
+	@echo 'make benchmark  the same, and accuracy, stability and cost compared with other programs,'
+	@echo '             attitude filters and the noise of the IMU; takes three hours'
+	@echo 'make docs    write the interface page, the plain URDF and the pictures'
+	@echo 'make lint    run ruff and mypy'
+	@echo 'make build   build with colcon in a temporary workspace, then test the installation'
+	@echo 'make clean   remove $(VENV) and caches, but no logs'
 	@echo
-	@echo 'PYTHON=$(PYTHON)  the interpreter (3.11 or newer)   VENV=$(VENV)  where to install'
+	@echo 'PYTHON=$(PYTHON)  interpreter, 3.11 or newer;  VENV=$(VENV)  virtual environment'
 
 run: export ROS_DOMAIN_ID := $(RUN_DOMAIN_ID)
 run: check-scene $(VENV)/.package
@@ -71,7 +72,7 @@ check-scene:
 
 dependencies: $(VENV)/.deps-test $(VENV)/.package
 
-# `pytest`, not `python -m pytest`: what is tested is the installed package.
+# `pytest`, not `python -m pytest`, so that the installed package is tested.
 test: dependencies
 	'$(VENV)/bin/pytest' $(TESTS) $(ARGS)
 
@@ -81,7 +82,7 @@ stress: dependencies
 	KILLS=$(KILLS) '$(VENV)/bin/pytest' -q test/test_kill.py
 	'$(VENV)/bin/python' test/stress.py $(STRESS)
 
-# Peers need hundreds of megabytes that the package does not: they have their own environment.
+# The programs to compare with need hundreds of megabytes, so they have their own environment.
 benchmark performance: export OMP_NUM_THREADS ?= 1
 benchmark performance: export OPENBLAS_NUM_THREADS ?= 1
 performance:
@@ -106,10 +107,10 @@ benchmark: performance
 	.venv-benchmark/bin/python benchmark/attitude_filter.py
 
 $(VENV)/.peers: $(wildcard benchmark/requirements*.txt) $(VENV)/.deps-test
-	@echo 'Installing into $(VENV) what the benchmarks compare with'
+	@echo 'Installing into $(VENV) the programs that the benchmarks compare with'
 	@$(PIP) -r benchmark/requirements.txt
 	@$(PIP) -r benchmark/requirements-built.txt || \
-	    echo 'numbalsoda is not compared: its source needs CMake and a Fortran compiler'
+	    echo 'numbalsoda is left out: its source needs CMake and a Fortran compiler'
 	@touch '$@'
 
 docs: $(VENV)/.deps-plot $(VENV)/.deps-test $(VENV)/.package
@@ -130,8 +131,8 @@ clean:
 	find $(wildcard benchmark examples launch spinning_top_sim test) -name __pycache__ -prune \
 	    -exec rm -rf {} +
 
-# Made anew when it is of another Python than the one asked for, was moved, was left half made or
-# does not run.  An environment that someone else made is used as it is, or left alone.
+# Created again if its Python is not the requested one, if it was moved, if it is incomplete or if
+# it does not run.  An environment that make did not create is used as it is, and never removed.
 PROBE := import sys; print("Python %d.%d" % sys.version_info[:2]); sys.exit(sys.version_info < (3, 11))
 ASKED := $(filter command environment,$(firstword $(origin PYTHON)))
 $(VENV)/.made: FORCE
@@ -140,18 +141,18 @@ $(VENV)/.made: FORCE
 	wanted=$$there; \
 	if [ -n '$(ASKED)' ] || [ -z "$$there" ]; then \
 	    wanted=$$($(PYTHON) -c '$(PROBE)' 2>&1) || { \
-	        echo 'Python 3.11 or newer is needed, and PYTHON=$(PYTHON) is not that:' "$$wanted" >&2; \
+	        echo 'Python 3.11 or newer is required, but PYTHON=$(PYTHON) is:' "$$wanted" >&2; \
 	        exit 1; }; \
 	fi; \
 	if [ "$$there" = "$$wanted" ] && [ "$$made" = '$(abspath $(VENV))' ]; then exit 0; fi; \
 	if [ -z "$$made" ] && [ -e '$(VENV)' ]; then \
 	    if [ "$$there" != "$$wanted" ]; then \
-	        echo '$(VENV) is there, was not made by make, and is not a' \
+	        echo '$(VENV) exists, was not created by make, and is not a' \
 	            "$$wanted environment: remove it, or choose another VENV=..." >&2; \
 	        exit 1; \
 	    fi; \
 	else \
-	    echo "Making $(VENV) with $$wanted"; \
+	    echo "Creating $(VENV) with $$wanted"; \
 	    rm -rf '$(VENV)' && mkdir -p '$(VENV)' && echo unfinished >'$@' && \
 	    $(PYTHON) -m venv '$(VENV)' || exit 1; \
 	fi; \
@@ -160,16 +161,16 @@ $(VENV)/.made: FORCE
 	    '$(abspath $(VENV))/build' '$(abspath $(VENV))/build' >'$(VENV)/setup.cfg' && \
 	echo '$(abspath $(VENV))' >'$@'
 
-# setuptools builds here and not in build/ of the sources, where modules that are gone stay on.
+# setuptools builds here, not in build/ of the sources, where removed modules would remain.
 export DIST_EXTRA_CONFIG := $(abspath $(VENV))/setup.cfg
 
-# What the package needs, and an extra of setup.py.
+# The dependencies of the package and of one extra of setup.py.
 $(VENV)/.deps-%: setup.py $(VENV)/.made
-	@echo 'Installing into $(VENV) what [$*] needs'
+	@echo 'Installing the dependencies [$*] into $(VENV)'
 	@$(PIP) '.[build,$*]'
 	@touch '$@'
 
-# The package alone, in seconds, without a network.
+# The package alone: takes seconds and needs no network.
 $(VENV)/.package: $(VENV)/.deps-ros $(SOURCES)
 	@echo 'Installing spinning_top_sim into $(VENV)'
 	@rm -rf '$(VENV)/build' && mkdir '$(VENV)/build'

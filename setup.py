@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Build and install by pip, by `colcon build`, by hand; the only place with version ranges."""
+"""Build and install with pip or colcon; the only file with version ranges."""
 
 from glob import glob
 
@@ -7,9 +7,9 @@ from setuptools import find_packages, setup
 
 NAME = 'spinning_top_sim'
 
-# Executable: the module whose main() it runs and whose return value is its exit code.
-# `ros2 run` looks in lib/<package>, where pip puts no console script: so each has a file in
-# scripts/ too, installed there as data by pip and by colcon alike.
+# Executable: the module whose main() it runs; main() returns the exit code.
+# `ros2 run` looks in lib/<package>, where pip installs no console scripts.  Therefore each
+# executable has a file in scripts/ as well, which pip and colcon install there as data.
 EXECUTABLES = {
     'sim_node': 'spinning_top_sim.nodes.sim_node',
     'replay_node': 'spinning_top_sim.nodes.replay_node',
@@ -32,7 +32,7 @@ DATA_FILES = {
 setup(
     name=NAME,
     version='0.1.0',
-    description='The heavy symmetric top in real time for ROS 2, with a known exact truth',
+    description='Real-time simulation of the heavy symmetric top for ROS 2, with exact ground truth',
     maintainer='spinning_top_sim maintainers',
     maintainer_email='maintainers@spinning-top-sim.example',
     license='Apache-2.0',
@@ -42,13 +42,13 @@ setup(
     entry_points={'console_scripts': [
         f'{name} = {module}:main' for name, module in EXECUTABLES.items()]},
     zip_safe=True,
-    # rclpy and the message packages are not here: on a ROS machine they come from ROS
-    # (package.xml), elsewhere from the extra `ros`.
+    # rclpy and the message packages come from ROS (package.xml), or from the extra `ros` on a
+    # machine without ROS.
     install_requires=[
         'numpy>=1.26,<3',
         'mcap>=1.2,<2',             # with zstandard and lz4
-        'PyYAML>=6,<7',             # parameter files, QoS in logs; not in sim_node
-        'scipy>=1.11,<2',           # tools alone; sim_node never imports it
+        'PyYAML>=6,<7',             # parameter files, QoS in logs; not used by sim_node
+        'scipy>=1.11,<2',           # used by the tools only; sim_node never imports it
         'tqdm>=4.64,<5',            # progress bars of the tools
     ],
     extras_require={
@@ -74,7 +74,7 @@ setup(
         # examples/attitude_filter.py
         'examples': ['ahrs>=0.4,<0.5', 'matplotlib>=3.6,<4', 'rosbags>=0.10.11,<0.12',
                      'vqf>=2.1,<3'],
-        # Narrow: a new release of these finds new faults.
+        # Narrow ranges: a new release reports new faults.
         'lint': [
             'mypy>=2.4.1,<2.5',
             'ruff>=0.17.5,<0.18',

@@ -11,54 +11,56 @@ from spinning_top_sim.streams.topics import INVARIANTS, JOINTS
 HEAD = """<!-- Written by docs/interface.py from the code. -->
 # Interface of sim_node
 
-The node is `spinning_top` in the namespace it is given. All names are relative unless they begin
-with `/`; `~` is the node's own name.
+The name of the node is `spinning_top`. All names are relative unless they begin with `/`; `~` is the
+name of the node.
 
-## Topics it publishes
+## Published topics
 
-Publishers are reliable and keep the last 10; QoS can be overridden as usual, by parameters
-`qos_overrides.<resolved topic>.publisher.<policy>`.
+Publishers are RELIABLE and KEEP_LAST with depth 10. The parameters
+`qos_overrides.<resolved topic>.publisher.<policy>` override their QoS.
 
-| topic | type | rate [Hz] | on | switched by |
+| topic | type | rate [Hz] | enabled | parameters |
 |---|---|---|---|---|
 """
 
 AFTER_TOPICS = """| `/diagnostics` | diagnostic_msgs/msg/DiagnosticArray | 1 | yes | |
 
-- `pose`: frame `world_frame`, q(world ← body), position at the pivot (0, 0, 0).
+- `pose`: attitude q(world ← body) in `world_frame`; the position is the pivot, (0, 0, 0).
 - `joint_states`: {joints}: φ, θ, ψ [rad], unwrapped, and their rates [rad/s].
-- `imu/data_raw` (REP-145): angular velocity [rad/s] and specific force [m/s²] in `imu.frame_id`,
-  +g upwards at rest; `orientation_covariance[0]` = −1: it carries no orientation.
+- `imu/data_raw` (REP-145): angular velocity [rad/s] and specific force [m/s²] in `imu.frame_id`, +g
+  upwards at rest; `orientation_covariance[0]` = −1, because it has no orientation.
 - `imu/data`: the same with the orientation of the IMU in the world.
-- `ground_truth/imu`, `ground_truth/odom`: exact and noise-free; covariances are 0 because they are.
-  The odometry's twist is in the body frame.
-- `~/invariants`: one labelled dimension, {invariants}. Drifts are relative to the value the motion
-  began with; the orientation error [rad] is against the exact solution.
-- `markers`: in `world_frame`, so no TF is needed: a cylinder with the top's mass and moments of inertia,
-  lines on it that show the spin, and the trace of the tip over the last `markers.trace_length`. Every
-  message has the whole trace; it is the exact solution's, and ends at the tip as the solver has it.
-- While paused nothing is sent. Stamps are the time of each sample on the grid k × period.
+- `ground_truth/imu_bias`: the bias that `imu/data_raw` contains.
+- `ground_truth/imu`, `ground_truth/odom`: noise-free, with covariances of 0. The twist of the odometry
+  is in the body frame.
+- `~/invariants`: one labelled dimension, {invariants}. Drifts are relative to the value at the start of
+  the motion; the orientation error [rad] is the angle to the exact solution.
+- `markers`: in `world_frame`, so that no TF is needed. A cylinder with the mass and the moments of inertia
+  of the top, lines on it that show the spin, and the trace of the tip over the last
+  `markers.trace_length`. Every message has the whole trace. The trace is that of the exact solution; its
+  last point is the tip according to the solver.
+- A stamp is the time of its sample, on the grid k × period. A paused node publishes no samples.
 
-## Topics, services, parameters it listens to
+## Subscribed topics and services
 
-| kind | name | type | what it does |
+| kind | name | type | effect |
 |---|---|---|---|
-| topic | `~/commands` | std_msgs/Float64MultiArray | [L3, Lz] in kg m²/s: an impulsive torque. Angles and θ' stay |
-| service | `~/set_pause` | std_srvs/SetBool | pause, resume; no catch-up |
-| service | `~/step` | std_srvs/Trigger | while paused: `step.count` × `step.dt` |
-| service | `~/reset` | std_srvs/Trigger | start state, spin and seed again; stamps go on |
-| service | `~/record` | std_srvs/SetBool | start, stop; the reply has path and counts |
-| parameters | `spin.l3`, `spin.lz` | double | a command with an answer: set both atomically |
+| topic | `~/commands` | std_msgs/Float64MultiArray | sets [L3, Lz] in kg m²/s, as an impulsive torque does; the angles and θ' stay |
+| service | `~/set_pause` | std_srvs/SetBool | pauses, resumes; the simulated time stands still meanwhile |
+| service | `~/step` | std_srvs/Trigger | advances by `step.count` × `step.dt`; only while paused |
+| service | `~/reset` | std_srvs/Trigger | starts again with the start state, spin and seed; stamps stay monotonic |
+| service | `~/record` | std_srvs/SetBool | starts, stops a log; the response has its path and counts |
+| parameters | `spin.l3`, `spin.lz` | double | the same as a command, with a result; set both atomically |
 
-A command that is refused (wrong length, NaN, infinite, Lz ≠ ±L3 with the axis at a pole) is logged
-with the reason and counted in `/diagnostics`; the motion goes on unchanged.
+The node refuses a command of wrong length, with NaN or infinity, or with Lz ≠ ±L3 while the axis is at a
+pole. It logs the reason and counts the command in `/diagnostics`. The motion continues unchanged.
 
 ## Parameters
 
-An integer is taken for a double. Those marked *reset* wait for `~/reset`, those marked *start*
-cannot be changed while the node runs.
+An integer is accepted as a double. A change takes effect at once, at the next `~/reset`, with the next
+recording, or only at the start of the node (read-only).
 
-| parameter | default | unit | allowed | takes effect | what it is |
+| parameter | default | unit | allowed values | takes effect | description |
 |---|---|---|---|---|---|
 """
 

@@ -6,22 +6,28 @@ import runpy
 
 from helpers.reference import ROOT, SCENES
 
+FOLDERS = 'config', 'docs', 'examples', 'launch', 'rviz', 'scripts', 'test', 'urdf', 'benchmark'
+
 
 def test_the_interface_page_is_written_from_the_present_code():
     page = runpy.run_path(str(ROOT / 'docs/interface.py'))['page']()
     assert (ROOT / 'docs/interface.md').read_text() == page
 
 
-def test_architecture_names_every_module_and_example_and_no_other():
+def test_architecture_has_every_folder_of_the_package_and_no_name_that_does_not_exist():
     text = (ROOT / 'docs/architecture.md').read_text()
-    named = set(re.findall(r'`(?:\w+/)*(\w+\.py)`', text))
-    modules = {path.name for path in (ROOT / 'spinning_top_sim').rglob('*.py')
-               if path.name != '__init__.py'}
-    tests = {path.name for path in (ROOT / 'test').glob('*.py')}
-    examples = {path.name for path in (ROOT / 'examples').glob('*.py')}
-    assert named - tests <= modules | examples
-    parts = {name for name in modules if name.startswith(('exact_', 'theta_', 'long_', 'errors'))}
-    assert not (modules | examples) - named - parts
+    package = ROOT / 'spinning_top_sim'
+    folders = {path.parent.name for path in package.glob('*/__init__.py')}
+    assert set(re.findall(r'^\| `(\w+)/` \|', text, re.MULTILINE)) == folders
+    text = re.sub(r'^```$.*?^```$', '', text, flags=re.MULTILINE | re.DOTALL)
+    named = {word for code in re.findall(r'`([^`]+)`', text) for word in re.findall(r'\w+', code)}
+    paths = [path for folder in (package, *map(ROOT.joinpath, FOLDERS))
+             for path in folder.rglob('*') if path.suffix in ('.py', '.md', '')]
+    known = {word for path in (*paths, *ROOT.glob('*.py'))
+             for word in re.findall(r'\w+', str(path.relative_to(ROOT)))}
+    known |= {word for path in package.rglob('*.py')
+              for word in re.findall(r'\w+', path.read_text())}
+    assert named - known == set()
 
 
 def test_the_readme_begins_with_the_two_commands_and_lists_every_scene():
