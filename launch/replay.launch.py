@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Replay a log, with the TF of the top that it is of and, if wanted, RViz.
+Replay a log, with the TF of its top and optionally RViz.
 
   ros2 launch spinning_top_sim replay.launch.py file:=run.mcap loop:=true rviz:=true
 """
@@ -23,21 +23,23 @@ SWITCH = ['true', 'false']
 
 def generate_launch_description() -> LaunchDescription:
     return LaunchDescription([
-        DeclareLaunchArgument('file', description='The log (.mcap)'),
-        DeclareLaunchArgument('rate', default_value='1.0', description='Recorded over real time'),
+        DeclareLaunchArgument('file', description='Log to replay (.mcap)'),
+        DeclareLaunchArgument('rate', default_value='1.0', description='Playback rate'),
         DeclareLaunchArgument(
-            'start', default_value='0.0', description='Begin so many seconds after its begin'),
+            'start', default_value='0.0',
+            description='Start this many seconds after the start of the log'),
         DeclareLaunchArgument(
-            'loop', default_value='false', choices=SWITCH, description='Begin again at the end'),
+            'loop', default_value='false', choices=SWITCH, description='Start again at the end'),
         DeclareLaunchArgument(
             'clock', default_value='false',
-            description="true, or Hz: publish the log's time on /clock; TF and RViz follow it"),
+            description='true, or a rate [Hz]: publish the time of the log on /clock, for TF and RViz '
+            'too'),
         DeclareLaunchArgument(
             'partial', default_value='false', choices=SWITCH,
-            description='Play what is whole of a torn log'),
+            description='Play the intact part of a truncated log'),
         DeclareLaunchArgument(
             'tf', default_value='true', choices=SWITCH,
-            description="Run robot_state_publisher, for a log of sim_node's"),
+            description="Run robot_state_publisher, if sim_node recorded the log"),
         DeclareLaunchArgument(
             'rviz', default_value='false', choices=SWITCH, description='Run RViz'),
         OpaqueFunction(function=_nodes)])
@@ -65,7 +67,7 @@ def _nodes(context: LaunchContext) -> list:
         with LogReader(Path(given['file'])) as log:
             run = read_run_description(log)
     except (LogError, ForeignLogError, OSError) as error:
-        # What cannot be played replay_node will tell.
+        # replay_node reports a log that cannot be played.
         return [*actions, LogInfo(msg=f'neither TF nor RViz: {error}')]
     topics = {name: topic for topic, name in run.topics.items()}
     namespace = _namespace(topics)
@@ -78,7 +80,7 @@ def _nodes(context: LaunchContext) -> list:
 
 
 def _namespace(topics: dict[str, str]) -> str:
-    """Return the namespace that the node had: what its topics have before their own names."""
+    """Return the namespace of the recorded node, from the names of its topics."""
     for name, topic in topics.items():
         if not name.startswith(('/', '~')) and topic.endswith(f'/{name}'):
             return topic.removesuffix(name).strip('/')

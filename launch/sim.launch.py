@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Simulate a scene, with TF and, if wanted, RViz.
+Simulate a scene, with TF and optionally RViz.
 
   ros2 launch spinning_top_sim sim.launch.py scene:=looping rviz:=true
   ros2 launch spinning_top_sim sim.launch.py namespace:=left set:='spin.l3:=2.0 seed:=7'
@@ -29,27 +29,27 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription([
         DeclareLaunchArgument(
             'scene', default_value='cusp',
-            description=f'Parameter file: one of {", ".join(SCENES)}, or a path'),
+            description=f'Scene: one of {", ".join(SCENES)}, or the path of a parameter file'),
         DeclareLaunchArgument(
             'params_file', default_value='',
-            description="Another parameter file whose values replace the scene's"),
+            description="Second parameter file, whose values override those of the scene"),
         DeclareLaunchArgument(
             'set', default_value='',
-            description='Parameters that replace those of the files: '
+            description='Parameters that override those of the files: '
             "'NAME:=VALUE NAME:=VALUE ...'"),
         DeclareLaunchArgument(
             'namespace', default_value='', description='Namespace of all nodes'),
         DeclareLaunchArgument(
             'frame_prefix', default_value='auto',
-            description='Before the names of all frames but world_frame; auto: the namespace '
-            'and a /, so that two tops share one TF tree'),
+            description='Prefix of all frame names except world_frame; auto: the namespace and a '
+            'slash, so that two tops share one TF tree'),
         DeclareLaunchArgument(
             'record', default_value='false',
-            description='true: record into the working directory; or the path of a file (.mcap) '
-            'or folder'),
+            description='true: record into the working directory; or the path of a log (.mcap) '
+            'or of a folder'),
         DeclareLaunchArgument(
             'use_sim_time', default_value='false', choices=SWITCH,
-            description="Follow another node's /clock"),
+            description="Use the /clock of another node"),
         DeclareLaunchArgument(
             'tf', default_value='true', choices=SWITCH,
             description='Run robot_state_publisher'),
@@ -57,7 +57,7 @@ def generate_launch_description() -> LaunchDescription:
             'rviz', default_value='false', choices=SWITCH, description='Run RViz'),
         DeclareLaunchArgument(
             'markers', default_value=LaunchConfiguration('rviz'), choices=SWITCH,
-            description='Publish the topic markers'),
+            description='Publish markers; default: the value of rviz'),
         OpaqueFunction(function=_nodes)])
 
 
