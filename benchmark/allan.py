@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Allan deviation of three simulated hours: is the noise the one that was commanded?
+Compare the Allan deviation of three simulated hours with the noise parameters.
 
     PYTHONPATH=. python benchmark/allan.py [--hours H] [--seeds N]
 
-The messages come out of the simulation's own pipeline, byte for byte as they would be published,
-of a top that hangs at rest.  Every seed from 0 on is shown; none is chosen.
+The messages are those that the node publishes, byte for byte, for a top that hangs at rest.  All
+seeds from 0 on are shown.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ PERIOD = 1.0 / RATE
 HANGING = {'initial.theta': math.pi, 'spin.l3': 0.0, 'spin.lz': 0.0, 'solver.method': 'exact',
            'imu.rate': RATE}
 KINDS = (('gyroscope', 'rad/s'), ('accelerometer', 'm/s²'))
-# White noise and walk are alike at tau = sqrt(3) N/K, here 0.35 s and 0.87 s.  So both have
-# thousands of independent averages in three hours: what 5 % of each asks for.
+# White noise and random walk are equal at tau = sqrt(3) N/K, here 0.35 s and 0.87 s.  So both have
+# thousands of independent averages in three hours, as an accuracy of 5 % requires.
 COMMANDED = {'imu.gyroscope_noise_density': 1e-3, 'imu.gyroscope_random_walk': 5e-3,
              'imu.accelerometer_noise_density': 2e-2, 'imu.accelerometer_random_walk': 4e-2}
 PRESET = 'adis16470'
-# Averages of 1, 2, 4, ... samples, up to this long [s]: later ones have few independent averages.
+# Longest averaging time [s]: longer ones have few independent averages.
 LONGEST = 128.0
 STRETCH_NS = 600 * 10 ** 9
 LIMIT = 0.05
@@ -82,26 +82,28 @@ def main() -> None:
 
 
 INTRODUCTION = """\
-{hours:g} h of a hanging top at {rate:g} Hz, {seeds} seeds from 0 on, six axes each: {verdict}
-{limit:.0%}, the worst off by {worst:.1%}. Overlapping Allan deviation of `allantools`, averages
-of 1, 2, 4, ... samples up to {longest:g} s.
+The data are {hours:g} h of a hanging top at {rate:g} Hz, for {seeds} seeds from 0 on and six axes
+each. The estimates are {verdict} {limit:.0%} of the parameters; the largest error is {worst:.1%}.
+The overlapping Allan deviation is that of `allantools`, for averages of 1, 2, 4, ... samples up
+to {longest:g} s.
 
 The variance of white noise N and a random walk K, sampled every T, over averages of m samples
-is sigma² = N²/tau + K² tau (2 m² + 1)/(6 m²), tau = m T: the familiar N/sqrt(tau) and K
-sqrt(tau/3) at its ends. N² and K² are fitted by least squares, each point weighted with the
-number of independent averages in it over the square of its variance.
+is sigma² = N²/tau + K² tau (2 m² + 1)/(6 m²), tau = m T. Its limits are the usual N/sqrt(tau) and
+K sqrt(tau/3). N² and K² are fitted by least squares. The weight of a point is the number of its
+independent averages over the square of its variance.
 
 ![Allan deviation of the readings](allan.png)
 """
 FROM_READINGS = """\
-From `imu/data_raw` alone. The walk is commanded so large that it rules from 1 s on: of a small
-one three hours hold too few independent averages to know it to 5 %. Standard deviation of the
-relative error, over seeds and axes: {noise:.2%} of N, {walk:.1%} of K; so 5 % is not luck.
+These estimates use `imu/data_raw` alone. The random walk is so large that it dominates from 1 s
+on: three hours contain too few independent averages to estimate a small one within 5 %. The
+standard deviation of the relative error over seeds and axes is {noise:.2%} for N and {walk:.1%}
+for K.
 """
 FROM_BIAS = """\
-The walks of a real device hide below the white noise for seconds: here N is from `imu/data_raw`
-less `ground_truth/imu_bias`, K from `ground_truth/imu_bias` itself, over averages of up to 4
-samples.
+The random walks of a real device are below the white noise for seconds. Here N is estimated from
+`imu/data_raw` minus `ground_truth/imu_bias`, and K from `ground_truth/imu_bias`, over averages of
+up to 4 samples.
 """
 
 
@@ -125,7 +127,7 @@ def simulate(values: dict[str, float], hours: float) -> tuple[np.ndarray, np.nda
 
 
 def allan(samples: np.ndarray, longest: float = LONGEST) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return averaging times [s], overlapping Allan deviations, and how many samples there are."""
+    """Return averaging times [s], overlapping Allan deviations and the number of samples."""
     longest = min(longest, len(samples) * PERIOD / 4.0)
     powers = 2.0 ** np.arange(int(math.log2(longest / PERIOD)) + 1)
     tau, deviation, _, _ = allantools.oadev(samples, rate=RATE, data_type='freq',
@@ -183,7 +185,7 @@ def draw(curves: Sequence[tuple[np.ndarray, np.ndarray, int]], hours: float) -> 
         panel.set_ylabel(f'Allan deviation [{unit}]')
         panel.grid(color='#DDDDDD', linewidth=0.6)
         panel.legend()
-    figure.suptitle(f'{hours:g} h at {RATE:g} Hz, seed 0, and what was commanded', fontsize=11)
+    figure.suptitle(f'{hours:g} h at {RATE:g} Hz, seed 0, and the parameters', fontsize=11)
     figure.tight_layout()
     path = ROOT / 'docs/allan.png'
     figure.savefig(path, dpi=110)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Published attitude filters on the scene `wavy`, beside the truth:
+Compare published attitude filters with the truth, on the scene `wavy`:
 
     PYTHONPATH=. python benchmark/attitude_filter.py
 
-The filters and the comparison are those of examples/attitude_filter.py.  What is varied: where the
-IMU sits, how often it is read, its errors, the filter's gain; and the integration of the rates
-alone, which no filter can do better than.
+The filters and the comparison are those of examples/attitude_filter.py.  The benchmark varies the
+position of the IMU, its rate, its errors and the gain of the filter.  It also integrates the rates
+alone, which bounds the accuracy of every filter.
 """
 
 from __future__ import annotations
@@ -85,45 +85,47 @@ def main() -> None:
 
 
 INTRODUCTION = """\
-{duration} s of the scene `{scene}`: tilt near 30 degrees, {spin:.3g} rad/s of spin. The IMU is
-read at {rate} Hz, from one sample to the next the top turns by {turned:.2g} degrees. Every
-filter starts level and gets the mean of two consecutive rate samples for the step between them.
-Errors are counted from {settle} s on: tilt, the angle between the estimated and the true
-vertical, rms over all poses; in brackets the drift of the heading, which six axes cannot know.
+The data are {duration} s of the scene `{scene}`, with a tilt near 30 degrees and {spin:.3g} rad/s
+of spin. The rate of the IMU is {rate} Hz; the top turns by {turned:.2g} degrees from one sample
+to the next. Every filter starts level. It gets the mean of two consecutive angular velocities for
+the step between them. The tables have the rms error of the tilt from {settle} s on, which is the
+angle between the estimated and the true vertical. In brackets is the drift of the heading, which
+six axes cannot observe.
 
-- `vqf`: VQF (Laidig and Seel 2023), package vqf. Rates integrated in closed form; the tilt is
-  corrected by the specific force averaged over 3 s in a frame that does not turn
-- `madgwick`, `ekf`: package ahrs. First-order steps; every sample of the specific force is
-  taken for gravity, as if the accelerometer were still
+- `vqf`: VQF (Laidig and Seel 2023), package vqf. It integrates the rates in closed form, and
+  corrects the tilt by the specific force averaged over 3 s in an inertial frame.
+- `madgwick`, `ekf`: package ahrs. They take first-order steps, and treat every sample of the
+  specific force as gravity.
 
 ![Tilt errors over time](attitude_filter.png)
 """
 ARM = """\
-The pivot does not move: there the accelerometer reads gravity and nothing else. A lever arm
-across the axis adds centripetal and tangential acceleration, which turn with the body: what
-takes each sample for gravity tilts towards them. Seen from a frame that does not turn they
-average out over a few turns, and that is what VQF does.
+The pivot does not move, so the accelerometer there measures gravity only. A lever arm across the
+axis adds centripetal and tangential acceleration, which turn with the body. A filter that treats
+each sample as gravity tilts towards them. In an inertial frame they cancel over a few turns, and
+VQF averages there.
 """
 OFTEN = """\
-With a perfect IMU at the pivot what is left is the filter's own error. VQF's falls with the
-square of the step: the mean of two samples for the rates between them. Madgwick's step compares
-the new sample of the specific force with the attitude before the step; in the sensor, gravity
-moves by {lag:.3g} degrees in 1/{rate} s. What first-order steps lose is seen in the heading.
+With a perfect IMU at the pivot, the remaining error is that of the filter. The error of VQF is
+proportional to the square of the step, as that of the mean of two angular velocities. Madgwick's
+filter compares the new sample of the specific force with the attitude before the step; in the
+sensor frame, gravity turns by {lag:.3g} degrees in 1/{rate} s. The drift of the heading shows the
+error of first-order steps.
 """
 INTEGRATION = """\
-The rates of a perfect IMU summed up from the true attitude on, by `AngularRate` of ahrs: angle
-to the true attitude after 60 s, over 60 s. `last`: a sample counts for the step that it ends,
-as it does in most drivers' loops; `mean`: the mean of both ends.
+`AngularRate` of ahrs integrates the rates of a perfect IMU from the true attitude. The table has
+the angle to the true attitude after 60 s, divided by 60 s. With `last`, a sample counts for the
+step that it ends, as in most drivers; with `mean`, the mean of both ends counts.
 """
 GAIN = """\
-Madgwick's only setting, in rad/s: a low one takes minutes to converge from 30 degrees on a
-lever arm, a high one follows the acceleration.
+The gain is the only setting of Madgwick's filter, in rad/s. With a low gain the filter needs
+minutes to converge from 30 degrees on a lever arm; with a high gain it follows the acceleration.
 """
 NOISE = """\
-The presets of config/imu, seed 0. Turn-on bias, white noise and resolution are those of the
-data sheets. A bias of the rates leans against the correction of the tilt and is a drift of the
-heading. VQF estimates it, but takes none of more than 2 deg/s for one: `icm_20948` has up to 5
-deg/s and more where nobody has calibrated it.
+These are the presets of config/imu with seed 0. Turn-on bias, white noise and resolution are
+those of the data sheets. A bias of the gyroscope acts against the correction of the tilt, and is
+a drift of the heading. VQF estimates the bias, but limits it to 2 deg/s. Without calibration,
+`icm_20948` has a bias of 5 deg/s and more.
 """
 
 

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """
-A node that only publishes: the floor under `sim_node`, for `node_cpu.py` and `startup.py`.
+A node that only publishes constant bytes, for `node_cpu.py` and `startup.py`.
 
-The same bytes again and again, by an rclpy timer or by a thread that sleeps to absolute
-deadlines; nothing is computed, counted or patched.  With parameters (a JSON file of name, value,
-description and range), services and subscription like those of `sim_node` where it is asked for.
+An rclpy timer, or a thread that sleeps until absolute deadlines, publishes the same bytes at each
+tick.  Nothing is computed.  On request the node has the parameters (a JSON file of name, value,
+description and range), the services and the subscription of `sim_node`.
 
     python benchmark/bare_node.py --ros-args -p rate:=1000.0 -p pacing:=thread
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The motions that the benchmarks run, and the instants at which they look at them."""
+"""The motions of the benchmarks, and the instants of their samples."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from spinning_top_sim.streams import parameters
 ROOT = Path(__file__).resolve().parent.parent
 
 # Samples fall on multiples of 2^-9 s = 1 953 125 ns: whole nanoseconds that are doubles of
-# seconds too, so that every method is asked for exactly the same instants.
+# seconds as well, so that every method is asked for the same instants.
 FINEST_NS = 1_953_125
 FINEST_HZ = 512
 
 
 @dataclass(frozen=True)
 class Case:
-    """A top, where it starts, and what it is called."""
+    """A top, its start and its title."""
 
     title: str
     top: Top
@@ -59,7 +59,7 @@ def _from_scene(title: str, name: str) -> Case:
 
 
 WHEEL = scene('cusp')[0]
-# A real toy top, spun about its axis only and let go at 30 degrees.
+# A toy top, spun about its axis only and released at 30 degrees.
 TOY = Top(lambda1=0.002, lambda3=0.001, mass=0.5, com_distance=0.05, gravity=9.80665)
 
 
@@ -72,9 +72,9 @@ def _toy(spin: float) -> Case:
 def near_pole(theta_min: float, theta: float = 1.0, theta_dot: float = -1.5, l3: float = 0.3
               ) -> Case:
     """
-    Return a top that swings over the upright position and misses it by about theta_min.
+    Return a top that passes the upright position at a distance of about theta_min.
 
-    There it moves across at v, and (Lz - L3)/(lambda1 theta_min) = v.
+    Its velocity there is v, and (Lz - L3)/(lambda1 theta_min) = v.
     """
     top = WHEEL
     # Energy at theta, with Lz = L3: phi' = L3/(lambda1 (1 + cos theta)).

@@ -1,15 +1,15 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """
-How small the chunks of a live log become, and what that costs: zstd's levels beside lz4.
+Measure size and time of compressed chunks of a live log: levels of zstd, and lz4.
 
     python benchmark/compression.py
     python benchmark/compression.py --no-report
 
-Chunks are those of a node that records three streams (pose, joint_states, imu/data_raw, whose
-gyroscope is noisy) with the default max_loss: four a second.  Each compressor gets every chunk
-cold, with the processor's caches full of something else, as it finds them in a node after a
-quarter of a second; and once more at once, warm.  All take turns.
+The chunks are those of a node that records three streams (pose, joint_states, and imu/data_raw
+with a noisy gyroscope) with the default max_loss, four per second.  Each compressor gets every
+chunk twice: cold, with other data in the processor's caches, as in a node after a quarter of a
+second; and again immediately, warm.  The compressors take turns.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def rows_at(rate: float, count: int) -> list[tuple[str, ...]]:
     size = {name: sum(len(compress(chunk)) for chunk in chunks) for name, compress in used.items()}
     standard = f'zstd {LEVELS[-1]}'
     return [(f'{rate:g}', f'{plain / len(chunks) / 1e3:.0f}',
-             name + (' (ours)' if name == f'zstd {ZSTD_LEVEL}' else ''),
+             name + (' (used)' if name == f'zstd {ZSTD_LEVEL}' else ''),
              f'{size[name] / plain:.3f}', f'{size[name] / size[standard]:.2f}',
              f'{median(cold[name]):.0f}', f'{median(warm[name]):.0f}',
              f'{memory_mb(compress):.2f}' if name.startswith('zstd') else '–')

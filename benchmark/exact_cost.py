@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What the exact solution costs, beside the integrators that a user would take instead.
+Measure the time of the exact solution, compared with integrators.
 
     python benchmark/exact_cost.py [--rounds 21]
 
-Every figure is the median over interleaved rounds: each round runs everything once, so that a busy
-machine slows all alike.  Ratios are to heyoka's Taylor integrator on the same motion and the
-same 1 kHz grid, raw (its six variables of the quadratic form, without the product that makes a
-body's attitude of them).  heyoka and scipy are optional; what is not installed is said to be
-missing.
+Every figure is the median over interleaved rounds: each round runs everything once, so that a
+busy machine slows all of them alike.  Ratios are relative to heyoka's Taylor integrator on the
+same motion and the same 1 kHz grid, raw: its six unknowns, without the product that turns them
+into the attitude of the body.  heyoka and scipy are optional; a missing one is reported.
 """
 
 import argparse
@@ -45,7 +44,7 @@ GRID = range(0, ARRAY * STEP_NS, STEP_NS)
 
 
 def exact_jobs(top, state):
-    """Yield the names of our costs, what to run, and how many states that makes."""
+    """Yield the name of each job, the function to run, and the number of its states."""
     solution = ExactSolution(top, state)
     t = np.random.default_rng(1).uniform(0.0, 100.0, ARRAY)
 
@@ -104,7 +103,7 @@ def scipy_job(solve_ivp, top, state):
 
 
 def peers():
-    """Import what is installed; say what is missing."""
+    """Import the optional packages; report a missing one."""
     try:
         import heyoka
     except ImportError:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Which share of the spin the transport equations should carry, and what projection and dense
-output do:
+Measure the choice of c in the transport equations, the projection and the dense output:
 
     PYTHONPATH=. python benchmark/gauge.py
 
-Evaluations that an error takes, over c/L3 (spinning_top_sim/solvers/transport.py), errors with and
-without the projection onto the invariants, and errors at the ends of steps and between them.
+The tables have the evaluations for a given error over c/L3
+(spinning_top_sim/solvers/transport.py), the errors with and without projection onto the
+invariants, and the errors at the ends of steps and between them.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ DEFAULT_TOLERANCE = 1e-11
 
 
 class Unprojected(TransportEquations):
-    """The same equations, left to drift."""
+    """The same equations without projection."""
 
     def project(self, y):
         return y
@@ -40,7 +40,7 @@ class Unprojected(TransportEquations):
 
 
 class OnlyNormalized(TransportEquations):
-    """The same equations with |q| = 1 restored, and nothing else."""
+    """The same equations with normalization of the quaternion only."""
 
     def project(self, y):
         alpha, beta, m = y
@@ -82,11 +82,11 @@ def main() -> None:
                          *(f'{report.number(error)} / {count}' for error, count in runs),
                          report.number(runs[2][0] / runs[0][0])))
             print(rows[-1], flush=True)
-    parts.append(report.table(('case', 'time [s]', 'projected', 'normalized', 'neither',
+    parts.append(report.table(('case', 'time [s]', 'projected', 'normalized', 'none',
                                'error ratio'), rows))
     parts.append('## Between the steps\n\nLargest error [rad] over 10 s at rtol '
                  f'{DEFAULT_TOLERANCE:g}, at the ends of the steps and halfway between them, '
-                 'there by the quintic\nHermite polynomial, or by the cubic one, which needs no '
+                 'there by the quintic\nHermite polynomial or by the cubic one, which needs no '
                  'second derivatives.\n')
     rows = [(case.title, *map(report.number, between_steps(case))) for case in CASES]
     parts.append(report.table(('case', 'ends', 'halfway, quintic', 'halfway, cubic'), rows))

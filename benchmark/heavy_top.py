@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The heavy top of Brüls, Cardona & Arnold, Mech. Mach. Theory 48 (2012) 121-137, in one command:
+Solve the heavy top of Brüls, Cardona & Arnold, Mech. Mach. Theory 48 (2012) 121-137:
 
     PYTHONPATH=. python benchmark/heavy_top.py
 
-Where the centre of mass is after 2 s, beside 20 digits and beside what others publish.  Exit code
-1 if our exact solution is further than BOUND from the digits.
+The table compares the position of the centre of mass after 2 s with 20 reference digits and with
+published results.  The exit code is 1 if the error of the exact solution exceeds BOUND.
 
-The digits: computed with 70-digit arithmetic from the decimals of the problem (Omega_z =
--4.61538 rad/s, 90 degrees).  Ours starts from the doubles next to them, Lz = lambda1 Omega_z
-among them, each off by up to half a unit in the last place: what that can do is shown by
-starting from their neighbours.
+The digits were computed with 70-digit arithmetic from the decimals of the problem (Omega_z =
+-4.61538 rad/s, 90 degrees).  The solvers start from the nearest doubles, such as Lz = lambda1
+Omega_z, each with an error of up to half a unit in the last place.  Starts from neighbouring
+doubles show the effect of this rounding.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ EARLY_ATTITUDE = ('-0.70827915297431256', '0.43878108812658190', '0.545728396145
                   '0.08939975282400501')
 
 
-# What others publish, m at 2 s; both from https://github.com/kynema/kynema, tests/.
+# Published results, m at 2 s; both from https://github.com/kynema/kynema, tests/.
 PUBLISHED = {
     'Kynema, constants of its test Dynamic_HeavyTopSpinningUnderGravity': (
         '-0.150416985652933', '-1.724164450779749', '-0.673023460701136'),
     'Kynema, heavy_top_kynema_material_0pt000002s.csv, steps of 2e-6 s': (
         '-0.1504168894608856', '-1.7241654846852867', '-0.6730223697288009'),
 }
-# EXUDYN with steps of 1e-4 s is about so far off at 0.2 s: a distance that was measured when the
-# digits were computed, and, unlike the others, cannot be measured again from here.
+# Error of EXUDYN with steps of 1e-4 s at 0.2 s.  It was measured when the digits were computed.
+# Unlike the others it is not measured again here.
 EXUDYN = 5.3e-5
 
 
@@ -69,11 +69,11 @@ def main() -> int:
     rows.append(('EXUDYN, steps of 1e-4 s (quoted, not measured here)', report.number(EXUDYN),
                  'at 0.2 s'))
     text = report.preamble('The heavy top of Brüls, Cardona and Arnold') + '\n' + report.table(
-        ('code', 'error', 'of what'), rows)
+        ('code', 'error', 'quantity'), rows)
     passed = ours <= BOUND
     text += (f'\nExact within {BOUND:g} m: {"yes" if passed else "NO"}.  The rows with a '
-             'neighbouring double say how far\none rounding of the start moves the end: the '
-             'digits belong to the decimals of the problem,\nwhich no double is.\n')
+             'neighbouring double show the\neffect of one rounding of the start: the decimals of '
+             'the problem are not doubles.\n')
     print(text)
     report.write('heavy_top.md', text)
     return 0 if passed else 1
@@ -111,7 +111,7 @@ def attitude_error(ns: int, digits: tuple[str, ...]) -> float:
 
 
 def neighbours() -> list[tuple[str, Case]]:
-    """Return the problem with one of its inexact constants moved to the double next to it."""
+    """Return the problem with one of its rounded constants moved to a neighbouring double."""
     top, start = HEAVY_TOP.top, HEAVY_TOP.start
     values = {'theta': start.theta, 'theta_dot': start.theta_dot, 'phi': start.phi,
               'psi': start.psi, 'l3': start.l3, 'lz': start.lz}

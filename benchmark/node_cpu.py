@@ -1,20 +1,20 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """
-Processor time of `sim_node`, beside an ordinary rclpy node and beside one that only publishes.
+Measure the processor time of `sim_node`, compared with other nodes.
 
-    python benchmark/node_cpu.py                                # all of it, half an hour
+    python benchmark/node_cpu.py                                # everything, takes half an hour
     python benchmark/node_cpu.py --rates 1000 --subscribers 1 --rounds 5 --no-report
 
-Three streams (pose, joint_states, imu/data_raw) at the same rate, for 0, 1 and 3 other processes
-that subscribe to all three.  `sim_node` runs with a tick a sample, and with the 200 ticks a second
-that it has by default, so above that samples come several at a time.  Beside it
-`straightforward_node.py` (a timer, scipy's RK45, message objects) and
-`bare_node.py` (the floor: constant bytes, a tick a sample, by timer and by thread).  Everything
-takes turns, in every round; what is reported are medians of rounds and of ratios within a round.
-Processor time is that of the whole process, its DDS threads too, over the time measured; arrivals
-are when the middleware of a subscriber received a message, jitter how far the time between two on
-a topic is from the period.
+Each node publishes three streams (pose, joint_states, imu/data_raw) at the same rate, for 0, 1
+and 3 other processes that subscribe to all of them.  `sim_node` runs with one tick per sample,
+and with its default of 200 ticks per second, where a tick publishes several samples at higher
+rates.  It is compared with `straightforward_node.py` (a timer, SciPy's RK45, message objects) and
+with `bare_node.py` ("floor": constant bytes, one tick per sample, with a timer and with a
+thread).  All take turns in every round.  The tables have medians of rounds, and of ratios within
+a round.  Processor time is that of the whole process with its DDS threads, relative to the
+elapsed time.  An arrival is the reception of a message by the middleware of a subscriber.  Jitter
+is the difference between the period and the time between two arrivals on a topic.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ OTHERS = ('ground_truth_imu', 'ground_truth_odom', 'invariants')
 RATES = (100, 200, 500, 1000, 2000)
 SUBSCRIBERS = (0, 1, 3)
 KINDS = {
-    'ours, 200 ticks, recording': (False, True), 'ours, 200 ticks': (False, False),
-    'ours, recording': (True, True), 'ours': (True, False),
+    'sim_node, 200 ticks, recording': (False, True), 'sim_node, 200 ticks': (False, False),
+    'sim_node, recording': (True, True), 'sim_node': (True, False),
     'straightforward': None, 'floor, timer': None, 'floor, thread': None,
 }
 STRAIGHT, FLOOR = 'straightforward', 'floor, thread'
@@ -48,9 +48,9 @@ STRAIGHT, FLOOR = 'straightforward', 'floor, thread'
 
 @dataclass
 class Result:
-    """What one run of one node was measured at; arrivals of all subscribers together."""
+    """Measurements of one run of one node; arrivals of all subscribers together."""
 
-    share: float                                # processor seconds a second
+    share: float                                # processor time over elapsed time
     rates: list[float] = field(default_factory=list)
     jitter_ms: list[float] = field(default_factory=list)
     lost: int = 0
@@ -58,7 +58,7 @@ class Result:
 
 
 def program(kind: str, rate: float, namespace: str, folder: Path) -> list[str]:
-    """Return what python is given to run this kind of node."""
+    """Return the arguments of python for this kind of node."""
     ours = KINDS[kind]
     if ours is not None:
         tick_a_sample, records = ours
@@ -80,7 +80,7 @@ _namespaces = itertools.count(1)
 
 def measure(kind: str, rate: float, subscribers: int, seconds: float, warm_up: float,
             folder: Path) -> Result | None:
-    """Run one node with its subscribers; None where something did not start."""
+    """Run one node with its subscribers; return None if one did not start."""
     namespace = f'/n{next(_namespaces)}'
     listeners = [Process((*script('listener.py'), namespace), talks=True)
                  for _ in range(subscribers)]
@@ -110,7 +110,7 @@ def measure(kind: str, rate: float, subscribers: int, seconds: float, warm_up: f
 
 
 def settled(listeners: list[Process], warm_up: float) -> bool:
-    """Wait until every listener has heard from every topic, and a while longer."""
+    """Wait until every listener has received every topic, and for the warm-up."""
     give_up = time.monotonic() + 30.0
     for listener in listeners:
         heard: set[str] = set()
@@ -125,7 +125,7 @@ def settled(listeners: list[Process], warm_up: float) -> bool:
 
 
 def result(share: float, said: list[dict], rate: float, kind: str) -> Result:
-    """Put together what the listeners have said."""
+    """Return the result of the reports of the listeners."""
     found = Result(share)
     period_ns = 1e9 / rate
     for times, numbers, stamps in (got for one in said for got in one.values()):
@@ -159,7 +159,7 @@ def measured(arguments: argparse.Namespace) -> dict:
                              f'{100 * one.share:.1f} %, {mean_rate(one):.0f} Hz')
                           + f', load {load():.1f}', flush=True)
     except KeyboardInterrupt:
-        print('interrupted: the tables show what there is, and are not written')
+        print('interrupted: the tables are incomplete, and are not written')
         arguments.no_report = True
     finally:
         shutil.rmtree(folder)
@@ -169,10 +169,10 @@ def measured(arguments: argparse.Namespace) -> dict:
 def together(programs: Mapping[str, Callable[[str], list[str]]], rounds: int, seconds: float,
              subscribers: int = 0) -> dict[str, list[float]]:
     """
-    Return the processor seconds a second of nodes that run side by side, of each in every round.
+    Return the processor time over elapsed time of nodes that run at once, of each in every round.
 
-    What this machine does to one it then does to the other; who is started first takes turns.
-    programs: what python is given to run a node, for a namespace;  subscribers: of each node
+    So both nodes meet the same load of the machine.  They take turns in starting first.
+    programs: arguments of python for a node, by its namespace;  subscribers: of each node
     """
     shares: dict[str, list[float]] = {name: [] for name in programs}
     for number_ in range(rounds):
@@ -202,7 +202,7 @@ def pair_row(shares: dict[str, list[float]]) -> tuple[str, ...]:
 
 
 def idle(rounds: int, seconds: float) -> str:
-    """Return the table of what streams cost that nobody listens to."""
+    """Return the table of the cost of streams without subscribers."""
     switches = [f'{name}.enabled' for name in (*STREAMS, 'imu_data', *OTHERS, 'clock')]
 
     def node(enabled: bool) -> Callable[[str], list[str]]:
@@ -210,21 +210,21 @@ def idle(rounds: int, seconds: float) -> str:
             'tick_rate': 1000.0, 'status_period': 0.0, **dict.fromkeys(switches, enabled)})]
 
     return table(
-        ('all streams enabled [%]', 'none enabled [%]', 'ratio', 'lowest', 'highest'),
+        ('all streams enabled [%]', 'none enabled [%]', 'ratio', 'smallest', 'largest'),
         [pair_row(together({'all': node(True), 'none': node(False)}, rounds, seconds))])
 
 
 def beside_the_floor(rounds: int, seconds: float) -> str:
-    """Return the table of what a tick a sample costs beside the floor, at 1 kHz."""
+    """Return the table of `sim_node` with one tick per sample and of the floor, at 1 kHz."""
     with tempfile.TemporaryDirectory() as name:
         def node(kind: str) -> Callable[[str], list[str]]:
             return lambda namespace: program(kind, 1000, namespace, Path(name))
 
         return table(
-            ('node', 'it [%]', 'the floor [%]', 'ratio', 'lowest', 'highest'),
+            ('node', 'node [%]', 'floor [%]', 'ratio', 'smallest', 'largest'),
             [(kind, *pair_row(together({kind: node(kind), FLOOR: node(FLOOR)}, rounds, seconds,
                                        subscribers=1)))
-             for kind in ('ours, recording', 'ours')])
+             for kind in ('sim_node, recording', 'sim_node')])
 
 
 def mean_rate(one: Result) -> float:
@@ -248,9 +248,9 @@ def share_table(found: dict) -> str:
     return table(('Hz', 'subscribers', *kinds), rows)
 
 
-COMPARED = (('ours, recording', STRAIGHT), ('ours', STRAIGHT),
-            ('ours, 200 ticks, recording', STRAIGHT), ('ours, 200 ticks', STRAIGHT),
-            ('floor, timer', STRAIGHT), ('ours, recording', FLOOR), ('ours', FLOOR))
+COMPARED = (('sim_node, recording', STRAIGHT), ('sim_node', STRAIGHT),
+            ('sim_node, 200 ticks, recording', STRAIGHT), ('sim_node, 200 ticks', STRAIGHT),
+            ('floor, timer', STRAIGHT), ('sim_node, recording', FLOOR), ('sim_node', FLOOR))
 
 
 def ratio_table(found: dict, per_sample: bool = False) -> str:
@@ -264,7 +264,7 @@ def ratio_table(found: dict, per_sample: bool = False) -> str:
 
 
 def arrival_table(found: dict) -> str:
-    """Return rate, jitter and loss of what one subscriber got."""
+    """Return rate, jitter and loss of the messages of one subscriber."""
     rows = []
     for (rate, subscribers), kinds in found.items():
         for kind, all_runs in kinds.items():
@@ -312,10 +312,10 @@ def main() -> None:
     parser.add_argument('--kinds', nargs='+', default=list(KINDS), choices=KINDS, metavar='KIND',
                         help=f'of {list(KINDS)}')
     parser.add_argument('--rounds', type=int, default=3)
-    parser.add_argument('--seconds', type=float, default=2.0, help='measured, each run')
+    parser.add_argument('--seconds', type=float, default=2.0, help='measured in each run')
     parser.add_argument('--warm-up', type=float, default=1.5, help='before that')
     parser.add_argument('--pair-rounds', type=int, default=6,
-                        help='of the tables of nodes side by side')
+                        help='of the tables of nodes that run at once')
     parser.add_argument('--no-report', action='store_true', help='print the tables only')
     arguments = parser.parse_args()
     head = preamble('Processor time of the node')        # with the commit that is there now
@@ -326,18 +326,18 @@ def main() -> None:
     print(floor, flush=True)
     found = measured(arguments)
     text = '\n'.join((
-        f'Load average at the begin {at_first:.1f}, at the end {load():.1f} (the benchmark '
-        f'itself is in the latter); {arguments.rounds} rounds of {arguments.seconds:g} s.\n',
+        f'Load average at the start {at_first:.1f}, at the end {load():.1f} (including the '
+        f'benchmark itself); {arguments.rounds} rounds of {arguments.seconds:g} s.\n',
         '## Processor time [% of a core]\n', share_table(found),
         '## Ratios of processor time\n', ratio_table(found),
-        '## Ratios of processor time for each sample that arrived\n',
+        '## Ratios of processor time per received sample\n',
         ratio_table(found, per_sample=True),
-        '## Beside the floor\n',
-        'Processor time at 1 kHz with a subscriber each; both nodes of a pair side by side, '
+        '## Compared with the floor\n',
+        'Processor time at 1 kHz with one subscriber each; both nodes of a pair run at once, '
         f'{arguments.pair_rounds} rounds.\n', floor,
-        '## Streams that nobody listens to\n',
-        'Processor time at 1000 ticks a second, default rates, no subscriber; both nodes of a '
-        f'pair side by side, {arguments.pair_rounds} rounds.\n', unheard,
+        '## Streams without subscribers\n',
+        'Processor time at 1000 ticks per second, default rates, no subscriber; both nodes of a '
+        f'pair run at once, {arguments.pair_rounds} rounds.\n', unheard,
         '## Arrivals\n', arrival_table(found)))
     print(text)
     if not arguments.no_report:

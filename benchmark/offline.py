@@ -1,14 +1,15 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """
-How fast `simulate` goes from the exact solution to a file, beside writers that only write.
+Measure the throughput of `simulate`, compared with MCAP writers.
 
     python benchmark/offline.py             # ratios, a few seconds a round
-    python benchmark/offline.py --hour      # also one hour at 1 kHz: 10.8 million messages
+    python benchmark/offline.py --hour      # also one hour at 1 kHz: 14.4 million messages
 
-Three streams at 1 kHz: pose, joint_states, imu/data_raw, zstd.  The other writers are handed the
-very messages that we compute, as ready-made bytes: mcap's own `Writer.add_message`, and rosbags'.
-All take turns in one process; what is reported are medians, and ratios within a round.
+`simulate` computes three streams at 1 kHz (pose, joint_states, imu/data_raw) with the exact
+solution and writes them with zstd.  The other writers, `Writer.add_message` of mcap and the
+writer of rosbags, only write the same messages as ready-made bytes.  All take turns in one
+process.  The tables have medians, and medians of ratios within a round.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ PARAMETERS = [argument for name, value in (
     ('ground_truth_imu.enabled', 'false'), ('ground_truth_odom.enabled', 'false'),
     ('invariants.enabled', 'false'), *((f'{stream}.rate', '1000.0') for stream in STREAMS),
 ) for argument in ('-p', f'{name}:={value}')]
-# imu/data_raw comes with the truth of its bias on a topic of its own.
+# The stream imu also has the topic ground_truth/imu_bias.
 TOPICS = ('/pose', '/joint_states', '/imu/data_raw')
 
 
@@ -47,7 +48,7 @@ def run_ours(path: Path, seconds: float) -> None:
 
 
 def ready_made(path: Path) -> list[tuple[str, str, int, bytes]]:
-    """Return topic, type, stamp and bytes of every message of a log of ours."""
+    """Return topic, type, stamp and bytes of every message of a log."""
     with open(path, 'rb') as file:
         return [(channel.topic, schema.name, message.log_time, message.data)
                 for schema, channel, message in make_reader(file).iter_messages()
@@ -87,7 +88,7 @@ def timed(function, *arguments) -> float:
 
 
 def rounds(folder: Path, seconds: float, count: int) -> str:
-    """Let all take turns; return messages a second, and ratios."""
+    """Let all take turns; return messages per second and ratios."""
     first = folder / 'first.mcap'
     run_ours(first, seconds)
     messages = ready_made(first)
@@ -103,11 +104,11 @@ def rounds(folder: Path, seconds: float, count: int) -> str:
         rows.append((name, f'{len(messages) / statistics.median(taken):,.0f}',
                      f'{statistics.median(ratios):.2f}'))
     return (f'{len(messages)} messages a run, {count} rounds.\n\n'
-            + table(('', 'messages/s', 'time, in that of ours'), rows))
+            + table(('', 'messages/s', 'time relative to simulate'), rows))
 
 
 def in_a_process(folder: Path, seconds: float) -> tuple[str, ...]:
-    """Run it in a process of its own; return what it took, with its start and its exit."""
+    """Run it in its own process; return the row of the table, with start and exit."""
     path = folder / 'long.mcap'
     taken, peak = processes.simulate(
         ('-o', str(path), '--duration', str(seconds), *PARAMETERS))
@@ -124,10 +125,10 @@ def main() -> None:
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--seconds', type=float, default=60.0, help='simulated, a round')
     parser.add_argument('--rounds', type=int, default=5)
-    parser.add_argument('--hour', action='store_true', help='also an hour, and its memory')
+    parser.add_argument('--hour', action='store_true', help='also one hour, with its memory')
     parser.add_argument('--no-report', action='store_true', help='print only')
     arguments = parser.parse_args()
-    head = preamble('`simulate` beside writers that only write',
+    head = preamble('`simulate` compared with MCAP writers',
                     ('numpy', 'mcap', 'zstandard', 'rosbags'))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

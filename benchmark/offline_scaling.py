@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """
-`simulate` over duration and number of streams: does it stay linear, and its memory flat?
+Measure time and memory of `simulate` over duration and number of streams.
 
-    python benchmark/offline_scaling.py             # to an hour, a minute
-    python benchmark/offline_scaling.py --long      # to ten hours
+    python benchmark/offline_scaling.py             # up to one hour; takes a minute
+    python benchmark/offline_scaling.py --long      # up to ten hours
 
-Each run is a process of its own, from start to exit, with streams at 100 Hz into a zstd log.
+Each run has its own process, measured from start to exit.  The streams have 100 Hz, the log has
+zstd.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ THREE = STREAMS[:3]
 
 
 def run(method: str, streams: tuple[str, ...], seconds: float, path: Path) -> list[str]:
-    """Simulate in a process of its own; return messages, time, rate and memory as cells."""
+    """Simulate in its own process; return messages, time, rate and memory as cells."""
     parameters = {'solver.method': method, 'max_error': 0.0,
                   **{f'{name}.enabled': str(name in streams).lower() for name in STREAMS},
                   **{f'{name}.rate': RATE for name in streams}}
@@ -59,7 +60,7 @@ def main() -> None:
     text = '\n'.join((f'Load average at the end {load():.1f}.\n',
                       f'Three streams ({", ".join(THREE)}):\n',
                       table(('solver', 'simulated [min]', *heads), duration_rows),
-                      'Ten minutes by the exact solution, more and more streams:\n',
+                      'Ten minutes with the exact solution, over the number of streams:\n',
                       table(('streams', *heads), stream_rows)))
     print(text)
     if not arguments.no_report:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Every method that the benchmarks compare, behind one face: ours and those of other people.
+All methods that the benchmarks compare, with one interface.
 
 `Peer.ready(case, setting)` does what is done once a model (compiling, loading) and is not timed;
 the runner it returns is asked for attitudes, which is what is timed, or for `Samples`, which hold
@@ -29,12 +29,12 @@ from spinning_top_sim.solvers.propagator import propagate
 
 
 class FailedError(Exception):
-    """The method says itself that it did not get through."""
+    """The method itself reports that it failed."""
 
 
 class Samples(NamedTuple):
     """
-    What a method says about n instants.
+    Result of a method at n instants.
 
     quaternion (n, 4) x, y, z, w;  omega (n, 3) body rates [rad/s];  phi, psi (n,) unwrapped
     [rad], None where the method has none.
@@ -61,7 +61,7 @@ class Runner:
     """
     One method at one setting on one case.
 
-    work: what the last run took, in `Peer.unit`; None if that is not known.
+    work: amount of work of the last run, in `Peer.unit`; None if unknown.
     """
 
     work: int | None = None
@@ -82,7 +82,7 @@ class Runner:
 
 @dataclass(frozen=True)
 class Peer:
-    """A method: its name, family (who it belongs to), settings, and the unit of its work."""
+    """A method: its name, its family (the package), its settings, and the unit of its work."""
 
     name: str
     family: str
@@ -103,7 +103,7 @@ class Peer:
         if self.needs:
             try:
                 __import__(self.needs)
-            except Exception as error:      # whatever a foreign package raises is the reason
+            except Exception as error:      # any exception of a package is the reason
                 return f'{type(error).__name__}: {error}'
         return None
 
@@ -150,7 +150,7 @@ def _rk45(equations: str) -> Callable[[Case, float], Runner]:
 # ------------------------------------------------------------------------- the literal equations
 
 def literal_rates(case: Case, y: Any, sin: Callable, cos: Callable) -> tuple[Any, ...]:
-    """Return eqs. (29)-(32), the paper's, as anyone would write them down."""
+    """Return eqs. (29)-(32) of the paper, written literally."""
     top, start = case.top, case.start
     theta, theta_dot = y[0], y[1]
     s, c = sin(theta), cos(theta)
@@ -265,7 +265,7 @@ def quadratic_start(case: Case) -> list[float]:
     top, start = case.top, case.start
     cosine, sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
     phi_dot = attitude.precession_rate(top, start.l3, start.lz, cosine ** 2, sine ** 2)
-    # Lx + i Ly: l3 along the axis, and the rates across it.
+    # Lx + i Ly from l3 along the axis and the rates across it.
     momentum = cmath.rect(1.0, start.phi) * complex(
         math.sin(start.theta) * (start.l3 - top.lambda1 * phi_dot * math.cos(start.theta)),
         top.lambda1 * start.theta_dot)
@@ -325,14 +325,14 @@ def _heyoka_grid(runner: Any, start: list[float], ns: np.ndarray) -> np.ndarray:
     integrator.state[:] = start
     outcome, _, _, steps, _, states = integrator.propagate_grid(ns / 1e9)
     runner.work = steps
-    if outcome.name != 'time_limit':        # what heyoka calls arriving at the last instant
+    if outcome.name != 'time_limit':        # heyoka's name for reaching the last instant
         raise FailedError(f'{outcome.name} at t = {integrator.time} s')
     return states
 
 
 @functools.cache
 def _diffrax_solve() -> Callable:
-    """Return run(t, start, constants, tolerance), compiled once a shape of t."""
+    """Return run(t, start, constants, tolerance), compiled once for each shape of t."""
     import diffrax
     import jax
     jax.config.update('jax_enable_x64', True)
@@ -504,7 +504,7 @@ def angles_between(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     """
     Return the rotation angle [rad] between attitudes (n, 4): q and -q are the same one.
 
-    Lengths are taken out first: whoever lets |q| drift is judged by its attitude.
+    Quaternions are normalized first, so that a drift of |q| does not count.
     """
     p = p / np.linalg.norm(p, axis=1, keepdims=True)
     q = q / np.linalg.norm(q, axis=1, keepdims=True)
@@ -514,7 +514,7 @@ def angles_between(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 def long_attitudes(case: Case, ns: np.ndarray) -> np.ndarray:
     """
-    Return (n, 4) x, y, z, w from heyoka in numbers of BITS bits: a truth that is not ours.
+    Return (n, 4) x, y, z, w from heyoka in BITS-bit arithmetic: an independent truth.
 
     The constants are taken as `ExactSolution` takes them: doubles, their products exact.
     """

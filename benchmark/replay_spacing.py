@@ -1,15 +1,15 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """
-How well `replay_node` keeps the recorded spacing, as a subscriber in another process sees it.
+Measure the spacing of messages of `replay_node` in a subscribing process.
 
-    python benchmark/replay_spacing.py              # three rates, about half a minute
+    python benchmark/replay_spacing.py              # three rates; takes half a minute
 
-The log has three topics (50, 100 and 200 Hz), no two messages at a time.  The spacing error is how
-much longer or shorter the time between two arrivals on a topic is than recorded, over rate; drift
-is the same for the first and the last arrival.  The subscriber's own waking up is in all of it.
-The line above the table says how late a thread is that does nothing but sleep: on a busy machine
-that is the measure.
+The log has three topics (50, 100 and 200 Hz) without simultaneous messages.  The spacing error is
+the difference between the time between two arrivals on a topic and the recorded time over the
+rate.  The drift is the same for the first and the last arrival.  Both contain the delay of the
+subscriber.  The line above the table has the delay of a thread that only sleeps, for comparison
+on a busy machine.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def arrivals(path: Path, rate: float, times: dict[str, list[int]], patience: flo
 
 
 def machine() -> str:
-    """Return how late a sleeper at 200 Hz wakes up here, now."""
+    """Return the delays of a thread that sleeps at 200 Hz."""
     late = []
     begin = time.monotonic()
     for deadline in (begin + n / 200.0 for n in range(1, 401)):

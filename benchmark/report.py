@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every generated table begins with, and how its rows are written."""
+"""Head and tables of the generated pages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PACKAGES = ('numpy', 'scipy', 'heyoka', 'mujoco', 'jax', 'diffrax', 'numbalsoda'
 
 
 def preamble(title: str, packages: Sequence[str] = PACKAGES) -> str:
-    """Return the heading: which command wrote this, when, with what, on what."""
+    """Return the head of a page: title, command, date, commit, machine and versions."""
     command = ' '.join(['python', os.path.relpath(sys.argv[0], ROOT), *sys.argv[1:]])
     now = datetime.datetime.now(datetime.UTC).strftime('%Y-%m-%d %H:%M UTC')
     return (f'# {title}\n\nWritten by `{command}` on {now}, commit {_commit()}: do not edit.\n\n'
@@ -28,7 +28,7 @@ def preamble(title: str, packages: Sequence[str] = PACKAGES) -> str:
 
 
 def versions(packages: Sequence[str] = PACKAGES) -> str:
-    """Return the versions of the libraries, the absent ones as such."""
+    """Return the versions of the libraries, or that one is absent."""
     found = []
     for name in packages:
         try:
@@ -45,7 +45,7 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def number(value: float | None, digits: int = 2) -> str:
-    """Return a number in few digits, or a dash where there is none."""
+    """Return a number in few digits, or a dash for None."""
     return '–' if value is None else f'{value:.{digits}g}'
 
 
@@ -56,16 +56,16 @@ def write(name: str, text: str) -> None:
     print(f'wrote {path.relative_to(ROOT)}')
 
 
-# What docs/performance.md holds, in this order; each benchmark writes its own section.
+# Sections of docs/performance.md in their order; each benchmark writes one of them.
 SECTIONS = ('node_cpu', 'wake_up', 'startup', 'solvers', 'offline', 'offline_scaling',
             'compression', 'soak')
 
 
 def write_section(name: str, head: str, description: str, *texts: str) -> None:
     """
-    Put a page into docs/performance.md as one of its SECTIONS, in place of what it was.
+    Replace one of the SECTIONS of docs/performance.md by a page.
 
-    description: a docstring, whose last paragraph stands below the head
+    description: a docstring; its last paragraph follows the head
     """
     page = '\n'.join((head, description.strip().split('\n\n')[-1] + '\n', *texts))
     path = ROOT / 'docs' / 'performance.md'
@@ -78,7 +78,7 @@ def write_section(name: str, head: str, description: str, *texts: str) -> None:
 
 
 def _commit() -> str:
-    """Return the commit, and whether anything but the pages that benchmarks write has changed."""
+    """Return the commit, marked if any file except the generated pages has changed."""
     commit = _git('describe', '--always')
     changed = _git('status', '--porcelain', '--untracked-files=no', '--', '.', ':!docs')
     return (commit + ('-dirty' if changed else '')) or 'unknown'

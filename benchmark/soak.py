@@ -1,16 +1,16 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """
-`sim_node` for a long time, with everything going on: does it stay as it was?
+Run `sim_node` for a long time, and measure its memory, its logs and its errors.
 
     python benchmark/soak.py                    # 30 minutes
     python benchmark/soak.py --minutes 4
 
-Three streams at 1 kHz with a tick a sample, a subscribing process that comes and goes, a log
-begun and ended again and again, a parameter changed every second (a command, a switch or a rate
-in turn).  At the end: how the resident memory went, whether every log has every sample between
-its first and its last, and what the node has said.  Exit code 1 where something is not in order:
-memory more than 2 MB above that of the first minute's end, a sample missing, an error.
+The node publishes three streams at 1 kHz with one tick per sample.  A subscribing process starts
+and ends repeatedly, and so does the recording.  A parameter changes every second (a command, an
+enabled stream or a rate in turn).  The report has the resident memory, the missing samples in
+each log and the errors that the node has printed.  The exit code is 1 if the memory is more than
+2 MB above that at the end of the first minute, if a sample is missing, or if there is an error.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Client:
         return future.result()
 
     def record(self, on: bool) -> str:
-        """Begin or end a log; return what the node says.  Raises SystemExit on refusal."""
+        """Start or stop a log; return the response.  Raises SystemExit on refusal."""
         answer = self._call(self._record, self._set_bool.Request(data=on))
         if not answer.success:
             raise SystemExit(answer.message)
@@ -98,7 +98,7 @@ def missing_in(path: Path) -> dict[str, tuple[int, int]]:
 
 
 def soak(minutes: float, log_every: float, listen_every: float, folder: Path) -> dict:
-    """Let it run; return what was seen."""
+    """Run the node; return the observations."""
     namespace = '/soak'
     parameters = {'tick_rate': RATE, 'status_period': 0.0,
                   'record.uri': f'{folder}/', 'imu.gyroscope_noise_density': 1e-3,
@@ -145,7 +145,7 @@ def soak(minutes: float, log_every: float, listen_every: float, folder: Path) ->
 
 
 def judge(seen: dict) -> tuple[list[tuple[str, str]], bool]:
-    """Return the rows of the report, and whether all is in order."""
+    """Return the rows of the report, and whether the run passes."""
     settled = [size for at, size in seen['memory'] if at >= SETTLED_S] or [0]
     first = median(settled[:10])        # a log ends and another begins in that second
     growth = max(settled) - first
@@ -153,9 +153,9 @@ def judge(seen: dict) -> tuple[list[tuple[str, str]], bool]:
     missing = sum(n for log in seen['logs'].values() for _, n in log.values())
     trouble = [line for line in seen['stderr'].splitlines() if any(t in line for t in TROUBLE)]
     rows = [('resident memory after a minute (median of 10 s) [MB]', f'{first / 1e6:.1f}'),
-            ('most afterwards, above that [MB]', f'{growth / 1e6:+.2f}'),
-            ('least afterwards, above that [MB]', f'{(min(settled) - first) / 1e6:+.2f}'),
-            ('at the end, above that [MB]', f'{(settled[-1] - first) / 1e6:+.2f}'),
+            ('largest afterwards, relative to that [MB]', f'{growth / 1e6:+.2f}'),
+            ('smallest afterwards, relative to that [MB]', f'{(min(settled) - first) / 1e6:+.2f}'),
+            ('at the end, relative to that [MB]', f'{(settled[-1] - first) / 1e6:+.2f}'),
             ('logs', str(len(seen['logs']))), ('samples in them', str(count)),
             ('samples missing in them', str(missing)),
             ('lines of errors', str(len(trouble))), ('exit code', str(seen['code']))]
@@ -171,7 +171,7 @@ def main() -> int:
     parser.add_argument('--minutes', type=float, default=30.0)
     parser.add_argument('--log-every', type=float, default=60.0, help='s')
     parser.add_argument('--listen-every', type=float, default=15.0,
-                        help='s, between the comings and goings of a subscriber')
+                        help='s, between start and end of a subscriber')
     parser.add_argument('--no-report', action='store_true', help='print only')
     arguments = parser.parse_args()
     head = preamble('A long run')        # with the commit that is there now

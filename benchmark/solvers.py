@@ -1,16 +1,17 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """
-Time per state over the number of states, ours beside others at their fine settings.
+Measure the time per state over the number of states, compared with other solvers.
 
     python benchmark/solvers.py                 # two minutes
 
-Two states, a hundred and a hundred thousand of the cusping scene, 512 a second from the start on,
-by the very calls of `peers.py`.  Time is processor time of the whole call over the number of
-states, medians of interleaved rounds in one process and one thread; setting up our exact solution
-is part of it except where it says "prepared", compiling and loading of others are not.  Prepared,
-"any times" are the same instants in random order, which steppers do not take.  Error: the largest
-rotation angle from the exact solution, whose own error stands in work_precision.md.
+Each method computes two, a hundred and a hundred thousand states of the scene `cusp` at 512 Hz
+from the start, with the functions of `peers.py`.  Time is the processor time of the whole call
+over the number of states, the median of interleaved rounds in one process and one thread.  It
+contains the set-up of the exact solution except in rows with "prepared".  It does not contain
+compilation and loading.  With "prepared, any times" the instants are in random order, which steps
+cannot have.  The error is the largest rotation angle to the exact solution, whose own error is in
+work_precision.md.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ LONGEST_S = 20.0
 
 
 class _Prepared(Runner):
-    """The exact solution, set up before."""
+    """The exact solution, after its set-up."""
 
     def __init__(self, case: Case, setting: float) -> None:
         super().__init__(case, setting)
@@ -62,7 +63,7 @@ PREPARED = (Peer('exact, prepared, any times', 'ours', _PreparedArray, (0.0,)),
 
 
 def absent() -> list[str]:
-    """Return what cannot be compared, and why."""
+    """Return the methods that cannot be compared, and why."""
     found = {}
     for name, _ in CHOSEN:
         one = peer(name)
@@ -124,7 +125,7 @@ def main() -> None:
     missing = absent()
     text = '\n'.join((
         f'{case.title}; {arguments.rounds} rounds.\n', table(heads, rows),
-        'Not compared:\n' if missing else 'Nothing is missing.', *missing, ''))
+        'Not compared:\n' if missing else 'No method is missing.', *missing, ''))
     print(text)
     if not arguments.no_report:
         write_section('solvers', head, __doc__, text)

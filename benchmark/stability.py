@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What happens where the equations are hard, and how errors grow in an hour:
+Compare methods where the equations are difficult, and the growth of errors in an hour:
 
     PYTHONPATH=. python benchmark/stability.py [--limit SECONDS] [--hour-limit SECONDS]
 
-Every situation meets every method in a process of its own with a time limit, since some never
-return.  Errors are against the exact solution, and its own against heyoka in long numbers.
+Each method runs on each situation in its own process with a time limit, because some never return.
+Errors are differences from the exact solution.  The error of the exact solution is the difference
+from heyoka in extended precision.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ from spinning_top_sim import State
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 
 DURATION, RATE = 10, 64
-# Limits are of processor time.  What does not even use it is waited for so many times longer.
+# Limits are processor times; this factor is the limit of real time.
 PATIENCE = 20.0
 SITUATIONS = (
     Case('at the top, moving', WHEEL, State(theta=0.0, theta_dot=3.0, l3=0.3, lz=0.3)),
@@ -67,8 +68,7 @@ METHODS = (
     ('SciPy RK45', 1e-6), ('SciPy DOP853', 1e-9), ('SciPy DOP853', 1e-12),
     ('SciPy LSODA', 1e-9), ('heyoka Euler', 2.0 ** -52), ('heyoka quadratic', 2.0 ** -52),
     ('MuJoCo RK4', 2048.0))
-# An attitude off by more is lost; angles off by more, while the attitude is not, are silently
-# wrong: a pass by a pole that is missed costs pi.
+# Bounds of right attitudes and angles [rad]: a missed passage of a pole is an error of pi.
 LOST_ATTITUDE, LOST_ANGLE = 0.01, 1.0
 
 SENSITIVITY_SPANS = (10, 30, 100)
@@ -87,7 +87,7 @@ RUNNERS = (
 
 @dataclasses.dataclass
 class Outcome:
-    """What a method did in a situation; errors [rad] are the largest over all samples."""
+    """Result of a method in a situation; errors [rad] are the largest over all samples."""
 
     verdict: str
     attitude: float | None = None
@@ -125,18 +125,19 @@ def main() -> None:
 
 
 INTRODUCTION = """
-{duration} s of every situation at {rate} Hz, at most {limit:g} s of processor time for each run.
+Every situation is {duration} s long with samples at {rate} Hz. A run has at most {limit:g} s of
+processor time.
 
-- **right**: finished, the attitude within {attitude:g} rad throughout, phi and psi, where the
-  method has them, within {angle:g} rad
-- **angles lost**: finished without a complaint and with the right attitude, but phi or psi is off
-  by more than {angle:g} rad: the pole was stepped over.  Where the axis rests at a pole only
-  phi + psi (phi - psi at the bottom) has a meaning, and that is compared
-- **wrong**: finished without a complaint, the attitude off by more than that
-- **refused**: stopped with an error that says so;  **hung**: not done within the time limit
-- **NaN**: returned not-a-numbers
+- **right**: the attitude is within {attitude:g} rad at all times, and phi and psi, if the method
+  has them, are within {angle:g} rad
+- **angles lost**: no error message and the right attitude, but the error of phi or psi exceeds
+  {angle:g} rad, because a step has passed over the pole.  Where the axis rests at a pole, only
+  phi + psi (phi - psi at the bottom) is defined and compared
+- **wrong**: no error message, but the error of the attitude exceeds that bound
+- **refused**: stopped with an error message;  **hung**: not finished within the time limit
+- **NaN**: returned NaN
 
-Only the Euler-angle methods and ours give phi and psi.
+Only `exact`, `rk45` and the methods in Euler angles compute phi and psi.
 """
 
 
@@ -182,7 +183,7 @@ def meet(case: Case, name: str, setting: float) -> Outcome:
 
 
 def in_child(run: Callable[..., Any], arguments: tuple[Any, ...], limit: float) -> Any:
-    """Run in a process of its own: what hangs is ended, what crashes is told."""
+    """Run in its own process, with a time limit; report crashes."""
     if reason := peer(arguments[1]).missing():
         return Outcome(f'missing: {reason}')
     context = multiprocessing.get_context('fork')
@@ -229,7 +230,7 @@ def _row(name: str, setting: float, outcome: Outcome) -> tuple[str, ...]:
 # ----------------------------------------------------------------------------------- sensitivity
 
 def sensitivity() -> str:
-    """Return a table: errors of rk45, and what one rounding of the start does to the truth."""
+    """Return the table of errors of rk45, and of the effect of one rounding of the start."""
     ns = grid_ns(SENSITIVITY_SPANS[-1], RATE)
     ends = [span * RATE + 1 for span in SENSITIVITY_SPANS]
     lines = []
@@ -295,7 +296,7 @@ DASHED = ('heyoka Euler', ('rk45 transport', 1e-13), ('SciPy DOP853', 1e-12))
 
 
 def draw(curves: dict[tuple[str, float], tuple[np.ndarray, ...]]) -> None:
-    """Draw error and energy over time, with the slopes that theory gives them."""
+    """Draw error and energy over time, with the slopes of the theory."""
     mpl.use('Agg')
     figure, panels = plt.subplots(1, 2, figsize=(13.5, 6.4))
     t = grid_ns(HOUR, HOUR_RATE)[1:] / 1e9

@@ -1,17 +1,18 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """
-From the start of a process to the first message that another process receives.
+Measure the time from the start of a process to its first message.
 
     python benchmark/startup.py                 # two minutes
-    python benchmark/startup.py --imports 30    # and what is imported, by time
+    python benchmark/startup.py --imports 30    # also the 30 slowest imports
 
-`sim_node` with its defaults and with recording, beside `bare_node.py` with the same publishers,
-subscription, services and parameters (their descriptions and ranges too), and beside that node
-without parameters and services.  All take turns; what is reported are medians, and medians of
-ratios within a round.  Discovery is in the time to the first message received, and takes now
-0.1 s, now 3 s, whoever publishes; so there is also a run without subscriber that ends itself at
-the first sample: its time from start to end, and its processor time.
+`sim_node` runs with its defaults and with recording.  It is compared with `bare_node.py` with the
+same publishers, subscription, services and parameters (including descriptions and ranges), and
+with that node without parameters and services.  All take turns.  The table has medians, and
+medians of ratios within a round.  The time to the first message in another process contains DDS
+discovery, which takes from 0.1 s to 3 s for every node.  Therefore the table also has the time
+from start to exit, and the processor time, of a run without subscriber that ends at the first
+sample.
 """
 
 from __future__ import annotations
@@ -32,12 +33,12 @@ from report import preamble, table, write_section
 
 from spinning_top_sim.streams import parameters
 
-OURS, RECORDING, LIKE, BARE = 'ours', 'ours, recording', 'bare, like ours', 'bare'
+OURS, RECORDING, LIKE, BARE = 'sim_node', 'sim_node, recording', 'bare, same interface', 'bare'
 KINDS = (OURS, RECORDING, LIKE, BARE)
 
 
 def parameter_file(path: Path) -> None:
-    """Write name, value, description and range of our parameters, as the bare node reads them."""
+    """Write name, value, description and range of the parameters for the bare node."""
     rows = []
     for parameter in parameters.TABLE:
         value = parameter.default
@@ -53,7 +54,7 @@ def parameter_file(path: Path) -> None:
 
 
 def program(kind: str, namespace: str, folder: Path, once: bool) -> list[str]:
-    """Return what python is given to run this kind of node, for ever or to its first sample."""
+    """Return the arguments of python for this kind of node, for ever or to its first sample."""
     if kind in (OURS, RECORDING):
         return [*SIM_NODE, *ros_arguments(namespace, {
             'record.enabled': kind == RECORDING, 'duration': 0.001 if once else 0.0,
@@ -148,14 +149,14 @@ def main() -> None:
         received = [run[2] for run in runs]
         rows.append((*cells, *(f'{quantile(received, share):.3f}' for share in (0.0, 0.25, 1.0))))
     text = '\n'.join((
-        f'{arguments.rounds} rounds; load average at the begin {at_first:.1f}, at the end '
+        f'{arguments.rounds} rounds; load average at the start {at_first:.1f}, at the end '
         f'{load():.1f}.\n',
-        table(('node', 'one sample and end [s]', 'ratio', 'processor time of that [s]', 'ratio',
-               'first message received after [s]', 'ratio', 'soonest', '25 % within',
+        table(('node', 'start to exit [s]', 'ratio', 'its processor time [s]', 'ratio',
+               'first message received after [s]', 'ratio', 'smallest', '25 % within',
                'all within'), rows),
-        f'Ratios are to the node called "{LIKE}".\n',
+        f'Ratios are relative to "{LIKE}".\n',
         '## Imports of `sim_node`\n',
-        'Own time of the modules of each package, one run of `python -X importtime`.\n',
+        'Own time of the modules of each package, from one run of `python -X importtime`.\n',
         import_times(arguments.imports)))
     print(text)
     if not arguments.no_report:

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """
-The top as a good rclpy node is usually written: what `node_cpu.py` measures `sim_node` against.
+The top as an ordinary rclpy node, with which `node_cpu.py` compares `sim_node`.
 
-A timer at the rate of the streams, scipy's RK45 stepped as far as the time is and read with its
-dense output, a new message object for every sample, plain publishers.  No parameters to change,
-no services, no recording, no skipping; a late tick is a lost sample.  The equations are (29)-(32)
-in Euler angles, in floats, at the tolerance that `sim_node` has by default.
+A timer has the rate of the streams.  SciPy's RK45 steps up to the present time, and its dense
+output gives the sample.  Every sample is a new message object.  The node has no parameters to
+change, no services and no recording; a late tick loses a sample.  The equations are (29)-(32) in
+Euler angles, at the default tolerance of `sim_node`.
 
     python benchmark/straightforward_node.py --ros-args -p rate:=1000.0
 """

@@ -2,8 +2,8 @@
 """
 Time limits, and times measured side by side in processor time of this process.
 
-Processor time leaves out what other processes of a busy machine take, and counts every thread:
-the benchmarks keep to one (`one_thread`).
+Processor time does not contain that of other processes, and counts every thread.  Therefore the
+benchmarks use one thread (`one_thread`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 
 
 def one_thread() -> None:
-    """Start this script anew if its numerical libraries may use more than one thread."""
+    """Restart this script if its numerical libraries may use more than one thread."""
     wanted = {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1', 'MKL_NUM_THREADS': '1',
               'XLA_FLAGS': '--xla_cpu_multi_thread_eigen=false'}
     if not wanted.items() <= os.environ.items():
@@ -27,15 +27,15 @@ def one_thread() -> None:
 
 
 class TimeUpError(Exception):
-    """A run took longer than it was given."""
+    """A run has exceeded its time limit."""
 
 
 @contextmanager
 def time_limit(seconds: float) -> Iterator[None]:
     """
-    Raise TimeUpError in the block after so long: at the next line of Python that runs in it.
+    Raise TimeUpError in the block after this time, at the next line of Python.
 
-    Of real time: a timer of processor time would coarsen that clock to the kernel's ticks.
+    The limit is of real time: a timer of processor time would reduce the resolution of that clock.
     """
     def stop(signum, frame):
         raise TimeUpError(f'not done after {seconds:g} s')
@@ -59,7 +59,7 @@ def interleaved(runs: Mapping[object, Callable[[], object]], rounds: int) -> dic
     """
     Return the median time [s] of each run, one of each in every round.
 
-    So a machine that is slower for a while is slower for all of them.
+    So a machine that is slower for a while affects all of them.
     """
     times: dict[object, list[float]] = {key: [] for key in runs}
     for _ in range(rounds):

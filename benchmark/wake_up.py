@@ -1,16 +1,17 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """
-What it costs to wake `sim_node` up for a tick, before the tick does anything.
+Measure the processor time of waking up `sim_node` for a tick.
 
     python benchmark/wake_up.py                         # two minutes
     python benchmark/wake_up.py --rates 200 --no-report
 
-One process holds a node with the topics, services and parameters of `sim_node`, whose motion
-stands still.  A timer on the steady clock with an empty callback is waited for in turns by rclpy's
-`SingleThreadedExecutor` and by its `EventsExecutor`, which `sim_node` has; beside them a thread
-that only sleeps until the time, which is what makes the ticks of `sim_node`.  Processor time is
-that of the whole process, a wake-up; medians of rounds and of ratios within a round.
+One process contains a node with the topics, services and parameters of `sim_node`; its motion
+does not run.  A timer on the steady clock with an empty callback is served in turns by rclpy's
+`SingleThreadedExecutor` and by its `EventsExecutor`, which `sim_node` uses.  They are compared
+with a thread that sleeps until absolute deadlines, which makes the ticks of `sim_node`.  The
+table has the processor time of the whole process per wake-up: medians of rounds, and of ratios
+within a round.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ SINGLE = 'SingleThreadedExecutor'
 
 
 class Waits:
-    """The ways to wait, each of which returns the processor time of a wake-up [us]."""
+    """The ways to wait; each returns the processor time per wake-up [us]."""
 
     def __init__(self, node: Simulator) -> None:
         self._node = node
@@ -90,9 +91,9 @@ def main() -> None:
             print(' | '.join(rows[-1]), flush=True)
     node.destroy_node()
     rclpy.try_shutdown()
-    text = (f'{arguments.rounds} rounds of {arguments.seconds:g} s; load average at the begin '
+    text = (f'{arguments.rounds} rounds of {arguments.seconds:g} s; load average at the start '
             f'{at_first:.1f}, at the end {load():.1f}.\n\n'
-            + table(('Hz', 'waited for by', 'a wake-up [us]', f'ratio to {SINGLE}'), rows))
+            + table(('Hz', 'woken by', 'time per wake-up [us]', f'relative to {SINGLE}'), rows))
     print(text)
     if not arguments.no_report:
         write_section('wake_up', head, __doc__, text)

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Error against time per state, every method over its tolerances: `make benchmark` or
+Compare error and time per state of all methods over their tolerances: `make benchmark` or
 
     PYTHONPATH=. python benchmark/work_precision.py [--quick] [--output FOLDER]
 
-For 10 s and for 1000 s of each case.  Error: the largest rotation angle from the truth over all
-samples.  The truth is our exact solution, which is itself held against heyoka in BITS-bit numbers
-there and then.  Time: processor time of the whole call, divided by the number of states; our
-exact solution's set-up is part of it, compiling and loading of a model are not.
+Each case runs for 10 s and for 1000 s.  The error is the largest rotation angle to the truth over
+all samples.  The truth is the exact solution, which is itself compared with heyoka in BITS-bit
+arithmetic.  The time is the processor time of the whole call over the number of states.  It
+contains the set-up of the exact solution, but not the compilation and loading of models.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ REFERENCE = ('SciPy DOP853', 1e-9)
 # Simulated time [s] and samples a second.
 SPANS = ((10, 512), (1000, 64))
 FEW = grid_ns(1, 1)
-# At how many instants the exact solution is held against long numbers.
+# Number of instants at which the exact solution is compared with extended precision.
 PROBES = 16
-# Long numbers are given so long [s]; where that does not do, the error stays unknown.
+# Time limit of extended precision [s]; beyond it, the error stays unknown.
 LONGEST_TRUTH = 60.0
 # Real time for a run, over the processor time that it is expected to take at most.
 PATIENCE = 20.0
@@ -47,7 +47,7 @@ PROBLEMS = (FailedError, IntegrationError, ArithmeticError, ValueError, RuntimeE
 
 @dataclass
 class Row:
-    """One method at one setting: its error, or why there is none, and its time."""
+    """One method at one setting: its error, or why it has none, and its time."""
 
     peer: Peer
     setting: float
@@ -65,7 +65,7 @@ def main() -> None:
                         help='simulated time [s]; default all')
     parser.add_argument('--output', type=Path, help='folder; default docs, quick: build/benchmark')
     parser.add_argument('--longest', type=float, default=4.0,
-                        help='skip what takes longer than this for one run [s]')
+                        help='leave out methods that take longer than this for one run [s]')
     options = parser.parse_args()
     one_thread()
     folder = options.output or ROOT / ('build/benchmark' if options.quick else 'docs')
@@ -96,22 +96,21 @@ def compare(duration: int, rate: int, rounds: int, longest: float, folder: Path)
 
 
 INTRODUCTION = """
-Error: the largest rotation angle [rad] between an attitude and the true one, over all samples.
-Truth: `method='exact'`, whose own error is measured at some of the instants against heyoka
-with {bits}-bit numbers.  Time: processor time of a whole call that returns all attitudes, divided
-by their number; what is done once before, a model's compilation or loading, is a column of its
-own, where a later setting may find in a cache what an earlier one compiled (our exact
-solution prepares each motion anew, some milliseconds, and that is in its time).
-Ratio 1 is {reference} at {tolerance:g}, if that ran.  Times are medians over interleaved rounds
-in one process, {rounds} here (where 1, at least {retakes} for runs below {short:g} s); a method
-whose run would take more than {longest:g} s is left out and says so.  SciPy, heyoka Euler and
-`rk45 euler` solve the paper's equations (29)-(32); heyoka quadratic and diffrax solve the
-quaternion form without poles.
-MuJoCo's setting is its fixed step.
+The error is the largest rotation angle [rad] between an attitude and the true one over all
+samples.  The truth is `method='exact'`; its own error is measured at some of the instants against
+heyoka in {bits}-bit arithmetic.  The time is the processor time of a whole call that returns all
+attitudes, over their number.  It contains the set-up of the exact solution, some milliseconds.
+The compilation or loading of a model has its own column, where a later setting may use the cache
+of an earlier one.  Ratios are relative to {reference} at {tolerance:g}, if that ran.  Times are
+medians over interleaved rounds in one process, {rounds} here (where 1, at least {retakes} for
+runs below {short:g} s).  A method whose run would take more than {longest:g} s is left out and
+marked.  SciPy, heyoka Euler and `rk45 euler` solve equations (29)-(32) of the paper; heyoka
+quadratic and diffrax solve quaternion equations without poles.  The setting of MuJoCo is its
+fixed step.
 
-Weak points of the comparison: how many samples share a step decides how much dense output
-weighs, and it weighs most for methods that take few steps; the right-hand sides of `rk45` and of
-SciPy are Python, compiled by nobody; one thread each.
+Limits of the comparison: the number of samples per step determines the share of dense output in
+the time, which is largest for methods with few steps.  The right-hand sides of `rk45` and of
+SciPy are Python and are not compiled.  Every method has one thread.
 """
 
 
@@ -163,7 +162,7 @@ def measure(case: Case, duration: int, rate: int, rounds: int, longest: float) -
 
 
 def _ready(peer: Peer, case: Case, setting: float, ns: np.ndarray) -> Runner:
-    """Load and compile all that a run over ns needs; some compile at their first call only."""
+    """Load and compile what a run over ns needs; some methods compile at their first call."""
     runner = peer.ready(case, setting)
     runner.attitudes(FEW)
     runner.compile(ns)
@@ -183,7 +182,7 @@ _LONG: dict[tuple[str, int], tuple[np.ndarray, np.ndarray] | None] = {}
 
 
 def _error_of_exact(case: Case, ns: np.ndarray, attitudes: np.ndarray) -> float | None:
-    """Return the error at PROBES instants against heyoka's long numbers, None without them."""
+    """Return the error at PROBES instants against extended precision, None without it."""
     key = case.title, len(ns)
     if key not in _LONG:
         at = np.linspace(0, len(ns) - 1, PROBES + 1).round().astype(int)
@@ -234,7 +233,7 @@ STYLES = {'exact, any times': ('P', '-'), 'exact, grid': ('X', '-'),
 
 
 def draw(results: dict[Case, list[Row]], duration: int, rate: int, path: Path) -> None:
-    """Draw a panel a case: error over time per state, a line a method."""
+    """Draw error over time per state, a panel for each case, a line for each method."""
     mpl.use('Agg')
     states = duration * rate + 1
     figure, panels = plt.subplots(2, 3, figsize=(13.5, 8.6), sharex=True, sharey=True)

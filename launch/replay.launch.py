@@ -32,14 +32,14 @@ def generate_launch_description() -> LaunchDescription:
             'loop', default_value='false', choices=SWITCH, description='Start again at the end'),
         DeclareLaunchArgument(
             'clock', default_value='false',
-            description='true, or a rate [Hz]: publish the time of the log on /clock, for TF and RViz '
-            'too'),
+            description='true, or a rate [Hz]: publish the time of the log on /clock, for TF and '
+            'RViz too'),
         DeclareLaunchArgument(
             'partial', default_value='false', choices=SWITCH,
             description='Play the intact part of a truncated log'),
         DeclareLaunchArgument(
             'tf', default_value='true', choices=SWITCH,
-            description="Run robot_state_publisher, if sim_node recorded the log"),
+            description='Run robot_state_publisher, if sim_node recorded the log'),
         DeclareLaunchArgument(
             'rviz', default_value='false', choices=SWITCH, description='Run RViz'),
         OpaqueFunction(function=_nodes)])

@@ -32,7 +32,7 @@ def generate_launch_description() -> LaunchDescription:
             description=f'Scene: one of {", ".join(SCENES)}, or the path of a parameter file'),
         DeclareLaunchArgument(
             'params_file', default_value='',
-            description="Second parameter file, whose values override those of the scene"),
+            description='Second parameter file, whose values override those of the scene'),
         DeclareLaunchArgument(
             'set', default_value='',
             description='Parameters that override those of the files: '
@@ -49,7 +49,7 @@ def generate_launch_description() -> LaunchDescription:
             'or of a folder'),
         DeclareLaunchArgument(
             'use_sim_time', default_value='false', choices=SWITCH,
-            description="Use the /clock of another node"),
+            description='Use the /clock of another node'),
         DeclareLaunchArgument(
             'tf', default_value='true', choices=SWITCH,
             description='Run robot_state_publisher'),
