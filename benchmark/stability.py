@@ -246,8 +246,8 @@ def sensitivity() -> str:
             errors = angles_between(attitudes, truth)
             lines.append((case.title, report.number(case.exact.m1), label,
                           *(report.number(errors[:end].max()) for end in ends)))
-    return ('Largest difference of the attitude from the exact motion [rad].  m1 says how close '
-            'the separatrix is.\n\n' + report.table(
+    return ('Largest difference of the attitude from the exact motion [rad].  m1 is the '
+            'distance from the separatrix.\n\n' + report.table(
                 ('motion', 'm1', 'what', *(f'{span} s' for span in SENSITIVITY_SPANS)), lines))
 
 
