@@ -3,7 +3,7 @@
 """
 Draw the pictures of the README: `python docs/figures.py` (extra `plot`).
 
-docs/motions.png shows three motions; docs/inspect_cusp.png is what `inspect --plot` draws.
+docs/motions.png shows three motions; docs/inspect_cusp.png is a page of `inspect --plot`.
 """
 
 import tempfile
@@ -19,12 +19,12 @@ from spinning_top_sim.tools.plots import INK, draw_sphere, draw_tip
 
 HERE = Path(__file__).parent
 # Caption, file in config/, nutations shown.
-PANELS = (('cusps: let go from rest', 'cusp', 5), ('loops: pushed backwards', 'looping', 5),
+PANELS = (('cusps: released from rest', 'cusp', 5), ('loops: pushed backwards', 'looping', 5),
           ('waves: pushed forwards', 'wavy', 5))
 
 
 def scene(name):
-    """Return top and start state of a scene; its file is flat, a name and a value a line."""
+    """Return top and start state of a scene; each line of its file has a name and a value."""
     values = {}
     for line in (HERE.parent / 'config' / f'{name}.yaml').read_text().splitlines():
         key, _, value = line.partition('#')[0].strip().partition(': ')
@@ -54,7 +54,7 @@ def motions(path):
 
 
 def page_about_a_log(path):
-    """Draw what `inspect --plot` draws about half a minute of cusps."""
+    """Draw the page of `inspect --plot` for half a minute of cusps."""
     with tempfile.TemporaryDirectory() as folder:
         log = f'{folder}/cusp.mcap'
         simulate.main(['-o', log, '--duration', '30', '--quiet',
@@ -64,7 +64,7 @@ def page_about_a_log(path):
 
 
 def main():
-    """Draw both."""
+    """Draw both pictures."""
     motions(HERE / 'motions.png')
     page_about_a_log(HERE / 'inspect_cusp.png')
 

@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Write docs/interface.md from the tables in the code: `python docs/interface.py`."""
+"""Write docs/interface.md from the tables of the code: `python docs/interface.py`."""
 
 from pathlib import Path
 
