@@ -57,7 +57,7 @@ help:
 	@echo 'PYTHON=$(PYTHON)  the interpreter (3.11 or newer)   VENV=$(VENV)  where to install'
 
 run: export ROS_DOMAIN_ID := $(RUN_DOMAIN_ID)
-run: check-scene $(VENV)/.package
+run: check-scene $(VENV)/.deps-plot $(VENV)/.package
 	@mkdir -p '$(LOGS)'
 	@echo 'Scene $(SCENE), recording into $(LOGS)/, until Ctrl-C. To listen from another terminal of'
 	@echo 'this machine:  export ROS_DOMAIN_ID=$(RUN_DOMAIN_ID)' \

@@ -47,7 +47,10 @@ setup(
     install_requires=[
         'numpy>=1.26,<3',
         'mcap>=1.2,<2',             # with zstandard and lz4
-        'scipy>=1.11,<2',           # tools alone; sim_node never imports it
+        # For the tools alone; sim_node needs none of these.
+        'PyYAML>=6.0,<7',
+        'scipy>=1.11,<2',
+        'tqdm>=4.64,<5',
     ],
     extras_require={
         'ros': [
@@ -62,14 +65,11 @@ setup(
             'mcap-ros2-support>=0.5.5,<0.7',
             'pyarrow>=14,<30',
             'pytest>=7.4,<10',
-            'PyYAML>=6.0,<7',
             'rosbags>=0.10.11,<0.12',
             'vqf>=2.1,<3',
             'xacro>=2.1,<3',
             'yourdfpy>=0.0.60,<0.1',
         ],
-        # Parameter files, a progress bar.
-        'tools': ['PyYAML>=6.0,<7', 'tqdm>=4.64,<5'],
         'parquet': ['pyarrow>=14,<30'],
         'plot': ['matplotlib>=3.6,<4'],     # inspect --plot, docs/figures.py
         # examples/attitude_filter.py

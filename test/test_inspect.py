@@ -5,7 +5,6 @@
 What is measured is compared with the closed form, which test_exact.py holds against 30 digits.
 """
 
-import io
 import json
 import re
 import struct
@@ -550,22 +549,6 @@ def test_a_reader_that_leaves_is_no_error(stepped):
     run.stdout.close()
     assert run.stderr.read() == b''
     assert run.wait(60) == 0
-
-
-def test_progress_is_shown_on_a_terminal_only(monkeypatch):
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
-
-    monkeypatch.setitem(sys.modules, 'tqdm', None)
-    for stream, quiet, shown in ((Terminal(), False, ['  0 %', ' 50 %', '100 %']),
-                                 (Terminal(), True, []), (io.StringIO(), False, [])):
-        monkeypatch.setattr(sys, 'stderr', stream)
-        with cli.progress('simulated', 20.0, 's', quiet=quiet) as show:
-            for done in (0.0, 10.0, 10.0001, 20.0):
-                show(done)
-        assert re.findall(r'\rsimulated (.{5})', stream.getvalue()) == shown
-        assert stream.getvalue().endswith('\r\033[K') == bool(shown)
 
 
 def test_wrong_arguments_are_2(capsys):

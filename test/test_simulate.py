@@ -2,6 +2,7 @@
 """The offline simulation: files, refusals, and the same bytes as the node's own pipeline."""
 
 import csv
+import io
 import json
 import resource
 import subprocess
@@ -17,6 +18,7 @@ from rosbags.highlevel import AnyReader
 from spinning_top_sim import solve
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.tools import cli
 from spinning_top_sim.tools.simulate import main
 
 EVERYTHING = ['-p', 'imu_data.enabled:=true', '-p', 'clock.enabled:=true',
@@ -307,3 +309,20 @@ def test_rclpy_and_scipy_are_not_imported():
     run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                          timeout=60, check=True)
     assert run.stdout.strip() == '[]'
+
+
+def test_progress_is_shown_on_a_terminal_only(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    for stream, quiet, shown in ((Terminal(), False, True), (Terminal(), True, False),
+                                 (io.StringIO(), False, False)):
+        monkeypatch.setattr(sys, 'stderr', stream)
+        with cli.progress('simulated', 20.0, 's', quiet=quiet) as show:
+            for done in (0.0, 10.0, 10.0001, 25.0):
+                show(done)
+        assert ('simulated   0%|' in stream.getvalue()) == shown
+        assert ('simulated 100%|' in stream.getvalue()) == shown
+        assert ('20/20 s' in stream.getvalue()) == shown
+        assert shown or stream.getvalue() == ''

@@ -53,13 +53,13 @@ def _run(arguments: argparse.Namespace) -> int:
     with LogReader(log) as reader, progress(
             'recovered', reader.size, 'bytes', quiet=reader.size < PROGRESS_BYTES) as show:
         recovered = recover(reader, output, lambda done, total: show(done))
-    damage = recovered.damage
-    for line in damage.lines():
+    lossless = recovered.damage.lossless
+    for line in recovered.damage.lines():
         print_line(line)
-    kept = (f'{count(recovered.messages, "message")} in {count(recovered.chunks, "chunk")}, '
-            f'{count(recovered.bytes, "byte")}')
-    print_line(f'{"kept all" if damage.lossless else "kept"}: {kept} in {recovered.path}')
-    return OK if damage.lossless else SOME_LOST
+    print_line(f'kept{" all" * lossless}: {count(recovered.messages, "message")} in '
+               f'{count(recovered.chunks, "chunk")}, {count(recovered.bytes, "byte")} in '
+               f'{recovered.path}')
+    return OK if lossless else SOME_LOST
 
 
 if __name__ == '__main__':

@@ -9,8 +9,7 @@ from typing import Any
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.pipeline import Rows, Simulation
-from spinning_top_sim.streams.schedule import NEVER_NS
-from spinning_top_sim.tools.blocks import block_length, targets
+from spinning_top_sim.streams.schedule import NEVER_NS, offline_block_ns, offline_targets
 from spinning_top_sim.tools.run_description import Event, RunDescription
 
 
@@ -94,9 +93,10 @@ class Rerun:
     def _advance_to(self, stop_ns: int, event: Event | None) -> Iterator[Event | None]:
         """Advance to a simulated time, then apply an event."""
         simulation = self.simulation
-        block_ns = NEVER_NS if not self._sends else block_length(
+        block_ns = NEVER_NS if not self._sends else offline_block_ns(
             [stream for stream in simulation.streams if stream.has_sinks])
-        for target_ns, item in targets(max(simulation.now_ns, 0), [(stop_ns, event)], block_ns):
+        for target_ns, item in offline_targets(
+                max(simulation.now_ns, 0), [(stop_ns, event)], block_ns):
             if self._sends or (item is not None and item.name == 'command'):
                 self._reach(target_ns)
             self.stamp_ns = simulation.epoch_ns + target_ns

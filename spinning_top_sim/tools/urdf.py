@@ -21,18 +21,10 @@ FRAME_NAME = re.compile(r'[\w.-]+(/[\w.-]+)*')
 
 def arguments(values: Mapping[str, Any]) -> dict[str, str]:
     """
-    Return the arguments of the xacro file.
+    Return the arguments of the xacro file for checked parameters.
 
-    Parameters
-    ----------
-    values : mapping
-        Checked parameters.  The links between world and body get the prefix of the body's frame:
-        a/base_link, a/nutation_link.
-
-    Raises
-    ------
-    ValueError
-        The frames cannot form a tree; names the parameter and what is allowed.
+    The links between world and body get the prefix of the body's frame: a/base_link,
+    a/nutation_link.  Raises ValueError, which names the parameter, for frames that form no tree.
     """
     for name in FRAMES.values():
         if not FRAME_NAME.fullmatch(values[name]):
@@ -46,8 +38,7 @@ def arguments(values: Mapping[str, Any]) -> dict[str, str]:
         if value in others:
             raise ValueError(f'{name} = {value!r}: must be another name than those of the '
                              'other frames of the robot description')
-    mounted = any(values['imu.lever_arm']) or any(values['imu.rpy'])
-    if imu == body and mounted:
+    if imu == body and any((*values['imu.lever_arm'], *values['imu.rpy'])):
         raise ValueError(f'imu.frame_id = {imu!r}: must not be the body_frame where '
                          'imu.lever_arm or imu.rpy is not zero')
     return {**{name: repr(values[parameter]) for name, parameter in NUMBERS.items()},
@@ -58,21 +49,11 @@ def arguments(values: Mapping[str, Any]) -> dict[str, str]:
 
 def robot_description(values: Mapping[str, Any], folder: str | Path) -> str:
     """
-    Return the URDF.
+    Return the URDF of checked parameters.
 
-    Parameters
-    ----------
-    values : mapping
-        Checked parameters.
-    folder : str or Path
-        Folder of the xacro file.
+    folder : folder of the xacro file
 
-    Raises
-    ------
-    ValueError
-        See `arguments`.
-    ImportError
-        xacro is not installed.
+    Raises ValueError as `arguments` does, and ImportError where xacro is not installed.
     """
     import xacro  # noqa: PLC0415
 
