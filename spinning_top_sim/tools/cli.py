@@ -36,6 +36,7 @@ def exit_code(name: str, command: Callable[[], int],
     try:
         code = command()
         sys.stdout.flush()
+        return code
     except BrokenPipeError:
         # The reader of the output, such as a pager, has ended.  Python flushes it once more.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -46,7 +47,6 @@ def exit_code(name: str, command: Callable[[], int],
     except KeyboardInterrupt:
         print_line(f'{name}: interrupted', sys.stderr)
         return INTERRUPTED
-    return code
 
 
 def print_line(text: str, file: TextIO | None = None) -> None:
@@ -83,7 +83,7 @@ class Table:
         cells = [list(self.head), *map(list, self.rows)]
         columns = list(zip(*cells, strict=True))
         widths = [max(map(len, column)) for column in columns]
-        least = [max(len(piece.rstrip()) for cell in column for piece in _pieces(cell))
+        least = [max(len(line) for cell in column for line in _wrapped(cell, 1))
                  for column in columns]
         excess = sum(widths) + len(GAP) * len(widths) - width
         # The columns that are wider than their longest word give way, the widest first.
@@ -101,15 +101,10 @@ class Table:
                 ).rstrip()
 
 
-def _pieces(text: str) -> list[str]:
-    """Return the pieces of a text between which a line may be broken."""
-    return re.split('(?<=[/ ])', text)
-
-
 def _wrapped(text: str, width: int) -> list[str]:
-    """Return the lines of a text in a column."""
+    """Return the lines of a text, broken after slashes and spaces only."""
     lines = ['']
-    for piece in _pieces(text):
+    for piece in re.split('(?<=[/ ])', text):
         if len(lines[-1] + piece.rstrip()) > width and lines[-1]:
             lines.append('')
         lines[-1] += piece

@@ -8,7 +8,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from spinning_top_sim.recording.damage import count
 from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.recovery import recover
 from spinning_top_sim.tools.cli import OK, exit_code, print_line, progress
 
 SOME_LOST = 3
@@ -43,11 +46,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    # Not before: --help needs none of it.
-    from spinning_top_sim.recording.damage import count  # noqa: PLC0415
-    from spinning_top_sim.recording.reader import LogReader  # noqa: PLC0415
-    from spinning_top_sim.recording.recovery import recover  # noqa: PLC0415
-
     log: Path = arguments.log
     output: Path = arguments.output or log.with_name(f'{log.stem}_recovered.mcap')
     with LogReader(log) as reader, progress(

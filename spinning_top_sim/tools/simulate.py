@@ -9,6 +9,7 @@ offset of the stamps.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -35,7 +36,7 @@ from spinning_top_sim.tools.table import Stop, write_table
 
 # In ROS a stamp of 0 means "no time".
 DEFAULT_EPOCH = 1.0
-FORMATS = {'.mcap': 'mcap', '.csv': 'csv', '.parquet': 'parquet'}
+FORMATS = ('mcap', 'csv', 'parquet')
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -70,7 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--epoch', type=float, default=DEFAULT_EPOCH, metavar='S',
                         help='stamp of t = 0 [s], default %(default)g')
     parser.add_argument('--namespace', default='/', help='of the topics in the log')
-    parser.add_argument('--format', choices=tuple(FORMATS.values()),
+    parser.add_argument('--format', choices=FORMATS,
                         help='format of the output; default: by the extension of its name')
     parser.add_argument('--quiet', action='store_true', help='no progress, no summary')
     return parser
@@ -80,9 +81,9 @@ def _run(arguments: argparse.Namespace) -> int:
     values = _parameters(arguments)
     stops = parse_stops(arguments.command, round(values['duration'] * NANOSECONDS))
     output = Path(arguments.output)
-    file_format = arguments.format or FORMATS.get(output.suffix)
-    if file_format is None:
-        raise ValueError(f'{output}: the name must end in {", ".join(FORMATS)}, or --format be '
+    file_format = arguments.format or output.suffix[1:]
+    if file_format not in FORMATS:
+        raise ValueError(f'{output}: the name must end in .{", .".join(FORMATS)}, or --format be '
                          'given')
     with progress('simulated', values['duration'], 's', quiet=arguments.quiet) as show:
         if file_format == 'mcap':
@@ -154,9 +155,8 @@ def write_log(path: Path, values: Mapping[str, Any], stops: Sequence[Stop],
     commands_topic, events_topic = len(streams), len(streams) + 1
     metadata = provenance(values, epoch_ns, -1, (), values)
     file = create_file(path, topics, metadata, compression=values['record.compression'])
-    writer = _LogWriter(file, streams, epoch_ns)
     simulation.record_blocks(streams)
-    try:
+    with contextlib.closing(_LogWriter(file, streams, epoch_ns)) as writer:
         writer.write(events_topic, 0, journal.event('start', 0, -1))
         for target_ns, momenta in offline_targets(0, stops, offline_block_ns(streams)):
             try:
@@ -170,8 +170,6 @@ def write_log(path: Path, values: Mapping[str, Any], stops: Sequence[Stop],
                     'command', t_ns, simulation.now_ns, l3=l3, lz=lz))
                 writer.write(commands_topic, t_ns, journal.command(l3, lz))
             show(target_ns / NANOSECONDS)
-    finally:
-        writer.close()
     return f'{sum(file.counts)} messages, {file.size / 1e6:.1f} MB'
 
 
@@ -183,8 +181,7 @@ class _LogWriter:
     """
 
     def __init__(self, file: McapFile, streams: Sequence[Stream], epoch_ns: int) -> None:
-        self._file, self._epoch_ns = file, epoch_ns
-        self._numbers = {stream.topic: number for number, stream in enumerate(streams)}
+        self._file, self._streams, self._epoch_ns = file, streams, epoch_ns
         self._blocks: list[tuple[int, NDArray[np.int64], NDArray[np.uint8]]] = []
         self._executor = ThreadPoolExecutor(1)
         self._pending: Future[None] | None = None
@@ -198,7 +195,7 @@ class _LogWriter:
     def take(self, stream: Stream, stamps_ns: NDArray[np.int64],
              rows: NDArray[np.uint8]) -> None:
         """Take a block of samples, which `write_blocks` writes."""
-        self._blocks.append((self._numbers[stream.topic], stamps_ns, rows.copy()))
+        self._blocks.append((self._streams.index(stream), stamps_ns, rows.copy()))
 
     def write_blocks(self) -> None:
         """Begin to write a chunk of the blocks.  Raises OSError of the chunk before."""
