@@ -201,7 +201,14 @@ def events_of(log):
     (['--duration', '1', '-p', 'initial.theta:=0.0', '--command', '0.5:2.0:1.0'], 'at a pole'),
     (['--duration', '1', '-p', 'initial.theta:=0.0', '-p', 'solver.equations:=euler'],
      'transport'),
-    (['--duration', '1', '-o', '/nowhere/run.mcap'], '/nowhere'),
+    (['--duration', '1', '-o', '/nowhere/run.mcap'],
+     'simulate: cannot record to /nowhere/run.mcap: there is no directory /nowhere\n'),
+    (['--duration', '1', '-o', '/proc/run.mcap'],
+     'simulate: cannot record to /proc/run.mcap: no files can be made in /proc\n'),
+    (['--duration', '1', '-o', '/nowhere/run.csv'],
+     'simulate: /nowhere/run.csv: No such file or directory\n'),
+    (['--duration', '1', '-o', '/proc/run.csv'],
+     'simulate: /proc/run.csv: No such file or directory\n'),
 ])
 def test_what_cannot_be_simulated_is_told_in_a_line(tmp_path, capsys, arguments, message):
     assert main(['-o', str(tmp_path / 'run.mcap'), '--quiet', *arguments]) == 1

@@ -42,7 +42,10 @@ def exit_code(name: str, command: Callable[[], int],
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
     except errors as error:
-        print_line(f'{name}: {error}', sys.stderr)
+        what = str(error)
+        if isinstance(error, OSError) and error.filename is not None:
+            what = f'{error.filename}: {error.strerror}'
+        print_line(f'{name}: {what}', sys.stderr)
         return FAILED
     except KeyboardInterrupt:
         print_line(f'{name}: interrupted', sys.stderr)
