@@ -39,15 +39,9 @@ def read_scene(path: str | Path) -> dict[str, object]:
     """
     Return what a ROS 2 parameter file sets for the node spinning_top, by name, not checked yet.
 
-    Raises ValueError, which names the file and what is wrong with it.
+    Raises OSError, or ValueError which names the file and what is wrong with it.
     """
-    try:
-        text = Path(path).read_text(encoding='utf-8')
-    except OSError as error:
-        raise ValueError(f'{path}: {error.strerror}') from error
-    except UnicodeDecodeError as error:
-        raise ValueError(f'{path} is not YAML: {error}') from error
-    content = _parse_yaml(text, str(path))
+    content = _parse_yaml(Path(path).read_bytes(), str(path))
     values: dict[str, object] = {}
     for node, sections in content.items() if isinstance(content, Mapping) else ():
         section = sections.get('ros__parameters') if isinstance(sections, Mapping) else None
@@ -71,7 +65,7 @@ def parse_assignment(text: str) -> tuple[str, object]:
     return name, value
 
 
-def _parse_yaml(text: str, source: str) -> object:
+def _parse_yaml(text: str | bytes, source: str) -> object:
     try:
         return yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError) as error:

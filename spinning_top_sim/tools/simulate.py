@@ -102,10 +102,8 @@ def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
     for path in arguments.params:
         given.update(read_scene(path))
     given.update(parse_assignment(text) for text in arguments.param)
-    if arguments.seed is not None:
-        given['seed'] = arguments.seed
-    if arguments.duration is not None:
-        given['duration'] = arguments.duration
+    given.update((name, value) for name, value in vars(arguments).items()
+                 if name in ('seed', 'duration') and value is not None)
     values = parameters.checked(given)
     if not values['duration'] > 0.0:
         raise ValueError(f'duration = {values["duration"]!r} s: must be > 0 (--duration)')
