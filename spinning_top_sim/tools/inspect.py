@@ -15,9 +15,7 @@ from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools.cli import FAILED, OK, exit_code, print_line, print_report, progress
 
 if TYPE_CHECKING:
-    from spinning_top_sim.recording.reader import LogReader
     from spinning_top_sim.tools.survey import Survey
-    from spinning_top_sim.tools.verify import Verdict
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -54,12 +52,17 @@ def _run(arguments: argparse.Namespace) -> int:
     from spinning_top_sim.recording.reader import LogReader  # noqa: PLC0415
     from spinning_top_sim.tools.report import as_json, as_text  # noqa: PLC0415
     from spinning_top_sim.tools.survey import survey  # noqa: PLC0415
+    from spinning_top_sim.tools.verify import verify  # noqa: PLC0415
 
     verdict = None
     with LogReader(arguments.log) as reader:
         found = survey(reader)
         if arguments.verify and found.run is not None:
-            verdict = _verify(reader, found, arguments.json)
+            begin_ns, end_ns = found.damage.start_ns, found.damage.end_ns
+            with progress('verified', (end_ns - begin_ns) / NANOSECONDS, 's',
+                          quiet=arguments.json) as show:
+                verdict = verify(reader, found.run,
+                                 lambda stamp_ns: show((stamp_ns - begin_ns) / NANOSECONDS))
     if arguments.json:
         print(json.dumps(as_json(arguments.log, found, verdict), indent=2, allow_nan=False))
     else:
@@ -72,16 +75,6 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.plot is not None or arguments.animate is not None:
         passed = _draw(arguments, found) and passed
     return OK if passed else FAILED
-
-
-def _verify(reader: LogReader, found: Survey, quiet: bool) -> Verdict:
-    from spinning_top_sim.tools.verify import verify  # noqa: PLC0415
-
-    assert found.run is not None
-    begin_ns, end_ns = found.begin_ns, found.end_ns
-    with progress('verified', (end_ns - begin_ns) / NANOSECONDS, 's', quiet=quiet) as show:
-        return verify(reader, found.run, end_ns,
-                      lambda stamp_ns: show((stamp_ns - begin_ns) / NANOSECONDS))
 
 
 def _draw(arguments: argparse.Namespace, found: Survey) -> bool:

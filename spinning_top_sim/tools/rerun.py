@@ -21,101 +21,68 @@ class Rerun:
     """
     The run of a log, computed again.
 
-    Parameters
-    ----------
-    run : RunDescription
-        From the log.
-    send : callable, optional
-        Takes the samples of the log's streams in blocks.  Without it only the motions are
-        computed.
+    run : from the log
+    send : takes the samples of the log's streams in blocks; without it only the motions are
+        computed
+    simulation : at the time that `advance` has reached, in the beginning that of the recording
+    stamp_ns : log time up to which all samples have been sent [ns]
 
-    Attributes
-    ----------
-    simulation : Simulation
-        At the time that `advance` has reached, in the beginning that of the recording.
-    stamp_ns : int
-        Log time up to which all samples have been sent [ns].
-
-    Raises
-    ------
-    DepartureError
-        A command before the recording is refused.
-    ValueError, IntegrationError
-        There is no motion with these parameters.
+    Raises DepartureError where there is no motion with these parameters and commands.
     """
 
     def __init__(self, run: RunDescription, send: Rows | None = None) -> None:
-        self._run, self._send = run, send
-        self._sends = False
+        self.run, self._send = run, send
         self._stopped = False       # the equations could not go on
-        self.simulation = simulation = Simulation(run.values, run.epoch_ns)
+        try:
+            self.simulation = simulation = Simulation(run.values, run.epoch_ns)
+        except (ValueError, IntegrationError) as error:
+            raise DepartureError(str(error)) from error
         for at_ns, l3, lz in run.history:
             self._reach(at_ns)
             self._command(at_ns, l3, lz)
         if send is not None:
             self._reach(run.begun_ns)
-        simulation.now_ns = max(run.begun_ns, simulation.now_ns)
-        if run.begun_ns < 0:
-            simulation.now_ns = -1      # commands before the first sample
+        # -1: commands before the first sample.
+        simulation.now_ns = -1 if run.begun_ns < 0 else max(run.begun_ns, simulation.now_ns)
         self._set_rates({name: value for name, value in run.now.items()
                          if value != run.values[name]})
         if send is not None:
             names = set(run.topics.values())
             simulation.record_blocks(
                 [stream for stream in simulation.streams if stream.topic in names])
-            self._sends = True
         self.stamp_ns = run.epoch_ns + simulation.now_ns
 
     def advance(self, end_ns: int) -> Iterator[Event | None]:
         """
-        Go on from event to event, and from block to block between them.
+        Go on to a log time; yield each event when it has been applied, and None after a block.
 
-        Parameters
-        ----------
-        end_ns : int
-            Log time up to which samples are wanted [ns].
-
-        Yields
-        ------
-        Event or None
-            The event that was just applied, if any.
-
-        Raises
-        ------
-        DepartureError
-            An event cannot be applied.
+        Raises DepartureError where an event cannot be applied.
         """
-        for event in self._run.events:
-            if event.name != 'start':
-                yield from self._advance_to(event.sent_ns, event)
-        yield from self._advance_to(end_ns - self.simulation.epoch_ns, None)
-
-    def _advance_to(self, stop_ns: int, event: Event | None) -> Iterator[Event | None]:
-        """Advance to a simulated time, then apply an event."""
         simulation = self.simulation
-        block_ns = NEVER_NS if not self._sends else offline_block_ns(
-            [stream for stream in simulation.streams if stream.has_sinks])
-        for target_ns, item in offline_targets(
-                max(simulation.now_ns, 0), [(stop_ns, event)], block_ns):
-            if self._sends or (item is not None and item.name == 'command'):
-                self._reach(target_ns)
-            self.stamp_ns = simulation.epoch_ns + target_ns
-            if item is not None:
-                simulation.now_ns = target_ns
-                self._apply(item)
-            yield item
+        for event in (*self.run.events, None):
+            if event is not None and event.name == 'start':
+                continue
+            stop_ns = end_ns - simulation.epoch_ns if event is None else event.sent_ns
+            block_ns = NEVER_NS if self._send is None else offline_block_ns(
+                [stream for stream in simulation.streams if stream.has_sinks])
+            for target_ns, item in offline_targets(max(simulation.now_ns, 0), [(stop_ns, event)],
+                                           block_ns):
+                # Without samples states are only needed where a command finds them.
+                if self._send is not None or (item is not None and item.name == 'command'):
+                    self._reach(target_ns)
+                self.stamp_ns = simulation.epoch_ns + target_ns
+                if item is not None:
+                    simulation.now_ns = target_ns
+                    self._apply(item)
+                yield item
 
     def _reach(self, target_ns: int) -> None:
         """Compute, and send, the samples up to a time, as far as the equations go."""
-        if target_ns <= self.simulation.now_ns or self._stopped:
-            return
-        try:
-            if self._sends and self._send is not None:
-                self.simulation.advance_in_blocks(target_ns, self._send)
-            else:
-                self.simulation.advance(target_ns)
-        except IntegrationError:
-            self._stopped = True
+        if not self._stopped:
+            try:
+                self.simulation.advance_in_blocks(target_ns, self._send or (lambda *_: None))
+            except IntegrationError:
+                self._stopped = True
 
     def _apply(self, event: Event) -> None:
         details = event.details
@@ -124,7 +91,7 @@ class Rerun:
                 self._command(event.t_ns, details['l3'], details['lz'])
             elif event.name == 'parameters':
                 self._set_rates(details)
-            elif event.name == 'reset':
+            else:
                 self.simulation.restart(parameters.checked(details['parameters']))
                 self.simulation.epoch_ns = int(details['epoch_ns'])
                 self._stopped = False

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -41,35 +40,28 @@ class RunDescription:
     now: Mapping[str, Any]                # and when the recording began
     epoch_ns: int                         # stamp of t = 0 [ns]
     begun_ns: int                         # simulated time at which the recording began [ns]
-    # commands before that: time [ns], L3 and Lz [kg m^2/s]
-    history: tuple[tuple[int, float, float], ...]
+    # Commands before that: time [ns], L3 and Lz [kg m^2/s]
+    history: Sequence[tuple[int, float, float]]
     surroundings: Mapping[str, str]       # version, platform and libraries
     topics: Mapping[str, str]             # stream, such as imu/data_raw, by topic of the log
     commands_topic: str | None            # None where the log has none
     events_topic: str | None
-    events: tuple[Event, ...]             # the journal
-    broken: tuple[tuple[int, str], ...]   # stamp [ns] of each damaged entry, and the reason
+    events: Sequence[Event]               # the journal
+    broken: Sequence[tuple[int, str]]     # stamp [ns] of each damaged entry, and the reason
 
 
 def read_run_description(reader: LogReader) -> RunDescription:
-    """
-    Return the run of a log that this package recorded.
-
-    Raises
-    ------
-    ForeignLogError
-        The log has no metadata of this package, or not all of them.
-    """
+    """Return the run of a log.  Raises ForeignLogError where the metadata do not have it."""
     metadata = reader.metadata.get(METADATA_NAME)
     if metadata is None:
         raise ForeignLogError('it was not recorded by spinning_top_sim: it has no metadata '
                               f'{METADATA_NAME!r}')
     try:
-        values = parameters.checked(json.loads(metadata['parameters']))
-        now = parameters.checked(json.loads(metadata['parameters_now']))
+        values, now = (parameters.checked(json.loads(metadata[key]))
+                       for key in ('parameters', 'parameters_now'))
         epoch_ns, begun_ns = int(metadata['epoch_ns']), int(metadata['begun_ns'])
-        history = tuple((int(t_ns), float(l3), float(lz))
-                        for t_ns, l3, lz in json.loads(metadata['history']))
+        history = [(int(t_ns), float(l3), float(lz))
+                   for t_ns, l3, lz in json.loads(metadata['history'])]
         surroundings = {key: metadata[key] for key in ('version', 'platform', 'libraries')}
     except (KeyError, TypeError, ValueError) as error:
         raise ForeignLogError(f'its metadata {METADATA_NAME!r} cannot be used: '
@@ -77,13 +69,17 @@ def read_run_description(reader: LogReader) -> RunDescription:
     names = _names(reader.topics, now)
     topics = {name: topic for topic, name in names.items()}
     commands_topic, events_topic = topics.get(journal.COMMANDS), topics.get(journal.EVENTS)
-    events, broken = _read_events(reader, events_topic)
-    return RunDescription(
-        values=values, now=now, epoch_ns=epoch_ns, begun_ns=begun_ns, history=history,
-        surroundings=surroundings,
-        topics={topic: name for topic, name in names.items()
-                if topic not in (commands_topic, events_topic)},
-        commands_topic=commands_topic, events_topic=events_topic, events=events, broken=broken)
+    events: list[Event] = []
+    broken: list[tuple[int, str]] = []
+    for message in () if events_topic is None else reader.messages(topics=[events_topic]):
+        try:
+            events.append(_event(message.log_time, message.data))
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            broken.append((message.log_time, f'{type(error).__name__}: {error}'))
+    streams = {topic: name for topic, name in names.items()
+               if topic not in (commands_topic, events_topic)}
+    return RunDescription(values, now, epoch_ns, begun_ns, history, surroundings, streams,
+                          commands_topic, events_topic, events, broken)
 
 
 def _names(topics: Sequence[LogTopic], now: Mapping[str, Any]) -> dict[str, str]:
@@ -94,42 +90,30 @@ def _names(topics: Sequence[LogTopic], now: Mapping[str, Any]) -> dict[str, str]
     that was put together anew they are known by the ends of their names.
     """
     every = all_streams(now)
-    recorded = [(stream.topic, stream.type_name)
-                for stream in journal.recorded_streams(every, now)] + list(journal.TOPICS)
+    recorded = [*((stream.topic, stream.type_name)
+                  for stream in journal.recorded_streams(every, now)), *journal.TOPICS]
     if [topic.type_name for topic in topics] == [type_name for _, type_name in recorded]:
         return {topic.name: name for topic, (name, _) in zip(topics, recorded, strict=True)}
-    known = [(stream.topic, stream.type_name) for stream in every] + list(journal.TOPICS)
+    # The longest first: one name may be the end of another.
+    known = sorted([*((stream.topic, stream.type_name) for stream in every), *journal.TOPICS],
+                   key=lambda pair: -len(pair[0]))
     found: dict[str, str] = {}
     for topic in topics:
-        candidates = [name for name, type_name in known if type_name == topic.type_name
-                      and topic.name.endswith('/' + name.removeprefix('~/').removeprefix('/'))
-                      and name not in found.values()]
-        if candidates:
-            found[topic.name] = max(candidates, key=len)
+        for name, type_name in known:
+            if (type_name == topic.type_name and name not in found.values()
+                    and topic.name.endswith('/' + name.lstrip('~/'))):
+                found[topic.name] = name
+                break
     return found
-
-
-def _read_events(reader: LogReader, topic: str | None,
-                 ) -> tuple[tuple[Event, ...], tuple[tuple[int, str], ...]]:
-    """Return the journal's events, and stamps and reasons of the entries that are damaged."""
-    events, broken = [], []
-    for message in () if topic is None else reader.messages(topics=[topic]):
-        try:
-            events.append(_event(message.log_time, message.data))
-        except (ValueError, KeyError, TypeError, struct.error) as error:
-            broken.append((message.log_time, f'{type(error).__name__}: {error}'))
-    return tuple(events), tuple(broken)
 
 
 def _event(stamp_ns: int, data: bytes) -> Event:
     """Return an event from its bytes.  Raises ValueError where they are not as written."""
     length_field = 4
-    content = json.loads(data[len(ENCAPSULATION) + length_field:-1])
-    details = {key: value for key, value in content.items()
-               if key not in ('event', 't_ns', 'sent_ns')}
-    event = Event(content['event'], stamp_ns, content['t_ns'], content['sent_ns'], details)
-    if journal.event(event.name, event.t_ns, event.sent_ns, **details) != data:
+    details = json.loads(data[len(ENCAPSULATION) + length_field:-1])
+    name, t_ns, sent_ns = (details.pop(key) for key in ('event', 't_ns', 'sent_ns'))
+    if journal.event(name, t_ns, sent_ns, **details) != data:
         raise ValueError('the bytes of the entry are not as it was written')
-    if event.name not in EVENT_NAMES:
-        raise ValueError(f'event {event.name!r} is unknown')
-    return event
+    if name not in EVENT_NAMES:
+        raise ValueError(f'event {name!r} is unknown')
+    return Event(name, stamp_ns, t_ns, sent_ns, details)

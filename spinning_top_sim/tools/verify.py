@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections import deque
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.recording.provenance import surroundings
-from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.recording.reader import LogMessage, LogReader
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.topics import Stream
 from spinning_top_sim.tools.rerun import DepartureError, Rerun
@@ -35,7 +34,7 @@ FIELDS = {
 
 @dataclass(frozen=True)
 class Difference:
-    """The first place where a log and the computation differ."""
+    """A place where a log and the computation differ."""
 
     topic: str
     stamp_ns: int                         # log time of the message [ns]
@@ -54,7 +53,7 @@ class Verdict:
     different: int = 0                    # how many of these differ
     missing: int = 0                      # messages that were computed and are not in the log
     unexpected: int = 0                   # messages that are in the log and were not computed
-    first: Difference | None = None       # the first of all these
+    first: Difference | None = None       # the earliest of all these
     stopped: str = ''                     # why the run could not be computed to its end
     # Differences of version and machine, which may change the last bits
     warnings: list[str] = field(default_factory=list)
@@ -65,143 +64,101 @@ class Verdict:
         return not (self.different or self.unexpected or self.stopped
                     or (self.missing and self.whole))
 
+    def note(self, topic: str, stamp_ns: int, what: str, logged: str, computed: str,
+             byte: int | None = None) -> None:
+        """Keep a difference if it is the earliest so far."""
+        if self.first is None or stamp_ns < self.first.stamp_ns:
+            self.first = Difference(topic, stamp_ns, byte, what, logged, computed)
 
-def verify(reader: LogReader, run: RunDescription, end_ns: int,
-           show: Callable[[int], None] = lambda stamp_ns: None) -> Verdict:
+
+def verify(reader: LogReader, run: RunDescription, show: Callable[[int], None]) -> Verdict:
     """
-    Compute the run of a log again and compare all messages, side by side.
+    Compute the run of a log again and compare all messages.
 
-    Parameters
-    ----------
-    reader : LogReader
-        The log.
-    run : RunDescription
-        Its run.
-    end_ns : int
-        Log time of the last message [ns].
-    show : callable
-        Takes the log time reached [ns].
+    show : takes the log time reached [ns]
     """
-    return _Comparison(reader, run, end_ns, show).run()
+    damage = reader.damage
+    topics = {name: topic for topic, name in run.topics.items()}
+    if run.commands_topic is not None:
+        topics[journal.COMMANDS] = run.commands_topic
+    verdict = Verdict(not damage.torn and damage.lossless, dict.fromkeys(topics.values(), 0),
+                      warnings=_warnings(run))
+    for stamp_ns, reason in run.broken:
+        verdict.different += 1
+        verdict.note(run.events_topic or '', stamp_ns, 'entry', reason, 'an entry of the journal')
+    # What is not in the log yet, by topic and stamp: several commands may have the same.
+    computed: defaultdict[tuple[str, int], list[bytes]] = defaultdict(list)
+
+    def take(stream: Stream, stamps_ns: NDArray[np.int64], rows: NDArray[np.uint8]) -> None:
+        topic, size, data = topics[stream.topic], rows.shape[1], rows.tobytes()
+        for number, stamp_ns in enumerate(stamps_ns[stamps_ns <= damage.end_ns].tolist()):
+            computed[topic, stamp_ns].append(data[number * size:(number + 1) * size])
+
+    def compare(message: LogMessage) -> None:
+        expected = computed[message.topic, message.log_time]
+        if not expected:
+            verdict.unexpected += 1
+            verdict.note(message.topic, message.log_time, 'message', 'there', 'no such message')
+        else:
+            verdict.compared[message.topic] += 1
+            if message.data != expected[0]:
+                verdict.different += 1
+                stream = next((stream for stream in rerun.simulation.streams
+                               if topics.get(stream.topic) == message.topic), None)
+                verdict.note(message.topic, message.log_time,
+                             *_difference(stream, message.data, expected[0]))
+            del expected[0]
+        if not expected:
+            del computed[message.topic, message.log_time]
+
+    messages = reader.messages(topics=topics.values())
+    message = next(messages, None)
+    try:
+        rerun = Rerun(run, take)
+        for event in rerun.advance(damage.end_ns):
+            show(rerun.stamp_ns)
+            if event is not None and event.name == 'command' and run.commands_topic is not None:
+                computed[run.commands_topic, event.stamp_ns].append(
+                    journal.command(event.details['l3'], event.details['lz']))
+            # Those of this very time may not all be computed.
+            while message is not None and message.log_time < rerun.stamp_ns:
+                compare(message)
+                message = next(messages, None)
+    except DepartureError as error:
+        verdict.stopped = str(error)
+    while message is not None:
+        compare(message)
+        message = next(messages, None)
+    for (topic, stamp_ns), expected in computed.items():
+        verdict.missing += len(expected)
+        if verdict.whole:
+            verdict.note(topic, stamp_ns, 'message', 'no such message', 'there')
+    return verdict
 
 
-class _Comparison:
-    """The messages of a log, and those computed that still wait for their counterparts."""
-
-    def __init__(self, reader: LogReader, run: RunDescription, end_ns: int,
-                 show: Callable[[int], None]) -> None:
-        self._reader, self._run, self._end_ns, self._show = reader, run, end_ns, show
-        self._topics = {name: topic for topic, name in run.topics.items()}
-        if run.commands_topic is not None:
-            self._topics[journal.COMMANDS] = run.commands_topic
-        self._waiting: dict[str, deque[tuple[int, bytes]]] = {
-            topic: deque() for topic in self._topics.values()}
-        self._verdict = Verdict(not reader.damage.torn and reader.damage.lossless,
-                                dict.fromkeys(self._waiting, 0), warnings=_warnings(run))
-
-    def run(self) -> Verdict:
-        verdict = self._verdict
-        for stamp_ns, reason in self._run.broken:
-            verdict.different += 1
-            self._note(Difference(self._run.events_topic or '', stamp_ns, None, 'entry',
-                                  reason, 'an entry of the journal'))
-        try:
-            self._rerun = Rerun(self._run, self._take)
-        except (DepartureError, ValueError, IntegrationError) as error:
-            verdict.stopped = str(error)
-            return verdict
-        self._progress = self._rerun.advance(self._end_ns)
-        for message in self._reader.messages(topics=list(self._waiting)):
-            self._compare(message.topic, message.log_time, message.data)
-        while self._compute_more():
-            self._miss_all()
-        self._miss_all()
-        return verdict
-
-    def _take(self, stream: Stream, stamps_ns: NDArray[np.int64],
-              rows: NDArray[np.uint8]) -> None:
-        """Let a block of computed messages wait for those of the log."""
-        rows = rows[stamps_ns <= self._end_ns]
-        size, data = rows.shape[1], rows.tobytes()
-        self._waiting[self._topics[stream.topic]].extend(
-            (stamp_ns, data[i * size:(i + 1) * size])
-            for i, stamp_ns in enumerate(stamps_ns[:len(rows)].tolist()))
-
-    def _compute_more(self) -> bool:
-        """Compute one more block; return whether there was one."""
-        try:
-            event = next(self._progress)
-        except StopIteration:
-            return False
-        except (DepartureError, ValueError) as error:
-            self._verdict.stopped = self._verdict.stopped or str(error)
-            return False
-        self._show(self._rerun.stamp_ns)
-        if event is not None and event.name == 'command' and self._run.commands_topic and (
-                event.stamp_ns <= self._end_ns):
-            self._waiting[self._run.commands_topic].append(
-                (event.stamp_ns, journal.command(event.details['l3'], event.details['lz'])))
-        return True
-
-    def _compare(self, topic: str, stamp_ns: int, data: bytes) -> None:
-        waiting, verdict = self._waiting[topic], self._verdict
-        while True:
-            while not waiting and self._compute_more():
-                pass
-            if not waiting or waiting[0][0] > stamp_ns:
-                verdict.unexpected += 1
-                self._note(Difference(topic, stamp_ns, None, 'message', 'there',
-                                      'no such message'))
-                return
-            computed_ns, computed = waiting.popleft()
-            if computed_ns == stamp_ns:
-                break
-            self._miss(topic, computed_ns)
-        verdict.compared[topic] += 1
-        if data != computed:
-            verdict.different += 1
-            if verdict.first is None:
-                self._note(self._difference(topic, stamp_ns, data, computed))
-
-    def _miss_all(self) -> None:
-        """Count the messages that were computed and are not in the log."""
-        for topic, waiting in self._waiting.items():
-            while waiting:
-                self._miss(topic, waiting.popleft()[0])
-
-    def _miss(self, topic: str, stamp_ns: int) -> None:
-        self._verdict.missing += 1
-        if self._verdict.whole:
-            self._note(Difference(topic, stamp_ns, None, 'message', 'no such message', 'there'))
-
-    def _note(self, difference: Difference) -> None:
-        self._verdict.first = self._verdict.first or difference
-
-    def _difference(self, topic: str, stamp_ns: int, data: bytes,
-                    computed: bytes) -> Difference:
-        if len(data) != len(computed):
-            return Difference(topic, stamp_ns, min(len(data), len(computed)), 'size',
-                              f'{len(data)} bytes', f'{len(computed)} bytes')
-        at = next(i for i, pair in enumerate(zip(data, computed, strict=True))
-                  if pair[0] != pair[1])
-        name = self._run.topics.get(topic)
-        stream = next((stream for stream in self._rerun.simulation.streams
-                       if stream.topic == name), None)
-        what, read = _field_at(stream, at)
-        return Difference(topic, stamp_ns, at, what, read(data), read(computed))
-
-
-def _field_at(stream: Stream | None, at: int) -> tuple[str, Callable[[bytes], str]]:
-    """Return the name of the field at a byte of a message, and what formats its value."""
+def _difference(stream: Stream | None, logged: bytes,
+                computed: bytes) -> tuple[str, str, str, int]:
+    """Return the name of the first field that differs, its values, and the byte."""
+    if len(logged) != len(computed):
+        return ('size', f'{len(logged)} bytes', f'{len(computed)} bytes',
+                min(len(logged), len(computed)))
+    at = next(at for at, (one, two) in enumerate(zip(logged, computed, strict=True)) if one != two)
     place = None if stream is None else stream.template.field_at(at)
+
+    def read(data: bytes) -> str:
+        if place is None:
+            return f'0x{data[at]:02x}'
+        if place[0] < 0:
+            return '{}.{:09d}'.format(*struct.unpack_from('<iI', data, place[2]))
+        return repr(struct.unpack_from('<d', data, place[2])[0])
+
     if stream is None or place is None:
-        return f'byte {at}', lambda data: f'0x{data[at]:02x}'
-    number, element, offset = place
-    if number < 0:
-        return 'header.stamp', lambda data: '{}.{:09d}'.format(
-            *struct.unpack_from('<iI', data, offset))
-    return (f'{FIELDS[stream.type_name][number]}[{element}]',
-            lambda data: repr(struct.unpack_from('<d', data, offset)[0]))
+        name = f'byte {at}'
+    else:
+        number, element, _ = place
+        name = ('header.stamp' if number < 0 else
+                f'{FIELDS[stream.type_name][number]}[{element}]')
+    return name, read(logged), read(computed), at
 
 
 def _warnings(run: RunDescription) -> list[str]:
