@@ -49,8 +49,7 @@ def in_memory(values, commands, duration_ns):
     """Return the same from the pipeline as the node drives it: tick by tick, bytes to a sink."""
     simulation = Simulation(parameters.checked(values), EPOCH_NS)
     streams = journal.recorded_streams(simulation.streams, simulation.values)
-    names = [stream.topic.replace('~', 'spinning_top') for stream in streams]
-    found = {name if name.startswith('/') else f'/{name}': {} for name in names}
+    found = {journal.resolve_topic(stream.topic, '/'): {} for stream in streams}
     messages_of = list(found.values())
 
     def write(numbers, stamp_ns, messages, size):
@@ -333,3 +332,14 @@ def test_progress_is_shown_on_a_terminal_only(monkeypatch):
         assert ('simulated 100%|' in stream.getvalue()) == shown
         assert ('20/20 s' in stream.getvalue()) == shown
         assert shown or stream.getvalue() == ''
+
+
+@pytest.mark.parametrize(('name', 'code'), [('run.csv', 0), ('run.mcap', 1)])
+def test_without_mcap_there_are_tables_and_a_clear_error(tmp_path, name, code):
+    run = subprocess.run(
+        [sys.executable, '-c', 'import sys\nsys.modules["mcap"] = None\n'
+         'from spinning_top_sim.tools.simulate import main\nsys.exit(main())',
+         '-o', tmp_path / name, '--duration', '1', '--quiet'],
+        capture_output=True, text=True, timeout=60, check=False)
+    assert run.returncode == code and 'Traceback' not in run.stderr
+    assert ('needs the Python package mcap' in run.stderr) == (code == 1)

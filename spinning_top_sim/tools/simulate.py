@@ -14,13 +14,12 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.recording.errors import RecordingError
-from spinning_top_sim.recording.mcap_file import McapFile
 from spinning_top_sim.recording.provenance import provenance
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.writer import create_file
@@ -33,6 +32,9 @@ from spinning_top_sim.streams.topics import Stream
 from spinning_top_sim.tools.cli import OK, exit_code, print_line, progress
 from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
 from spinning_top_sim.tools.table import Stop, write_table
+
+if TYPE_CHECKING:
+    from spinning_top_sim.recording.mcap_file import McapFile
 
 # In ROS a stamp of 0 means "no time".
 DEFAULT_EPOCH = 1.0
