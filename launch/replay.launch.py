@@ -5,6 +5,7 @@ Replay a log, with the TF of the top that it is of and, if wanted, RViz.
   ros2 launch spinning_top_sim replay.launch.py file:=run.mcap loop:=true rviz:=true
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
@@ -67,17 +68,16 @@ def _nodes(context: LaunchContext) -> list:
     except (LogError, ForeignLogError, OSError) as error:
         # What cannot be played replay_node will tell.
         return [*actions, LogInfo(msg=f'neither TF nor RViz: {error}')]
-    topics = {name: topic for topic, name in run.topics.items()}
-    namespace = _namespace(topics)
-    if on['tf'] and 'joint_states' in topics:
+    namespace = _namespace(run.topics)
+    if on['tf'] and 'joint_states' in run.topics:
         actions += launch_helpers.state_publisher(
-            SHARE, run.now, namespace, topics['joint_states'], clocked)
+            SHARE, run.now, namespace, run.topics['joint_states'], clocked)
     if on['rviz']:
         actions.append(launch_helpers.rviz(SHARE, run.now['world_frame'], namespace, clocked))
     return actions
 
 
-def _namespace(topics: dict[str, str]) -> str:
+def _namespace(topics: Mapping[str, str]) -> str:
     """Return the namespace that the node had: what its topics have before their own names."""
     for name, topic in topics.items():
         if not name.startswith(('/', '~')) and topic.endswith(f'/{name}'):

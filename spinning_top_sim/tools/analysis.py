@@ -96,18 +96,17 @@ class Attitudes:
         """cos^2 and sin^2 of theta/2: the smaller keeps the digits near a pole."""
         return attitude.half_angle_squares(self.quaternion)
 
+    @cached_property
+    def axis(self) -> tuple[Reals, Reals, Reals]:
+        """The symmetry axis in the world frame."""
+        return attitude.axis_in_world(self.quaternion)
+
     @property
-    def height(self) -> Reals:
-        """cos(theta)."""
-        return self.half_angle_squares[0] - self.half_angle_squares[1]
-
-    @cached_property
     def tip(self) -> Complexes:
-        """X + iy of the axis' tip: sin(theta) exp(i phi)."""
-        x, y, _ = attitude.axis_in_world(self.quaternion)
-        return x + 1j * y
+        """Tip of the axis as x + iy: sin(theta) exp(i phi)."""
+        return self.axis[0] + 1j * self.axis[1]
 
-    @cached_property
+    @property
     def body_tip(self) -> Complexes:
         """sin(theta) exp(i psi)."""
         x, y, _ = attitude.vertical_in_body(self.quaternion)
@@ -126,8 +125,10 @@ class Attitudes:
     @property
     def phi_dot(self) -> Reals | None:
         """Precession rate [rad/s]; NaN at a pole where the log has no angles."""
-        if self.angles is not None or self.vertical_and_rates is None:
-            return None if self.angles is None else self.angles[3]
+        if self.angles is not None:
+            return self.angles[3]
+        if self.vertical_and_rates is None:
+            return None
         up, omega = self.vertical_and_rates
         with np.errstate(invalid='ignore'):
             return (omega[0] * up[0] + omega[1] * up[1]) / (up[0] ** 2 + up[1] ** 2)
@@ -244,8 +245,10 @@ def measure(data: Attitudes) -> Measured:
     precession, spin = (None if reason else _mean_rate(data, angle, phasor, begin, end)
                         for angle, phasor in ((data.phi, data.tip), (data.psi, data.body_tip)))
     if not reason and None in (precession, spin):
-        reason = 'phi or psi turns too fast between samples to be unwrapped'
+        reason = 'phi or psi cannot be unwrapped: a pole, or too few samples in a turn'
     phi_dot = data.phi_dot
+    if phi_dot is not None and np.isnan(phi_dot).any():
+        phi_dot = None
     return Measured(
         samples=count, nutations=nutations, nutation_period=period, theta_min=low,
         theta_max=high, mean_precession_rate=precession, mean_spin_rate=spin,
@@ -310,7 +313,8 @@ def _unresolved(data: Attitudes, period: float) -> str:
 def _mean_rate(data: Attitudes, angle: Reals, phasor: Complexes, begin: float,
                end: float) -> float | None:
     """Return the mean rate of phi or psi [rad/s] between two indices, None if unknown."""
-    if data.angles is None and np.max(np.abs(np.diff(angle))) > LARGEST_STEP:
+    if data.angles is None and (
+            not phasor.all() or np.max(np.abs(np.diff(angle))) > LARGEST_STEP):
         return None
     # The phasor is smooth where the angle jumps, and slow without its mean rate.
     rate = (angle[-1] - angle[0]) / (len(angle) - 1)
@@ -332,9 +336,10 @@ def measured_regime(top: Top, data: Attitudes) -> str | None:
     if values is None or rate is None:
         return None
     l3, lz = float(np.median(values[1])), float(np.median(values[2]))
-    middle = int(np.argmin(np.abs(data.height - np.median(data.height))))
+    height = data.axis[2]
+    middle = int(np.argmin(np.abs(height - np.median(height))))
     sine = float(abs(data.tip[middle]))
-    theta = math.atan2(sine, data.height[middle])
+    theta = math.atan2(sine, height[middle])
     theta_dot = 2.0 * float(rate[middle]) / sine if sine >= SNAP else 0.0
     natural = math.sqrt(top.lambda1 * max(abs(top.gravity_torque), top.lambda1 * theta_dot ** 2))
     scale = max(abs(l3), abs(lz), natural) * SNAP

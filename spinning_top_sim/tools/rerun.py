@@ -47,9 +47,8 @@ class Rerun:
         self._set_rates({name: value for name, value in run.now.items()
                          if value != run.values[name]})
         if send is not None:
-            names = set(run.topics.values())
             simulation.record_blocks(
-                [stream for stream in simulation.streams if stream.topic in names])
+                [stream for stream in simulation.streams if stream.topic in run.topics])
         self.stamp_ns = run.epoch_ns + simulation.now_ns
 
     def advance(self, end_ns: int) -> Iterator[Event | None]:

@@ -43,7 +43,7 @@ class RunDescription:
     # Commands before that: time [ns], L3 and Lz [kg m^2/s]
     history: Sequence[tuple[int, float, float]]
     surroundings: Mapping[str, str]       # version, platform and libraries
-    topics: Mapping[str, str]             # stream, such as imu/data_raw, by topic of the log
+    topics: Mapping[str, str]             # topic in the log by that of the stream, imu/data_raw
     commands_topic: str | None            # None where the log has none
     events_topic: str | None
     events: Sequence[Event]               # the journal
@@ -66,9 +66,9 @@ def read_run_description(reader: LogReader) -> RunDescription:
     except (KeyError, TypeError, ValueError) as error:
         raise ForeignLogError(f'its metadata {METADATA_NAME!r} cannot be used: '
                               f'{type(error).__name__}: {error}') from error
-    names = _names(reader.topics, now)
-    topics = {name: topic for topic, name in names.items()}
-    commands_topic, events_topic = topics.get(journal.COMMANDS), topics.get(journal.EVENTS)
+    topics = _topics(reader.topics, now)
+    commands_topic, events_topic = topics.pop(journal.COMMANDS, None), topics.pop(
+        journal.EVENTS, None)
     events: list[Event] = []
     broken: list[tuple[int, str]] = []
     for message in () if events_topic is None else reader.messages(topics=[events_topic]):
@@ -76,15 +76,13 @@ def read_run_description(reader: LogReader) -> RunDescription:
             events.append(_event(message.log_time, message.data))
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             broken.append((message.log_time, f'{type(error).__name__}: {error}'))
-    streams = {topic: name for topic, name in names.items()
-               if topic not in (commands_topic, events_topic)}
-    return RunDescription(values, now, epoch_ns, begun_ns, history, surroundings, streams,
+    return RunDescription(values, now, epoch_ns, begun_ns, history, surroundings, topics,
                           commands_topic, events_topic, events, broken)
 
 
-def _names(topics: Sequence[LogTopic], now: Mapping[str, Any]) -> dict[str, str]:
+def _topics(topics: Sequence[LogTopic], now: Mapping[str, Any]) -> dict[str, str]:
     """
-    Return the stream, or the part of the journal, of each topic that is one.
+    Return the topic in the log of each stream and of the parts of the journal.
 
     A log as it was written has them in a known order, whatever they were remapped to.  In a log
     that was put together anew they are known by the ends of their names.
@@ -93,17 +91,15 @@ def _names(topics: Sequence[LogTopic], now: Mapping[str, Any]) -> dict[str, str]
     recorded = [*((stream.topic, stream.type_name)
                   for stream in journal.recorded_streams(every, now)), *journal.TOPICS]
     if [topic.type_name for topic in topics] == [type_name for _, type_name in recorded]:
-        return {topic.name: name for topic, (name, _) in zip(topics, recorded, strict=True)}
-    # The longest first: one name may be the end of another.
-    known = sorted([*((stream.topic, stream.type_name) for stream in every), *journal.TOPICS],
-                   key=lambda pair: -len(pair[0]))
+        return {name: topic.name for topic, (name, _) in zip(topics, recorded, strict=True)}
+    known = [*((stream.topic, stream.type_name) for stream in every), *journal.TOPICS]
     found: dict[str, str] = {}
     for topic in topics:
-        for name, type_name in known:
-            if (type_name == topic.type_name and name not in found.values()
-                    and topic.name.endswith('/' + name.lstrip('~/'))):
-                found[topic.name] = name
-                break
+        names = [name for name, type_name in known
+                 if type_name == topic.type_name and name not in found
+                 and topic.name.endswith('/' + name.lstrip('~/'))]
+        if names:
+            found[max(names, key=len)] = topic.name
     return found
 
 

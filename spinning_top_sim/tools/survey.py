@@ -160,7 +160,7 @@ def survey(reader: LogReader) -> Survey:
     except ForeignLogError as error:
         found.foreign_reason = str(error)
     else:
-        for topic, name in found.run.topics.items():
+        for name, topic in found.run.topics.items():
             found.topics[topic].stream = name
         sections = _find_sections(found, found.run)
     ends_ns = [section.end_ns for section in sections]
@@ -211,15 +211,14 @@ def _section(found: Survey, rerun: Rerun, cause: str, begin_ns: int) -> Section:
     by_name = {stream.topic: copy.copy(stream) for stream in simulation.streams}
     if cause != 'parameters':
         segment, exact = simulation.segment, simulation.describe()
-        topics = {name: topic for topic, name in run.topics.items()}
         period_ns = ((exact and exact.nutation_period) or math.inf) * NANOSECONDS
-        source = max((name for name in SOURCES if name in topics), default=None,
+        source = max((name for name in SOURCES if name in run.topics), default='',
                      key=lambda name: min(period_ns / by_name[name].period_ns, ENOUGH_SAMPLES))
         found.motions.append(Motion(
             cause, begin_ns, begin_ns, simulation.epoch_ns + segment.start_ns, segment, exact,
-            None if source is None else topics[source]))
+            run.topics.get(source)))
     return Section(found.motions[-1], begin_ns, begin_ns, simulation.epoch_ns,
-                   {topic: by_name[name] for topic, name in run.topics.items()},
+                   {topic: by_name[name] for name, topic in run.topics.items()},
                    Imu(simulation.values))
 
 

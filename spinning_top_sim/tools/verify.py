@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import json
+import re
 import struct
 from collections import defaultdict
 from collections.abc import Callable, Mapping
@@ -78,7 +78,7 @@ def verify(reader: LogReader, run: RunDescription, show: Callable[[int], None]) 
     show : takes the log time reached [ns]
     """
     damage = reader.damage
-    topics = {name: topic for topic, name in run.topics.items()}
+    topics = dict(run.topics)
     if run.commands_topic is not None:
         topics[journal.COMMANDS] = run.commands_topic
     verdict = Verdict(not damage.torn and damage.lossless, dict.fromkeys(topics.values(), 0),
@@ -142,23 +142,19 @@ def _difference(stream: Stream | None, logged: bytes,
     if len(logged) != len(computed):
         return ('size', f'{len(logged)} bytes', f'{len(computed)} bytes',
                 min(len(logged), len(computed)))
-    at = next(at for at, (one, two) in enumerate(zip(logged, computed, strict=True)) if one != two)
+    at = next(at for at, pair in enumerate(zip(logged, computed, strict=True))
+              if pair[0] != pair[1])
     place = None if stream is None else stream.template.field_at(at)
-
-    def read(data: bytes) -> str:
-        if place is None:
-            return f'0x{data[at]:02x}'
-        if place[0] < 0:
-            return '{}.{:09d}'.format(*struct.unpack_from('<iI', data, place[2]))
-        return repr(struct.unpack_from('<d', data, place[2])[0])
-
     if stream is None or place is None:
-        name = f'byte {at}'
+        return f'byte {at}', f'0x{logged[at]:02x}', f'0x{computed[at]:02x}', at
+    number, element, offset = place
+    if number < 0:
+        what, code, text = 'header.stamp', '<iI', '{}.{:09d}'
     else:
-        number, element, _ = place
-        name = ('header.stamp' if number < 0 else
-                f'{FIELDS[stream.type_name][number]}[{element}]')
-    return name, read(logged), read(computed), at
+        what, code, text = f'{FIELDS[stream.type_name][number]}[{element}]', '<d', '{!r}'
+    one, two = (text.format(*struct.unpack_from(code, data, offset))
+                for data in (logged, computed))
+    return what, one, two, at
 
 
 def _warnings(run: RunDescription) -> list[str]:
@@ -169,10 +165,8 @@ def _warnings(run: RunDescription) -> list[str]:
 
 
 def _versions(recorded: Mapping[str, str]) -> dict[str, str]:
-    try:
-        numpy_version = str(json.loads(recorded['libraries']).get('numpy'))
-    except ValueError:
-        numpy_version = 'unknown'
     # Of the libraries only numpy computes.
+    numpy_version = re.search('"numpy": "([^"]*)"', recorded['libraries'])
     return {'the version of spinning_top_sim': recorded['version'],
-            'the platform': recorded['platform'], 'numpy': numpy_version}
+            'the platform': recorded['platform'],
+            'numpy': numpy_version[1] if numpy_version else 'unknown'}
