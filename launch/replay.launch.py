@@ -16,7 +16,7 @@ from launch_ros.actions import Node
 from spinning_top_sim.nodes import launch_helpers
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.tools.run_description import ForeignLogError, read_run_description
+from spinning_top_sim.tools.recorded_run import ForeignLogError, read_run_description
 
 SHARE = Path(get_package_share_directory('spinning_top_sim'))
 SWITCH = ['true', 'false']

@@ -232,29 +232,20 @@ def measure(data: Attitudes) -> Measured:
     time is known best, and the tip is far from the poles, where phi may jump.
     """
     low, high, count = _extreme(data, 1.0), _extreme(data, -1.0), len(data.stamps_ns)
-    nutations, period, begin, end = 0, None, 0.0, count - 1.0
-    reason = ''
+    nutations, period, begin, end, reason = 0, None, 0.0, count - 1.0, ''
     if high - low >= RESTS:
         nutations, begin, end = _crossings(data)
-        if nutations:
-            period = (end - begin) / nutations * data.period
-            reason = _unresolved(data, period)
-            period = None if reason else period
-        else:
-            reason = 'not one whole nutation'
+        period = (end - begin) / nutations * data.period if nutations else None
+        reason = 'not one whole nutation' if period is None else _unresolved(data, period)
     precession, spin = (None if reason else _mean_rate(data, angle, phasor, begin, end)
                         for angle, phasor in ((data.phi, data.tip), (data.psi, data.body_tip)))
     if not reason and None in (precession, spin):
         reason = 'phi or psi cannot be unwrapped: a pole, or too few samples in a turn'
     phi_dot = data.phi_dot
-    if phi_dot is not None and np.isnan(phi_dot).any():
-        phi_dot = None
-    return Measured(
-        samples=count, nutations=nutations, nutation_period=period, theta_min=low,
-        theta_max=high, mean_precession_rate=precession, mean_spin_rate=spin,
-        precession_min=None if phi_dot is None else float(np.min(phi_dot)),
-        precession_max=None if phi_dot is None else float(np.max(phi_dot)),
-        missing=(reason,) if reason else ())
+    extremes = [] if phi_dot is None else [float(np.min(phi_dot)), float(np.max(phi_dot))]
+    slowest, fastest = extremes if np.isfinite(extremes).all() and extremes else (None, None)
+    return Measured(count, nutations, None if reason else period, low, high, precession, spin,
+                    slowest, fastest, (reason,) if reason else ())
 
 
 def _extreme(data: Attitudes, sign: float) -> float:

@@ -166,14 +166,14 @@ def _accuracy_panels(figure: Figure, grid: GridSpec, found: Survey) -> None:
     for series, style, colour, label in zip(
             found.drifts.get(drift_topic, {}).values(), ('-', '--', ':'), COLOURS,
             ('E', '$L_3$', '$L_z$'), strict=False):
-        drift.plot((series.times_ns - begin_ns) * 1e-9, series.values, style, color=colour,
-                   linewidth=1.0, label=label)
+        stamps_ns, values = series.points
+        drift.plot((stamps_ns - begin_ns) * 1e-9, values, style, color=colour, linewidth=1.0,
+                   label=label)
     if drift_topic:
         _legend(drift)
     if error_topic:
-        series = found.errors[error_topic]
-        error.plot((series.times_ns - begin_ns) * 1e-9, series.values, color=COLOURS[2],
-                   linewidth=1.0)
+        stamps_ns, values = found.errors[error_topic].points
+        error.plot((stamps_ns - begin_ns) * 1e-9, values, color=COLOURS[2], linewidth=1.0)
         error.set_ylim(bottom=0.0)
     if len(found.motions) <= MOST_MARKS:
         for motion in found.motions[1:]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from spinning_top_sim.recording.damage import count, seconds
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools.cli import Table
-from spinning_top_sim.tools.run_description import RunDescription
+from spinning_top_sim.tools.recorded_run import RunDescription
 from spinning_top_sim.tools.survey import Motion, Survey
 from spinning_top_sim.tools.verify import Verdict
 

@@ -28,9 +28,10 @@ from spinning_top_sim.streams.segment import Segment
 from spinning_top_sim.streams.topics import Stream
 from spinning_top_sim.tools import analysis
 from spinning_top_sim.tools.analysis import Attitudes, Measured
-from spinning_top_sim.tools.rerun import DepartureError, Rerun
-from spinning_top_sim.tools.run_description import (
+from spinning_top_sim.tools.recorded_run import (
+    DepartureError,
     ForeignLogError,
+    Rerun,
     RunDescription,
     read_run_description,
 )
@@ -63,28 +64,25 @@ class TopicReport:
 
 
 class Series:
-    """Statistics of a long series of numbers, and at most MOST_POINTS points of it."""
+    """Statistics of a long series of numbers, and `points`: at most MOST_POINTS of it."""
 
     def __init__(self) -> None:
-        self.times_ns: NDArray[np.int64] = np.empty(0, np.int64)
-        self.values: NDArray[np.float64] = np.empty(0)
-        self.largest = 0.0
-        self._square_sum, self._count = 0.0, 0
+        self.points = np.empty((2, 0))      # log times [ns], values
+        self.largest = self._square_sum = 0.0
+        self._count = 0
 
     def add(self, times_ns: NDArray[np.int64], values: NDArray[np.float64]) -> None:
         """Append values, without those that are not finite."""
-        good = np.isfinite(values)
-        times_ns, values = times_ns[good], values[good]
-        self.largest = max(self.largest, float(np.max(np.abs(values), initial=0.0)))
-        self._square_sum += float(np.sum(values * values))
-        self._count += len(values)
-        self.times_ns = np.concatenate((self.times_ns, times_ns))
-        self.values = np.concatenate((self.values, values))
-        while len(self.values) > MOST_POINTS:
+        points = np.stack((times_ns, values))[:, np.isfinite(values)]
+        sizes = np.abs(points[1])
+        self.largest = max(self.largest, float(np.max(sizes, initial=0.0)))
+        self._square_sum += float(sizes @ sizes)
+        self._count += len(sizes)
+        self.points = np.concatenate((self.points, points), axis=1)
+        while self.points.shape[1] > MOST_POINTS:
             # Of two neighbours the larger one.
-            pairs = self.values[:len(self.values) // 2 * 2].reshape(-1, 2)
-            pick = 2 * np.arange(len(pairs)) + np.argmax(np.abs(pairs), axis=1)
-            self.times_ns, self.values = self.times_ns[pick], self.values[pick]
+            pairs = np.abs(self.points[1, :self.points.shape[1] // 2 * 2]).reshape(-1, 2)
+            self.points = self.points[:, 2 * np.arange(len(pairs)) + np.argmax(pairs, axis=1)]
 
     @property
     def rms(self) -> float:

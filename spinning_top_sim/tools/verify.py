@@ -16,8 +16,7 @@ from spinning_top_sim.recording.provenance import surroundings
 from spinning_top_sim.recording.reader import LogMessage, LogReader
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.topics import Stream
-from spinning_top_sim.tools.rerun import DepartureError, Rerun
-from spinning_top_sim.tools.run_description import RunDescription
+from spinning_top_sim.tools.recorded_run import DepartureError, Rerun, RunDescription
 
 # Names in the message definition of the arrays of numbers in a template, in their order.
 FIELDS = {

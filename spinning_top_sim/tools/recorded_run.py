@@ -1,24 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The run of a log, from its metadata and journal: enough to compute it again."""
+"""The run of a log: what metadata and journal say about it, and how it is computed again."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.writer import METADATA_NAME
+from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.all_streams import all_streams
 from spinning_top_sim.streams.cdr import ENCAPSULATION
+from spinning_top_sim.streams.pipeline import Rows, Simulation
+from spinning_top_sim.streams.schedule import NEVER_NS, offline_block_ns, offline_targets
 
 EVENT_NAMES = ('start', 'command', 'parameters', 'reset')
 
 
 class ForeignLogError(Exception):
     """A log lacks what is needed to compute its run again; the text says what."""
+
+
+class DepartureError(Exception):
+    """The computation cannot follow the journal; the text says where."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +47,7 @@ class RunDescription:
     now: Mapping[str, Any]                # and when the recording began
     epoch_ns: int                         # stamp of t = 0 [ns]
     begun_ns: int                         # simulated time at which the recording began [ns]
-    # Commands before that: time [ns], L3 and Lz [kg m^2/s]
-    history: Sequence[tuple[int, float, float]]
+    history: Sequence[Event]              # commands before that
     surroundings: Mapping[str, str]       # version, platform and libraries
     topics: Mapping[str, str]             # topic in the log by that of the stream, imu/data_raw
     commands_topic: str | None            # None where the log has none
@@ -60,15 +66,15 @@ def read_run_description(reader: LogReader) -> RunDescription:
         values, now = (parameters.checked(json.loads(metadata[key]))
                        for key in ('parameters', 'parameters_now'))
         epoch_ns, begun_ns = int(metadata['epoch_ns']), int(metadata['begun_ns'])
-        history = [(int(t_ns), float(l3), float(lz))
+        history = [Event('command', epoch_ns + t_ns, t_ns, t_ns, {'l3': l3, 'lz': lz})
                    for t_ns, l3, lz in json.loads(metadata['history'])]
         surroundings = {key: metadata[key] for key in ('version', 'platform', 'libraries')}
     except (KeyError, TypeError, ValueError) as error:
         raise ForeignLogError(f'its metadata {METADATA_NAME!r} cannot be used: '
                               f'{type(error).__name__}: {error}') from error
     topics = _topics(reader.topics, now)
-    commands_topic, events_topic = topics.pop(journal.COMMANDS, None), topics.pop(
-        journal.EVENTS, None)
+    commands_topic = topics.pop(journal.COMMANDS, None)
+    events_topic = topics.pop(journal.EVENTS, None)
     events: list[Event] = []
     broken: list[tuple[int, str]] = []
     for message in () if events_topic is None else reader.messages(topics=[events_topic]):
@@ -113,3 +119,92 @@ def _event(stamp_ns: int, data: bytes) -> Event:
     if name not in EVENT_NAMES:
         raise ValueError(f'event {name!r} is unknown')
     return Event(name, stamp_ns, t_ns, sent_ns, details)
+
+
+class Rerun:
+    """
+    The run of a log, computed again.
+
+    send : takes the samples of the log's streams in blocks; without it only motions are computed
+    simulation : at the time that `advance` has reached, in the beginning that of the recording
+    stamp_ns : log time up to which all samples have been sent [ns]
+
+    Raises DepartureError where there is no motion with these parameters and commands.
+    """
+
+    def __init__(self, run: RunDescription, send: Rows | None = None) -> None:
+        self.run, self._send = run, send
+        self._stopped = False       # the equations could not go on
+        try:
+            self.simulation = simulation = Simulation(run.values, run.epoch_ns)
+        except (ValueError, IntegrationError) as error:
+            raise DepartureError(str(error)) from error
+        for event in run.history:
+            self._reach(event.t_ns)
+            self._apply(event)
+        if send is not None:
+            self._reach(run.begun_ns)
+        # -1: commands before the first sample.
+        simulation.now_ns = -1 if run.begun_ns < 0 else max(run.begun_ns, simulation.now_ns)
+        self._set_rates({name: value for name, value in run.now.items()
+                         if value != run.values[name]})
+        if send is not None:
+            simulation.record_blocks(
+                [stream for stream in simulation.streams if stream.topic in run.topics])
+        self.stamp_ns = run.epoch_ns + simulation.now_ns
+
+    def advance(self, end_ns: int) -> Iterator[Event | None]:
+        """
+        Go on to a log time; yield each event when it has been applied, and None after a block.
+
+        Raises DepartureError where an event cannot be applied.
+        """
+        simulation = self.simulation
+        for event in (*self.run.events, None):
+            if event is not None and event.name == 'start':
+                continue
+            stop_ns = end_ns - simulation.epoch_ns if event is None else event.sent_ns
+            block_ns = NEVER_NS if self._send is None else offline_block_ns(
+                [stream for stream in simulation.streams if stream.has_sinks])
+            for target_ns, item in offline_targets(
+                    max(simulation.now_ns, 0), [(stop_ns, event)], block_ns):
+                # Without samples states are only needed where a command finds them.
+                if self._send is not None or (item is not None and item.name == 'command'):
+                    self._reach(target_ns)
+                self.stamp_ns = simulation.epoch_ns + target_ns
+                if item is not None:
+                    simulation.now_ns = target_ns
+                    self._apply(item)
+                yield item
+
+    def _reach(self, target_ns: int) -> None:
+        """Compute, and send, the samples up to a time, as far as the equations go."""
+        if not self._stopped:
+            try:
+                self.simulation.advance_in_blocks(target_ns, self._send or (lambda *_: None))
+            except IntegrationError:
+                self._stopped = True
+
+    def _apply(self, event: Event) -> None:
+        details = event.details
+        try:
+            if event.name == 'command':
+                self.simulation.command(details['l3'], details['lz'])
+                applied_ns = self.simulation.history[-1][0]
+                if applied_ns != event.t_ns:
+                    raise ValueError(f'applied at {applied_ns} ns')
+            elif event.name == 'parameters':
+                self._set_rates(details)
+            else:
+                self.simulation.restart(parameters.checked(details['parameters']))
+                self.simulation.epoch_ns = int(details['epoch_ns'])
+                self._stopped = False
+        except (KeyError, TypeError, ValueError, IntegrationError) as error:
+            raise DepartureError(f'{event.name} at t = {event.t_ns} ns: '
+                                 f'{type(error).__name__}: {error}') from error
+
+    def _set_rates(self, changed: Mapping[str, Any]) -> None:
+        for stream in self.simulation.streams:
+            name = f'{stream.parameter}.rate'
+            if name in changed:
+                stream.set_rate(parameters.BY_NAME[name].check(changed[name]))
