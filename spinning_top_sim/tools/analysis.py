@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -15,7 +13,6 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.attitude import Quaternion
 from spinning_top_sim.physics.regimes import regime
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.streams.imu import Imu
@@ -39,25 +36,49 @@ LARGEST_STEP = 2.5
 SNAP = 1e-9
 
 
-@dataclass
 class Attitudes:
     """
-    Samples of the body's attitude, in order of time.
+    Samples of the body's attitude, in order of time, and what follows from each.
 
     stamps_ns : (n,) log times [ns]
     rows : (4, n) q(world <- body) as x, y, z, w; below it, if the log has them, (3, n) angular
         velocity in the body frame [rad/s], or (6, n) phi, theta, psi and their rates
+    cos2, sin2 : (n,) squares, of theta/2: the smaller keeps the digits near a pole
+    height : (n,) cos(theta)
+    tip, body_tip : (n,) sin(theta) exp(i phi) and sin(theta) exp(i psi)
+    phi, psi : (n,) [rad], unwrapped if the log does not count turns
+    up, omega : vertical and angular velocity [rad/s] in a frame whose z is the axis
+    phi_dot, sin2_rate : (n,) rates of phi and sin2 [1/s]; like omega None where the log has none
     """
 
-    stamps_ns: NDArray[np.int64]
-    rows: Reals
+    def __init__(self, stamps_ns: NDArray[np.int64], rows: Reals) -> None:
+        self.stamps_ns, self.rows = stamps_ns, rows
+        x, y, z, w = self.quaternion = tuple(rows[:4])
+        self.cos2, self.sin2 = attitude.half_angle_squares((x, y, z, w))
+        tip_x, tip_y, self.height = attitude.axis_in_world((x, y, z, w))
+        self.up = attitude.vertical_in_body((x, y, z, w))
+        self.tip, self.body_tip = tip_x + 1j * tip_y, -self.up[0] + 1j * self.up[1]
+        self.omega = tuple(rows[4:]) or None
+        self.phi_dot = self.sin2_rate = None
+        self.counts_turns = len(rows) == 10
+        if self.counts_turns:
+            self.phi, theta, self.psi, self.phi_dot, theta_dot, psi_dot = rows[4:]
+            sine, cosine = np.sin(theta), np.cos(theta)
+            # In the frame that does not spin.
+            self.up = -sine, 0.0 * sine, cosine
+            self.omega = -self.phi_dot * sine, theta_dot, psi_dot + self.phi_dot * cosine
+        else:
+            self.phi, self.psi = (np.unwrap(np.angle(tip)) for tip in (self.tip, self.body_tip))
+        if self.omega is not None:
+            (one, two, _), (up_1, up_2, _) = self.omega, self.up
+            self.sin2_rate = 0.5 * (up_2 * one - up_1 * two)
+            if self.phi_dot is None:
+                with np.errstate(invalid='ignore'):     # NaN at a pole
+                    self.phi_dot = (one * up_1 + two * up_2) / (up_1 ** 2 + up_2 ** 2)
 
-    def part(self, piece: slice | NDArray[np.bool_]) -> Attitudes:
+    def part(self, piece: slice) -> Attitudes:
+        """Return some of the samples."""
         return Attitudes(self.stamps_ns[piece], self.rows[:, piece])
-
-    def first(self, seconds: float) -> Attitudes:
-        """Return the samples of the first seconds, two at least."""
-        return self.part(slice(max(2, int(np.searchsorted(self.time, seconds, 'right')))))
 
     @property
     def time(self) -> Reals:
@@ -69,77 +90,19 @@ class Attitudes:
         """Mean time between two samples [s]."""
         return float(self.time[-1]) / (len(self.time) - 1)
 
-    @property
-    def quaternion(self) -> Quaternion:
-        x, y, z, w = self.rows[:4]
-        return x, y, z, w
+    def first(self, seconds: float) -> Attitudes:
+        """Return the samples of the first seconds, two at least."""
+        return self.part(slice(max(2, int(np.searchsorted(self.time, seconds, 'right')))))
 
-    @property
-    def angles(self) -> Reals | None:
-        """phi, theta, psi and their rates (6, n), as the log has them [rad], [rad/s]."""
-        return self.rows[4:] if len(self.rows) == 10 else None
-
-    @cached_property
-    def vertical_and_rates(self) -> tuple[Sequence[Reals], Sequence[Reals]] | None:
-        """Upward vertical and angular velocity [rad/s] in one frame whose z is the axis."""
-        if self.angles is not None:     # in that frame which does not spin
-            _, theta, _, phi_dot, theta_dot, psi_dot = self.angles
-            sine, cosine = np.sin(theta), np.cos(theta)
-            return ((-sine, np.zeros_like(sine), cosine),
-                    (-phi_dot * sine, theta_dot, psi_dot + phi_dot * cosine))
-        if len(self.rows) == 4:
+    def constants(self, top: Top) -> tuple[Reals, Reals, Reals] | None:
+        """Return E [J], L3 and Lz [kg m^2/s] in each sample (n,); None without rates."""
+        if self.omega is None:
             return None
-        return attitude.vertical_in_body(self.quaternion), tuple(self.rows[4:])
-
-    @cached_property
-    def half_angle_squares(self) -> tuple[Reals, Reals]:
-        """cos^2 and sin^2 of theta/2: the smaller keeps the digits near a pole."""
-        return attitude.half_angle_squares(self.quaternion)
-
-    @cached_property
-    def axis(self) -> tuple[Reals, Reals, Reals]:
-        """The symmetry axis in the world frame."""
-        return attitude.axis_in_world(self.quaternion)
-
-    @property
-    def tip(self) -> Complexes:
-        """Tip of the axis as x + iy: sin(theta) exp(i phi)."""
-        return self.axis[0] + 1j * self.axis[1]
-
-    @property
-    def body_tip(self) -> Complexes:
-        """sin(theta) exp(i psi)."""
-        x, y, _ = attitude.vertical_in_body(self.quaternion)
-        return -x + 1j * y
-
-    @property
-    def phi(self) -> Reals:
-        """Precession angle, unwrapped [rad]."""
-        return np.unwrap(np.angle(self.tip)) if self.angles is None else self.angles[0]
-
-    @property
-    def psi(self) -> Reals:
-        """Spin angle, unwrapped [rad]."""
-        return np.unwrap(np.angle(self.body_tip)) if self.angles is None else self.angles[2]
-
-    @property
-    def phi_dot(self) -> Reals | None:
-        """Precession rate [rad/s]; NaN at a pole where the log has no angles."""
-        if self.angles is not None:
-            return self.angles[3]
-        if self.vertical_and_rates is None:
-            return None
-        up, omega = self.vertical_and_rates
-        with np.errstate(invalid='ignore'):
-            return (omega[0] * up[0] + omega[1] * up[1]) / (up[0] ** 2 + up[1] ** 2)
-
-    @property
-    def sin2_half_rate(self) -> Reals | None:
-        """Rate of sin^2(theta/2) [1/s]: theta' sin(theta)/2."""
-        if self.vertical_and_rates is None:
-            return None
-        up, omega = self.vertical_and_rates
-        return 0.5 * (up[1] * omega[0] - up[0] * omega[1])
+        (one, two, spin), (up_1, up_2, height) = self.omega, self.up
+        l3 = top.lambda3 * spin
+        return (0.5 * top.lambda1 * (one ** 2 + two ** 2) + 0.5 * l3 * spin
+                + top.gravity_torque * height,
+                l3, top.lambda1 * (one * up_1 + two * up_2) + l3 * height)
 
 
 def attitudes_of(name: str, imu: Imu, stamps_ns: NDArray[np.int64],
@@ -162,7 +125,7 @@ def attitudes_of(name: str, imu: Imu, stamps_ns: NDArray[np.int64],
     norm = np.linalg.norm(columns[:4], axis=0)
     valid = np.isfinite(norm) & (norm > 0.0)
     columns[:4, valid] /= norm[valid]
-    return Attitudes(stamps_ns, columns).part(valid)
+    return Attitudes(stamps_ns[valid], columns[:, valid])
 
 
 def longest_run(parts: list[Attitudes]) -> Attitudes:
@@ -173,17 +136,6 @@ def longest_run(parts: list[Attitudes]) -> Attitudes:
     cuts = np.array([0, *(np.flatnonzero(np.diff(steps)) + 1), len(steps)])
     longest = int(np.argmax(np.diff(cuts)))
     return data.part(slice(cuts[longest], cuts[longest + 1] + 1))
-
-
-def constants(top: Top, data: Attitudes) -> tuple[Reals, Reals, Reals] | None:
-    """Return E [J], L3 and Lz [kg m^2/s] in each sample (n,); None where there are no rates."""
-    if data.vertical_and_rates is None:
-        return None
-    up, omega = data.vertical_and_rates
-    l3 = top.lambda3 * omega[2]
-    energy = (0.5 * top.lambda1 * (omega[0] ** 2 + omega[1] ** 2) + 0.5 * l3 * omega[2]
-              + top.gravity_torque * up[2])
-    return energy, l3, top.lambda1 * (omega[0] * up[0] + omega[1] * up[1]) + l3 * up[2]
 
 
 def interpolate(values: NDArray[Number], at: Reals) -> NDArray[Number]:
@@ -250,11 +202,10 @@ def measure(data: Attitudes) -> Measured:
 
 def _extreme(data: Attitudes, sign: float) -> float:
     """Return the least (sign 1) or greatest (-1) tilt, also between samples [rad]."""
-    cos2, sin2 = data.half_angle_squares
-    index = int(np.argmin(sign * sin2))
+    index = int(np.argmin(sign * data.sin2))
     # Of the two squares the smaller one: it keeps the digits of a small angle.
-    near_top = bool(sin2[index] < 0.5)
-    square, sign = (sin2, sign) if near_top else (cos2, -sign)
+    near_top = bool(data.sin2[index] < 0.5)
+    square, sign = (data.sin2, sign) if near_top else (data.cos2, -sign)
     extreme = float(square[index])
     if 0 < index < len(square) - 1 and len(square) >= POINTS:
         found = minimize_scalar(
@@ -273,8 +224,7 @@ def _value(values: Reals, at: float) -> float:
 def _crossings(data: Attitudes) -> tuple[int, float, float]:
     """Return how many whole nutations there are, and the indices at which they begin and end."""
     # Both rise with the axis; the smaller one keeps the digits of a small angle.
-    cos2, sin2 = data.half_angle_squares
-    values = -sin2 if np.mean(sin2) < 0.5 else cos2
+    values = -data.sin2 if np.mean(data.sin2) < 0.5 else data.cos2
     middle = 0.5 * (float(np.min(values)) + float(np.max(values)))
     rising = np.flatnonzero((values[:-1] < middle) & (values[1:] >= middle))
     if len(rising) < 2:
@@ -286,13 +236,12 @@ def _crossings(data: Attitudes) -> tuple[int, float, float]:
 
 def _unresolved(data: Attitudes, period: float) -> str:
     """Return why the samples are too few for a nutation, '' if they are not."""
-    rate, count = data.sin2_half_rate, len(data.stamps_ns)
+    rate, count = data.sin2_rate, len(data.stamps_ns)
     if rate is not None and count > POINTS:
         # Too few samples show a slower nutation, whose rate is not the one in the data.
         at = np.linspace(POINTS // 2, count - POINTS // 2 - 1, 200).astype(int)
         step = 1e-3
-        ahead, behind = (interpolate(data.half_angle_squares[1], at + sign * step)
-                         for sign in (1, -1))
+        ahead, behind = (interpolate(data.sin2, at + sign * step) for sign in (1, -1))
         difference = (ahead - behind) / (2.0 * step * data.period) - rate[at]
         if np.max(np.abs(difference)) > RATE_TOLERANCE * np.max(np.abs(rate)):
             return ('a nutation takes only a few samples: '
@@ -304,7 +253,7 @@ def _unresolved(data: Attitudes, period: float) -> str:
 def _mean_rate(data: Attitudes, angle: Reals, phasor: Complexes, begin: float,
                end: float) -> float | None:
     """Return the mean rate of phi or psi [rad/s] between two indices, None if unknown."""
-    if data.angles is None and (
+    if not data.counts_turns and (
             not phasor.all() or np.max(np.abs(np.diff(angle))) > LARGEST_STEP):
         return None
     # The phasor is smooth where the angle jumps, and slow without its mean rate.
@@ -323,14 +272,13 @@ def measured_regime(top: Top, data: Attitudes) -> str | None:
 
     A motion that differs from a special one by less than SNAP is taken for it.
     """
-    values, rate = constants(top, data), data.sin2_half_rate
+    values, rate = data.constants(top), data.sin2_rate
     if values is None or rate is None:
         return None
     l3, lz = float(np.median(values[1])), float(np.median(values[2]))
-    height = data.axis[2]
-    middle = int(np.argmin(np.abs(height - np.median(height))))
+    middle = int(np.argmin(np.abs(data.height - np.median(data.height))))
     sine = float(abs(data.tip[middle]))
-    theta = math.atan2(sine, height[middle])
+    theta = math.atan2(sine, data.height[middle])
     theta_dot = 2.0 * float(rate[middle]) / sine if sine >= SNAP else 0.0
     natural = math.sqrt(top.lambda1 * max(abs(top.gravity_torque), top.lambda1 * theta_dot ** 2))
     scale = max(abs(l3), abs(lz), natural) * SNAP

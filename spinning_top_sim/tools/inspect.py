@@ -79,24 +79,22 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _draw(arguments: argparse.Namespace, found: Survey) -> bool:
     """Draw the pictures that are asked for; return whether that worked."""
-    if found.shown is None:
-        print_line('inspect: nothing to draw: no attitude of a top in this log', sys.stderr)
-        return False
     try:
+        if found.shown is None:
+            raise ValueError('nothing to draw: no attitude of a top in this log')
         from spinning_top_sim.tools import plots  # noqa: PLC0415
-    except ImportError as error:
-        print_line("inspect: pictures need matplotlib: pip install 'spinning_top_sim[plot]', or "
-                   f'apt install python3-matplotlib ({error})', sys.stderr)
-        return False
-    try:
+
         if arguments.plot is not None:
             plots.draw_page(found, arguments.plot, arguments.log.name)
         if arguments.animate is not None:
             plots.animate(found, arguments.animate)
+        return True
+    except ImportError as error:
+        print_line("inspect: pictures need matplotlib: pip install 'spinning_top_sim[plot]', or "
+                   f'apt install python3-matplotlib ({error})', sys.stderr)
     except (OSError, ValueError) as error:
         print_line(f'inspect: {error}', sys.stderr)
-        return False
-    return True
+    return False
 
 
 if __name__ == '__main__':

@@ -74,7 +74,7 @@ def smooth_tip(data: Attitudes) -> tuple[Reals, Complexes, Reals]:
     """Return time [s], tip (x + iy) and height of the axis, with points between the samples."""
     last = len(data.stamps_ns) - 1
     at = np.linspace(0.0, last, last * FINER + 1)
-    return at * data.period, interpolate(data.tip, at), interpolate(data.axis[2], at)
+    return at * data.period, interpolate(data.tip, at), interpolate(data.height, at)
 
 
 def draw_page(found: Survey, path: Path, name: str) -> None:
@@ -214,7 +214,7 @@ def animate(found: Survey, path: Path) -> None:
     at = np.arange(frames) / (FRAMES_PER_S * data.period)
     spin = np.interp(at, np.arange(len(data.psi)), data.psi)
     trace = np.linspace(0.0, at[-1], frames * FINER)
-    tip, height = interpolate(data.tip, trace), interpolate(data.axis[2], trace)
+    tip, height = interpolate(data.tip, trace), interpolate(data.height, trace)
     lowest = -0.9 if np.min(height) > -0.2 else -1.25
     figure = Figure(figsize=(FRAME_SIZE, FRAME_SIZE), dpi=FRAME_DPI)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))

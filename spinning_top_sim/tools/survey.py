@@ -240,7 +240,7 @@ def _analyse(found: Survey, section: Section, topic: str, samples: list[LogMessa
         return
     if topic == motion.source:
         motion.samples.append(data)
-    values = analysis.constants(segment.solver.top, data)
+    values = data.constants(segment.solver.top)
     if values is not None and stream.topic != 'imu/data':       # which is noisy
         drifts = found.drifts.setdefault(
             topic, {name: Series() for name in ('energy', 'l3', 'lz')})

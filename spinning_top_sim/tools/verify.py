@@ -3,17 +3,18 @@
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.recording.provenance import surroundings
-from spinning_top_sim.recording.reader import LogMessage, LogReader
+from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.topics import Stream
 from spinning_top_sim.tools.recorded_run import DepartureError, Rerun, RunDescription
@@ -77,59 +78,55 @@ def verify(reader: LogReader, run: RunDescription, show: Callable[[int], None]) 
     show : takes the log time reached [ns]
     """
     damage = reader.damage
-    topics = dict(run.topics)
-    if run.commands_topic is not None:
-        topics[journal.COMMANDS] = run.commands_topic
-    verdict = Verdict(not damage.torn and damage.lossless, dict.fromkeys(topics.values(), 0),
-                      warnings=_warnings(run))
+    topics = [*run.topics.values(), run.commands_topic]
+    verdict = Verdict(not damage.torn and damage.lossless,
+                      {topic: 0 for topic in topics if topic is not None}, warnings=_warnings(run))
     for stamp_ns, reason in run.broken:
         verdict.different += 1
         verdict.note(run.events_topic or '', stamp_ns, 'entry', reason, 'an entry of the journal')
-    # What is not in the log yet, by topic and stamp: several commands may have the same.
-    computed: defaultdict[tuple[str, int], list[bytes]] = defaultdict(list)
+    # What has not been met in the log, by topic and stamp: several commands may have the same.
+    computed: defaultdict[tuple[str, int], list[tuple[Stream | None, bytes]]] = defaultdict(list)
 
     def take(stream: Stream, stamps_ns: NDArray[np.int64], rows: NDArray[np.uint8]) -> None:
-        topic, size, data = topics[stream.topic], rows.shape[1], rows.tobytes()
+        topic, size, data = run.topics[stream.topic], rows.shape[1], rows.tobytes()
         for number, stamp_ns in enumerate(stamps_ns[stamps_ns <= damage.end_ns].tolist()):
-            computed[topic, stamp_ns].append(data[number * size:(number + 1) * size])
+            computed[topic, stamp_ns].append((stream, data[number * size:(number + 1) * size]))
 
-    def compare(message: LogMessage) -> None:
-        expected = computed[message.topic, message.log_time]
-        if not expected:
-            verdict.unexpected += 1
-            verdict.note(message.topic, message.log_time, 'message', 'there', 'no such message')
-        else:
-            verdict.compared[message.topic] += 1
-            if message.data != expected[0]:
-                verdict.different += 1
-                stream = next((stream for stream in rerun.simulation.streams
-                               if topics.get(stream.topic) == message.topic), None)
-                verdict.note(message.topic, message.log_time,
-                             *_difference(stream, message.data, expected[0]))
-            del expected[0]
-        if not expected:
-            del computed[message.topic, message.log_time]
-
-    messages = reader.messages(topics=topics.values())
+    messages = reader.messages(topics=verdict.compared)
     message = next(messages, None)
+
+    def compare(before_ns: float) -> None:
+        nonlocal message
+        while message is not None and message.log_time < before_ns:
+            key = message.topic, message.log_time
+            if key in computed:
+                stream, expected = computed[key].pop(0)
+                if not computed[key]:
+                    del computed[key]
+                verdict.compared[message.topic] += 1
+                if message.data != expected:
+                    verdict.different += 1
+                    what, logged, value, byte = _difference(stream, message.data, expected)
+                    verdict.note(*key, what, logged, value, byte)
+            else:
+                verdict.unexpected += 1
+                verdict.note(*key, 'message', 'there', 'no such message')
+            message = next(messages, None)
+
     try:
         rerun = Rerun(run, take)
         for event in rerun.advance(damage.end_ns):
             show(rerun.stamp_ns)
             if event is not None and event.name == 'command' and run.commands_topic is not None:
                 computed[run.commands_topic, event.stamp_ns].append(
-                    journal.command(event.details['l3'], event.details['lz']))
-            # Those of this very time may not all be computed.
-            while message is not None and message.log_time < rerun.stamp_ns:
-                compare(message)
-                message = next(messages, None)
+                    (None, journal.command(event.details['l3'], event.details['lz'])))
+            # Another command at this very time may follow.
+            compare(rerun.stamp_ns)
     except DepartureError as error:
         verdict.stopped = str(error)
-    while message is not None:
-        compare(message)
-        message = next(messages, None)
-    for (topic, stamp_ns), expected in computed.items():
-        verdict.missing += len(expected)
+    compare(math.inf)
+    for (topic, stamp_ns), left in computed.items():
+        verdict.missing += len(left)
         if verdict.whole:
             verdict.note(topic, stamp_ns, 'message', 'no such message', 'there')
     return verdict
@@ -158,14 +155,10 @@ def _difference(stream: Stream | None, logged: bytes,
 
 def _warnings(run: RunDescription) -> list[str]:
     """Return the differences of this machine from that of the recording."""
-    then, now = _versions(run.surroundings), _versions(surroundings())
-    return [f'{what} was {then[what]}, is {now[what]}' for what in now
-            if then[what] != now[what]]
-
-
-def _versions(recorded: Mapping[str, str]) -> dict[str, str]:
-    # Of the libraries only numpy computes.
-    numpy_version = re.search('"numpy": "([^"]*)"', recorded['libraries'])
-    return {'the version of spinning_top_sim': recorded['version'],
-            'the platform': recorded['platform'],
-            'numpy': numpy_version[1] if numpy_version else 'unknown'}
+    then, now = (
+        {'the version of spinning_top_sim': recorded['version'],
+         'the platform': recorded['platform'],
+         # Of the libraries only numpy computes.
+         'numpy': ''.join(re.findall('"numpy": "([^"]*)"', recorded['libraries'])) or 'unknown'}
+        for recorded in (run.surroundings, surroundings()))
+    return [f'{what} was {then[what]}, is {now[what]}' for what in now if then[what] != now[what]]
