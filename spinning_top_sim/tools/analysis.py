@@ -76,10 +76,6 @@ class Attitudes:
                 with np.errstate(invalid='ignore'):     # NaN at a pole
                     self.phi_dot = (one * up_1 + two * up_2) / (up_1 ** 2 + up_2 ** 2)
 
-    def part(self, piece: slice) -> Attitudes:
-        """Return some of the samples."""
-        return Attitudes(self.stamps_ns[piece], self.rows[:, piece])
-
     @property
     def time(self) -> Reals:
         """Since the first sample [s]."""
@@ -92,7 +88,8 @@ class Attitudes:
 
     def first(self, seconds: float) -> Attitudes:
         """Return the samples of the first seconds, two at least."""
-        return self.part(slice(max(2, int(np.searchsorted(self.time, seconds, 'right')))))
+        count = max(2, int(np.searchsorted(self.time, seconds, 'right')))
+        return Attitudes(self.stamps_ns[:count], self.rows[:, :count])
 
     def constants(self, top: Top) -> tuple[Reals, Reals, Reals] | None:
         """Return E [J], L3 and Lz [kg m^2/s] in each sample (n,); None without rates."""
@@ -128,14 +125,15 @@ def attitudes_of(name: str, imu: Imu, stamps_ns: NDArray[np.int64],
     return Attitudes(stamps_ns[valid], columns[:, valid])
 
 
-def longest_run(parts: list[Attitudes]) -> Attitudes:
-    """Return the longest part without gaps, at one rate, of consecutive samples of a topic."""
-    data = Attitudes(np.concatenate([part.stamps_ns for part in parts]),
-                     np.concatenate([part.rows for part in parts], axis=1))
-    steps = np.diff(data.stamps_ns)
+def longest_run(blocks: list[tuple[NDArray[np.int64], Reals]]) -> Attitudes:
+    """Return the longest part without gaps, at one rate, of blocks of stamps and rows."""
+    stamps_ns = np.concatenate([stamps_ns for stamps_ns, _ in blocks])
+    rows = np.concatenate([rows for _, rows in blocks], axis=1)
+    steps = np.diff(stamps_ns)
     cuts = np.array([0, *(np.flatnonzero(np.diff(steps)) + 1), len(steps)])
     longest = int(np.argmax(np.diff(cuts)))
-    return data.part(slice(cuts[longest], cuts[longest + 1] + 1))
+    part = slice(cuts[longest], cuts[longest + 1] + 1)
+    return Attitudes(stamps_ns[part], rows[:, part])
 
 
 def interpolate(values: NDArray[Number], at: Reals) -> NDArray[Number]:

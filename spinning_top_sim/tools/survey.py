@@ -27,7 +27,7 @@ from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.segment import Segment
 from spinning_top_sim.streams.topics import Stream
 from spinning_top_sim.tools import analysis
-from spinning_top_sim.tools.analysis import Attitudes, Measured
+from spinning_top_sim.tools.analysis import Attitudes, Measured, Reals
 from spinning_top_sim.tools.recorded_run import (
     DepartureError,
     ForeignLogError,
@@ -71,7 +71,7 @@ class Series:
         self.largest = self._square_sum = 0.0
         self._count = 0
 
-    def add(self, times_ns: NDArray[np.int64], values: NDArray[np.float64]) -> None:
+    def add(self, times_ns: NDArray[np.int64], values: Reals) -> None:
         """Append values, without those that are not finite."""
         points = np.stack((times_ns, values))[:, np.isfinite(values)]
         sizes = np.abs(points[1])
@@ -101,7 +101,8 @@ class Motion:
     segment: Segment                      # its constants and its exact solution
     exact: Description | None             # None where the closed form cannot hold it
     source: str | None                    # topic that measures it best
-    samples: list[Attitudes] = field(default_factory=list)      # of this topic
+    # Of this topic: log times (n,) [ns], and `Attitudes.rows`
+    samples: list[tuple[NDArray[np.int64], Reals]] = field(default_factory=list)
     measured: Measured | None = None      # the numbers of `exact` from these samples
     regime: str | None = None             # name of the motion by them
 
@@ -137,12 +138,12 @@ class Survey:
     shown: tuple[Motion, Attitudes] | None = None
     # By topic of the IMU, in the same time: (n, 7) time since the first motion began [s],
     # angular velocity [rad/s], specific force [m/s^2].
-    readings: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
+    readings: dict[str, list[Reals]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     @property
     def shown_s(self) -> float:
-        """How long the samples shown in pictures last, from the begin of the first motion [s]."""
+        """How long the samples shown in pictures last [s]."""
         exact = self.motions[0].exact
         return max(SHOWN_S, SHOWN_NUTATIONS * ((exact and exact.nutation_period) or 0.0))
 
@@ -239,7 +240,7 @@ def _analyse(found: Survey, section: Section, topic: str, samples: list[LogMessa
     if data is None or not len(data.stamps_ns):
         return
     if topic == motion.source:
-        motion.samples.append(data)
+        motion.samples.append((data.stamps_ns, data.rows))
     values = data.constants(segment.solver.top)
     if values is not None and stream.topic != 'imu/data':       # which is noisy
         drifts = found.drifts.setdefault(
@@ -282,13 +283,10 @@ def _count(report: TopicReport, stamps_ns: NDArray[np.int64],
 
 def _measure(found: Survey, motion: Motion) -> None:
     """Measure a motion from the samples of its source."""
-    parts, motion.samples = motion.samples, []
-    data = analysis.longest_run(parts) if parts else None
+    samples, motion.samples = motion.samples, []
+    data = analysis.longest_run(samples) if samples else None
     if data is None or len(data.stamps_ns) < 2:
         return
     motion.measured = analysis.measure(data)
     motion.regime = analysis.measured_regime(motion.segment.solver.top, data)
-    until_ns = found.motions[0].begin_ns + round(found.shown_s * NANOSECONDS)
-    count = int(np.searchsorted(data.stamps_ns, until_ns, 'right'))
-    if found.shown is None and count > 1:
-        found.shown = motion, data.part(slice(count))
+    found.shown = found.shown or (motion, data.first(found.shown_s))
