@@ -4,23 +4,30 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from cycler import cycler
+from matplotlib import rc_context
 from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.gridspec import GridSpec, SubplotSpec
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.tools.analysis import Attitudes, Complexes, Reals, interpolate
-from spinning_top_sim.tools.survey import Survey
+from spinning_top_sim.tools.survey import Series, Survey
 
 # From the world to the viewer: towards, right, up.
 VIEW = Rotation.from_euler('zy', (60.0, 45.0), degrees=True)
 INK, FAINT, PATH = '#1b1b1b', '#c9c9c9', '#0b6fa4'
 # Okabe and Ito's colours: distinct also for the colour-blind, and as greys.
 COLOURS = ('#0072b2', '#d55e00', '#009e73')
+STYLE: dict[Any, Any] = {
+    'axes.labelsize': 9, 'axes.prop_cycle': cycler(color=COLOURS), 'axes.spines.right': False,
+    'axes.spines.top': False, 'axes.titlesize': 11, 'axes.xmargin': 0.0, 'legend.fontsize': 8,
+    'legend.frameon': False, 'lines.linewidth': 1.2, 'text.color': INK, 'xtick.labelsize': 8,
+    'ytick.labelsize': 8}
 FINER = 10                  # points drawn for each sample
 PAGE_NUTATIONS, PAGE_S = 8, 5.0      # on the page; seconds where theta rests
 MOST_MARKS = 30             # motions whose begin is marked
@@ -88,42 +95,41 @@ def draw_page(found: Survey, path: Path, name: str) -> None:
     """
     assert found.shown is not None
     motion, data = found.shown
-    measured = motion.measured
-    period = None if measured is None else measured.nutation_period
-    shown_s = PAGE_S if period is None else PAGE_NUTATIONS * period
+    assert motion.measured is not None
+    period, mean = motion.measured.nutation_period, motion.measured.mean_precession_rate
+    shown_s = PAGE_NUTATIONS * period if period else PAGE_S
     data = data.first(shown_s)
     rows = 4 if found.readings else 3
-    figure = Figure(figsize=(11.0, 2.4 * rows + 0.6), layout='constrained')
-    grid = figure.add_gridspec(rows, 2, height_ratios=[1.1, 1.1, 1.0, 1.0][:rows])
-    regime = motion.regime or (motion.exact.name if motion.exact else '')
-    figure.suptitle(f'{name}: {regime}', fontsize=14, color=INK)
-    _tip_panel(figure.add_subplot(grid[0:2, 0]), data, period or 0.0)
-
-    time, _, height = smooth_tip(data)
-    tilt = _panel(figure, grid[0, 1], '' if period is None else f'nutation, period {period:.9g} s',
-                  'tilt θ [deg]')
-    tilt.plot(time, np.degrees(np.arccos(np.clip(height, -1.0, 1.0))), color=COLOURS[0])
-    mean = None if measured is None else measured.mean_precession_rate
-    _precession_panel(
-        _panel(figure, grid[1, 1], '' if mean is None else
-               f'precession, mean {mean:.9g} rad/s (dashed)', "φ' [rad/s]", tilt), data, mean)
-    _accuracy_panels(figure, grid, found)
-    if found.readings:
-        _imu_panels(figure, grid, found, shown_s)
-    figure.savefig(path, dpi=120)
-
-
-def _panel(figure: Figure, place: SubplotSpec, title: str, quantity: str,
-           share: Axes | None = None, time: str = 'time [s]') -> Axes:
-    axes = figure.add_subplot(place, sharex=share)
-    axes.set_title(title, fontsize=11)
-    axes.set_ylabel(quantity, fontsize=9)
-    axes.set_xlabel(time, fontsize=9)
-    axes.tick_params(labelsize=8)
-    axes.margins(x=0.0)
-    for side in ('top', 'right'):
-        axes.spines[side].set_visible(False)
-    return axes
+    with rc_context(STYLE):
+        figure = Figure(figsize=(11.0, 2.4 * rows + 0.6), layout='constrained')
+        grid = figure.add_gridspec(rows, 2, height_ratios=[1.1, 1.1, 1.0, 1.0][:rows])
+        regime = motion.regime or (motion.exact.name if motion.exact else '')
+        figure.suptitle(f'{name}: {regime}', fontsize=14)
+        _tip_panel(figure.add_subplot(grid[0:2, 0]), data, period or 0.0)
+        tilt = figure.add_subplot(grid[0, 1])
+        time, _, height = smooth_tip(data)
+        tilt.plot(time, np.degrees(np.arccos(np.clip(height, -1.0, 1.0))))
+        tilt.set(title=f'nutation, period {period:.9g} s' if period else '',
+                 xlabel='time [s]', ylabel='tilt θ [deg]')
+        _precession_panel(figure.add_subplot(grid[1, 1], sharex=tilt), data, mean)
+        _drift_panel(figure.add_subplot(grid[2, 0]), found)
+        _error_panel(figure.add_subplot(grid[2, 1]), found)
+        if found.readings:
+            # The noisy readings, else the noise-free ones, else the bias.
+            topic = min(found.readings, key=lambda name: (not name.endswith('data_raw'),
+                                                          not name.endswith('ground_truth/imu')))
+            time, *vectors = np.concatenate(found.readings[topic]).T
+            shown = time <= time[0] + shown_s
+            for column, quantity in enumerate(('angular velocity [rad/s]',
+                                               'specific force [m/s²]')):
+                axes = figure.add_subplot(grid[3, column])
+                for axis, values in zip('xyz', vectors[3 * column:], strict=False):
+                    axes.plot((time - time[0])[shown], values[shown], label=axis)
+                axes.legend(loc='upper right', ncols=3)
+                axes.margins(y=0.2)
+                axes.set(title=f'{quantity.partition(" [")[0]}, {topic}', xlabel='time [s]',
+                         ylabel=quantity)
+        figure.savefig(path, dpi=120)
 
 
 def _tip_panel(axes: Axes, data: Attitudes, period: float) -> None:
@@ -131,15 +137,16 @@ def _tip_panel(axes: Axes, data: Attitudes, period: float) -> None:
     if len(turned):         # one turn is enough, if two nutations are in it
         data = data.first(max(float(data.time[turned[0]]), 2.0 * period))
     time, tip, height = smooth_tip(data)
-    tilts = np.arccos(np.clip([np.max(height), np.min(height)], -1.0, 1.0))
-    draw_sphere(axes, (*tilts, np.pi / 2), -0.9 if tilts[1] < np.radians(100.0) else -1.25)
+    low, high = np.arccos(np.clip([np.max(height), np.min(height)], -1.0, 1.0))
+    draw_sphere(axes, (low, high, np.pi / 2), -0.9 if high < np.radians(100.0) else -1.25)
     draw_tip(axes, tip, height)
-    axes.set_title(f'path of the tip, t = 0 to {time[-1]:.3g} s', fontsize=11, color=INK)
+    axes.set_title(f'path of the tip, t = 0 to {time[-1]:.3g} s')
 
 
 def _precession_panel(axes: Axes, data: Attitudes, mean: float | None) -> None:
+    axes.set(xlabel='time [s]', ylabel="φ' [rad/s]")
     rate = data.phi_dot
-    if rate is None:
+    if rate is None or np.isnan(rate).all():
         axes.text(0.5, 0.5, "φ': no topic with rates", ha='center', transform=axes.transAxes)
     else:
         axes.plot(data.time, rate, color=COLOURS[1])
@@ -149,57 +156,41 @@ def _precession_panel(axes: Axes, data: Attitudes, mean: float | None) -> None:
         axes.axhline(0.0, color=FAINT, linewidth=0.8, zorder=0)
     if mean is not None:
         axes.axhline(mean, color=INK, linewidth=0.9, linestyle='--')
+        axes.set_title(f'precession, mean {mean:.9g} rad/s (dashed)')
 
 
-def _accuracy_panels(figure: Figure, grid: GridSpec, found: Survey) -> None:
-    """Draw drifts and errors from the topics where they are least, and where motions begin."""
-    begin_ns = found.damage.start_ns
-    drift_topic = min(found.drifts, default='', key=lambda name:
-                      found.drifts[name]['energy'].largest)
-    error_topic = min(found.errors, default='', key=lambda name: found.errors[name].largest)
-    drift, error = (
-        _panel(figure, grid[2, column], f'{title}, from {topic}' if topic else '', quantity,
-               time='time in the log [s]')
-        for column, title, topic, quantity in (
-            (0, 'drift of the constants', drift_topic, 'relative drift'),
-            (1, 'error against the exact solution', error_topic, 'orientation error [rad]')))
-    for series, style, colour, label in zip(
-            found.drifts.get(drift_topic, {}).values(), ('-', '--', ':'), COLOURS,
-            ('E', '$L_3$', '$L_z$'), strict=False):
-        stamps_ns, values = series.points
-        drift.plot((stamps_ns - begin_ns) * 1e-9, values, style, color=colour, linewidth=1.0,
-                   label=label)
-    if drift_topic:
-        _legend(drift)
-    if error_topic:
-        stamps_ns, values = found.errors[error_topic].points
-        error.plot((stamps_ns - begin_ns) * 1e-9, values, color=COLOURS[2], linewidth=1.0)
-        error.set_ylim(bottom=0.0)
-    if len(found.motions) <= MOST_MARKS:
-        for motion in found.motions[1:]:
-            for axes in (drift, error):
-                axes.axvline((motion.begin_ns - begin_ns) * 1e-9, color=FAINT, linewidth=0.8,
-                             zorder=0)
+def _drift_panel(axes: Axes, found: Survey) -> None:
+    topic = min(found.drifts, default='', key=lambda name: found.drifts[name]['energy'].largest)
+    if topic:
+        for series, style, label in zip(found.drifts[topic].values(), ('-', '--', ':'),
+                                        ('E', '$L_3$', '$L_z$'), strict=True):
+            axes.plot(*_points(found, series), style, label=label)
+        axes.legend(loc='upper left', ncols=3)
+        axes.margins(y=0.25)
+        axes.set_title(f'drift of the constants, from {topic}')
+    _mark_motions(axes, found, 'relative drift')
 
 
-def _imu_panels(figure: Figure, grid: GridSpec, found: Survey, shown_s: float) -> None:
-    # The noisy readings, else the noise-free ones, else the bias.
-    topic = min(found.readings, key=lambda name: (not name.endswith('data_raw'),
-                                                  not name.endswith('ground_truth/imu')))
-    time, *vectors = np.concatenate(found.readings[topic]).T
-    shown = time <= time[0] + shown_s
-    for column, quantity, unit in ((0, 'angular velocity', 'rad/s'),
-                                   (1, 'specific force', 'm/s²')):
-        axes = _panel(figure, grid[3, column], f'{quantity}, {topic}', f'{quantity} [{unit}]')
-        for number, axis in enumerate('xyz'):
-            axes.plot((time - time[0])[shown], vectors[3 * column + number][shown],
-                      color=COLOURS[number], linewidth=0.9, label=axis)
-        _legend(axes)
+def _error_panel(axes: Axes, found: Survey) -> None:
+    if found.errors:
+        topic = min(found.errors, key=lambda name: found.errors[name].largest)
+        axes.plot(*_points(found, found.errors[topic]), color=COLOURS[2])
+        axes.set_title(f'error against the exact solution, from {topic}')
+        axes.set_ylim(bottom=0.0)
+    _mark_motions(axes, found, 'orientation error [rad]')
 
 
-def _legend(axes: Axes) -> None:
-    axes.legend(loc='upper right', ncols=3, fontsize=8, frameon=False)
-    axes.margins(y=0.22)
+def _points(found: Survey, series: Series) -> tuple[Reals, Reals]:
+    stamps_ns, values = series.points
+    return (stamps_ns - found.damage.start_ns) * 1e-9, values
+
+
+def _mark_motions(axes: Axes, found: Survey, quantity: str) -> None:
+    """Mark commands and resets, where there are not too many, and label the axes."""
+    for motion in found.motions[1:] if len(found.motions) <= MOST_MARKS else ():
+        axes.axvline((motion.begin_ns - found.damage.start_ns) * 1e-9, color=FAINT,
+                     linewidth=0.8, zorder=0)
+    axes.set(xlabel='time in the log [s]', ylabel=quantity)
 
 
 def animate(found: Survey, path: Path) -> None:
