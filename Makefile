@@ -58,7 +58,7 @@ help:
 	@echo 'PYTHON=$(PYTHON)  interpreter, 3.11 or newer;  VENV=$(VENV)  virtual environment'
 
 run: export ROS_DOMAIN_ID := $(RUN_DOMAIN_ID)
-run: check-scene $(VENV)/.package
+run: check-scene $(VENV)/.deps-plot $(VENV)/.package
 	@mkdir -p '$(LOGS)'
 	@echo 'Scene $(SCENE), recording into $(LOGS)/, until Ctrl-C. To listen from another terminal of'
 	@echo 'this machine:  export ROS_DOMAIN_ID=$(RUN_DOMAIN_ID)' \

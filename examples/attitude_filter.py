@@ -16,10 +16,11 @@ end of --settle on.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -71,14 +72,7 @@ def madgwick(period: float, gain: float = 0.033) -> Step:
     """
     from ahrs.filters import Madgwick
 
-    filter_ = Madgwick(Dt=period, gain=gain)
-    attitude = np.array((1.0, 0.0, 0.0, 0.0))
-
-    def step(rates: np.ndarray, force: np.ndarray) -> Sequence[float]:
-        nonlocal attitude
-        attitude = filter_.updateIMU(attitude, rates, force)
-        return attitude
-    return step
+    return _from_rest(Madgwick(Dt=period, gain=gain).updateIMU)
 
 
 def ekf(period: float) -> Step:
@@ -89,11 +83,16 @@ def ekf(period: float) -> Step:
     """
     from ahrs.filters import EKF
 
-    filter_, attitude = EKF(Dt=period), np.array((1.0, 0.0, 0.0, 0.0))
+    return _from_rest(EKF(Dt=period).update)
+
+
+def _from_rest(update: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]) -> Step:
+    """Return the steps of a filter that is given its attitude, from the identity on."""
+    attitude = np.array((1.0, 0.0, 0.0, 0.0))
 
     def step(rates: np.ndarray, force: np.ndarray) -> Sequence[float]:
         nonlocal attitude
-        attitude = filter_.update(attitude, rates, force)
+        attitude = update(attitude, rates, force)
         return attitude
     return step
 
@@ -121,21 +120,11 @@ class Comparison:
     """
     One filter, fed with samples of the IMU and compared with poses of the same stamps.
 
-    Parameters
-    ----------
-    name : str
-        One of FILTERS.
-    rpy : sequence of float
-        Mounting of the IMU in the body: roll, pitch and yaw as in URDF [rad].
-
-    Attributes
-    ----------
-    errors : list of Error
-        So far.
-    lost : int
-        Samples that never came, bridged by a straight line.
-    restarts : int
-        Of the filter, after gaps too long for that or stamps that went back.
+    name : one of FILTERS
+    rpy : mounting of the IMU in the body: roll, pitch and yaw as in URDF [rad]
+    errors : so far
+    lost : samples that never came, bridged by a straight line
+    restarts : of the filter, after gaps too long for that or stamps that went back
     """
 
     def __init__(self, name: str, rpy: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
@@ -158,8 +147,8 @@ class Comparison:
             return
         self._first.append(sample)
         if len(self._first) > LEARNED_FROM:
-            self._period_ns = min(abs(b[0] - a[0]) for a, b in
-                                  zip(self._first, self._first[1:], strict=False)) or 1
+            self._period_ns = min(abs(b[0] - a[0])
+                                  for a, b in itertools.pairwise(self._first)) or 1
             self._start(self._first[0])
             for one in self._first[1:]:
                 self._advance(one)
@@ -233,8 +222,8 @@ class Summary(NamedTuple):
     """
     How a filter did after it has settled, angles in degrees.
 
-    converged: when the tilt has fallen below CONVERGED_DEG for good [s], inf: never;
-    heading_rate: drift of the heading [deg/s]
+    converged : when the tilt has fallen below CONVERGED_DEG for good [s], inf: never
+    heading_rate : drift of the heading [deg/s]
     """
 
     name: str
@@ -265,17 +254,18 @@ def compare(path: Path, names: Sequence[str], namespace: str = '/',
     """
     Run filters through a log.
 
-    rpy: mounting of the IMU [rad], None: what the log says.  Raises ValueError for a log without
-    these topics, and LogError for what is none.
+    rpy : mounting of the IMU [rad], None: what the log says
+
+    Raises ValueError for a log without these topics, and LogError for what is no log.
     """
     from rosbags.typesys import Stores, get_typestore
 
     from spinning_top_sim.recording.reader import LogReader
+    from spinning_top_sim.streams.journal import resolve_topic
 
     typestore = get_typestore(Stores.ROS2_JAZZY)
+    imu, pose = (resolve_topic(topic, namespace) for topic in (IMU_TOPIC, POSE_TOPIC))
     with LogReader(path) as reader:
-        space = '/' + namespace.strip('/')
-        imu, pose = (f'{space.rstrip("/")}/{topic}' for topic in (IMU_TOPIC, POSE_TOPIC))
         there = {topic.name: topic.type_name for topic in reader.topics}
         for topic in (imu, pose):
             if topic not in there:
@@ -373,16 +363,12 @@ def make_node(arguments: argparse.Namespace) -> Any:
             first_ns, last_ns = errors[0].stamp_ns, errors[-1].stamp_ns
             if last_ns - self._reported_ns >= REPORT_NS:
                 self._reported_ns = last_ns
-                for line in self._now((last_ns - first_ns) / NANOSECONDS):
-                    self.get_logger().info(line)
+                for comparison in filter(lambda one: one.errors, self._comparisons):
+                    self.get_logger().info(
+                        f'{comparison.name} at {(last_ns - first_ns) / NANOSECONDS:.2f} s: tilt '
+                        f'error {math.degrees(comparison.errors[-1].tilt):.3g} deg')
             if arguments.duration and last_ns - first_ns >= arguments.duration * NANOSECONDS:
                 self.finished.set_result(0)
-
-        def _now(self, t: float) -> Iterator[str]:
-            for comparison in self._comparisons:
-                if comparison.errors:
-                    yield (f'{comparison.name} at {t:.2f} s: tilt error '
-                           f'{math.degrees(comparison.errors[-1].tilt):.3g} deg')
 
         def stop(self) -> None:
             report(self._comparisons, arguments)

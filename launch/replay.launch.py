@@ -5,6 +5,7 @@ Replay a log, with the TF of its top and optionally RViz.
   ros2 launch spinning_top_sim replay.launch.py file:=run.mcap loop:=true rviz:=true
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
@@ -15,7 +16,7 @@ from launch_ros.actions import Node
 from spinning_top_sim.nodes import launch_helpers
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.tools.run_description import ForeignLogError, read_run_description
+from spinning_top_sim.tools.recorded_run import ForeignLogError, read_run_description
 
 SHARE = Path(get_package_share_directory('spinning_top_sim'))
 SWITCH = ['true', 'false']
@@ -69,18 +70,17 @@ def _nodes(context: LaunchContext) -> list:
     except (LogError, ForeignLogError, OSError) as error:
         # replay_node reports a log that cannot be played.
         return [*actions, LogInfo(msg=f'neither TF nor RViz: {error}')]
-    topics = {name: topic for topic, name in run.topics.items()}
-    namespace = _namespace(topics)
-    if on['tf'] and 'joint_states' in topics:
+    namespace = _namespace(run.topics)
+    if on['tf'] and 'joint_states' in run.topics:
         actions += launch_helpers.state_publisher(
-            SHARE, run.now, namespace, topics['joint_states'], clocked)
+            SHARE, run.now, namespace, run.topics['joint_states'], clocked)
     if on['rviz']:
         actions.append(launch_helpers.rviz(SHARE, run.now['world_frame'], namespace, clocked))
     return actions
 
 
-def _namespace(topics: dict[str, str]) -> str:
-    """Return the namespace of the recorded node, from the names of its topics."""
+def _namespace(topics: Mapping[str, str]) -> str:
+    """Return the namespace that the node had: what its topics have before their own names."""
     for name, topic in topics.items():
         if not name.startswith(('/', '~')) and topic.endswith(f'/{name}'):
             return topic.removesuffix(name).strip('/')

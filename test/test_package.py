@@ -212,6 +212,21 @@ def test_the_metadata_ask_for_little():
     assert names == ['PyYAML', 'mcap', 'numpy', 'scipy', 'tqdm']
 
 
+def test_manifest_and_setup_py_require_the_same(setup_py):
+    keys = {'python3-numpy': 'numpy', 'python3-scipy': 'scipy', 'python3-tqdm': 'tqdm',
+            'python3-yaml': 'PyYAML', 'mcap-ros2-support': 'mcap'}
+    declared = {keys[dependency.name] for dependency in
+                parse_package(str(ROOT / 'package.xml')).exec_depends if dependency.name in keys}
+    required = {re.split('[<>]', line)[0] for line in setup_py.install_requires}
+    assert declared == required == set(keys.values())
+
+
+def test_make_run_installs_what_the_tools_draw_with():
+    plan = subprocess.run(['make', '--dry-run', '--always-make', 'run'], cwd=ROOT, check=True,
+                          capture_output=True, text=True, timeout=60).stdout
+    assert "'.[build,plot]'" in plan and "'.[build,ros]'" in plan
+
+
 def test_every_source_says_its_license():
     heads = {path: path.read_text(encoding='utf-8').splitlines()[:2]
              for path in sources() if is_program(path)}

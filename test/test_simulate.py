@@ -2,6 +2,7 @@
 """The offline simulation: files, refusals, and the same bytes as the node's own pipeline."""
 
 import csv
+import io
 import json
 import resource
 import subprocess
@@ -17,6 +18,7 @@ from rosbags.highlevel import AnyReader
 from spinning_top_sim import solve
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.tools import cli
 from spinning_top_sim.tools.simulate import main
 
 EVERYTHING = ['-p', 'imu_data.enabled:=true', '-p', 'clock.enabled:=true',
@@ -47,8 +49,7 @@ def in_memory(values, commands, duration_ns):
     """Return the same from the pipeline as the node drives it: tick by tick, bytes to a sink."""
     simulation = Simulation(parameters.checked(values), EPOCH_NS)
     streams = journal.recorded_streams(simulation.streams, simulation.values)
-    names = [stream.topic.replace('~', 'spinning_top') for stream in streams]
-    found = {name if name.startswith('/') else f'/{name}': {} for name in names}
+    found = {journal.resolve_topic(stream.topic, '/'): {} for stream in streams}
     messages_of = list(found.values())
 
     def write(numbers, stamp_ns, messages, size):
@@ -199,7 +200,14 @@ def events_of(log):
     (['--duration', '1', '-p', 'initial.theta:=0.0', '--command', '0.5:2.0:1.0'], 'at a pole'),
     (['--duration', '1', '-p', 'initial.theta:=0.0', '-p', 'solver.equations:=euler'],
      'transport'),
-    (['--duration', '1', '-o', '/nowhere/run.mcap'], '/nowhere'),
+    (['--duration', '1', '-o', '/nowhere/run.mcap'],
+     'simulate: cannot record to /nowhere/run.mcap: there is no directory /nowhere\n'),
+    (['--duration', '1', '-o', '/proc/run.mcap'],
+     'simulate: cannot record to /proc/run.mcap: no files can be made in /proc\n'),
+    (['--duration', '1', '-o', '/nowhere/run.csv'],
+     'simulate: /nowhere/run.csv: No such file or directory\n'),
+    (['--duration', '1', '-o', '/proc/run.csv'],
+     'simulate: /proc/run.csv: No such file or directory\n'),
 ])
 def test_what_cannot_be_simulated_is_told_in_a_line(tmp_path, capsys, arguments, message):
     assert main(['-o', str(tmp_path / 'run.mcap'), '--quiet', *arguments]) == 1
@@ -307,3 +315,31 @@ def test_rclpy_and_scipy_are_not_imported():
     run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                          timeout=60, check=True)
     assert run.stdout.strip() == '[]'
+
+
+def test_progress_is_shown_on_a_terminal_only(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    for stream, quiet, shown in ((Terminal(), False, True), (Terminal(), True, False),
+                                 (io.StringIO(), False, False)):
+        monkeypatch.setattr(sys, 'stderr', stream)
+        with cli.progress('simulated', 20.0, 's', quiet=quiet) as show:
+            for done in (0.0, 10.0, 10.0001, 25.0):
+                show(done)
+        assert ('simulated   0%|' in stream.getvalue()) == shown
+        assert ('simulated 100%|' in stream.getvalue()) == shown
+        assert ('20/20 s' in stream.getvalue()) == shown
+        assert shown or stream.getvalue() == ''
+
+
+@pytest.mark.parametrize(('name', 'code'), [('run.csv', 0), ('run.mcap', 1)])
+def test_without_mcap_there_are_tables_and_a_clear_error(tmp_path, name, code):
+    run = subprocess.run(
+        [sys.executable, '-c', 'import sys\nsys.modules["mcap"] = None\n'
+         'from spinning_top_sim.tools.simulate import main\nsys.exit(main())',
+         '-o', tmp_path / name, '--duration', '1', '--quiet'],
+        capture_output=True, text=True, timeout=60, check=False)
+    assert run.returncode == code and 'Traceback' not in run.stderr
+    assert ('needs the Python package mcap' in run.stderr) == (code == 1)

@@ -382,8 +382,9 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
             f'cannot record to {path}: it exists, and a recording overwrites nothing'
         ) from error
     except FileNotFoundError as error:
-        raise RecordingError(
-            f'cannot record to {path}: there is no directory {path.parent}') from error
+        # A directory such as /proc is there, and takes no files.
+        reason = 'no files can be made in' if path.parent.is_dir() else 'there is no directory'
+        raise RecordingError(f'cannot record to {path}: {reason} {path.parent}') from error
     except (OSError, ValueError) as error:
         raise RecordingError(f'cannot record to {path}: {_reason(error)}') from error
     return file

@@ -14,6 +14,7 @@ from typing import Any
 from spinning_top_sim.streams import messages
 from spinning_top_sim.streams.topics import Stream
 
+NODE_NAME = 'spinning_top'
 COMMANDS, EVENTS = '~/commands', '~/events'
 # Recorded behind the streams, in this order.
 TOPICS = ((COMMANDS, 'std_msgs/msg/Float64MultiArray'), (EVENTS, 'std_msgs/msg/String'))
@@ -24,6 +25,19 @@ def recorded_streams(streams: Sequence[Stream], values: Mapping[str, Any]) -> li
     chosen = values['record.streams']
     return [stream for stream in streams if is_enabled(stream.parameter, values)
             and ('all' in chosen or stream.parameter in chosen)]
+
+
+def resolve_topic(topic: str, namespace: str) -> str:
+    """
+    Return a topic's full name, as ROS resolves it for the node spinning_top.
+
+    topic : relative ('pose'), private ('~/commands') or absolute ('/clock')
+    namespace : of the node, with or without slashes at its ends
+    """
+    if topic.startswith('/'):
+        return topic
+    parts = [namespace.strip('/'), topic.replace('~', NODE_NAME, 1)]
+    return '/' + '/'.join(filter(None, parts))
 
 
 def is_enabled(parameter: str, values: Mapping[str, Any]) -> bool:

@@ -6,11 +6,14 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import re
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TextIO
+
+from tqdm import tqdm
 
 OK = 0
 FAILED = 1
@@ -20,43 +23,33 @@ INTERRUPTED = 130
 TEXT_WIDTH = 118
 # Between the columns of a table, and before the first.
 GAP = '  '
-# A text that is wider than its column is broken after one of these.
-BREAK_AFTER = '/ '
 
 
 def exit_code(name: str, command: Callable[[], int],
               errors: tuple[type[Exception], ...]) -> int:
     """
-    Run a command and return its exit code.
+    Run a command; return its code, FAILED after one of `errors`, INTERRUPTED after Ctrl-C.
 
-    Parameters
-    ----------
-    name : str
-        Name of the executable; it begins each line about an error.
-    command : callable
-        Does the work and returns an exit code.
-    errors : tuple of exception types
-        Errors of the user's input or of the system.  They are printed in one line.
-
-    Returns
-    -------
-    int
-        The code of `command`, FAILED after one of `errors`, or INTERRUPTED after Ctrl-C.
+    name : of the executable, before each error that is printed
+    errors : those of the user's input or of the system, told in one line
     """
     try:
         code = command()
         sys.stdout.flush()
+        return code
     except BrokenPipeError:
         # The reader of the output, such as a pager, has ended.  Python flushes it once more.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
     except errors as error:
-        print_line(f'{name}: {error}', sys.stderr)
+        what = str(error)
+        if isinstance(error, OSError) and error.filename is not None:
+            what = f'{error.filename}: {error.strerror}'
+        print_line(f'{name}: {what}', sys.stderr)
         return FAILED
     except KeyboardInterrupt:
         print_line(f'{name}: interrupted', sys.stderr)
         return INTERRUPTED
-    return code
 
 
 def print_line(text: str, file: TextIO | None = None) -> None:
@@ -68,48 +61,16 @@ def print_line(text: str, file: TextIO | None = None) -> None:
 def progress(what: str, total: float, unit: str, *, quiet: bool = False,
              ) -> Iterator[Callable[[float], None]]:
     """
-    Show progress on a terminal: a bar where tqdm is installed, else a percentage.
+    Show a bar on a terminal, nothing elsewhere; yield what takes the amount done so far.
 
-    Parameters
-    ----------
-    what : str
-        What is being done, such as 'simulated'.
-    total : float
-        Amount at the end, in `unit`.
-    unit : str
-        Unit of the amounts.
-    quiet : bool
-        Show nothing.
-
-    Yields
-    ------
-    callable
-        Takes the amount done so far.
+    what : what is being done, such as 'simulated'
+    total : amount at the end, in `unit`
     """
-    if quiet or not sys.stderr.isatty() or not total > 0.0:
-        yield lambda done: None
-        return
-    try:
-        from tqdm import tqdm  # noqa: PLC0415
-    except ImportError:
-        shown = -1
-
-        def show(done: float) -> None:
-            nonlocal shown
-            percent = int(100.0 * done / total)
-            if percent != shown:
-                shown = percent
-                print(f'\r{what} {percent:3d} %', end='', file=sys.stderr, flush=True)
-
-        try:
-            yield show
-        finally:
-            print('\r\033[K', end='', file=sys.stderr, flush=True)
-        return
-    with tqdm(total=total, unit=unit, desc=what, bar_format=(
-            '{desc} {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} {unit} '
-            '[{elapsed}<{remaining}]')) as bar:
-        yield lambda done: bar.update(done - bar.n)
+    # None: no bar where there is no terminal.
+    with tqdm(total=total, unit=unit, desc=what, disable=quiet or not total > 0.0 or None,
+              bar_format='{desc} {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} {unit} '
+                         '[{elapsed}<{remaining}]') as bar:
+        yield lambda done: bar.update(min(done, total) - bar.n)
 
 
 @dataclass(frozen=True)
@@ -125,7 +86,7 @@ class Table:
         cells = [list(self.head), *map(list, self.rows)]
         columns = list(zip(*cells, strict=True))
         widths = [max(map(len, column)) for column in columns]
-        least = [max(len(piece.rstrip()) for cell in column for piece in _pieces(cell))
+        least = [max(len(line) for cell in column for line in _wrapped(cell, 1))
                  for column in columns]
         excess = sum(widths) + len(GAP) * len(widths) - width
         # The columns that are wider than their longest word give way, the widest first.
@@ -143,20 +104,10 @@ class Table:
                 ).rstrip()
 
 
-def _pieces(text: str) -> list[str]:
-    """Return the pieces of a text between which a line may be broken."""
-    pieces = ['']
-    for character in text:
-        pieces[-1] += character
-        if character in BREAK_AFTER:
-            pieces.append('')
-    return pieces
-
-
 def _wrapped(text: str, width: int) -> list[str]:
-    """Return the lines of a text in a column."""
+    """Return the lines of a text, broken after slashes and spaces only."""
     lines = ['']
-    for piece in _pieces(text):
+    for piece in re.split('(?<=[/ ])', text):
         if len(lines[-1] + piece.rstrip()) > width and lines[-1]:
             lines.append('')
         lines[-1] += piece
@@ -165,8 +116,9 @@ def _wrapped(text: str, width: int) -> list[str]:
 
 def print_report(content: Iterable[str | Table]) -> None:
     """Print lines and tables, as wide as the terminal."""
-    width = shutil.get_terminal_size((TEXT_WIDTH, 0)).columns if sys.stdout.isatty() else (
-        TEXT_WIDTH)
+    width = TEXT_WIDTH
+    if sys.stdout.isatty():
+        width = shutil.get_terminal_size((TEXT_WIDTH, 0)).columns
     for item in content:
         for line in [item] if isinstance(item, str) else item.lines(width):
             print_line(line)

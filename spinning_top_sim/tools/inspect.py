@@ -15,9 +15,7 @@ from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools.cli import FAILED, OK, exit_code, print_line, print_report, progress
 
 if TYPE_CHECKING:
-    from spinning_top_sim.recording.reader import LogReader
     from spinning_top_sim.tools.survey import Survey
-    from spinning_top_sim.tools.verify import Verdict
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -54,12 +52,17 @@ def _run(arguments: argparse.Namespace) -> int:
     from spinning_top_sim.recording.reader import LogReader  # noqa: PLC0415
     from spinning_top_sim.tools.report import as_json, as_text  # noqa: PLC0415
     from spinning_top_sim.tools.survey import survey  # noqa: PLC0415
+    from spinning_top_sim.tools.verify import verify  # noqa: PLC0415
 
     verdict = None
     with LogReader(arguments.log) as reader:
         found = survey(reader)
         if arguments.verify and found.run is not None:
-            verdict = _verify(reader, found, arguments.json)
+            begin_ns, end_ns = found.damage.start_ns, found.damage.end_ns
+            with progress('verified', (end_ns - begin_ns) / NANOSECONDS, 's',
+                          quiet=arguments.json) as show:
+                verdict = verify(reader, found.run,
+                                 lambda stamp_ns: show((stamp_ns - begin_ns) / NANOSECONDS))
     if arguments.json:
         print(json.dumps(as_json(arguments.log, found, verdict), indent=2, allow_nan=False))
     else:
@@ -74,36 +77,24 @@ def _run(arguments: argparse.Namespace) -> int:
     return OK if passed else FAILED
 
 
-def _verify(reader: LogReader, found: Survey, quiet: bool) -> Verdict:
-    from spinning_top_sim.tools.verify import verify  # noqa: PLC0415
-
-    assert found.run is not None
-    begin_ns, end_ns = found.begin_ns, found.end_ns
-    with progress('verified', (end_ns - begin_ns) / NANOSECONDS, 's', quiet=quiet) as show:
-        return verify(reader, found.run, end_ns,
-                      lambda stamp_ns: show((stamp_ns - begin_ns) / NANOSECONDS))
-
-
 def _draw(arguments: argparse.Namespace, found: Survey) -> bool:
     """Draw the pictures that are asked for; return whether that worked."""
-    if found.shown is None:
-        print_line('inspect: nothing to draw: no attitude of a top in this log', sys.stderr)
-        return False
     try:
+        if found.shown is None:
+            raise ValueError('nothing to draw: no attitude of a top in this log')
         from spinning_top_sim.tools import plots  # noqa: PLC0415
-    except ImportError as error:
-        print_line("inspect: pictures need matplotlib: pip install 'spinning_top_sim[plot]', or "
-                   f'apt install python3-matplotlib ({error})', sys.stderr)
-        return False
-    try:
+
         if arguments.plot is not None:
             plots.draw_page(found, arguments.plot, arguments.log.name)
         if arguments.animate is not None:
             plots.animate(found, arguments.animate)
+        return True
+    except ImportError as error:
+        print_line("inspect: pictures need matplotlib: pip install 'spinning_top_sim[plot]', or "
+                   f'apt install python3-matplotlib ({error})', sys.stderr)
     except (OSError, ValueError) as error:
         print_line(f'inspect: {error}', sys.stderr)
-        return False
-    return True
+    return False
 
 
 if __name__ == '__main__':

@@ -9,7 +9,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from spinning_top_sim.recording.damage import count
 from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.salvage import recover
 from spinning_top_sim.tools.cli import OK, exit_code, print_line, progress
 
 SOME_LOST, TERMINATED = 3, 143
@@ -49,23 +52,18 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    # Not before: --help needs none of it.
-    from spinning_top_sim.recording.damage import count  # noqa: PLC0415
-    from spinning_top_sim.recording.reader import LogReader  # noqa: PLC0415
-    from spinning_top_sim.recording.salvage import recover  # noqa: PLC0415
-
     log: Path = arguments.log
     output: Path = arguments.output or log.with_name(f'{log.stem}_recovered.mcap')
     with LogReader(log) as reader, progress(
             'recovered', reader.size, 'bytes', quiet=reader.size < PROGRESS_BYTES) as show:
         recovered = recover(reader, output, lambda done, total: show(done))
-    damage = recovered.damage
-    for line in damage.lines():
+    lossless = recovered.damage.lossless
+    for line in recovered.damage.lines():
         print_line(line)
-    kept = (f'{count(recovered.messages, "message")} in {count(recovered.chunks, "chunk")}, '
-            f'{count(recovered.bytes, "byte")}')
-    print_line(f'{"kept all" if damage.lossless else "kept"}: {kept} in {recovered.path}')
-    return OK if damage.lossless else SOME_LOST
+    print_line(f'kept{" all" * lossless}: {count(recovered.messages, "message")} in '
+               f'{count(recovered.chunks, "chunk")}, {count(recovered.bytes, "byte")} in '
+               f'{recovered.path}')
+    return OK if lossless else SOME_LOST
 
 
 if __name__ == '__main__':

@@ -3,43 +3,45 @@
 
 from __future__ import annotations
 
+import difflib
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+
+import yaml
 
 from spinning_top_sim.streams import parameters
 
 # Names of nodes in a file that stand for the node spinning_top.
-NODES = ('/**', 'spinning_top', '/spinning_top', '/**/spinning_top')
+NODES = ('/**', '/*', 'spinning_top', '/spinning_top', '/**/spinning_top')
 # Parameters that every node has; rclpy takes them.
-ROS_PARAMETERS = ('use_sim_time', 'qos_overrides')
+ROS_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
+
+
+class _Loader(yaml.SafeLoader):
+    """Finds the types of plain scalars as rcl does: 1e5 is a double, 1_000 and ~ are strings."""
+
+
+_Loader.bool_values = yaml.SafeLoader.bool_values | {'y': True, 'n': False}
+_Loader.yaml_implicit_resolvers = {}
+for _type, _pattern in (
+        ('null', r''),
+        ('bool', r'[yY]|yes|Yes|YES|[nN]|no|No|NO|true|True|TRUE|false|False|FALSE|on|On|ON|'
+                 r'off|Off|OFF'),
+        ('int', r'[-+]?(0[xX][0-9a-fA-F]+|0[0-7]*|[1-9][0-9]*)'),
+        ('float', r'[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|'
+                  r'[-+]?\.?(inf|Inf|INF)|\.?(nan|NaN|NAN)')):
+    _Loader.add_implicit_resolver(
+        f'tag:yaml.org,2002:{_type}', re.compile(f'({_pattern})$'), None)
 
 
 def read_scene(path: str | Path) -> dict[str, object]:
     """
-    Return the parameters that a ROS 2 parameter file sets for the node spinning_top.
+    Return what a ROS 2 parameter file sets for the node spinning_top, by name, not checked yet.
 
-    Parameters
-    ----------
-    path : str or Path
-        YAML file.
-
-    Returns
-    -------
-    dict
-        Values by the parameters' dotted names, not checked yet.
-
-    Raises
-    ------
-    ValueError
-        Names the file and what is wrong with it.
+    Raises OSError, or ValueError which names the file and what is wrong with it.
     """
-    try:
-        text = Path(path).read_text(encoding='utf-8')
-    except OSError as error:
-        raise ValueError(f'{path}: {error.strerror}') from error
-    except UnicodeDecodeError as error:
-        raise ValueError(f'{path} is not YAML: {error}') from error
-    content = _parse_yaml(text, str(path))
+    content = _parse_yaml(Path(path).read_bytes(), str(path))
     values: dict[str, object] = {}
     for node, sections in content.items() if isinstance(content, Mapping) else ():
         section = sections.get('ros__parameters') if isinstance(sections, Mapping) else None
@@ -48,27 +50,26 @@ def read_scene(path: str | Path) -> dict[str, object]:
     if not values:
         raise ValueError(f'{path} has no parameters for the node spinning_top: it must have '
                          "'/**:' or 'spinning_top:', and 'ros__parameters:' in it")
+    for name, value in values.items():
+        _check(name, value, str(path))
     return values
 
 
 def parse_assignment(text: str) -> tuple[str, object]:
     """Return name and value of NAME:=VALUE, the value read as YAML.  Raises ValueError."""
-    name, separator, value = text.partition(':=')
-    if not separator or name not in parameters.BY_NAME:
-        raise ValueError(f'{text!r}: must be NAME:=VALUE with the name of a parameter')
-    return name, _parse_yaml(value, text)
+    name, separator, yaml_text = text.partition(':=')
+    if not separator:
+        raise ValueError(f'{text!r}: must be NAME:=VALUE')
+    value = _parse_yaml(yaml_text, text)
+    _check(name, value, text)
+    return name, value
 
 
-def _parse_yaml(text: str, name: str) -> object:
-    """Return the content of a YAML text.  Raises ValueError, which begins with the name."""
+def _parse_yaml(text: str | bytes, source: str) -> object:
     try:
-        import yaml  # noqa: PLC0415
-    except ImportError as error:
-        raise ValueError(f'{name}: reading it needs the Python package PyYAML: {error}') from error
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ValueError(f'{name} is not YAML: {" ".join(str(error).split())}') from error
+        return yaml.load(text, _Loader)
+    except (yaml.YAMLError, ValueError) as error:
+        raise ValueError(f'{source} is not YAML: {" ".join(str(error).split())}') from error
 
 
 def _flatten(section: Mapping[str, object], prefix: str = '') -> Iterator[tuple[str, object]]:
@@ -81,3 +82,16 @@ def _flatten(section: Mapping[str, object], prefix: str = '') -> Iterator[tuple[
             yield from _flatten(value, f'{full}.')
         else:
             yield full, value
+
+
+def _check(name: str, value: object, source: str) -> None:
+    """Raise ValueError for a name that is unknown and a value that no ROS parameter has."""
+    if name not in parameters.BY_NAME:
+        near = difflib.get_close_matches(name, parameters.BY_NAME, 1)
+        hint = f'; did you mean {near[0]}?' if near else ''
+        raise ValueError(f'{source}: there is no parameter {name}{hint}')
+    if value is None:
+        raise ValueError(f'{source}: {name} has no value')
+    if isinstance(value, list) and len(set(map(type, value))) > 1:
+        raise ValueError(f'{source}: {name} = {value!r}: the items of a list must have one type, '
+                         'such as [0.0, 1.5]')

@@ -9,33 +9,36 @@ offset of the stamps.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from spinning_top_sim.recording.errors import RecordingError
+from spinning_top_sim.recording.provenance import provenance
+from spinning_top_sim.recording.rosbag2 import RecordedTopic
+from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.schedule import offline_block_ns, offline_targets
+from spinning_top_sim.streams.topics import Stream
 from spinning_top_sim.tools.cli import OK, exit_code, print_line, progress
-from spinning_top_sim.tools.names import resolve_topic
 from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
+from spinning_top_sim.tools.table import Stop, write_table
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from spinning_top_sim.recording.mcap_writer import McapWriter
-    from spinning_top_sim.streams.topics import Stream
 
 # In ROS a stamp of 0 means "no time".
 DEFAULT_EPOCH = 1.0
-FORMATS = {'.mcap': 'mcap', '.csv': 'csv', '.parquet': 'parquet'}
-
-# Time [ns], L3 and Lz [kg m^2/s].
-Command = tuple[int, float, float]
+FORMATS = ('mcap', 'csv', 'parquet')
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -70,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--epoch', type=float, default=DEFAULT_EPOCH, metavar='S',
                         help='stamp of t = 0 [s], default %(default)g')
     parser.add_argument('--namespace', default='/', help='of the topics in the log')
-    parser.add_argument('--format', choices=tuple(FORMATS.values()),
+    parser.add_argument('--format', choices=FORMATS,
                         help='format of the output; default: by the extension of its name')
     parser.add_argument('--quiet', action='store_true', help='no progress, no summary')
     return parser
@@ -78,22 +81,18 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(arguments: argparse.Namespace) -> int:
     values = _parameters(arguments)
-    duration_ns = round(values['duration'] * NANOSECONDS)
-    commands = parse_commands(arguments.command, duration_ns)
+    stops = parse_stops(arguments.command, round(values['duration'] * NANOSECONDS))
     output = Path(arguments.output)
-    file_format = arguments.format or _format_of(output)
+    file_format = arguments.format or output.suffix[1:]
+    if file_format not in FORMATS:
+        raise ValueError(f'{output}: the name must end in .{", .".join(FORMATS)}, or --format be '
+                         'given')
     with progress('simulated', values['duration'], 's', quiet=arguments.quiet) as show:
-        def show_ns(t_ns: int) -> None:
-            show(t_ns / NANOSECONDS)
-
         if file_format == 'mcap':
-            summary = write_log(output, values, duration_ns, commands,
-                                epoch_ns=round(arguments.epoch * NANOSECONDS),
-                                namespace=arguments.namespace, show=show_ns)
+            summary = write_log(output, values, stops, show,
+                                round(arguments.epoch * NANOSECONDS), arguments.namespace)
         else:
-            from spinning_top_sim.tools.table import write_table  # noqa: PLC0415
-
-            summary = write_table(output, file_format, values, duration_ns, commands, show_ns)
+            summary = write_table(output, file_format, values, stops, show)
     if not arguments.quiet:
         print_line(f'{output}: {summary}')
     return OK
@@ -105,34 +104,23 @@ def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
     for path in arguments.params:
         given.update(read_scene(path))
     given.update(parse_assignment(text) for text in arguments.param)
-    if arguments.seed is not None:
-        given['seed'] = arguments.seed
-    if arguments.duration is not None:
-        given['duration'] = arguments.duration
+    given.update((name, value) for name, value in vars(arguments).items()
+                 if name in ('seed', 'duration') and value is not None)
     values = parameters.checked(given)
     if not values['duration'] > 0.0:
         raise ValueError(f'duration = {values["duration"]!r} s: must be > 0 (--duration)')
     return values
 
 
-def parse_commands(texts: Sequence[str], duration_ns: int) -> list[Command]:
+def parse_stops(commands: Sequence[str], duration_ns: int) -> list[Stop]:
     """
-    Return the commands of a command line in the order in which they are applied.
+    Return the commands in the order in which they are applied, and the end of the run.
 
-    Parameters
-    ----------
-    texts : sequence of str
-        Each T:L3:LZ, in s and kg m^2/s.
-    duration_ns : int
-        End of the run [ns], the latest time of a command.
-
-    Raises
-    ------
-    ValueError
-        Names the text and what is allowed.
+    commands : each T:L3:LZ, in s and kg m^2/s
+    duration_ns : end of the run [ns], the latest time of a command
     """
-    commands = []
-    for text in texts:
+    stops: list[Stop] = []
+    for text in commands:
         try:
             t, l3, lz = map(float, text.split(':'))
             at_ns = round(t * NANOSECONDS)
@@ -141,90 +129,47 @@ def parse_commands(texts: Sequence[str], duration_ns: int) -> list[Command]:
         if not 0 <= at_ns <= duration_ns:
             raise ValueError(f'--command {text}: T must be from 0 to the end of the run, '
                              f'{duration_ns / NANOSECONDS:g} s')
-        commands.append((at_ns, l3, lz))
+        stops.append((at_ns, (l3, lz)))
     # The sort is stable: commands at the same time keep their order.
-    return sorted(commands, key=lambda command: command[0])
+    return [*sorted(stops, key=lambda stop: stop[0]), (duration_ns, None)]
 
 
-def _format_of(output: Path) -> str:
-    if output.suffix not in FORMATS:
-        raise ValueError(f'{output}: the name must end in {", ".join(FORMATS)}, or --format be '
-                         'given')
-    return FORMATS[output.suffix]
-
-
-def write_log(path: Path, values: Mapping[str, Any], duration_ns: int,
-              commands: Sequence[Command] = (), *, epoch_ns: int, namespace: str = '/',
-              show: Callable[[int], None] = lambda t_ns: None) -> str:
+def write_log(path: Path, values: Mapping[str, Any], stops: Sequence[Stop],
+              show: Callable[[float], object], epoch_ns: int, namespace: str) -> str:
     """
-    Simulate a run into a new log.
+    Simulate a run into a new log; return the number of messages and the size of the file.
 
-    Parameters
-    ----------
-    path : Path
-        The log; it must not exist.
-    values : mapping
-        Checked parameters (`parameters.checked`).
-    duration_ns : int
-        Simulated time [ns].
-    commands : sequence of (int, float, float)
-        Time [ns], L3 and Lz [kg m^2/s], in ascending order of time.
-    epoch_ns : int
-        Stamp of t = 0 [ns].
-    namespace : str
-        Namespace of the topics.
-    show : callable
-        Takes the simulated time reached [ns].
-
-    Returns
-    -------
-    str
-        Number of messages and size of the file.
-
-    Raises
-    ------
-    RecordingError
-        The file cannot be created.
-    OSError
-        Writing failed.
-    ValueError
-        The motion cannot begin, or a command is refused.
-    IntegrationError
-        The Euler form cannot go on.
-
-    Notes
-    -----
     After an error the log is closed and readable, and holds what was computed before.
-    """
-    from spinning_top_sim.recording.provenance import provenance  # noqa: PLC0415
-    from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
-    from spinning_top_sim.recording.writer import create_file  # noqa: PLC0415
-    from spinning_top_sim.streams.pipeline import Simulation  # noqa: PLC0415
-    from spinning_top_sim.tools.blocks import block_length, targets  # noqa: PLC0415
 
+    values : checked parameters
+    stops : in ascending order of time, the last one is the end of the run
+    show : takes the simulated time reached [s]
+    epoch_ns : stamp of t = 0 [ns]
+    namespace : of the topics
+    """
     simulation = Simulation(values, epoch_ns)
     streams = journal.recorded_streams(simulation.streams, values)
-    topics = [RecordedTopic(resolve_topic(name, namespace), type_name) for name, type_name in
-              (*((stream.topic, stream.type_name) for stream in streams), *journal.TOPICS)]
+    topics = [RecordedTopic(journal.resolve_topic(name, namespace), type_name)
+              for name, type_name in (*((stream.topic, stream.type_name) for stream in streams),
+                                      *journal.TOPICS)]
+    commands_topic, events_topic = len(streams), len(streams) + 1
     metadata = provenance(values, epoch_ns, -1, (), values)
     file = create_file(path, topics, metadata, compression=values['record.compression'])
-    writer = _LogWriter(file, streams, epoch_ns)
     simulation.record_blocks(streams)
-    try:
-        writer.write_event('start', 0, -1)
-        stops = [*((command[0], command) for command in commands), (duration_ns, None)]
-        for target_ns, command in targets(0, stops, block_length(streams)):
+    with contextlib.closing(_LogWriter(file, streams, epoch_ns)) as writer:
+        writer.write(events_topic, 0, journal.event('start', 0, -1))
+        for target_ns, momenta in offline_targets(0, stops, offline_block_ns(streams)):
             try:
                 simulation.advance_in_blocks(target_ns, writer.take)
             finally:                # also what was computed before the motion could not go on
                 writer.write_blocks()
-            if command is not None:
-                _, l3, lz = command
-                simulation.command(l3, lz)
-                writer.write_command(*simulation.history[-1], simulation.now_ns)
-            show(target_ns)
-    finally:
-        writer.close()
+            if momenta is not None:
+                simulation.command(*momenta)
+                t_ns, l3, lz = simulation.history[-1]
+                writer.write(events_topic, t_ns, journal.event(
+                    'command', t_ns, simulation.now_ns, l3=l3, lz=lz))
+                writer.write(commands_topic, t_ns, journal.command(l3, lz))
+            show(target_ns / NANOSECONDS)
     return f'{sum(file.counts)} messages, {file.size / 1e6:.1f} MB'
 
 
@@ -236,26 +181,21 @@ class _LogWriter:
     """
 
     def __init__(self, file: McapWriter, streams: Sequence[Stream], epoch_ns: int) -> None:
-        self._file, self._epoch_ns = file, epoch_ns
-        self._numbers = {stream.topic: number for number, stream in enumerate(streams)}
-        self._commands_topic, self._events_topic = len(streams), len(streams) + 1
+        self._file, self._streams, self._epoch_ns = file, streams, epoch_ns
         self._blocks: list[tuple[int, NDArray[np.int64], NDArray[np.uint8]]] = []
         self._executor = ThreadPoolExecutor(1)
         self._pending: Future[None] | None = None
 
-    def write_event(self, name: str, t_ns: int, sent_ns: int, **details: float) -> None:
-        """Write an entry of the journal with the next chunk.  Raises OSError."""
-        self._write(self._events_topic, t_ns, journal.event(name, t_ns, sent_ns, **details))
-
-    def write_command(self, t_ns: int, l3: float, lz: float, sent_ns: int) -> None:
-        """Write an applied command with the next chunk.  Raises OSError."""
-        self.write_event('command', t_ns, sent_ns, l3=l3, lz=lz)
-        self._write(self._commands_topic, t_ns, journal.command(l3, lz))
+    def write(self, topic_index: int, t_ns: int, data: bytes) -> None:
+        """Write an entry of the journal with the next chunk."""
+        self._wait()
+        if self._file.append(topic_index, self._epoch_ns + t_ns, data):
+            self._file.write_chunk()
 
     def take(self, stream: Stream, stamps_ns: NDArray[np.int64],
              rows: NDArray[np.uint8]) -> None:
         """Take a block of samples, which `write_blocks` writes."""
-        self._blocks.append((self._numbers[stream.topic], stamps_ns, rows.copy()))
+        self._blocks.append((self._streams.index(stream), stamps_ns, rows.copy()))
 
     def write_blocks(self) -> None:
         """Begin to write a chunk of the blocks.  Raises OSError of the chunk before."""
@@ -266,18 +206,13 @@ class _LogWriter:
             self._file.write_chunk()
             self._pending = self._executor.submit(self._file.put_plain_chunk, chunk)
 
-    def _write(self, topic_index: int, t_ns: int, data: bytes) -> None:
-        self._wait()
-        if self._file.append(topic_index, self._epoch_ns + t_ns, data):
-            self._file.write_chunk()
-
     def _wait(self) -> None:
         pending, self._pending = self._pending, None
         if pending is not None:
             pending.result()
 
     def close(self) -> None:
-        """Finish the file.  Raises OSError."""
+        """Finish the file."""
         try:
             self._wait()
         finally:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,92 +21,59 @@ UNITS = {
     'l3': 'kg m^2/s', 'lz': 'kg m^2/s'}
 ROWS_AT_ONCE = 20_000
 
-# The columns of consecutive rows, in the order of UNITS, each (n,).
-Rows = Sequence[NDArray[np.float64]]
+# Time [ns], and L3 and Lz commanded there [kg m^2/s].
+Stop = tuple[int, tuple[float, float] | None]
+# Consecutive rows of the table; the first axis has the columns, in the order of UNITS.
+Rows = NDArray[np.float64]
 
 
-def write_table(path: Path, file_format: str, values: Mapping[str, Any], duration_ns: int,
-                commands: Sequence[tuple[int, float, float]],
-                show: Callable[[int], None]) -> str:
+def write_table(path: Path, file_format: str, values: Mapping[str, Any], stops: Sequence[Stop],
+                show: Callable[[float], object]) -> str:
     """
-    Simulate a run into a new table of states, on the grid of `pose.rate`.
+    Simulate a run into a new table of states, on the grid of `pose.rate`; return what it holds.
 
-    Parameters
-    ----------
-    path : Path
-        The table; it must not exist.
-    file_format : {'csv', 'parquet'}
-        Format of the file.
-    values : mapping
-        Checked parameters (`parameters.checked`).
-    duration_ns : int
-        Simulated time [ns].
-    commands : sequence of (int, float, float)
-        Time [ns], L3 and Lz [kg m^2/s], in ascending order of time.
-    show : callable
-        Takes the simulated time reached [ns].
-
-    Returns
-    -------
-    str
-        Number of rows and names of columns.
-
-    Raises
-    ------
-    OSError
-        The file exists, or writing failed.
-    ValueError
-        pyarrow is missing, the motion cannot begin, or a command is refused.
-    IntegrationError
-        The Euler form cannot go on.
+    file_format : 'csv' or 'parquet'
+    values : checked parameters
+    stops : in ascending order of time, the last one is the end of the run
+    show : takes the simulated time reached [s]
     """
     # Before there is a file: pyarrow may be missing, and there may be no motion.
     write = _write_csv if file_format == 'csv' else _parquet_writer()
     simulation = Simulation(values)
     period_ns = max(1, round(NANOSECONDS / values['pose.rate']))
-    count = 0
-
-    def counted() -> Iterator[Rows]:
-        nonlocal count
-        for rows in _rows(simulation, period_ns, duration_ns, commands):
-            yield rows
-            count += len(rows[0])
-            show(count * period_ns)
-
-    with open(path, 'xb') as file:
-        write(file, counted())
-    return f'{count} rows of {", ".join(UNITS)}'
+    write(path, _rows(simulation, period_ns, stops, show))
+    return f'{stops[-1][0] // period_ns + 1} rows of {", ".join(UNITS)}'
 
 
-def _rows(simulation: Simulation, period_ns: int, duration_ns: int,
-          commands: Sequence[tuple[int, float, float]]) -> Iterator[Rows]:
+def _rows(simulation: Simulation, period_ns: int, stops: Sequence[Stop],
+          show: Callable[[float], object]) -> Iterator[Rows]:
     """Yield consecutive rows of the table.  A command changes the rows after its time."""
     next_ns = 0
-    stops = [*((at_ns, (l3, lz)) for at_ns, l3, lz in commands), (duration_ns, None)]
     for end_ns, momenta in stops:
         while next_ns <= end_ns:
             count = min((end_ns - next_ns) // period_ns + 1, ROWS_AT_ONCE)
             times = range(next_ns, next_ns + count * period_ns, period_ns)
             states = simulation.segment.states(times)
-            columns = (np.array(times) / NANOSECONDS, states.theta, states.theta_dot, states.phi,
-                       states.phi_dot, states.psi, states.psi_dot, *states.quaternion.T,
-                       *states.angular_velocity.T, states.energy, states.l3, states.lz)
-            yield [np.broadcast_to(column, count) for column in columns]
-            next_ns += count * period_ns
+            yield np.stack(np.broadcast_arrays(
+                np.array(times) / NANOSECONDS, states.theta, states.theta_dot, states.phi,
+                states.phi_dot, states.psi, states.psi_dot, *states.quaternion.T,
+                *states.angular_velocity.T, states.energy, states.l3, states.lz))
+            show(times[-1] / NANOSECONDS)
+            next_ns = times.stop
         simulation.advance(end_ns)
         if momenta is not None:
             simulation.command(*momenta)
 
 
-def _write_csv(file: BinaryIO, blocks: Iterable[Rows]) -> None:
-    head = ','.join(f'{name} [{unit}]' for name, unit in UNITS.items())
-    file.write(f'{head}\n'.encode())
-    for columns in blocks:
-        lines = zip(*(column.tolist() for column in columns), strict=True)
-        file.write(''.join(','.join(map(repr, line)) + '\n' for line in lines).encode())
+def _write_csv(path: Path, blocks: Iterable[Rows]) -> None:
+    with open(path, 'x', encoding='utf-8') as file:
+        file.write(','.join(f'{name} [{unit}]' for name, unit in UNITS.items()) + '\n')
+        for rows in blocks:
+            # csv.writer looks for what to quote in every number, and takes a third longer.
+            file.writelines(','.join(map(repr, row)) + '\n' for row in rows.T.tolist())
 
 
-def _parquet_writer() -> Callable[[BinaryIO, Iterable[Rows]], None]:
+def _parquet_writer() -> Callable[[Path, Iterable[Rows]], None]:
     """Return what writes a Parquet file.  Raises ValueError where pyarrow is missing."""
     try:
         import pyarrow as pa  # noqa: PLC0415
@@ -115,9 +82,8 @@ def _parquet_writer() -> Callable[[BinaryIO, Iterable[Rows]], None]:
         raise ValueError(f'parquet needs the Python package pyarrow: {error}') from error
     schema = pa.schema([(name, pa.float64()) for name in UNITS])
 
-    def write(file: BinaryIO, blocks: Iterable[Rows]) -> None:
-        with parquet.ParquetWriter(file, schema) as writer:
-            for columns in blocks:
-                writer.write_table(pa.table(list(map(np.ascontiguousarray, columns)),
-                                            schema=schema))
+    def write(path: Path, blocks: Iterable[Rows]) -> None:
+        with open(path, 'xb') as file, parquet.ParquetWriter(file, schema) as writer:
+            for rows in blocks:
+                writer.write_table(pa.table(list(rows), schema=schema))
     return write

@@ -11,34 +11,27 @@ from typing import Any
 from spinning_top_sim.streams import parameters
 
 XACRO_FILE = 'spinning_top.urdf.xacro'
-# Arguments of the xacro file, and the parameters of the same meaning.
-NUMBERS = {name: f'top.{name}' for name in ('mass', 'com_distance', 'lambda1', 'lambda3')}
-VECTORS = {'imu_lever_arm': 'imu.lever_arm', 'imu_rpy': 'imu.rpy'}
-FRAMES = {'world_frame': 'world_frame', 'body_frame': 'body_frame', 'imu_frame_id': 'imu.frame_id'}
+FRAMES = ('world_frame', 'body_frame', 'imu.frame_id')
+# The parameters that are arguments of the xacro file, by their names there.
+ARGUMENTS = {name.removeprefix('top.').replace('.', '_'): name for name in (
+    'top.mass', 'top.com_distance', 'top.lambda1', 'top.lambda3', 'imu.lever_arm', 'imu.rpy',
+    *FRAMES)}
 LINKS_BETWEEN = ('precession_link', 'nutation_link')
 FRAME_NAME = re.compile(r'[\w.-]+(/[\w.-]+)*')
 
 
 def arguments(values: Mapping[str, Any]) -> dict[str, str]:
     """
-    Return the arguments of the xacro file.
+    Return the arguments of the xacro file for checked parameters.
 
-    Parameters
-    ----------
-    values : mapping
-        Checked parameters.  The links between world and body get the prefix of the body's frame:
-        a/base_link, a/nutation_link.
-
-    Raises
-    ------
-    ValueError
-        The frames cannot form a tree; names the parameter and what is allowed.
+    The links between world and body get the prefix of the body's frame: a/base_link,
+    a/nutation_link.  Raises ValueError, which names the parameter, for frames that form no tree.
     """
-    for name in FRAMES.values():
+    for name in FRAMES:
         if not FRAME_NAME.fullmatch(values[name]):
             raise ValueError(f'{name} = {values[name]!r}: must be letters, digits, _ . - with / '
                              'between')
-    world, body, imu = (values[name] for name in FRAMES.values())
+    world, body, imu = (values[name] for name in FRAMES)
     prefix = body[:body.rfind('/') + 1]
     between = [prefix + name for name in LINKS_BETWEEN]
     for name, value, others in (('world_frame', world, [body, imu, *between]),
@@ -46,33 +39,23 @@ def arguments(values: Mapping[str, Any]) -> dict[str, str]:
         if value in others:
             raise ValueError(f'{name} = {value!r}: must be another name than those of the '
                              'other frames of the robot description')
-    mounted = any(values['imu.lever_arm']) or any(values['imu.rpy'])
-    if imu == body and mounted:
+    if imu == body and any((*values['imu.lever_arm'], *values['imu.rpy'])):
         raise ValueError(f'imu.frame_id = {imu!r}: must not be the body_frame where '
                          'imu.lever_arm or imu.rpy is not zero')
-    return {**{name: repr(values[parameter]) for name, parameter in NUMBERS.items()},
-            **{name: ' '.join(map(repr, values[parameter]))
-               for name, parameter in VECTORS.items()},
-            **{name: values[parameter] for name, parameter in FRAMES.items()}, 'prefix': prefix}
+    texts = {}
+    for name, parameter in ARGUMENTS.items():
+        value = values[parameter]
+        texts[name] = ' '.join(map(str, value)) if isinstance(value, tuple) else str(value)
+    return {**texts, 'prefix': prefix}
 
 
 def robot_description(values: Mapping[str, Any], folder: str | Path) -> str:
     """
-    Return the URDF.
+    Return the URDF of checked parameters.
 
-    Parameters
-    ----------
-    values : mapping
-        Checked parameters.
-    folder : str or Path
-        Folder of the xacro file.
+    folder : folder of the xacro file
 
-    Raises
-    ------
-    ValueError
-        See `arguments`.
-    ImportError
-        xacro is not installed.
+    Raises ValueError as `arguments` does, and ImportError where xacro is not installed.
     """
     import xacro  # noqa: PLC0415
 

@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The run of a log: what metadata and journal say about it, and how it is computed again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from spinning_top_sim.recording.reader import LogReader, LogTopic
+from spinning_top_sim.recording.writer import METADATA_NAME
+from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.streams import journal, parameters
+from spinning_top_sim.streams.all_streams import all_streams
+from spinning_top_sim.streams.cdr import ENCAPSULATION
+from spinning_top_sim.streams.pipeline import Rows, Simulation
+from spinning_top_sim.streams.schedule import NEVER_NS, offline_block_ns, offline_targets
+
+EVENT_NAMES = ('start', 'command', 'parameters', 'reset')
+
+
+class ForeignLogError(Exception):
+    """A log lacks what is needed to compute its run again; the text says what."""
+
+
+class DepartureError(Exception):
+    """The computation cannot follow the journal; the text says where."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """An entry of the journal."""
+
+    name: str                             # one of EVENT_NAMES
+    stamp_ns: int                         # log time [ns]
+    t_ns: int                             # simulated time [ns]
+    sent_ns: int                          # time up to which all samples had been sent [ns]
+    details: Mapping[str, Any]            # the rest of the entry
+
+
+@dataclass(frozen=True)
+class RunDescription:
+    """The run of a log, by its metadata and journal."""
+
+    values: Mapping[str, Any]             # checked parameters when the motion began
+    now: Mapping[str, Any]                # and when the recording began
+    epoch_ns: int                         # stamp of t = 0 [ns]
+    begun_ns: int                         # simulated time at which the recording began [ns]
+    history: Sequence[Event]              # commands before that
+    surroundings: Mapping[str, str]       # version, platform and libraries
+    topics: Mapping[str, str]             # topic in the log by that of the stream, imu/data_raw
+    commands_topic: str | None            # None where the log has none
+    events_topic: str | None
+    events: Sequence[Event]               # the journal
+    broken: Sequence[tuple[int, str]]     # stamp [ns] of each damaged entry, and the reason
+
+
+def read_run_description(reader: LogReader) -> RunDescription:
+    """Return the run of a log.  Raises ForeignLogError where the metadata do not have it."""
+    metadata = reader.metadata.get(METADATA_NAME)
+    if metadata is None:
+        raise ForeignLogError('it was not recorded by spinning_top_sim: it has no metadata '
+                              f'{METADATA_NAME!r}')
+    try:
+        values, now = (parameters.checked(json.loads(metadata[key]))
+                       for key in ('parameters', 'parameters_now'))
+        epoch_ns, begun_ns = int(metadata['epoch_ns']), int(metadata['begun_ns'])
+        history = [Event('command', epoch_ns + t_ns, t_ns, t_ns, {'l3': l3, 'lz': lz})
+                   for t_ns, l3, lz in json.loads(metadata['history'])]
+        surroundings = {key: metadata[key] for key in ('version', 'platform', 'libraries')}
+    except (KeyError, TypeError, ValueError) as error:
+        raise ForeignLogError(f'its metadata {METADATA_NAME!r} cannot be used: '
+                              f'{type(error).__name__}: {error}') from error
+    topics = _topics(reader.topics, now)
+    commands_topic = topics.pop(journal.COMMANDS, None)
+    events_topic = topics.pop(journal.EVENTS, None)
+    events: list[Event] = []
+    broken: list[tuple[int, str]] = []
+    for message in () if events_topic is None else reader.messages(topics=[events_topic]):
+        try:
+            events.append(_event(message.log_time, message.data))
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            broken.append((message.log_time, f'{type(error).__name__}: {error}'))
+    return RunDescription(values, now, epoch_ns, begun_ns, history, surroundings, topics,
+                          commands_topic, events_topic, events, broken)
+
+
+def _topics(topics: Sequence[LogTopic], now: Mapping[str, Any]) -> dict[str, str]:
+    """
+    Return the topic in the log of each stream and of the parts of the journal.
+
+    A log as it was written has them in a known order, whatever they were remapped to.  In a log
+    that was put together anew they are known by the ends of their names.
+    """
+    every = all_streams(now)
+    recorded = [*((stream.topic, stream.type_name)
+                  for stream in journal.recorded_streams(every, now)), *journal.TOPICS]
+    if [topic.type_name for topic in topics] == [type_name for _, type_name in recorded]:
+        return {name: topic.name for topic, (name, _) in zip(topics, recorded, strict=True)}
+    known = [*((stream.topic, stream.type_name) for stream in every), *journal.TOPICS]
+    found: dict[str, str] = {}
+    for topic in topics:
+        names = [name for name, type_name in known
+                 if type_name == topic.type_name and name not in found
+                 and topic.name.endswith('/' + name.lstrip('~/'))]
+        if names:
+            found[max(names, key=len)] = topic.name
+    return found
+
+
+def _event(stamp_ns: int, data: bytes) -> Event:
+    """Return an event from its bytes.  Raises ValueError where they are not as written."""
+    length_field = 4
+    details = json.loads(data[len(ENCAPSULATION) + length_field:-1])
+    name, t_ns, sent_ns = (details.pop(key) for key in ('event', 't_ns', 'sent_ns'))
+    if journal.event(name, t_ns, sent_ns, **details) != data:
+        raise ValueError('the bytes of the entry are not as it was written')
+    if name not in EVENT_NAMES:
+        raise ValueError(f'event {name!r} is unknown')
+    return Event(name, stamp_ns, t_ns, sent_ns, details)
+
+
+class Rerun:
+    """
+    The run of a log, computed again.
+
+    send : takes the samples of the log's streams in blocks; without it only motions are computed
+    simulation : at the time that `advance` has reached, in the beginning that of the recording
+    stamp_ns : log time up to which all samples have been sent [ns]
+
+    Raises DepartureError where there is no motion with these parameters and commands.
+    """
+
+    def __init__(self, run: RunDescription, send: Rows | None = None) -> None:
+        self.run, self._send = run, send
+        self._stopped = False       # the equations could not go on
+        try:
+            self.simulation = simulation = Simulation(run.values, run.epoch_ns)
+        except (ValueError, IntegrationError) as error:
+            raise DepartureError(str(error)) from error
+        for event in run.history:
+            self._reach(event.t_ns)
+            self._apply(event)
+        if send is not None:
+            self._reach(run.begun_ns)
+        # -1: commands before the first sample.
+        simulation.now_ns = -1 if run.begun_ns < 0 else max(run.begun_ns, simulation.now_ns)
+        self._set_rates({name: value for name, value in run.now.items()
+                         if value != run.values[name]})
+        if send is not None:
+            simulation.record_blocks(
+                [stream for stream in simulation.streams if stream.topic in run.topics])
+        self.stamp_ns = run.epoch_ns + simulation.now_ns
+
+    def advance(self, end_ns: int) -> Iterator[Event | None]:
+        """
+        Go on to a log time; yield each event when it has been applied, and None after a block.
+
+        Raises DepartureError where an event cannot be applied.
+        """
+        simulation = self.simulation
+        for event in (*self.run.events, None):
+            if event is not None and event.name == 'start':
+                continue
+            stop_ns = end_ns - simulation.epoch_ns if event is None else event.sent_ns
+            block_ns = NEVER_NS if self._send is None else offline_block_ns(
+                [stream for stream in simulation.streams if stream.has_sinks])
+            for target_ns, item in offline_targets(
+                    max(simulation.now_ns, 0), [(stop_ns, event)], block_ns):
+                # Without samples states are only needed where a command finds them.
+                if self._send is not None or (item is not None and item.name == 'command'):
+                    self._reach(target_ns)
+                self.stamp_ns = simulation.epoch_ns + target_ns
+                if item is not None:
+                    simulation.now_ns = target_ns
+                    self._apply(item)
+                yield item
+
+    def _reach(self, target_ns: int) -> None:
+        """Compute, and send, the samples up to a time, as far as the equations go."""
+        if not self._stopped:
+            try:
+                self.simulation.advance_in_blocks(target_ns, self._send or (lambda *_: None))
+            except IntegrationError:
+                self._stopped = True
+
+    def _apply(self, event: Event) -> None:
+        details = event.details
+        try:
+            if event.name == 'command':
+                self.simulation.command(details['l3'], details['lz'])
+                applied_ns = self.simulation.history[-1][0]
+                if applied_ns != event.t_ns:
+                    raise ValueError(f'applied at {applied_ns} ns')
+            elif event.name == 'parameters':
+                self._set_rates(details)
+            else:
+                self.simulation.restart(parameters.checked(details['parameters']))
+                self.simulation.epoch_ns = int(details['epoch_ns'])
+                self._stopped = False
+        except (KeyError, TypeError, ValueError, IntegrationError) as error:
+            raise DepartureError(f'{event.name} at t = {event.t_ns} ns: '
+                                 f'{type(error).__name__}: {error}') from error
+
+    def _set_rates(self, changed: Mapping[str, Any]) -> None:
+        for stream in self.simulation.streams:
+            name = f'{stream.parameter}.rate'
+            if name in changed:
+                stream.set_rate(parameters.BY_NAME[name].check(changed[name]))

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameter files: `simulate` finds in them what rclpy finds for `sim_node`."""
+
+import contextlib
+
+import pytest
+
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
+from spinning_top_sim.tools.simulate import main
+
+VALUES = ['1e-9', '1e5', '-1E+5', '1.5', '.5', '5.', '+5', '-3', '010', '08', '0x1F', '0', '1_000',
+          '1:30', '~', 'null', 't', 'y', 'No', 'on', 'True', 'tRUE', '.inf', 'nan', '.NaN',
+          '-.nan', '2020-01-01', '0b11', '1e', 'e5', '""', '"1"', "'true'", '!!str 5', 'a b',
+          '[1, 2, 3]', '[1.0, 2e3]', '[a, b]', '["1", a]', '[true, false]']
+REFUSED = ['[1, 2.0]', '[1e3, 2]', '[0.5, a]', '[true, "n"]', '', '[1', '{']
+
+
+@contextlib.contextmanager
+def ros_node(path):
+    """Yield a node spinning_top that was started with a parameter file."""
+    pytest.importorskip('rclpy')
+    import helpers.node_harness  # noqa: F401 - DDS stays on this machine
+    import rclpy
+    from rclpy.context import Context
+    from rclpy.node import Node
+
+    context = Context()
+    rclpy.init(args=['--ros-args', '--params-file', str(path)], context=context)
+    try:
+        node = Node('spinning_top', context=context, start_parameter_services=False,
+                    automatically_declare_parameters_from_overrides=True)
+        yield node
+        node.destroy_node()
+    finally:
+        rclpy.shutdown(context=context)
+
+
+def scene(path, **values):
+    lines = (f'    {name}: {text}\n' for name, text in values.items())
+    path.write_text('/**:\n  ros__parameters:\n' + ''.join(lines))
+    return path
+
+
+def test_values_have_the_types_that_rcl_finds(tmp_path):
+    path = scene(tmp_path / 'p.yaml', **{f'p{k}': text for k, text in enumerate(VALUES)})
+    with ros_node(path) as node:
+        theirs = [node.get_parameter(f'p{k}').value for k in range(len(VALUES))]
+    ours = [parse_assignment(f'spin.l3:={text}')[1] for text in VALUES]
+    assert list(zip(VALUES, map(repr, ours), strict=True)) == list(
+        zip(VALUES, map(repr, theirs), strict=True))
+
+
+@pytest.mark.parametrize('text', REFUSED)
+def test_what_rcl_refuses_is_refused(tmp_path, capfd, text):
+    path = scene(tmp_path / 'p.yaml', **{'spin.l3': text})
+    with pytest.raises(Exception, match=r'p\.yaml'), ros_node(path):
+        pass
+    with pytest.raises(ValueError, match=r'p\.yaml'):
+        read_scene(path)
+
+
+def test_a_file_gives_the_parameters_that_the_node_starts_with(tmp_path):
+    pytest.importorskip('rclpy')
+    from spinning_top_sim.nodes.ros_parameters import start_values
+
+    path = scene(tmp_path / 'p.yaml', **{
+        'imu.gyroscope_noise_density': '1e-9', 'max_error': '1e5', 'spin.l3': '2',
+        'imu.lever_arm': '[0, 0, 1]', 'markers.enabled': 'yes', 'use_sim_time': 'true',
+        'start_type_description_service': 'false', 'world_frame': '"1"', 'seed': '0x10'})
+    ours = parameters.checked(read_scene(path))
+    with ros_node(path) as node:
+        assert ours == start_values(node)
+    assert (ours['imu.gyroscope_noise_density'], ours['max_error']) == (1e-9, 1e5)
+    assert (ours['imu.lever_arm'], ours['world_frame'], ours['seed']) == ((0.0, 0.0, 1.0), '1', 16)
+
+
+@pytest.mark.parametrize('sections', [
+    ['/**'], ['/*'], ['spinning_top'], ['/spinning_top'], ['/**/spinning_top'],
+    ['spinning_top', '/**'], ['/**', 'spinning_top'], ['/**', 'other']])
+def test_the_last_section_of_the_node_decides(tmp_path, sections):
+    path = tmp_path / 'p.yaml'
+    path.write_text(''.join(f'{name}:\n  ros__parameters:\n    world_frame: f{k}\n'
+                            for k, name in enumerate(sections)))
+    with ros_node(path) as node:
+        assert read_scene(path) == {'world_frame': node.get_parameter('world_frame').value}
+
+
+def test_an_unknown_name_is_refused_with_a_likely_one(tmp_path, capsys):
+    path = scene(tmp_path / 'p.yaml', **{'spin.l33': 1.0})
+    output = tmp_path / 'run.mcap'
+    for arguments, source in ((['--params', str(path)], str(path)),
+                              (['-p', 'spin.l33:=1.0'], 'spin.l33:=1.0')):
+        assert main(['-o', str(output), '--duration', '1', *arguments]) == 1
+        assert capsys.readouterr().err == (
+            f'simulate: {source}: there is no parameter spin.l33; did you mean spin.l3?\n')
+    assert not output.exists()
