@@ -77,9 +77,9 @@ def play(messages, rate=1.0, plan=None, cost_ns=0, **options):
         sent.append((index, fake.now_ns - 77))
         fake.now_ns += cost_ns
 
-    player = Playback(messages, EPOCH_NS, rate, send, source=fake.now, sleep=fake.sleep, **options)
+    player = Playback(EPOCH_NS, send, rate=rate, source=fake.now, sleep=fake.sleep, **options)
     fake.at_rest = {77 + at: (lambda act=act: act(player)) for at, act in (plan or {}).items()}
-    player.run()
+    player.run(messages)
     return sent, player, fake
 
 
@@ -150,8 +150,9 @@ def test_a_pause_from_another_thread_waits_for_the_message_that_is_being_sent():
             sending.set()
             assert go_on.wait(PATIENCE_S)
 
-    player = Playback(messages_at(*range(10_000)), EPOCH_NS, 1.0, send)
-    playing = threading.Thread(target=player.run, daemon=True)
+    player = Playback(EPOCH_NS, send)
+    playing = threading.Thread(target=player.run, args=(messages_at(*range(10_000)),),
+                               daemon=True)
     playing.start()
     assert sending.wait(PATIENCE_S)
     pausing = threading.Thread(target=player.pause, args=(True,), daemon=True)
@@ -536,7 +537,7 @@ def test_what_cannot_be_played_is_one_line_and_exit_code_2(tmp_path, strangers_l
             ((text,), 'no MCAP'),
             ((path, '--topics', '/nobody'), '/chatter'),
             ((path, '--start', '99'), '1.180 s'),
-            ((path, '--rate', '0'), 'must be a finite number > 0')):
+            ((path, '--rate', '0'), 'must be a number in [1e-06, 1e+09]')):
         with Replay(tmp_path / 'node', *options) as node:
             assert node.wait() == 2
         assert says in node.err.splitlines()[-1], node.err

@@ -50,15 +50,11 @@ def main(argv: list[str] | None = None) -> int:
 def _prepare(argv: list[str]) -> Callable[[], Replayer]:
     from rclpy.utilities import remove_ros_args  # noqa: PLC0415
 
-    options = vars(_parser().parse_args(remove_ros_args(argv)[1:]))
-    log = _open(options.pop('file'), partial=options['partial'])
+    options = _parser().parse_args(remove_ros_args(argv)[1:])
+    from spinning_top_sim.nodes.replayer import Replayer  # noqa: PLC0415
 
-    def make_node() -> Replayer:
-        from spinning_top_sim.nodes.replayer import Options, Replayer  # noqa: PLC0415
-
-        return Replayer(log, Options(**options))
-
-    return make_node
+    log = _open(options.file, partial=options.partial)
+    return lambda: Replayer(log, options)
 
 
 def _open(path: Path, *, partial: bool) -> LogReader:
@@ -68,16 +64,15 @@ def _open(path: Path, *, partial: bool) -> LogReader:
 
     try:
         log = LogReader(path)
-        damage = None if log.whole else log.damage
+        torn = not log.whole and (log.damage.torn or log.damage.losses)
     except LogError as error:
         raise ValueError(error) from error
-    if damage is not None and (damage.torn or damage.losses):
-        if not partial:
-            raise ValueError(f'{path} is torn: `recover` makes a whole log of it, --partial plays '
-                             'what is whole')
-        said = '; '.join(damage.lines()[:1])
-        print(f'replay_node: {path} is torn, playing what is whole{said and "; "}{said}',
-              file=sys.stderr)
+    if torn and not partial:
+        raise ValueError(f'{path} is torn: `recover` makes a whole log of it, --partial plays '
+                         'what is whole')
+    if torn:
+        print(f'replay_node: {path} is torn, playing what is whole', *log.damage.lines()[:1],
+              sep='; ', file=sys.stderr)
     return log
 
 
@@ -86,7 +81,7 @@ def _parser() -> argparse.ArgumentParser:
         prog='replay_node', description=DESCRIPTION, epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('file', type=Path, metavar='FILE', help='the log')
-    parser.add_argument('-r', '--rate', type=_positive, metavar='R',
+    parser.add_argument('-r', '--rate', type=float, metavar='R',
                         help='recorded over real time (default: the parameter `rate`, 1)')
     parser.add_argument('-l', '--loop', action='store_true',
                         help='begin again at the end; --clock goes on')
@@ -94,7 +89,7 @@ def _parser() -> argparse.ArgumentParser:
                         help='begin S seconds after the begin of the log')
     parser.add_argument('--topics', nargs='+', default=[], metavar='T',
                         help='play these only, by their recorded names')
-    parser.add_argument('--clock', type=_positive, nargs='?', const=CLOCK_RATE, default=0.0,
+    parser.add_argument('--clock', type=_not_negative, nargs='?', const=CLOCK_RATE, default=0.0,
                         metavar='HZ', help="publish the log's time on /clock, HZ times a second "
                         f'(default {CLOCK_RATE:g}), instead of a recorded /clock')
     parser.add_argument('--partial', action='store_true',
@@ -108,16 +103,9 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _positive(text: str) -> float:
-    value = float(text)
-    if not (math.isfinite(value) and value > 0.0):
-        raise argparse.ArgumentTypeError(f'{text}: must be a finite number > 0')
-    return value
-
-
 def _not_negative(text: str) -> float:
     value = float(text)
-    if not (math.isfinite(value) and value >= 0.0):
+    if not 0.0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f'{text}: must be a finite number >= 0')
     return value
 
