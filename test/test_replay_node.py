@@ -11,12 +11,15 @@ import dataclasses
 import importlib
 import itertools
 import signal
+import struct
 import threading
 import time
 from fractions import Fraction
 
 import pytest
 from helpers.node_harness import PATIENCE_S, Peer, SimNode, Topic
+from mcap.opcode import Opcode
+from mcap.writer import Writer as McapWriter
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import (
@@ -34,7 +37,7 @@ from spinning_top_sim.nodes import playback
 from spinning_top_sim.nodes.playback import ROUND_GAP_NS, Playback, ReadAhead, rounds
 from spinning_top_sim.nodes.replayer import message_class
 from spinning_top_sim.recording import writer
-from spinning_top_sim.recording.rosbag2 import RecordedTopic
+from spinning_top_sim.recording.rosbag2 import RecordedTopic, offered_qos_yaml
 from spinning_top_sim.recording.schemas import find_definition
 from spinning_top_sim.recording.writer import McapRecorder
 
@@ -477,6 +480,50 @@ def test_an_unknown_type_is_named_once_and_the_rest_plays(peer, tmp_path):
     assert_same(raw, [[string_cdr(n) for n in range(10)]])
     assert node.err.count(THING) == 1
     assert '/thing is not played' in node.err
+
+
+def test_one_odd_channel_does_not_stop_the_others(peer, tmp_path):
+    qos = {'/plain': {}, '/deadline': {'deadline': {'sec': -1, 'nsec': 0}},
+           '/liveliness': {'liveliness': 2}, '/depth': {'depth': -1}}
+    odd = {'/no_schema': (0, 'cdr'), '/no_type': (3, 'cdr'), '/no_cdr': (1, 'json'),
+           'no name!': (1, 'cdr'), '/plain': (2, 'cdr')}
+    path = tmp_path / 'odd.mcap'
+    with path.open('wb') as file:
+        log = McapWriter(file)
+        log.start('ros2')
+        for name in (STRING, TWIST, 'no type; at all'):
+            log.register_schema(name, 'ros2msg', b'')
+        channels = [log.register_channel(name, 'cdr', 1, {
+            'offered_qos_profiles': offered_qos_yaml(RecordedTopic(name, STRING, policies))})
+            for name, policies in qos.items()]
+        channels += [log.register_channel(name, encoding, schema)
+                     for name, (schema, encoding) in odd.items()]
+        for n, channel in enumerate(channels):
+            log.add_message(channel, EPOCH_NS + n, string_cdr(n), EPOCH_NS + n)
+        log.finish()
+    raw, node = play_all(peer, tmp_path, path, [(name, STRING) for name in qos], depth=10)
+    assert_same(raw, [[string_cdr(n)] for n in range(len(qos))])
+    for name in odd:
+        assert node.err.count(f'{name} is not played') == 1
+    for name, policies in qos.items():
+        assert node.err.count(f'{name} is published with default QoS') == len(policies)
+
+
+@pytest.mark.parametrize('start_ns', [0, EPOCH_NS - SECOND, EPOCH_NS + SECOND])
+def test_an_index_that_does_not_fit_the_messages_is_an_error(tmp_path, start_ns):
+    path = tmp_path / 'run.mcap'
+    write_log(path, 10)
+    content = bytearray(path.read_bytes())
+    summary, = struct.unpack_from('<Q', content, len(content) - 28)
+    while content[summary] != Opcode.CHUNK_INDEX:
+        summary += 9 + struct.unpack_from('<Q', content, summary + 1)[0]
+    struct.pack_into('<QQ', content, summary + 9, start_ns, start_ns)
+    struct.pack_into('<I', content, len(content) - 12, 0)       # no checksum of the summary
+    path.write_bytes(content)
+    with Replay(tmp_path, path) as node:
+        assert node.wait() == 2
+    assert 'recover' in node.err
+    assert f'the index of {path} does not fit' in node.err
 
 
 def test_a_type_that_has_changed_since_is_warned_about(peer, tmp_path, monkeypatch):

@@ -14,7 +14,6 @@ from spinning_top_sim.nodes import executable
 
 if TYPE_CHECKING:
     from spinning_top_sim.nodes.replayer import Replayer
-    from spinning_top_sim.recording.reader import LogReader
 
 DESCRIPTION = """\
 Publish the messages of a ROS 2 log (.mcap) with their recorded spacing, then end.
@@ -51,29 +50,10 @@ def _prepare(argv: list[str]) -> Callable[[], Replayer]:
     from rclpy.utilities import remove_ros_args  # noqa: PLC0415
 
     options = _parser().parse_args(remove_ros_args(argv)[1:])
-    from spinning_top_sim.nodes.replayer import Replayer  # noqa: PLC0415
+    from spinning_top_sim.nodes.replayer import Replayer, open_log  # noqa: PLC0415
 
-    log = _open(options.file, partial=options.partial)
+    log = open_log(options.file, options.partial)
     return lambda: Replayer(log, options)
-
-
-def _open(path: Path, *, partial: bool) -> LogReader:
-    """Open a log.  Raises ValueError for what is none, and for a torn one unless `partial`."""
-    from spinning_top_sim.recording.errors import LogError  # noqa: PLC0415
-    from spinning_top_sim.recording.reader import LogReader  # noqa: PLC0415
-
-    try:
-        log = LogReader(path)
-        torn = not log.whole and (log.damage.torn or log.damage.losses)
-    except LogError as error:
-        raise ValueError(error) from error
-    if torn and not partial:
-        raise ValueError(f'{path} is torn: `recover` makes a whole log of it, --partial plays '
-                         'what is whole')
-    if torn:
-        print(f'replay_node: {path} is torn, playing what is whole', *log.damage.lines()[:1],
-              sep='; ', file=sys.stderr)
-    return log
 
 
 def _parser() -> argparse.ArgumentParser:

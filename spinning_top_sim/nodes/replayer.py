@@ -31,7 +31,7 @@ from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes import reports
 from spinning_top_sim.nodes.playback import ROUND_GAP_NS, Message, Playback, ReadAhead, rounds
-from spinning_top_sim.recording.errors import DefinitionNotFoundError
+from spinning_top_sim.recording.errors import DefinitionNotFoundError, LogError
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
 from spinning_top_sim.recording.schemas import find_definition
@@ -83,7 +83,7 @@ class Replayer(Node):
         self._clock_publishers = []
         if options.clock:
             self._clock_publishers.append(self.create_publisher(ClockMessage, '/clock', 10))
-            self.create_timer(1.0 / options.clock, self._publish_clock, clock=steady)
+            self.create_timer(1.0 / max(options.clock, SLOWEST), self._publish_clock, clock=steady)
         self.create_timer(1.0, self._show_status, clock=steady)
         self.create_service(SetBool, '~/set_pause', self._on_pause)
         self._stopping = threading.Event()
@@ -92,16 +92,13 @@ class Replayer(Node):
 
     def _open_publishers(self) -> dict[int, Publisher]:
         """Return the publishers by channel; warn of the topics that cannot be played."""
-        wanted = set(self._options.topics)
         there = {channel.name for channel in self._log.topics}
-        if wanted and not wanted & there:
-            raise ValueError(f'the log has none of the topics {", ".join(sorted(wanted))}; it has '
-                             f'{", ".join(sorted(there)) or "none at all"}')
+        wanted = set(self._options.topics) or there
         for name in sorted(wanted - there):
             self.get_logger().warning(f'the log has no topic {name}')
         channels: dict[tuple[str, str], list[LogTopic]] = defaultdict(list)
         for channel in self._log.topics:
-            if not wanted or channel.name in wanted:
+            if channel.name in wanted:
                 channels[channel.name, channel.type_name].append(channel)
         outputs = {}
         for (name, _), alike in channels.items():
@@ -111,8 +108,9 @@ class Replayer(Node):
                 self.get_logger().warning(f'{name} is not played: {error}')
             else:
                 outputs.update({channel.channel_id: publisher for channel in alike})
-        if channels and not outputs and not self._options.clock:
-            raise ValueError('none of the topics can be played')
+        if wanted and not outputs and not self._options.clock:
+            raise ValueError('none of the topics can be played; the log has '
+                             f'{", ".join(sorted(there)) or "none at all"}')
         return outputs
 
     def _publisher(self, channels: list[LogTopic]) -> Publisher:
@@ -251,6 +249,22 @@ class Replayer(Node):
         late = f' | {self._playback.late} late' if self._playback.late else ''
         self._terminal.show(f'{self._position()} | x{self.get_parameter("rate").value:g}{paused} '
                             f'| {self._playback.sent} messages{late}')
+
+
+def open_log(path: Path, partial: bool) -> LogReader:
+    """Open a log.  Raises ValueError for what is none, and for a torn one unless `partial`."""
+    try:
+        log = LogReader(path)
+        torn = not log.whole and (log.damage.torn or log.damage.losses)
+    except LogError as error:
+        raise ValueError(error) from error
+    if torn and not partial:
+        raise ValueError(f'{path} is torn: `recover` makes a whole log of it, --partial plays '
+                         'what is whole')
+    if torn:
+        print(f'replay_node: {path} is torn, playing what is whole', *log.damage.lines()[:1],
+              sep='; ', file=sys.stderr)
+    return log
 
 
 def message_class(type_name: str) -> type:
