@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clocks, and the thread that calls a function at absolute deadlines."""
+"""Clocks, a fair lock, and the thread that calls a function at absolute deadlines."""
 
 from __future__ import annotations
 
@@ -9,17 +9,7 @@ from collections.abc import Callable
 
 
 class SimulatedClock:
-    """
-    Maps a source clock to simulated time: scale times as fast, with pauses.
-
-    Parameters
-    ----------
-    source
-        Returns the time of the clock to follow [ns].
-    scale
-        Simulated over source time.
-
-    """
+    """Maps a source clock [ns] to simulated time [ns]: `scale` times as fast, with pauses."""
 
     def __init__(self, source: Callable[[], int], scale: float) -> None:
         self._source, self._scale = source, scale
@@ -33,11 +23,9 @@ class SimulatedClock:
 
     def set_scale(self, scale: float) -> None:
         """Go on from the present time at another speed."""
-        now_ns, running = self.now(), self.running
+        if self.running:
+            self.start(self.now())
         self._scale = scale
-        self.stop(now_ns)
-        if running:
-            self.start(now_ns)
 
     def start(self, simulated_ns: int) -> None:
         """Run from this simulated time on."""
@@ -62,60 +50,37 @@ class SimulatedClock:
 
 
 class MonotonicClock:
-    """
-    Follows a clock and leaves out its steps back, as of the /clock of a log played in a loop.
-
-    Parameters
-    ----------
-    source
-        Returns the time of the clock to follow [ns].
-
-    """
+    """Follows a clock and leaves out its steps back, as of the /clock of a log in a loop."""
 
     def __init__(self, source: Callable[[], int]) -> None:
         self._source = source
-        self._newest: int | None = None
-        self._stepped_back_ns = self._taken_ns = 0
+        self._newest = 0
+        self.stepped_back_ns = 0
 
     def __call__(self) -> int:
         reading = self._source()
-        if self._newest is not None and reading < self._newest:
-            self._stepped_back_ns += self._newest - reading
+        self.stepped_back_ns += max(0, self._newest - reading)
         self._newest = reading
-        return reading + self._stepped_back_ns
-
-    def take_step_back(self) -> int:
-        """Return by how much the clock has stepped back since this was last asked [ns]."""
-        before, self._taken_ns = self._taken_ns, self._stepped_back_ns
-        return self._taken_ns - before
+        return reading + self.stepped_back_ns
 
 
 class FairLock:
     """
-    A reentrant lock that threads get in the order in which they ask for it.
+    A lock that threads get in turn.
 
-    A thread that takes an ordinary lock again and again leaves the others no turn.
+    A thread that takes an ordinary lock again and again, as ticks do on an overloaded machine,
+    leaves the others no turn: waking up takes them longer than it is free.
     """
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._queue = threading.Lock()      # held by the thread that is next
-        self._owner: int | None = None
-        self._depth = 0
+        self._lock, self._next = threading.Lock(), threading.Lock()
 
     def __enter__(self) -> None:
-        this = threading.get_ident()
-        if self._owner != this:
-            with self._queue:
-                self._lock.acquire()
-            self._owner = this
-        self._depth += 1
+        with self._next:        # held by the thread that is next
+            self._lock.acquire()
 
     def __exit__(self, *_: object) -> None:
-        self._depth -= 1
-        if self._depth == 0:
-            self._owner = None
-            self._lock.release()
+        self._lock.release()
 
 
 class DeadlineThread(threading.Thread):
@@ -126,15 +91,9 @@ class DeadlineThread(threading.Thread):
     the grid of deadlines stays.  A sleeping thread wakes up at less processor time than an rclpy
     timer (`python benchmark/wake_up.py`).
 
-    Parameters
-    ----------
-    tick
-        Called at each deadline; returns whether `idle` is called before the next one.
-    rate
-        Deadlines per second [Hz].
-    idle
-        Does what is left to do between two ticks.
-
+    tick : called at each deadline; returns whether `idle` is called before the next one
+    rate : deadlines per second [Hz]
+    idle : does what is left to do between two ticks
     """
 
     # Longest sleep [s], so that `stop` is quick.
@@ -145,7 +104,7 @@ class DeadlineThread(threading.Thread):
     SHORTEST_NAP = 1e-4
 
     def __init__(self, tick: Callable[[], object], rate: float,
-                 idle: Callable[[], None] = lambda: None, *, name: str = 'simulation') -> None:
+                 idle: Callable[[], object] = lambda: None, *, name: str = 'simulation') -> None:
         super().__init__(name=name, daemon=True)
         self._tick, self._idle = tick, idle
         self._stopped = False
@@ -162,20 +121,15 @@ class DeadlineThread(threading.Thread):
 
     def run(self) -> None:
         grid: tuple[float, float] | None = None
-        newest = 0
+        newest = 0              # number of the deadline of the newest tick
         while not self._stopped:
             before, grid = grid, self._grid
             origin, period = grid
-            passed = int((time.monotonic() - origin) // period)     # the newest deadline
-            if grid is not before:
-                newest = passed
-            if passed <= newest:
-                newest += 1
-                deadline = origin + newest * period
-                while (left := deadline - time.monotonic()) > 0.0 and not self._stopped:
-                    time.sleep(min(left, self.LONGEST_SLEEP))
-            else:
-                newest = passed
+            passed = int((time.monotonic() - origin) // period)
+            newest = passed + 1 if grid is not before else max(passed, newest + 1)
+            deadline = origin + newest * period
+            while (left := deadline - time.monotonic()) > 0.0 and not self._stopped:
+                time.sleep(min(left, self.LONGEST_SLEEP))
             if not self._stopped and self._tick():
                 nap = min(self.NAP * period, self.LONGEST_SLEEP)
                 if nap >= self.SHORTEST_NAP:

@@ -7,8 +7,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -59,20 +58,13 @@ class MotionReport:
         """
         Return the message for /diagnostics; its level is that of the worst problem.
 
-        Parameters
-        ----------
-        stamp, name
-            Time of the message, and what it calls the node.
-        max_error
-            Largest orientation error [rad] that is no problem; 0: the error is not computed.
-
+        stamp, name : time of the message, and what it calls the node
+        max_error : largest orientation error that is no problem; 0: it is not computed [rad]
         """
         simulation, loop = self._simulation, self._loop
         error = math.nan if max_error == 0.0 else simulation.orientation_error
         skipped = sum(stream.skipped for stream in simulation.streams)
-        problems = []
-        if loop.paused:
-            problems.append((OK, 'paused'))
+        problems = [(OK, 'paused' if loop.paused else 'running')]
         if skipped or loop.counters.slipped_ns:
             problems.append((WARN, 'this machine cannot keep up'))
         if error > max_error > 0.0:
@@ -82,11 +74,11 @@ class MotionReport:
             problems.append((ERROR, f'recording: {self._session.error}'))
         if loop.failure:
             problems.append((ERROR, loop.failure))
-        level, message = max(problems, key=lambda problem: problem[0], default=(OK, 'running'))
-        values = {**self._numbers(error, skipped), **self._session.numbers()}
+        level, message = max(problems, key=lambda problem: problem[0])
         array = DiagnosticArray(status=[DiagnosticStatus(
             level=bytes([level]), name=name, hardware_id='none', message=message,
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])])
+            values=[KeyValue(key=key, value=str(value))
+                    for key, value in self._numbers(error, skipped).items()])])
         array.header.stamp = stamp
         return array
 
@@ -105,6 +97,7 @@ class MotionReport:
             'rejected commands': counters.rejected_commands,
             'integration steps': simulation.steps,
             'evaluations': simulation.evaluations,
+            **self._session.numbers(),
         }
 
     def _sent(self) -> int:
@@ -123,30 +116,13 @@ class MotionReport:
     def status_line(self) -> str:
         """Return the line for the terminal, with the angle in degrees."""
         simulation, loop, size = self._simulation, self._loop, self._session.size
-        state = simulation.state()
+        theta = math.degrees(float(simulation.state().theta[0]))
         flag = ' FAILED' if loop.failure else ' paused' if loop.paused else ''
-        log = '' if size is None else f' | log {human_readable(size)}'
+        log = f' | log {size}' if size else ''
         return (f't {loop.now_ns / NANOSECONDS:9.2f} s{flag} | {self._regime} | '
-                f'theta {math.degrees(float(state.theta[0])):6.2f} deg | '
-                f'L3 {simulation.l3:.4g} Lz {simulation.lz:.4g} | x{self.speed.factor:.2f} | '
-                f'dE/E {simulation.energy_drift:+.0e} | {self._sent()} msgs{log}')
-
-
-def impossible_body(values: Mapping[str, Any]) -> str:
-    """Return the warning of moments of inertia that no rigid body has."""
-    return (f'top.lambda3 = {values["top.lambda3"]!r} kg m^2: no rigid body has this with '
-            f'top.lambda1 = {values["top.lambda1"]!r}, top.mass = {values["top.mass"]!r} and '
-            f'top.com_distance = {values["top.com_distance"]!r} (lambda3 <= 2 (lambda1 - M R^2)); '
-            'simulated all the same')
-
-
-def human_readable(count: float) -> str:
-    """Return a number of bytes as a size such as 1.2 MB."""
-    for unit in ('B', 'kB', 'MB'):
-        if count < 1000.0:
-            return f'{count:.0f} {unit}' if unit == 'B' else f'{count:.1f} {unit}'
-        count /= 1000.0
-    return f'{count:.1f} GB'
+                f'theta {theta:6.2f} deg | L3 {simulation.l3:.4g} Lz {simulation.lz:.4g} | '
+                f'x{self.speed.factor:.2f} | dE/E {simulation.energy_drift:+.0e} | '
+                f'{self._sent()} msgs{log}')
 
 
 class Terminal:

@@ -33,13 +33,9 @@ def _prepare(argv: list[str]) -> Callable[[], Simulator] | None:
     if '--help' in argv[1:] or '-h' in argv[1:]:
         _show_help()
         return None
-    return _make_node
-
-
-def _make_node() -> Simulator:
     from spinning_top_sim.nodes.simulator import Simulator  # noqa: PLC0415
 
-    return Simulator()
+    return Simulator
 
 
 def _show_help() -> None:
