@@ -80,7 +80,8 @@ def play(messages, rate=1.0, plan=None, cost_ns=0, **options):
         sent.append((index, fake.now_ns - 77))
         fake.now_ns += cost_ns
 
-    player = Playback(EPOCH_NS, send, rate=rate, source=fake.now, sleep=fake.sleep, **options)
+    player = Playback(EPOCH_NS, send, source=fake.now, sleep=fake.sleep, **options)
+    player.set_rate(rate)
     fake.at_rest = {77 + at: (lambda act=act: act(player)) for at, act in (plan or {}).items()}
     player.run(messages)
     return sent, player, fake

@@ -107,11 +107,11 @@ class Playback:
     source, sleep : returns steady time [ns]; waits at most so many seconds (None: until woken)
     """
 
-    def __init__(self, begin_ns: int, send: Callable[[int, bytes], None], *, rate: float = 1.0,
-                 paused: bool = False, source: Callable[[], int] = time.monotonic_ns,
-                 sleep: Callable[[float | None], None] | None = None) -> None:
+    def __init__(self, begin_ns: int, send: Callable[[int, bytes], None], *, paused: bool = False,
+                 source: Callable[[], int] = time.monotonic_ns,
+                 sleep: Callable[[float | None], object] | None = None) -> None:
         self._begin_ns, self._send, self._source = begin_ns, send, source
-        self._clock = SimulatedClock(source, rate)
+        self._clock = SimulatedClock(source, 1.0)
         self._clock.stop(begin_ns)
         self._sent_until = begin_ns         # all messages before this time are sent
         self._stopped = False
@@ -124,10 +124,10 @@ class Playback:
     def run(self, messages: Iterable[Message]) -> None:
         """Play messages in the order of their times, to the end or until stopped."""
         for at_ns, index, data in messages:
-            self._sent_until = at_ns
             if not self.sent:           # reading the first message may have taken a while
                 with self._lock:
                     self._set_clock(self._begin_ns, self.paused)
+            self._sent_until = at_ns
             if not self._send_when_due(at_ns, index, data):
                 return
 

@@ -280,12 +280,9 @@ def message_class(type_name: str) -> type:
     package, name = match.groups()
     prefixes = [*filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)),
                 sys.prefix]
-    try:
-        if any(Path(prefix, AMENT_INDEX, package).is_file() for prefix in prefixes):
-            found: type = getattr(importlib.import_module(f'{package}.msg'), name)
-            return found
-    except (ImportError, AttributeError):
-        pass
+    if any(Path(prefix, AMENT_INDEX, package).is_file() for prefix in prefixes):
+        with contextlib.suppress(ImportError, AttributeError):
+            return getattr(importlib.import_module(f'{package}.msg'), name)
     raise LookupError(f'{type_name} is not installed')
 
 
