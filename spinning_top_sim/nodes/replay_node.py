@@ -26,16 +26,18 @@ Publish the messages of a ROS 2 log (.mcap) with their recorded spacing, then en
 EPILOG = """\
 Topics keep their recorded names, whatever the namespace of this node (`replay`); remapping with
 `--ros-args -r FROM:=TO` works on them. They are published with the recorded QoS, and
-`qos_overrides.<topic>.publisher.{history,depth,reliability}` override it. A topic whose type is
-not installed is named and left out. Messages go out in the order of their log times and with their
-recorded bytes: stamps inside them stay as they are, in every round of --loop. What is late is sent
-at once; at high rates a greater depth keeps more of it for subscribers that cannot follow.
+`qos_overrides.<topic>.publisher.{history,depth,reliability}` override it. A topic that cannot be
+published, such as one of a type that is not installed, is named and left out. Messages go out in
+the order of their log times and with their recorded bytes: stamps inside them stay as they are, in
+every round of --loop. What is late is sent at once; at high rates a greater depth keeps more of it
+for subscribers that cannot follow.
 
 while playing:
   ros2 service call /replay/set_pause std_srvs/srv/SetBool '{data: true}'
   ros2 param set /replay rate 2.0
 
-exit code: 0 played (also in part: topics left out, ended by a signal), 2 cannot be played
+exit code: 0 played (also in part: topics left out, ended by a signal), 2 cannot be played, or is
+damaged inside
 """
 
 CLOCK_RATE = 40.0           # Hz, as `ros2 bag play` has it

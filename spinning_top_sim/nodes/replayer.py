@@ -186,14 +186,14 @@ class Replayer(Node):
         """Yield the messages of a round."""
         names = {channel.name for channel in self._log.topics
                  if channel.channel_id in self._outputs}
-        # An index that lies shows only where it does not choose the messages.
+        # A reader that is told where to start takes the index's word for it.
         start = self._begin_ns if self._options.start else None
         for message in self._log.messages(names, start):
-            at_ns = message.log_time
-            if 0 < at_ns < self._log_begin_ns or at_ns > self._end_ns:
+            at_ns = message.log_time or self._begin_ns      # 0: recorded before there was a time
+            if not self._log_begin_ns <= at_ns <= self._end_ns:
                 raise ValueError(f'the index of {self._log.path} does not fit its messages: '
                                  '`recover` makes a log with a right one')
-            if at_ns >= self._begin_ns and message.channel_id in self._outputs:
+            if message.channel_id in self._outputs:
                 yield at_ns, message.channel_id, message.data
 
     def _tell_damage(self) -> bool:
