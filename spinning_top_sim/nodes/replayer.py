@@ -35,8 +35,8 @@ from spinning_top_sim.recording.errors import DefinitionNotFoundError, LogError
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
 from spinning_top_sim.recording.schemas import find_definition
+from spinning_top_sim.streams.cdr import NANOSECONDS
 
-NANOSECONDS = 1_000_000_000
 # REP-144 and the ROS 2 interface names.
 TYPE_NAME = re.compile(r'([a-z][a-z0-9_]*)/(?:msg/)?([A-Z][A-Za-z0-9_]*)')
 AMENT_INDEX = 'share/ament_index/resource_index/packages'
