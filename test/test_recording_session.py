@@ -14,7 +14,7 @@ from helpers.node_harness import PATIENCE_S
 from helpers.node_logs import events_in, log_of
 
 from spinning_top_sim.nodes.pacing import FairLock
-from spinning_top_sim.nodes.recording_session import RecordingSession, human_readable
+from spinning_top_sim.nodes.recording_session import RecordingSession
 from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.writer import McapRecorder
@@ -189,8 +189,3 @@ def test_a_recording_that_fails_is_closed_and_says_why(tmp_path, monkeypatch):
     assert recorded.session.error == 'the disk is gone'
     assert recorded.session.numbers() == {'recorder': 'failed'}
     assert not any(stream.has_sinks for stream in recorded.simulation.streams)
-
-
-def test_sizes_are_for_people():
-    assert [human_readable(count) for count in (0, 999, 1000, 2_500_000, 7.3e9, 2e13)] == [
-        '0 B', '999 B', '1.0 kB', '2.5 MB', '7.3 GB', '20000.0 GB']

@@ -21,16 +21,12 @@ SPIN_S = 0.2
 
 
 class RunnableNode(Protocol):
-    """A node as `run` needs it; `finished` completes with its exit code (None: 0)."""
+    """A node that `start` has begin to work before the spin, and `stop` end in any state."""
 
-    finished: Future
+    finished: Future                # completes with the exit code, None for 0
 
-    def start(self) -> None:
-        """Begin to work: the node is about to be spun."""
-
-    def stop(self) -> None:
-        """End the work, whatever state the context is in."""
-
+    def start(self) -> None: ...
+    def stop(self) -> None: ...
     def destroy_node(self) -> None: ...
 
 
@@ -39,13 +35,11 @@ def run(name: str, argv: list[str],
     """
     Run a node; return 0 after an ordinary end, 2 if it cannot be started.
 
-    name : of the executable, for messages
-    argv : arguments, with those for ROS
-    prepare : takes the arguments; returns a function that makes the node, or None if there is
-        nothing to run.  Both may raise ValueError, RuntimeError or OSError, whose text is shown.
+    `prepare` takes the arguments.  It returns a function that makes the node, or None if there is
+    nothing to run.  Both may raise ValueError, RuntimeError or OSError, whose text is shown.
     """
     # Nothing is open yet, and a KeyboardInterrupt in the midst of imports is easily lost.
-    _on_interrupt(lambda *_: _exit(130))
+    _handle(signal.SIGINT, lambda *_: _exit(130))
     try:
         make_node = prepare(argv)
     except (ValueError, RuntimeError, OSError) as error:
@@ -53,10 +47,10 @@ def run(name: str, argv: list[str],
     return 0 if make_node is None else _run(name, argv, make_node)
 
 
-def _on_interrupt(handler: Callable[[int, object], object]) -> None:
-    """Handle SIGINT, unless it is ignored, as that of a job in the background is."""
-    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
-        signal.signal(signal.SIGINT, handler)
+def _handle(number: signal.Signals, handler: Callable[[int, object], object]) -> None:
+    """Handle a signal unless it is ignored, as nohup ignores SIGHUP."""
+    if signal.getsignal(number) != signal.SIG_IGN:
+        signal.signal(number, handler)
 
 
 def _cannot_start(name: str, error: Exception) -> int:
@@ -83,10 +77,9 @@ def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode]) -> i
     # rclpy shuts the context down at SIGINT and SIGTERM, from `init` on; a launched node gets
     # SIGINT twice, from the terminal and from launch.
     interrupts: list[int] = []
-    _on_interrupt(lambda number, _: interrupts.append(number))
+    _handle(signal.SIGINT, lambda number, _: interrupts.append(number))
     for number in (signal.SIGHUP, signal.SIGQUIT):
-        if signal.getsignal(number) is signal.SIG_DFL:
-            signal.signal(number, lambda *_: signal.raise_signal(signal.SIGTERM))
+        _handle(number, lambda *_: signal.raise_signal(signal.SIGTERM))
     try:
         rclpy.init(args=argv)
     except Exception as error:          # a params file that is missing or no YAML, a bad remapping

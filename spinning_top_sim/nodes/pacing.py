@@ -50,26 +50,27 @@ class SimulatedClock:
 
 
 class MonotonicClock:
-    """Follows a clock and leaves out its steps back, as of the /clock of a log in a loop."""
+    """Follows a clock, and tells and leaves out its steps back, as of a log played in a loop."""
 
-    def __init__(self, source: Callable[[], int]) -> None:
-        self._source = source
-        self._newest = 0
-        self.stepped_back_ns = 0
+    def __init__(self, source: Callable[[], int], tell: Callable[[int], object]) -> None:
+        self._source, self._tell = source, tell
+        self._newest_ns = self._stepped_back_ns = 0
 
     def __call__(self) -> int:
-        reading = self._source()
-        self.stepped_back_ns += max(0, self._newest - reading)
-        self._newest = reading
-        return reading + self.stepped_back_ns
+        back_ns, self._newest_ns = self._newest_ns, self._source()
+        back_ns -= self._newest_ns
+        if back_ns > 0:
+            self._stepped_back_ns += back_ns
+            self._tell(back_ns)
+        return self._newest_ns + self._stepped_back_ns
 
 
 class FairLock:
     """
     A lock that threads get in turn.
 
-    A thread that takes an ordinary lock again and again, as ticks do on an overloaded machine,
-    leaves the others no turn: waking up takes them longer than it is free.
+    An ordinary lock stays with a thread that takes it again and again, as ticks do on a machine
+    that is overloaded: those who wait for it do not wake up in time.
     """
 
     def __init__(self) -> None:
@@ -85,15 +86,11 @@ class FairLock:
 
 class DeadlineThread(threading.Thread):
     """
-    Calls a function at absolute deadlines until it is stopped.
+    Calls `tick` at absolute deadlines until it is stopped, and `idle` behind it where it asks so.
 
     A tick that comes late comes at once.  Deadlines that have passed meanwhile are skipped, and
     the grid of deadlines stays.  A sleeping thread wakes up at less processor time than an rclpy
     timer (`python benchmark/wake_up.py`).
-
-    tick : called at each deadline; returns whether `idle` is called before the next one
-    rate : deadlines per second [Hz]
-    idle : does what is left to do between two ticks
     """
 
     # Longest sleep [s], so that `stop` is quick.
@@ -104,8 +101,8 @@ class DeadlineThread(threading.Thread):
     SHORTEST_NAP = 1e-4
 
     def __init__(self, tick: Callable[[], object], rate: float,
-                 idle: Callable[[], object] = lambda: None, *, name: str = 'simulation') -> None:
-        super().__init__(name=name, daemon=True)
+                 idle: Callable[[], object]) -> None:
+        super().__init__(name='simulation', daemon=True)
         self._tick, self._idle = tick, idle
         self._stopped = False
         # Origin and period [s].  Another thread may replace it at any time.
@@ -139,5 +136,5 @@ class DeadlineThread(threading.Thread):
     def stop(self) -> None:
         """Ask the thread to end, and wait for it."""
         self._stopped = True
-        if self.is_alive() and self is not threading.current_thread():
+        if self.is_alive():
             self.join(5.0)

@@ -51,14 +51,11 @@ class RecordingSession:
         self._journal_topics: dict[str, int] = {}
         self._file_lock = threading.Lock()      # one opens or closes at a time
 
-    # ------------------------------------------------------------------------ start and stop
-
     def start(self, values: Mapping[str, Any]) -> Callable[[], str]:
         """
         Keep in memory what is to be recorded from now on; return what opens the log for it.
 
-        Opening returns what to tell the user.  It raises RecordingError if the log cannot be
-        opened, for whatever reason; then nothing is recorded.
+        That returns what to tell the user, or raises RecordingError; then nothing is recorded.
         """
         if self._recorder is not None:
             path = self._recorder.path
@@ -96,11 +93,7 @@ class RecordingSession:
         self._simulation.log_to(write or (lambda *_: None), streams)
 
     def stop(self, error: str | None = None) -> str | None:
-        """
-        Close the log; return what it holds, for the user, or None if there is no recording.
-
-        error : why the recording stops, if the user has not asked for it
-        """
+        """Close the log, for this reason; return what it holds, or None if there is none."""
         with self._file_lock:
             with self._lock:
                 recorder, self._recorder = self._recorder, None
@@ -110,17 +103,16 @@ class RecordingSession:
                 self.error = error
             summary = recorder.close()
         text = (f'{summary.path}: {sum(summary.counts.values())} messages, '
-                f'{human_readable(summary.bytes)}')
+                f'{summary.bytes / 1e6:.1f} MB')
         return f'{text}; stopped early: {summary.error}' if summary.error else text
 
     def check(self) -> str | None:
         """Close a recording that has failed; return the reason."""
-        error = None if self._recorder is None else self._recorder.error
-        if error:
-            self.stop(error)
-        return error
-
-    # ------------------------------------------------------------------------------ messages
+        recorder = self._recorder
+        if recorder is None or recorder.error is None:
+            return None
+        self.stop(recorder.error)
+        return recorder.error
 
     def write_command(self, l3: float, lz: float) -> None:
         """Record a command applied now, both as a message and as an event."""
@@ -149,12 +141,11 @@ class RecordingSession:
         if self._recorder is not None:
             self._recorder.wait_for_room(0.1)
 
-    # -------------------------------------------------------------------------------- report
-
     @property
     def size(self) -> str | None:
         """Size of the log, for the user; None without one."""
-        return None if self._recorder is None else human_readable(self._recorder.counters.bytes)
+        recorder = self._recorder
+        return None if recorder is None else f'{recorder.counters.bytes / 1e6:.1f} MB'
 
     def numbers(self) -> dict[str, object]:
         """Return what /diagnostics says about the recording."""
@@ -197,12 +188,3 @@ def _dated(folder: Path) -> Iterator[Path]:
     yield folder / f'{stem}.mcap'
     for number in itertools.count(2):
         yield folder / f'{stem}_{number}.mcap'
-
-
-def human_readable(count: float) -> str:
-    """Return a number of bytes as a size such as 1.2 MB."""
-    for unit in ('B', 'kB', 'MB'):
-        if count < 1000.0:
-            return f'{count:.0f} {unit}' if unit == 'B' else f'{count:.1f} {unit}'
-        count /= 1000.0
-    return f'{count:.1f} GB'

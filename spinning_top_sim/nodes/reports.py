@@ -22,35 +22,13 @@ if TYPE_CHECKING:
 OK, WARN, ERROR = 0, 1, 2
 
 
-class Speedometer:
-    """Measures the real-time factor, simulated over real time between two readings."""
-
-    # Shortest time to measure [s]: reports that were held up follow each other at once.
-    SHORTEST = 0.1
-
-    def __init__(self) -> None:
-        self.begin(0)
-
-    def begin(self, simulated_ns: int) -> None:
-        """Measure from here on, as after a reset."""
-        self._real, self._simulated = time.monotonic(), simulated_ns
-        self.factor = 0.0
-
-    def read(self, simulated_ns: int) -> float:
-        """Return the factor since the reading before."""
-        elapsed, advanced = time.monotonic() - self._real, simulated_ns - self._simulated
-        if elapsed >= self.SHORTEST:
-            self.begin(simulated_ns)
-            self.factor = max(0.0, advanced / 1e9 / elapsed)
-        return self.factor
-
-
 class MotionReport:
     """Describes a running simulation; the caller holds the simulation's lock."""
 
     def __init__(self, simulation: Simulation, loop: TickLoop, session: RecordingSession) -> None:
         self._simulation, self._loop, self._session = simulation, loop, session
-        self.speed = Speedometer()
+        self._speed = 0.0                       # simulated over real time, at the last reading
+        self._read_at, self._read_ns = time.monotonic(), 0
         self._described: object = None          # the motion that `_regime` names
         self._regime = ''
 
@@ -58,14 +36,12 @@ class MotionReport:
         """
         Return the message for /diagnostics; its level is that of the worst problem.
 
-        stamp, name : time of the message, and what it calls the node
         max_error : largest orientation error that is no problem; 0: it is not computed [rad]
         """
         simulation, loop = self._simulation, self._loop
-        error = math.nan if max_error == 0.0 else simulation.orientation_error
-        skipped = sum(stream.skipped for stream in simulation.streams)
+        error = simulation.orientation_error if max_error else math.nan
         problems = [(OK, 'paused' if loop.paused else 'running')]
-        if skipped or loop.counters.slipped_ns:
+        if self.overloaded:
             problems.append((WARN, 'this machine cannot keep up'))
         if error > max_error > 0.0:
             problems.append((WARN, f'orientation error {error:.3g} rad: more than max_error = '
@@ -78,19 +54,24 @@ class MotionReport:
         array = DiagnosticArray(status=[DiagnosticStatus(
             level=bytes([level]), name=name, hardware_id='none', message=message,
             values=[KeyValue(key=key, value=str(value))
-                    for key, value in self._numbers(error, skipped).items()])])
+                    for key, value in self._numbers(error).items()])])
         array.header.stamp = stamp
         return array
 
-    def _numbers(self, error: float, skipped: int) -> dict[str, object]:
+    @property
+    def overloaded(self) -> bool:
+        """Whether samples have come too late to be published, or the clock has slipped."""
+        return self._skipped() > 0 or self._loop.counters.slipped_ns > 0
+
+    def _numbers(self, error: float) -> dict[str, object]:
         simulation, counters, now_ns = self._simulation, self._loop.counters, self._loop.now_ns
         return {
             'simulated time [s]': f'{now_ns / NANOSECONDS:.6f}',
-            'real-time factor': f'{self.speed.read(now_ns):.3f}',
+            'real-time factor': f'{self._measure_speed(now_ns):.3f}',
             'late ticks': counters.late_ticks,
             'skipped ticks': counters.skipped_ticks,
             'published messages': self._sent(),
-            'skipped samples': skipped,
+            'skipped samples': self._skipped(),
             'clock slip [s]': f'{counters.slipped_ns / NANOSECONDS:.3f}',
             'orientation error [rad]': f'{error:.3g}',
             'commands': counters.commands,
@@ -100,8 +81,20 @@ class MotionReport:
             **self._session.numbers(),
         }
 
+    def _measure_speed(self, now_ns: int) -> float:
+        """Return simulated over real time since the reading before, or since a reset."""
+        elapsed = time.monotonic() - self._read_at
+        if elapsed > 0.1:       # reports that were held up follow each other at once
+            since_ns = self._read_ns if self._read_ns <= now_ns else 0
+            self._speed = (now_ns - since_ns) / NANOSECONDS / elapsed
+            self._read_at, self._read_ns = self._read_at + elapsed, now_ns
+        return self._speed
+
     def _sent(self) -> int:
         return sum(stream.sent for stream in self._simulation.streams)
+
+    def _skipped(self) -> int:
+        return sum(stream.skipped for stream in self._simulation.streams)
 
     def new_motion(self) -> str | None:
         """Return the present motion in numbers if that was not said yet."""
@@ -121,7 +114,7 @@ class MotionReport:
         log = f' | log {size}' if size else ''
         return (f't {loop.now_ns / NANOSECONDS:9.2f} s{flag} | {self._regime} | '
                 f'theta {theta:6.2f} deg | L3 {simulation.l3:.4g} Lz {simulation.lz:.4g} | '
-                f'x{self.speed.factor:.2f} | dE/E {simulation.energy_drift:+.0e} | '
+                f'x{self._speed:.2f} | dE/E {simulation.energy_drift:+.0e} | '
                 f'{self._sent()} msgs{log}')
 
 
@@ -130,7 +123,7 @@ class Terminal:
 
     def __init__(self) -> None:
         self._overwrites = sys.stdout.isatty()
-        self._open = False
+        self._open = False              # the cursor stands behind a line
 
     def show(self, line: str) -> None:
         """Show the newest line."""

@@ -31,18 +31,14 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
         read_only=parameter.effect is Effect.START,
         additional_constraints=parameter.allowed)
     lowest = parameter.minimum if parameter.above is None else parameter.above
-    highest = parameter.maximum
-    if lowest is None and highest is None:
-        return result
-    if parameter.is_double:
-        largest = sys.float_info.max
+    bounds = {'from_value': lowest, 'to_value': parameter.maximum}
+    given = {name: bound for name, bound in bounds.items() if bound is not None}
+    if given and parameter.is_double:
         result.floating_point_range = [FloatingPointRange(
-            from_value=-largest if lowest is None else float(lowest),
-            to_value=largest if highest is None else float(highest))]
-    else:
+            **{'from_value': -sys.float_info.max, 'to_value': sys.float_info.max, **given})]
+    elif given:
         result.integer_range = [IntegerRange(
-            from_value=-2 ** 63 if lowest is None else int(lowest),
-            to_value=2 ** 63 - 1 if highest is None else int(highest))]
+            **{'from_value': -2 ** 63, 'to_value': 2 ** 63 - 1, **given})]
     return result
 
 

@@ -7,7 +7,7 @@ import functools
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -27,7 +27,6 @@ from spinning_top_sim.nodes.ros_parameters import SPIN
 from spinning_top_sim.nodes.stream_publishers import StreamPublishers
 from spinning_top_sim.nodes.tick_loop import TickLoop, next_epoch
 from spinning_top_sim.recording.errors import RecordingError
-from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import Simulation
@@ -38,10 +37,6 @@ SWITCH_INTERVAL_S = 1e-4
 CLOCK_PERIOD_S = 0.02
 # At the end of `duration` all subscribers together are waited for at most this long.
 ACKNOWLEDGED_S = 1.0
-
-
-class RefusedError(Exception):
-    """A service does nothing; the text says why."""
 
 
 class Simulator(Node):
@@ -68,17 +63,17 @@ class Simulator(Node):
         self._follows = (self.get_parameter('use_sim_time').value
                          and not journal.is_enabled('clock', values))
         self._date = self.get_clock() if self._follows else Clock(clock_type=ClockType.SYSTEM_TIME)
-        self._followed = MonotonicClock(self._date_ns)
-        self._told_back_ns = 0
+        logger = self.get_logger()
+        followed = MonotonicClock(self._date_ns, lambda back_ns: logger.warning(
+            f'/clock stepped back by {back_ns / NANOSECONDS:g} s: the motion and its stamps go on '
+            'from where they are'))
         self._lock = FairLock()
         self._outputs = StreamPublishers(self)
         self._session = RecordingSession(simulation, self._lock, self._outputs.topics_to_record)
-        logger = self.get_logger()
         self._loop = TickLoop(
             simulation, values, self._session, align=self._align_ticks,
             update_subscribers=lambda: self._outputs.update_subscribers(simulation.streams),
-            warn=logger.warning, error=logger.error,
-            source=self._followed if self._follows else time.monotonic_ns)
+            error=logger.error, source=followed if self._follows else time.monotonic_ns)
         self._pacer = DeadlineThread(self._guarded(self._tick), values['tick_rate'],
                                      self._guarded(self._idle))
         self._report = reports.MotionReport(simulation, self._loop, self._session)
@@ -93,8 +88,7 @@ class Simulator(Node):
 
     def _make_interface(self) -> None:
         self._diagnostics = self._outputs.create(DiagnosticArray, '/diagnostics')
-        self.create_subscription(Float64MultiArray, '~/commands', self._guarded(self._on_command),
-                                 10)
+        self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
         for name, kind, act in (('set_pause', SetBool, self._set_pause),
                                 ('step', Trigger, self._step), ('reset', Trigger, self._reset),
                                 ('record', SetBool, self._record)):
@@ -135,7 +129,6 @@ class Simulator(Node):
         epoch_ns = self._simulation.epoch_ns = next_epoch(now_ns)
         if not self._follows:
             time.sleep((epoch_ns - now_ns) / NANOSECONDS)
-        self._report.speed.begin(0)
         self._loop.start()
         records = self._values['record.enabled']
         open_log = self._session.start(self._values) if records else None
@@ -147,9 +140,9 @@ class Simulator(Node):
                 self._session.error = str(error)
                 self.get_logger().error(f'not recording: {error}')
 
-    def _align_ticks(self, origin_ns: int) -> None:
+    def _align_ticks(self, origin_ns: int | None) -> None:
         """Have ticks just after samples are due."""
-        if not self._follows:
+        if origin_ns is not None and not self._follows:
             self._pacer.align(origin_ns / NANOSECONDS)
 
     def stop(self) -> None:
@@ -196,25 +189,33 @@ class Simulator(Node):
 
     # ---------------------------------------------------------------- commands, parameters
 
-    def _on_command(self, message: Float64MultiArray) -> None:
+    def _outcome(self, act: Callable[[Any], str | None], asked: object) -> tuple[bool, str]:
+        """Return whether `act` does it, and what it says; unexpected errors stop the motion."""
         try:
-            if len(message.data) != 2:
-                raise ValueError(f'data has {len(message.data)} values: must be [L3, Lz]')
-            with self._lock:
-                self._command(*message.data)
-        except ValueError as error:
+            return True, act(asked) or ''
+        except (ValueError, RuntimeError, RecordingError) as error:
+            return False, str(error)
+        except Exception as error:
+            self._fail(error)
+            return False, f'{type(error).__name__}: {error}'
+
+    def _on_command(self, message: Float64MultiArray) -> None:
+        accepted, text = self._outcome(self._take_command, message.data)
+        if accepted:
+            self._show_spin()
+        else:
             self._loop.counters.rejected_commands += 1
-            self.get_logger().warning(f'~/commands: refused: {error}')
-            return
-        self._show_spin(*message.data)
+            self.get_logger().warning(f'~/commands: refused: {text}')
 
-    def _command(self, l3: float, lz: float) -> None:
-        self._loop.command(l3, lz)
-        self._session.write_command(l3, lz)
+    def _take_command(self, data: Sequence[float]) -> None:
+        if len(data) != 2:
+            raise ValueError(f'data has {len(data)} values: must be [L3, Lz]')
+        with self._lock:
+            self._loop.command(*data)
 
-    def _show_spin(self, l3: float, lz: float) -> None:
+    def _show_spin(self) -> None:
         """Have the parameters show the spin that a command or a reset has set."""
-        self._values |= {'spin.l3': l3, 'spin.lz': lz}
+        self._values |= {'spin.l3': self._simulation.l3, 'spin.lz': self._simulation.lz}
         self._showing_spin = True
         try:
             self.set_parameters([Parameter(name, value=self._values[name]) for name in SPIN])
@@ -226,27 +227,21 @@ class Simulator(Node):
         changes = {p.name: p.value for p in given if p.name in parameters.BY_NAME}
         if self._showing_spin or not changes:
             return SetParametersResult(successful=True)
-        try:
-            values = ros_parameters.changed(self._values, changes, self._start_spin)
-            with self._lock:
-                self._apply(values, set(changes))
-        except (ValueError, RuntimeError) as error:
-            self._loop.counters.rejected_commands += not changes.keys().isdisjoint(SPIN)
-            return SetParametersResult(successful=False, reason=str(error))
-        except Exception as error:
-            self._fail(error)
-            return SetParametersResult(successful=False, reason=f'{type(error).__name__}: {error}')
-        self._values = values
-        return SetParametersResult(successful=True)
+        successful, reason = self._outcome(self._change, changes)
+        if not (successful or changes.keys().isdisjoint(SPIN)):
+            self._loop.counters.rejected_commands += 1
+        return SetParametersResult(successful=successful, reason=reason)
 
-    def _apply(self, values: dict[str, Any], changed: set[str]) -> None:
-        """Put a validated change into effect.  Raises ValueError to refuse it."""
-        if not changed.isdisjoint(SPIN):
-            self._command(values['spin.l3'], values['spin.lz'])
-        rest = sorted(changed.difference(SPIN))
-        if rest:
-            self._session.write_event('parameters', **{name: values[name] for name in rest})
-            self._put_into_effect(values, rest)
+    def _change(self, changes: dict[str, Any]) -> None:
+        values = ros_parameters.changed(self._values, changes, self._start_spin)
+        rest = sorted(changes.keys() - SPIN)
+        with self._lock:
+            if len(rest) < len(changes):
+                self._loop.command(values['spin.l3'], values['spin.lz'])
+            if rest:
+                self._session.write_event('parameters', **{name: values[name] for name in rest})
+                self._put_into_effect(values, rest)
+        self._values = values
 
     def _put_into_effect(self, values: dict[str, Any], changed: list[str]) -> None:
         streams = self._simulation.streams
@@ -255,7 +250,6 @@ class Simulator(Node):
                 stream.set_rate(values[f'{stream.parameter}.rate'])
         if any(name.endswith('.enabled') for name in changed):
             self._outputs.open(streams, values)
-            self._loop.look_for_subscribers()
         if 'status_period' in changed:
             self._set_status_period(values['status_period'])
         if 'tick_rate' in changed:
@@ -265,19 +259,12 @@ class Simulator(Node):
     # ---------------------------------------------------------------------------- services
 
     def _serve(self, act: Callable[[Any], str], request: object, response: Any) -> object:
-        """Answer a service with the text that `act` returns, or with why it does nothing."""
-        try:
-            response.message, response.success = act(request), True
-        except (RefusedError, RecordingError) as error:
-            response.message = str(error)
-        except Exception as error:
-            self._fail(error)
-            response.message = f'{type(error).__name__}: {error}'
+        response.success, response.message = self._outcome(act, request)
         return response
 
     def _check_started(self) -> None:
         if not self._loop.started:
-            raise RefusedError('waiting for the first /clock (use_sim_time is set)')
+            raise RuntimeError('waiting for the first /clock (use_sim_time is set)')
 
     def _set_pause(self, request: SetBool.Request) -> str:
         with self._lock:
@@ -289,57 +276,35 @@ class Simulator(Node):
 
     def _step(self, _: Trigger.Request) -> str:
         with self._lock:
-            if not self._loop.paused:
-                raise RefusedError('running: ~/step works while paused (~/set_pause true)')
             self._check_started()
-            left_ns = self._loop.step(self._values['step.count'], self._values['step.dt'])
-            if self._loop.failure:
-                raise RefusedError(self._loop.failure)
-            if left_ns:
-                raise RefusedError(f'{self._loop.time_text}: this takes too long, '
-                                   f'{left_ns / NANOSECONDS:.9g} s are left')
+            self._loop.step(self._values['step.count'], self._values['step.dt'])
             return self._loop.time_text
 
     def _reset(self, _: Trigger.Request) -> str:
-        simulation = self._simulation
         with self._lock:
             self._check_started()
             # Back to the spin it was started with, whatever was commanded since.
-            values = {**self._values, **self._start_spin}
-            sent_ns = simulation.now_ns
-            try:
-                self._loop.reset(values, self._date_ns())
-            except (ValueError, IntegrationError) as error:
-                raise RefusedError(f'not reset: {error}') from error
-            self._report.speed.begin(0)
-            self._session.write_event('reset', sent_ns, epoch_ns=simulation.epoch_ns,
-                                      parameters=values)
-        self._show_spin(simulation.l3, simulation.lz)
-        return f'at t = 0, stamps go on from {simulation.epoch_ns} ns'
+            self._loop.reset({**self._values, **self._start_spin}, self._date_ns())
+        self._show_spin()
+        return f'at t = 0, stamps go on from {self._simulation.epoch_ns} ns'
 
     def _record(self, request: SetBool.Request) -> str:
         if not request.data:
             return self._session.stop() or 'not recording'
         self._check_started()
-        try:
-            return self._session.start(self._values)()
-        except RecordingError as error:
-            self.get_logger().error(f'not recording: {error}')
-            raise
+        return self._session.start(self._values)()
 
     # ----------------------------------------------------------------------------- reports
 
     def _publish_diagnostics(self) -> None:
-        """Look at the followed clock and the recording, and publish /diagnostics."""
-        back_ns = self._followed.stepped_back_ns - self._told_back_ns
-        if back_ns:
-            self._told_back_ns += back_ns
-            self.get_logger().warning(
-                f'/clock stepped back by {back_ns / NANOSECONDS:g} s: the motion and its stamps '
-                'go on from where they are')
+        """Look at the recording, and publish /diagnostics."""
         reason = self._session.check()
         if reason:
             self.get_logger().error(f'recording stopped: {reason}; the simulation goes on')
+        if self._report.overloaded:
+            self.get_logger().warning(
+                'this machine cannot keep up with these rates: live topics skip samples, or the '
+                'clock slips; a recording stays complete, and /diagnostics counts', once=True)
         if self._values['max_error'] > 0.0:
             # Without the lock: it takes milliseconds, and ticks would wait.
             self._simulation.segment.reference.prepare()

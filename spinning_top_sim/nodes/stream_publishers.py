@@ -57,12 +57,13 @@ class StreamPublishers:
 
     def topics_to_record(self, streams: Sequence[Stream]) -> list[Topic]:
         """Return the topics of these streams, and behind them those of the journal."""
-        publishers = [self._by_topic[stream.topic] for stream in streams]
-        return [(publisher.topic_name, stream.type_name,
-                 {name: int(getattr(publisher.qos_profile, name)) for name in RECORDED_POLICIES})
-                for stream, publisher in zip(streams, publishers, strict=True)
-                ] + [(self._node.resolve_topic_name(name), type_name, {})
-                     for name, type_name in journal.TOPICS]
+        topics: list[Topic] = []
+        for stream in streams:
+            publisher = self._by_topic[stream.topic]
+            topics.append((publisher.topic_name, stream.type_name, {
+                name: int(getattr(publisher.qos_profile, name)) for name in RECORDED_POLICIES}))
+        return [*topics, *((self._node.resolve_topic_name(name), type_name, {})
+                           for name, type_name in journal.TOPICS)]
 
     def wait_for_all_acked(self, seconds: float) -> None:
         """Wait until subscribers have all messages, together at most this long."""

@@ -58,19 +58,17 @@ class TickLoop:
     A tick sends every sample that is due, however late it comes, so no sample depends on how
     ticks fall.  Not thread-safe: calls from several threads need a lock around them.
 
-    values : checked parameters
-    recording : without room there, nothing is sent
-    update_subscribers : sets `publish` of each stream that has subscribers; called every 50 ms
-    align : takes the source's time of simulated time 0 [ns], whenever the clock starts
-    warn, error : take a text for the log
+    recording : where it has no room, nothing is sent
+    update_subscribers : sets `publish` of each stream that has subscribers
+    align : takes the source's time of simulated time 0 [ns]; None while the clock stands
+    error : takes a text for the log
     source : returns the time that simulated time follows [ns]
     steady : returns steady time [ns]; decides which ticks are late and how long one may work
     """
 
     def __init__(self, simulation: Simulation, values: Mapping[str, Any],
                  recording: RecordingSession, *, update_subscribers: Callable[[], object],
-                 align: Callable[[int], object], warn: Callable[[str], object],
-                 error: Callable[[str], object],
+                 align: Callable[[int | None], object], error: Callable[[str], object],
                  source: Callable[[], int] = time.monotonic_ns,
                  steady: Callable[[], int] = time.monotonic_ns) -> None:
         self.counters = Counters()
@@ -79,9 +77,8 @@ class TickLoop:
         self.failure: str | None = None         # why the motion stands still until `reset`
         self._simulation, self._recording = simulation, recording
         self._update_subscribers, self._align = update_subscribers, align
-        self._warn, self._error, self._steady = warn, error, steady
+        self._error, self._steady = error, steady
         self._clock = SimulatedClock(source, values['time_scale'])
-        self._warned_overload = False
         self._subscribers_due_ns = 0            # on the steady clock
         self._late_from_ns = NEVER_NS           # on the steady clock
         self._fast_until_ns = -1                # simulated time until which ticks are fast
@@ -105,23 +102,12 @@ class TickLoop:
         self._restart_clock()
 
     def _restart_clock(self) -> None:
-        """
-        Let simulated time go on from where samples are sent up to.
-
-        It stands exactly there if anything holds the motion.  The next tick is not late.
-        """
+        """Let time go on from where samples are sent up to, or stand there if it is held."""
         self._fast_until_ns, self._late_from_ns = -1, NEVER_NS
         self._clock.stop(self.now_ns)
         if self.started and not (self.ended or self.paused or self.failure):
             self._clock.start(self.now_ns)
-            self._tell_origin()
-
-    def _tell_origin(self) -> None:
-        origin_ns = self._clock.when(0)
-        if origin_ns is not None:
-            self._align(origin_ns)
-
-    # ------------------------------------------------------------------------------- ticks
+        self._align(self._clock.when(0))
 
     def tick(self) -> bool:
         """Send what is due; return whether `idle` has something to do before the next tick."""
@@ -152,8 +138,7 @@ class TickLoop:
         if now_ns >= self._subscribers_due_ns:
             self._update_subscribers()
             self._subscribers_due_ns = now_ns + SUBSCRIBERS_PERIOD_NS
-        simulation, due_ns = self._simulation, self._due()
-        self._advance(due_ns)
+        simulation, due_ns = self._simulation, self._advance()
         if simulation.now_ns >= self._duration_ns:
             self.ended = True
             self._restart_clock()
@@ -171,46 +156,29 @@ class TickLoop:
                 self._duration_ns,
                 NEVER_NS if self._computing else simulation.ready_ns - self._ahead_ns)
 
-    def _due(self) -> int:
-        """Return the simulated time of the clock, at most the duration [ns]."""
-        return min(self._clock.now(), self._duration_ns)
-
-    def _advance(self, target_ns: int) -> None:
-        """Send the samples up to a time, or as many as one tick has time for."""
+    def _advance(self) -> int:
+        """Send what is due, or as much as one tick has time for; return until when is due [ns]."""
         simulation, has_room = self._simulation, self._recording.has_room
+        target_ns = min(self._clock.now(), self._duration_ns)
+        if not self._clock.running:
+            return target_ns
         publish_from_ns = target_ns - int(LATEST_NS * self._time_scale)
-        late = simulation.now_ns < publish_from_ns
-        skipped = self._skipped() if late else 0
         stop_at_ns = self._steady() + TICK_BUDGET_NS
         try:
             arrived = has_room() and simulation.advance(
                 target_ns, publish_from_ns, lambda: self._steady() > stop_at_ns or not has_room())
         except IntegrationError as error:
             self.fail(str(error))
-            return
+            return target_ns
         lag_ns = target_ns - simulation.now_ns
         if not arrived and lag_ns > LONGEST_LAG_NS * self._time_scale:
             self.counters.slipped_ns += lag_ns
             self._restart_clock()
-            self._warn_overload('the clock slips')
-        elif late and self._skipped() > skipped:
-            self._warn_overload('live topics skip samples')
-
-    def _skipped(self) -> int:
-        return sum(stream.skipped for stream in self._simulation.streams)
-
-    def _warn_overload(self, consequence: str) -> None:
-        if not self._warned_overload:
-            self._warned_overload = True
-            self._warn(f'this machine cannot keep up with these rates: {consequence}; a recording '
-                       'stays complete, and /diagnostics counts')
-
-    # ------------------------------------------------------------------- what others ask for
+        return target_ns
 
     def pause(self) -> None:
         """Send what is due, then hold the motion; does nothing when paused already."""
-        if self._clock.running:
-            self._advance(self._due())
+        self._advance()
         self.paused = True
         self._restart_clock()
 
@@ -220,12 +188,10 @@ class TickLoop:
             self.paused = False
             self._restart_clock()
 
-    def step(self, count: int, dt: float) -> int:
-        """
-        Move a paused motion on by count x dt [s], rounded to 1 ns.
-
-        Returns the simulated time left to do [ns]: not 0 if the step takes too long, or fails.
-        """
+    def step(self, count: int, dt: float) -> None:
+        """Move a paused motion on by count x dt [s], rounded to 1 ns, or raise RuntimeError."""
+        if not self.paused:
+            raise RuntimeError('running: ~/step works while paused (~/set_pause true)')
         self._update_subscribers()
         target_ns = self.now_ns + round(count * dt * NANOSECONDS)
         stop_at_ns = self._steady() + STEP_BUDGET_NS
@@ -240,20 +206,19 @@ class TickLoop:
         except IntegrationError as error:
             self.fail(str(error))
         self._restart_clock()
-        return target_ns - self.now_ns
+        if self.failure:
+            raise RuntimeError(self.failure)
+        if self.now_ns < target_ns:
+            raise RuntimeError(f'{self.time_text}: this takes too long, '
+                               f'{(target_ns - self.now_ns) / NANOSECONDS:.9g} s are left')
 
     def command(self, l3: float, lz: float) -> None:
-        """
-        Send what is due, then let L3 and Lz jump [kg m^2/s].
-
-        Raises ValueError if there is no such motion, or the motion has failed; nothing changes
-        then.
-        """
-        if self._clock.running:
-            self._advance(self._due())
-        if self.failure is not None:
+        """Send what is due, then let L3 and Lz jump [kg m^2/s], or raise ValueError."""
+        self._advance()
+        if self.failure:
             raise ValueError(f'l3 = {l3!r}, lz = {lz!r}: the motion stands still: {self.failure}')
         self._simulation.command(l3, lz)
+        self._recording.write_command(l3, lz)
         self.counters.commands += 1
 
     def reset(self, values: Mapping[str, Any], date_ns: int) -> None:
@@ -263,20 +228,19 @@ class TickLoop:
         t = 0 is stamped with this date, or later, so that stamps never go back.  Raises ValueError
         or IntegrationError if no motion begins there; the present one goes on then.
         """
-        simulation = self._simulation
-        last_ns = simulation.epoch_ns + simulation.now_ns
+        simulation, sent_ns = self._simulation, self._simulation.now_ns
         simulation.restart(values)
-        simulation.epoch_ns = next_epoch(max(last_ns + 1, date_ns))
+        simulation.epoch_ns = next_epoch(max(simulation.epoch_ns + sent_ns + 1, date_ns))
         self.failure = None
         self._restart_clock()
+        self._recording.write_event('reset', sent_ns, epoch_ns=simulation.epoch_ns,
+                                    parameters=values)
 
     def fail(self, reason: str) -> None:
         """Hold the motion until `reset`."""
         self.failure = reason
         self._restart_clock()
         self._error(f'{reason}; the motion stands still until ~/reset')
-
-    # -------------------------------------------------------------------------- parameters
 
     def set_pace(self, values: Mapping[str, Any]) -> None:
         """Take over tick_rate, time_scale and duration."""
@@ -288,8 +252,4 @@ class TickLoop:
             1.5 * self._tick_period_ns, min(TICKS_AHEAD * self._tick_period_ns, AHEAD_NS)))
         self._late_from_ns, self._fast_until_ns = NEVER_NS, -1
         self._clock.set_scale(self._time_scale)
-        self._tell_origin()
-
-    def look_for_subscribers(self) -> None:
-        """Have the next tick count subscribers, as when publishers have come or gone."""
-        self._subscribers_due_ns, self._fast_until_ns = 0, -1
+        self._align(self._clock.when(0))
