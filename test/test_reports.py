@@ -72,7 +72,7 @@ def test_the_worst_problem_is_the_level_and_the_message(reported):
     assert numbers['recorder'] == 'off'
     level, message, numbers = status_of(reported, max_error=0.0)
     assert math.isnan(float(numbers['orientation error [rad]']))
-    reported.loop.counters.slipped_ns = 1_500_000_000
+    reported.loop.slipped_ns = 1_500_000_000
     level, message, numbers = status_of(reported)
     assert (level, message) == (1, 'this machine cannot keep up')
     assert numbers['clock slip [s]'] == '1.500'
@@ -81,7 +81,7 @@ def test_the_worst_problem_is_the_level_and_the_message(reported):
     reported.session.error = None
     reported.loop.fail('at a pole')
     assert status_of(reported)[:2] == (2, 'at a pole')
-    reported.loop.counters.slipped_ns = 0
+    reported.loop.slipped_ns = 0
     reported.loop.reset(reported.simulation.values, 0)
     assert status_of(reported)[:2] == (0, 'paused')
     reported.loop.step(1, 1.0)

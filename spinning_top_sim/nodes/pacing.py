@@ -50,7 +50,7 @@ class SimulatedClock:
 
 
 class MonotonicClock:
-    """Follows a clock, and tells and leaves out its steps back, as of a log played in a loop."""
+    """Follows a clock without its steps back, as of a log in a loop, and tells of these [ns]."""
 
     def __init__(self, source: Callable[[], int], tell: Callable[[int], object]) -> None:
         self._source, self._tell = source, tell

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from spinning_top_sim.nodes.tick_loop import TickLoop
     from spinning_top_sim.streams.pipeline import Simulation
 
-OK, WARN, ERROR = 0, 1, 2
-
 
 class MotionReport:
     """Describes a running simulation; the caller holds the simulation's lock."""
@@ -40,19 +38,19 @@ class MotionReport:
         """
         simulation, loop = self._simulation, self._loop
         error = simulation.orientation_error if max_error else math.nan
-        problems = [(OK, 'paused' if loop.paused else 'running')]
+        problems = [(DiagnosticStatus.OK, 'paused' if loop.paused else 'running')]
         if self.overloaded:
-            problems.append((WARN, 'this machine cannot keep up'))
+            problems.append((DiagnosticStatus.WARN, 'this machine cannot keep up'))
         if error > max_error > 0.0:
-            problems.append((WARN, f'orientation error {error:.3g} rad: more than max_error = '
-                                   f'{max_error:g} rad'))
+            problems.append((DiagnosticStatus.WARN, f'orientation error {error:.3g} rad: more '
+                                                    f'than max_error = {max_error:g} rad'))
         if self._session.error:
-            problems.append((ERROR, f'recording: {self._session.error}'))
+            problems.append((DiagnosticStatus.ERROR, f'recording: {self._session.error}'))
         if loop.failure:
-            problems.append((ERROR, loop.failure))
+            problems.append((DiagnosticStatus.ERROR, loop.failure))
         level, message = max(problems, key=lambda problem: problem[0])
         array = DiagnosticArray(status=[DiagnosticStatus(
-            level=bytes([level]), name=name, hardware_id='none', message=message,
+            level=level, name=name, hardware_id='none', message=message,
             values=[KeyValue(key=key, value=str(value))
                     for key, value in self._numbers(error).items()])])
         array.header.stamp = stamp
@@ -61,21 +59,24 @@ class MotionReport:
     @property
     def overloaded(self) -> bool:
         """Whether samples have come too late to be published, or the clock has slipped."""
-        return self._skipped() > 0 or self._loop.counters.slipped_ns > 0
+        return self._loop.slipped_ns > 0 or self._total('skipped') > 0
+
+    def _total(self, count: str) -> int:
+        return sum(getattr(stream, count) for stream in self._simulation.streams)
 
     def _numbers(self, error: float) -> dict[str, object]:
-        simulation, counters, now_ns = self._simulation, self._loop.counters, self._loop.now_ns
+        simulation, loop, now_ns = self._simulation, self._loop, self._loop.now_ns
         return {
             'simulated time [s]': f'{now_ns / NANOSECONDS:.6f}',
             'real-time factor': f'{self._measure_speed(now_ns):.3f}',
-            'late ticks': counters.late_ticks,
-            'skipped ticks': counters.skipped_ticks,
-            'published messages': self._sent(),
-            'skipped samples': self._skipped(),
-            'clock slip [s]': f'{counters.slipped_ns / NANOSECONDS:.3f}',
+            'late ticks': loop.late_ticks,
+            'skipped ticks': loop.skipped_ticks,
+            'published messages': self._total('sent'),
+            'skipped samples': self._total('skipped'),
+            'clock slip [s]': f'{loop.slipped_ns / NANOSECONDS:.3f}',
             'orientation error [rad]': f'{error:.3g}',
-            'commands': counters.commands,
-            'rejected commands': counters.rejected_commands,
+            'commands': loop.commands,
+            'rejected commands': loop.rejected_commands,
             'integration steps': simulation.steps,
             'evaluations': simulation.evaluations,
             **self._session.numbers(),
@@ -89,12 +90,6 @@ class MotionReport:
             self._speed = (now_ns - since_ns) / NANOSECONDS / elapsed
             self._read_at, self._read_ns = self._read_at + elapsed, now_ns
         return self._speed
-
-    def _sent(self) -> int:
-        return sum(stream.sent for stream in self._simulation.streams)
-
-    def _skipped(self) -> int:
-        return sum(stream.skipped for stream in self._simulation.streams)
 
     def new_motion(self) -> str | None:
         """Return the present motion in numbers if that was not said yet."""
@@ -115,7 +110,7 @@ class MotionReport:
         return (f't {loop.now_ns / NANOSECONDS:9.2f} s{flag} | {self._regime} | '
                 f'theta {theta:6.2f} deg | L3 {simulation.l3:.4g} Lz {simulation.lz:.4g} | '
                 f'x{self._speed:.2f} | dE/E {simulation.energy_drift:+.0e} | '
-                f'{self._sent()} msgs{log}')
+                f"{self._total('sent')} msgs{log}")
 
 
 class Terminal:

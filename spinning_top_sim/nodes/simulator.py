@@ -204,7 +204,7 @@ class Simulator(Node):
         if accepted:
             self._show_spin()
         else:
-            self._loop.counters.rejected_commands += 1
+            self._loop.rejected_commands += 1
             self.get_logger().warning(f'~/commands: refused: {text}')
 
     def _take_command(self, data: Sequence[float]) -> None:
@@ -229,7 +229,7 @@ class Simulator(Node):
             return SetParametersResult(successful=True)
         successful, reason = self._outcome(self._change, changes)
         if not (successful or changes.keys().isdisjoint(SPIN)):
-            self._loop.counters.rejected_commands += 1
+            self._loop.rejected_commands += 1
         return SetParametersResult(successful=successful, reason=reason)
 
     def _change(self, changes: dict[str, Any]) -> None:

@@ -5,17 +5,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from spinning_top_sim.nodes.pacing import SimulatedClock
+from spinning_top_sim.nodes.recording_session import RecordingSession
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.streams.schedule import NEVER_NS
-
-if TYPE_CHECKING:
-    from spinning_top_sim.nodes.recording_session import RecordingSession
 
 # The stamp of t = 0 is a multiple of this, so that grids meet across streams and runs.
 EPOCH_GRID_NS = 10_000_000
@@ -33,17 +30,6 @@ STEP_BUDGET_NS = 2_000_000_000
 LATEST_NS = 500_000_000
 # A simulation further behind than this lets its clock slip: its real-time factor falls below 1.
 LONGEST_LAG_NS = 1_000_000_000
-
-
-@dataclass
-class Counters:
-    """Counts since the start of the node."""
-
-    late_ticks: int = 0
-    skipped_ticks: int = 0
-    slipped_ns: int = 0
-    commands: int = 0
-    rejected_commands: int = 0
 
 
 def next_epoch(date_ns: int) -> int:
@@ -71,7 +57,8 @@ class TickLoop:
                  align: Callable[[int | None], object], error: Callable[[str], object],
                  source: Callable[[], int] = time.monotonic_ns,
                  steady: Callable[[], int] = time.monotonic_ns) -> None:
-        self.counters = Counters()
+        self.late_ticks = self.skipped_ticks = self.slipped_ns = 0      # since the start
+        self.commands = self.rejected_commands = 0
         self.started = self.ended = False       # `ended`: all samples of `duration` are sent
         self.paused: bool = values['start_paused']
         self.failure: str | None = None         # why the motion stands still until `reset`
@@ -121,8 +108,8 @@ class TickLoop:
         if not self._clock.running:
             return False
         if now_ns > late_from_ns:
-            self.counters.late_ticks += 1
-            self.counters.skipped_ticks += round(
+            self.late_ticks += 1
+            self.skipped_ticks += round(
                 (now_ns - late_from_ns + self._late_after_ns) / self._tick_period_ns) - 1
         return self._slow_tick(now_ns)
 
@@ -172,7 +159,7 @@ class TickLoop:
             return target_ns
         lag_ns = target_ns - simulation.now_ns
         if not arrived and lag_ns > LONGEST_LAG_NS * self._time_scale:
-            self.counters.slipped_ns += lag_ns
+            self.slipped_ns += lag_ns
             self._restart_clock()
         return target_ns
 
@@ -219,7 +206,7 @@ class TickLoop:
             raise ValueError(f'l3 = {l3!r}, lz = {lz!r}: the motion stands still: {self.failure}')
         self._simulation.command(l3, lz)
         self._recording.write_command(l3, lz)
-        self.counters.commands += 1
+        self.commands += 1
 
     def reset(self, values: Mapping[str, Any], date_ns: int) -> None:
         """
