@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction
+from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, Shutdown
 from launch_ros.actions import Node
 
 from spinning_top_sim.nodes import launch_helpers
@@ -49,8 +49,7 @@ def generate_launch_description() -> LaunchDescription:
 def _nodes(context: LaunchContext) -> list:
     given = {name: context.launch_configurations[name] for name in (
         'file', 'rate', 'start', 'loop', 'clock', 'partial', 'tf', 'rviz')}
-    on = {name: launch_helpers.switch(name, given[name])
-          for name in ('loop', 'partial', 'tf', 'rviz')}
+    on = {name: given[name] == 'true' for name in ('loop', 'partial', 'tf', 'rviz')}
     options = ['--rate', str(launch_helpers.number('rate', given['rate'])),
                '--start', str(launch_helpers.number('start', given['start'], zero=True))]
     options += [f'--{name}' for name in ('loop', 'partial') if on[name]]
@@ -60,8 +59,9 @@ def _nodes(context: LaunchContext) -> list:
         if given['clock'].lower() != 'true':
             options.append(str(launch_helpers.number('clock', given['clock'])))
     node = Node(package='spinning_top_sim', executable='replay_node', output='screen',
-                emulate_tty=True, arguments=[given['file'], *options])
-    actions = launch_helpers.until_it_ends(node)
+                emulate_tty=True, arguments=[given['file'], *options],
+                on_exit=Shutdown(reason='it has ended'))
+    actions = [node]
     if not (on['tf'] or on['rviz']):
         return actions
     try:

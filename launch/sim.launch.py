@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
@@ -65,8 +65,7 @@ def _nodes(context: LaunchContext) -> list:
     given = {name: context.launch_configurations[name] for name in (
         'scene', 'params_file', 'set', 'namespace', 'frame_prefix', 'record', 'use_sim_time',
         'tf', 'rviz', 'markers')}
-    on = {name: launch_helpers.switch(name, given[name])
-          for name in ('use_sim_time', 'tf', 'rviz', 'markers')}
+    on = {name: given[name] == 'true' for name in ('use_sim_time', 'tf', 'rviz', 'markers')}
     namespace = given['namespace'].strip('/')
     files = [_scene_file(given['scene']), *filter(None, [given['params_file']])]
     values = {}
@@ -88,18 +87,18 @@ def _nodes(context: LaunchContext) -> list:
 
     node = Node(package='spinning_top_sim', executable='sim_node', namespace=namespace,
                 output='screen', emulate_tty=True, sigterm_timeout='15',
-                parameters=[*map(str, files), {
+                on_exit=Shutdown(reason='it has ended'), parameters=[*map(str, files), {
                     **{name: list(value) if isinstance(value, tuple) else value
                        for name, value in asked.items()},
                     'use_sim_time': on['use_sim_time']}])
-    actions = launch_helpers.until_it_ends(node)
+    actions = [node]
     if on['tf']:
         actions += launch_helpers.state_publisher(
             SHARE, values, namespace, resolve_topic('joint_states', namespace),
             on['use_sim_time'])
     if on['rviz']:
         actions.append(launch_helpers.rviz(SHARE, values['world_frame'], namespace,
-                                      on['use_sim_time']))
+                                           on['use_sim_time']))
     return actions
 
 

@@ -53,9 +53,7 @@ def installed(monkeypatch):
     monkeypatch.setattr(packages, 'get_package_share_directory', lambda name: str(ROOT))
     for module, names in {
             'launch': ('LaunchContext', 'LaunchDescription'), 'launch.action': ('Action',),
-            'launch.actions': ('DeclareLaunchArgument', 'EmitEvent', 'LogInfo', 'OpaqueFunction',
-                               'RegisterEventHandler'),
-            'launch.event_handlers': ('OnProcessExit',), 'launch.events': ('Shutdown',),
+            'launch.actions': ('DeclareLaunchArgument', 'LogInfo', 'OpaqueFunction', 'Shutdown'),
             'launch.substitutions': ('LaunchConfiguration',), 'launch_ros': (),
             'launch_ros.actions': ('Node',),
             'launch_ros.parameter_descriptions': ('ParameterValue',)}.items():
@@ -97,6 +95,7 @@ def started(name, **given):
         values[key] = value
     actions = make(SimpleNamespace(launch_configurations=values))
     nodes = [action for action in actions if type(action).__name__ == 'Node']
+    assert [hasattr(node, 'on_exit') for node in nodes] == [True] + (len(nodes) - 1) * [False]
     return SimpleNamespace(
         nodes={f'{node.package}/{node.executable}': node for node in nodes},
         said=[action.msg for action in actions if type(action).__name__ == 'LogInfo'])

@@ -12,14 +12,13 @@ pytest.importorskip('rclpy')
 
 from helpers.node_harness import PATIENCE_S
 from helpers.node_logs import events_in, log_of
-from rclpy.qos import QoSProfile
 
 from spinning_top_sim.nodes.pacing import FairLock
 from spinning_top_sim.nodes.recording_session import RecordingSession
 from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.writer import McapRecorder
-from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.pipeline import Simulation
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -34,16 +33,20 @@ class Recorded:
         self.values = parameters.checked({'record.uri': str(folder), 'record.min_free_bytes': 0,
                                           **given})
         self.simulation = Simulation(self.values, EPOCH_NS)
-        self.publishers = {
-            stream.topic: SimpleNamespace(topic_name=f'/ns/{stream.topic.lstrip("~/")}',
-                                          qos_profile=QoSProfile(depth=10))
-            for stream in self.simulation.streams}
         self.lock = FairLock()
-        self.session = RecordingSession(self.simulation, self.lock,
-                                        lambda name: f'/ns/top/{name.lstrip("~/")}')
+        self.remapped = {}
+        self.session = RecordingSession(self.simulation, self.lock, self.topics)
+
+    def topics(self, streams):
+        names = [*((stream.topic, stream.type_name) for stream in streams), *journal.TOPICS]
+        return [(f'/ns/{self.remapped.get(name, name.lstrip("~/"))}', type_name, {'depth': 10})
+                for name, type_name in names]
 
     def start(self):
-        return self.session.start(self.values, self.publishers)
+        return self.session.start(self.values)()
+
+    def is_held(self):
+        return self.lock._lock.locked()
 
     def stop(self):
         """Close the log; return what is in it, and its metadata."""
@@ -73,11 +76,11 @@ def test_ticks_and_commands_go_on_while_a_log_is_being_opened_and_are_in_it(tmp_
     opening = threading.Thread(target=lambda: answers.append(recorded.start()), daemon=True)
     opening.start()
     assert slow_disk.opening.wait(PATIENCE_S)
-    assert recorded.lock._owner is None             # the other thread waits for the disk
+    assert not recorded.is_held()                   # the other thread waits for the disk
     with recorded.lock:
         simulation.advance(2 * SECOND)
         simulation.command(2.0, 1.0)
-        session.write_command(2 * SECOND, 2.0, 1.0)
+        session.write_command(2.0, 1.0)
         simulation.advance(3 * SECOND)
     assert session.has_room() and session.size is None
     slow_disk.go_on.set()
@@ -90,18 +93,18 @@ def test_ticks_and_commands_go_on_while_a_log_is_being_opened_and_are_in_it(tmp_
     assert metadata['spinning_top_sim']['begun_ns'] == str(SECOND)
     assert json.loads(metadata['spinning_top_sim']['history']) == []
     assert [event['event'] for event in events_in(log)] == ['start', 'command']
-    assert len(log['/ns/top/commands']) == 1
+    assert [at - EPOCH_NS for at, _ in log['/ns/commands']] == [2 * SECOND]
 
 
 def test_what_reads_files_is_done_without_the_lock(tmp_path, monkeypatch):
     recorded = Recorded(tmp_path)
-    owners = []
+    held = []
     ordinary = provenance.surroundings
     monkeypatch.setattr(provenance, 'surroundings',
-                        lambda: owners.append(recorded.lock._owner) or ordinary())
+                        lambda: held.append(recorded.is_held()) or ordinary())
     recorded.start()
     recorded.stop()
-    assert owners == [None]
+    assert held == [False]
 
 
 def test_what_waits_for_the_file_is_bounded(tmp_path, slow_disk, monkeypatch):
@@ -159,11 +162,11 @@ def test_a_file_that_is_named_is_never_overwritten_and_nothing_is_kept(tmp_path)
 def test_topics_of_one_name_are_refused_and_nothing_is_kept(tmp_path):
     """As two topics are that were remapped to the same name."""
     recorded = Recorded(tmp_path)
-    recorded.publishers['joint_states'].topic_name = '/ns/pose'
+    recorded.remapped['joint_states'] = 'pose'
     with pytest.raises(RecordingError, match="'/ns/pose' is listed twice"):
         recorded.start()
     assert list(tmp_path.iterdir()) == []
-    assert not any(stream.recorded for stream in recorded.simulation.streams)
+    assert not any(stream.has_sinks for stream in recorded.simulation.streams)
     assert recorded.session.stop() is None
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the launch files share: arguments, robot_state_publisher and RViz."""
+"""What the launch files share: numbers as arguments, robot_state_publisher and RViz."""
 
 from __future__ import annotations
 
@@ -10,9 +10,7 @@ from typing import Any
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from launch.action import Action
-from launch.actions import EmitEvent, LogInfo, RegisterEventHandler
-from launch.event_handlers import OnProcessExit
-from launch.events import Shutdown
+from launch.actions import LogInfo
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
@@ -22,14 +20,6 @@ from spinning_top_sim.tools.urdf import inertia_warning, robot_description
 STATE_PUBLISHER = 'robot_state_publisher'
 # The highest rate that it accepts [Hz].
 HIGHEST_PUBLISH_FREQUENCY = 1000.0
-SWITCHES = {'true': True, 'false': False}
-
-
-def switch(name: str, text: str) -> bool:
-    """Return whether an argument is 'true'.  Raises ValueError unless it is 'true' or 'false'."""
-    if text.lower() not in SWITCHES:
-        raise ValueError(f'{name} = {text!r}: must be true or false')
-    return SWITCHES[text.lower()]
 
 
 def number(name: str, text: str, *, zero: bool = False) -> float:
@@ -48,34 +38,16 @@ def state_publisher(share: Path, values: Mapping[str, Any], namespace: str, join
     """
     Return robot_state_publisher, or a line that says why there is no TF.
 
-    Parameters
-    ----------
-    share
-        Share folder of this package.
-    values
-        Checked parameters of the top.
-    namespace, joint_states
-        Namespace of the node, and full name of the topic.
-    use_sim_time
-        Whether it follows /clock.
-
-    Raises
-    ------
-    ValueError
-        If the frames are impossible.
-
+    `joint_states` is the full name of the topic.  Raises ValueError if the frames are impossible.
     """
     try:
         get_package_prefix(STATE_PUBLISHER)
-    except PackageNotFoundError:
-        return [LogInfo(msg=f'no TF: the package {STATE_PUBLISHER} is not installed')]
-    try:
         description = robot_description(values, share / 'urdf')
-    except ImportError:
-        return [LogInfo(msg='no TF: the package xacro is not installed')]
+    except (PackageNotFoundError, ImportError) as error:
+        missing = 'xacro' if isinstance(error, ImportError) else STATE_PUBLISHER
+        return [LogInfo(msg=f'no TF: the package {missing} is not installed')]
     warning = inertia_warning(values)
-    warnings: list[Action] = [LogInfo(msg=f'WARNING: {warning}')] if warning else []
-    return [*warnings, Node(
+    return [*([LogInfo(msg=f'WARNING: {warning}')] if warning else []), Node(
         package=STATE_PUBLISHER, executable=STATE_PUBLISHER, namespace=namespace,
         remappings=[('joint_states', joint_states)], parameters=[{
             'robot_description': ParameterValue(description, value_type=str),
@@ -92,9 +64,3 @@ def rviz(share: Path, world_frame: str, namespace: str, use_sim_time: bool) -> N
         remappings=[(f'/{topic}', resolve_topic(topic, namespace))
                     for topic in ('markers', 'robot_description')],
         parameters=[{'use_sim_time': use_sim_time}])
-
-
-def until_it_ends(node: Node) -> list[Action]:
-    """Return a node, and an action that shuts everything down when it ends."""
-    return [node, RegisterEventHandler(OnProcessExit(
-        target_action=node, on_exit=[EmitEvent(event=Shutdown(reason='it has ended'))]))]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clocks, and the thread that calls a function at absolute deadlines."""
+"""Clocks, a fair lock, and the thread that calls a function at absolute deadlines."""
 
 from __future__ import annotations
 
@@ -9,17 +9,7 @@ from collections.abc import Callable
 
 
 class SimulatedClock:
-    """
-    Maps a source clock to simulated time: scale times as fast, with pauses.
-
-    Parameters
-    ----------
-    source
-        Returns the time of the clock to follow [ns].
-    scale
-        Simulated over source time.
-
-    """
+    """Maps a source clock [ns] to simulated time [ns]: `scale` times as fast, with pauses."""
 
     def __init__(self, source: Callable[[], int], scale: float) -> None:
         self._source, self._scale = source, scale
@@ -33,11 +23,9 @@ class SimulatedClock:
 
     def set_scale(self, scale: float) -> None:
         """Go on from the present time at another speed."""
-        now_ns, running = self.now(), self.running
+        if self.running:
+            self.start(self.now())
         self._scale = scale
-        self.stop(now_ns)
-        if running:
-            self.start(now_ns)
 
     def start(self, simulated_ns: int) -> None:
         """Run from this simulated time on."""
@@ -62,79 +50,47 @@ class SimulatedClock:
 
 
 class MonotonicClock:
-    """
-    Follows a clock and leaves out its steps back, as of the /clock of a log played in a loop.
+    """Follows a clock without its steps back, as of a log in a loop, and tells of these [ns]."""
 
-    Parameters
-    ----------
-    source
-        Returns the time of the clock to follow [ns].
-
-    """
-
-    def __init__(self, source: Callable[[], int]) -> None:
-        self._source = source
-        self._newest: int | None = None
-        self._stepped_back_ns = self._taken_ns = 0
+    def __init__(self, source: Callable[[], int], tell: Callable[[int], object]) -> None:
+        self._source, self._tell = source, tell
+        self._newest_ns = self._stepped_back_ns = 0
 
     def __call__(self) -> int:
-        reading = self._source()
-        if self._newest is not None and reading < self._newest:
-            self._stepped_back_ns += self._newest - reading
-        self._newest = reading
-        return reading + self._stepped_back_ns
-
-    def take_step_back(self) -> int:
-        """Return by how much the clock has stepped back since this was last asked [ns]."""
-        before, self._taken_ns = self._taken_ns, self._stepped_back_ns
-        return self._taken_ns - before
+        back_ns, self._newest_ns = self._newest_ns, self._source()
+        back_ns -= self._newest_ns
+        if back_ns > 0:
+            self._stepped_back_ns += back_ns
+            self._tell(back_ns)
+        return self._newest_ns + self._stepped_back_ns
 
 
 class FairLock:
     """
-    A reentrant lock that threads get in the order in which they ask for it.
+    A lock that threads get in turn.
 
-    A thread that takes an ordinary lock again and again leaves the others no turn.
+    An ordinary lock stays with a thread that takes it again and again, as ticks do on a machine
+    that is overloaded: those who wait for it do not wake up in time.
     """
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._queue = threading.Lock()      # held by the thread that is next
-        self._owner: int | None = None
-        self._depth = 0
+        self._lock, self._next = threading.Lock(), threading.Lock()
 
     def __enter__(self) -> None:
-        this = threading.get_ident()
-        if self._owner != this:
-            with self._queue:
-                self._lock.acquire()
-            self._owner = this
-        self._depth += 1
+        with self._next:        # held by the thread that is next
+            self._lock.acquire()
 
     def __exit__(self, *_: object) -> None:
-        self._depth -= 1
-        if self._depth == 0:
-            self._owner = None
-            self._lock.release()
+        self._lock.release()
 
 
 class DeadlineThread(threading.Thread):
     """
-    Calls a function at absolute deadlines until it is stopped.
+    Calls `tick` at absolute deadlines until it is stopped, and `idle` behind it where it asks so.
 
     A tick that comes late comes at once.  Deadlines that have passed meanwhile are skipped, and
     the grid of deadlines stays.  A sleeping thread wakes up at less processor time than an rclpy
     timer (`python benchmark/wake_up.py`).
-
-    Parameters
-    ----------
-    tick
-        Called at each deadline; returns whether `idle` is called before the next one.
-    rate
-        Deadlines per second [Hz].
-    idle
-        Does what is left to do between two ticks.
-
     """
 
     # Longest sleep [s], so that `stop` is quick.
@@ -145,8 +101,8 @@ class DeadlineThread(threading.Thread):
     SHORTEST_NAP = 1e-4
 
     def __init__(self, tick: Callable[[], object], rate: float,
-                 idle: Callable[[], None] = lambda: None, *, name: str = 'simulation') -> None:
-        super().__init__(name=name, daemon=True)
+                 idle: Callable[[], object]) -> None:
+        super().__init__(name='simulation', daemon=True)
         self._tick, self._idle = tick, idle
         self._stopped = False
         # Origin and period [s].  Another thread may replace it at any time.
@@ -162,20 +118,15 @@ class DeadlineThread(threading.Thread):
 
     def run(self) -> None:
         grid: tuple[float, float] | None = None
-        newest = 0
+        newest = 0              # number of the deadline of the newest tick
         while not self._stopped:
             before, grid = grid, self._grid
             origin, period = grid
-            passed = int((time.monotonic() - origin) // period)     # the newest deadline
-            if grid is not before:
-                newest = passed
-            if passed <= newest:
-                newest += 1
-                deadline = origin + newest * period
-                while (left := deadline - time.monotonic()) > 0.0 and not self._stopped:
-                    time.sleep(min(left, self.LONGEST_SLEEP))
-            else:
-                newest = passed
+            passed = int((time.monotonic() - origin) // period)
+            newest = passed + 1 if grid is not before else max(passed, newest + 1)
+            deadline = origin + newest * period
+            while (left := deadline - time.monotonic()) > 0.0 and not self._stopped:
+                time.sleep(min(left, self.LONGEST_SLEEP))
             if not self._stopped and self._tick():
                 nap = min(self.NAP * period, self.LONGEST_SLEEP)
                 if nap >= self.SHORTEST_NAP:
@@ -185,5 +136,5 @@ class DeadlineThread(threading.Thread):
     def stop(self) -> None:
         """Ask the thread to end, and wait for it."""
         self._stopped = True
-        if self.is_alive() and self is not threading.current_thread():
+        if self.is_alive():
             self.join(5.0)

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded messages with their recorded spacing: reading ahead, rounds, and when to send."""
+"""When a recorded message is due, and a thread that reads the messages before they are."""
 
 from __future__ import annotations
 
 import contextlib
-import itertools
 import queue
 import threading
 import time
@@ -14,8 +13,8 @@ from spinning_top_sim.nodes.pacing import FairLock, SimulatedClock
 
 Message = tuple[int, int, bytes]    # time [ns], which publisher, CDR
 
-# Between the last message of a round and the first of the next; also what a log of a single
-# moment is repeated at.
+# Between the last message of a round and the first of the next; also the period of a log whose
+# messages have all the same time.
 ROUND_GAP_NS = 10_000_000
 # A message sent later than this is counted.
 LATE_NS = 10_000_000
@@ -29,23 +28,15 @@ def rounds(read: Callable[[], Iterable[Message]], span_ns: int, loop: bool) -> I
     """
     Yield the messages once, or again and again with times that go on.
 
-    Parameters
-    ----------
-    read
-        Returns the messages of one round.
-    span_ns
-        Length of a round [ns]; the next one begins ROUND_GAP_NS later.
-    loop
-        Whether there is a next round.
-
+    read : returns the messages of one round
+    span_ns : length of a round [ns]; the next one begins ROUND_GAP_NS later
     """
     shift = 0
     while True:
-        empty = True
+        at_ns = None
         for at_ns, index, data in read():
-            empty = False
             yield at_ns + shift, index, data
-        if empty or not loop:
+        if at_ns is None or not loop:
             return
         shift += span_ns + ROUND_GAP_NS
 
@@ -54,27 +45,23 @@ class ReadAhead:
     """
     Iterates over messages that a thread reads ahead, a bounded number of them.
 
-    Reading takes a while whenever a chunk begins, so the thread that waits for deadlines does not
-    read.  An error of the reading is raised after the messages before it.
+    The thread that sends does not read, because every new chunk takes a while.  An error of the
+    reading is raised after the messages before it.
     """
 
-    _END = object()
-
-    def __init__(self, messages: Iterable[Message]) -> None:
+    def __init__(self, messages: Iterator[Message]) -> None:
         self._messages = messages
-        self._batches: queue.Queue = queue.Queue(BATCHES)
+        self._batches: queue.Queue[list[Message]] = queue.Queue(BATCHES)    # an empty one: the end
+        self._error: Exception | None = None
         self._stopped = False
         self._thread = threading.Thread(target=self._read, name='read ahead', daemon=True)
         self._thread.start()
 
     def __iter__(self) -> Iterator[Message]:
-        while not self._stopped:
-            batch = self._batches.get()
-            if batch is self._END:
-                return
-            if isinstance(batch, Exception):
-                raise batch
+        while batch := self._batches.get():
             yield from batch
+        if self._error is not None:
+            raise self._error
 
     def stop(self) -> None:
         """End both the reading and the iterating."""
@@ -83,28 +70,29 @@ class ReadAhead:
         with contextlib.suppress(queue.Empty):
             while True:
                 self._batches.get_nowait()
-        with contextlib.suppress(queue.Full):
-            self._batches.put_nowait(self._END)
-        if self._thread is not threading.current_thread():
-            self._thread.join(1.0)
+        self._batches.put([])
+        self._thread.join(1.0)
 
     def _read(self) -> None:
+        batch = None
+        while batch != [] and not self._stopped:
+            batch = self._next_batch()
+            self._batches.put(batch)
+
+    def _next_batch(self) -> list[Message]:
+        """Return the next messages: none at the end, which is also where an error leads to."""
         batch: list[Message] = []
         size = 0
-        last: object = self._END
         try:
             for message in self._messages:
                 batch.append(message)
                 size += len(message[2])
-                if size >= BATCH_BYTES or len(batch) >= BATCH_MESSAGES:
-                    self._batches.put(batch)
-                    batch, size = [], 0
-                if self._stopped:
-                    return
+                if size >= BATCH_BYTES or len(batch) >= BATCH_MESSAGES or self._stopped:
+                    break
         except Exception as error:
-            last = error
-        self._batches.put(batch)
-        self._batches.put(last)
+            self._error = error
+            self._messages = iter(())
+        return batch
 
 
 class Playback:
@@ -114,85 +102,63 @@ class Playback:
     Each deadline is computed from the clock, never from the one before, so nothing drifts.  A
     late message is sent at once and counted, not dropped.
 
-    Parameters
-    ----------
-    messages
-        In the order of their times.
-    begin_ns, rate
-        Time at which the clock starts [ns], and its speed.
-    send
-        Takes the index of a publisher, and CDR.
-    source, sleep
-        Returns steady time [ns]; waits at most so many seconds (None: until woken).
-
-    Attributes
-    ----------
-    sent, late : int
-        Counts of messages.
-    paused : bool
-
+    begin_ns : time at which the clock starts [ns]
+    send : takes the index of a publisher, and CDR
+    source, sleep : returns steady time [ns]; waits at most so many seconds (None: until woken)
     """
 
-    def __init__(self, messages: Iterable[Message], begin_ns: int, rate: float,
-                 send: Callable[[int, bytes], None], *, paused: bool = False,
+    def __init__(self, begin_ns: int, send: Callable[[int, bytes], None], *, paused: bool = False,
                  source: Callable[[], int] = time.monotonic_ns,
-                 sleep: Callable[[float | None], None] | None = None) -> None:
-        self._messages, self._send, self._source = messages, send, source
-        self._clock = SimulatedClock(source, rate)
+                 sleep: Callable[[float | None], object] | None = None) -> None:
+        self._begin_ns, self._send, self._source = begin_ns, send, source
+        self._clock = SimulatedClock(source, 1.0)
         self._clock.stop(begin_ns)
-        self._begun = False
+        self._sent_until = begin_ns         # all messages before this time are sent
         self._stopped = False
-        self._known_until = begin_ns        # all messages before this time are sent
         self._wake = threading.Event()
-        self._sleep = sleep or self._sleep_until_told
+        self._sleep = sleep or self._sleep_until_woken
         self._lock = FairLock()             # the clock, and sending
         self.paused = paused
         self.sent = self.late = 0
 
-    def run(self) -> None:
-        """Play to the end, or until stopped."""
-        messages = iter(self._messages)
-        first = list(itertools.islice(messages, 1))     # read before the clock starts
-        with self._control():
-            self._begun = True
-            self._run_clock()
-        for at_ns, index, data in itertools.chain(first, messages):
-            self._known_until = at_ns
+    def run(self, messages: Iterable[Message]) -> None:
+        """Play messages in the order of their times, to the end or until stopped."""
+        for at_ns, index, data in messages:
+            if not self.sent:           # reading the first message may have taken a while
+                with self._lock:
+                    self._set_clock(self._begin_ns, self.paused)
+            self._sent_until = at_ns
             if not self._send_when_due(at_ns, index, data):
                 return
 
     def now(self) -> int:
         """Return the time up to which all messages are sent [ns]."""
-        with self._control():
-            return min(self._clock.now(), self._known_until)
+        with self._lock:
+            return min(self._clock.now(), self._sent_until)
 
     def pause(self, paused: bool) -> None:
         """Pause, or go on without catching up; once paused, no message is sent any more."""
-        with self._control():
-            self.paused = paused
-            self._run_clock()
+        with self._lock:
+            self._set_clock(self._clock.now(), paused)
+        self._wake.set()
 
     def set_rate(self, rate: float) -> None:
         """Go on at another rate."""
-        with self._control():
+        with self._lock:
             self._clock.set_scale(rate)
+        self._wake.set()
 
     def stop(self) -> None:
         """Make `run` return, soon."""
-        with self._control():
+        with self._lock:
             self._stopped = True
+        self._wake.set()
 
-    def rest(self, seconds: float) -> bool:
-        """Wait before or after playing; return False once stopped."""
-        self._sleep(seconds)
-        return not self._stopped
-
-    def _run_clock(self) -> None:
-        runs = self._begun and not self.paused
-        if runs and not self._clock.running:
-            self._clock.start(self._clock.now())
-        elif not runs:
-            self._clock.stop()
+    def _set_clock(self, at_ns: int, paused: bool) -> None:
+        self.paused = paused
+        self._clock.stop(at_ns)
+        if not paused:
+            self._clock.start(at_ns)
 
     def _send_when_due(self, at_ns: int, index: int, data: bytes) -> bool:
         """Send a message when its time has come; return False when stopped before."""
@@ -209,12 +175,6 @@ class Playback:
                     return True
             self._sleep(None if left is None else left / 1e9)
 
-    @contextlib.contextmanager
-    def _control(self) -> Iterator[None]:
-        with self._lock:
-            yield
-        self._wake.set()
-
-    def _sleep_until_told(self, seconds: float | None) -> None:
+    def _sleep_until_woken(self, seconds: float | None) -> None:
         self._wake.wait(None if seconds is None else min(seconds, threading.TIMEOUT_MAX))
         self._wake.clear()

@@ -14,7 +14,6 @@ from spinning_top_sim.nodes import executable
 
 if TYPE_CHECKING:
     from spinning_top_sim.nodes.replayer import Replayer
-    from spinning_top_sim.recording.reader import LogReader
 
 DESCRIPTION = """\
 Publish the messages of a ROS 2 log (.mcap) with their recorded spacing, then end.
@@ -27,16 +26,18 @@ Publish the messages of a ROS 2 log (.mcap) with their recorded spacing, then en
 EPILOG = """\
 Topics keep their recorded names, whatever the namespace of this node (`replay`); remapping with
 `--ros-args -r FROM:=TO` works on them. They are published with the recorded QoS, and
-`qos_overrides.<topic>.publisher.{history,depth,reliability}` override it. A topic whose type is
-not installed is named and left out. Messages go out in the order of their log times and with their
-recorded bytes: stamps inside them stay as they are, in every round of --loop. What is late is sent
-at once; at high rates a greater depth keeps more of it for subscribers that cannot follow.
+`qos_overrides.<topic>.publisher.{history,depth,reliability}` override it. A topic that cannot be
+published, such as one of a type that is not installed, is named and left out. Messages go out in
+the order of their log times and with their recorded bytes: stamps inside them stay as they are, in
+every round of --loop. What is late is sent at once; at high rates a greater depth keeps more of it
+for subscribers that cannot follow.
 
 while playing:
   ros2 service call /replay/set_pause std_srvs/srv/SetBool '{data: true}'
   ros2 param set /replay rate 2.0
 
-exit code: 0 played (also in part: topics left out, ended by a signal), 2 cannot be played
+exit code: 0 played (also in part: topics left out, ended by a signal), 2 cannot be played, or is
+damaged inside
 """
 
 CLOCK_RATE = 40.0           # Hz, as `ros2 bag play` has it
@@ -50,35 +51,11 @@ def main(argv: list[str] | None = None) -> int:
 def _prepare(argv: list[str]) -> Callable[[], Replayer]:
     from rclpy.utilities import remove_ros_args  # noqa: PLC0415
 
-    options = vars(_parser().parse_args(remove_ros_args(argv)[1:]))
-    log = _open(options.pop('file'), partial=options['partial'])
+    options = _parser().parse_args(remove_ros_args(argv)[1:])
+    from spinning_top_sim.nodes.replayer import Replayer, open_log  # noqa: PLC0415
 
-    def make_node() -> Replayer:
-        from spinning_top_sim.nodes.replayer import Options, Replayer  # noqa: PLC0415
-
-        return Replayer(log, Options(**options))
-
-    return make_node
-
-
-def _open(path: Path, *, partial: bool) -> LogReader:
-    """Open a log.  Raises ValueError for what is none, and for a torn one unless `partial`."""
-    from spinning_top_sim.recording.errors import LogError  # noqa: PLC0415
-    from spinning_top_sim.recording.reader import LogReader  # noqa: PLC0415
-
-    try:
-        log = LogReader(path)
-        damage = None if log.whole else log.damage
-    except LogError as error:
-        raise ValueError(error) from error
-    if damage is not None and (damage.truncated or damage.losses):
-        if not partial:
-            raise ValueError(f'{path} is torn: `recover` makes a whole log of it, --partial plays '
-                             'what is whole')
-        said = '; '.join(damage.lines()[:1])
-        print(f'replay_node: {path} is torn, playing what is whole{said and "; "}{said}',
-              file=sys.stderr)
-    return log
+    log = open_log(options.file, options.partial)
+    return lambda: Replayer(log, options)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -86,7 +63,7 @@ def _parser() -> argparse.ArgumentParser:
         prog='replay_node', description=DESCRIPTION, epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('file', type=Path, metavar='FILE', help='the log')
-    parser.add_argument('-r', '--rate', type=_positive, metavar='R',
+    parser.add_argument('-r', '--rate', type=float, metavar='R',
                         help='recorded over real time (default: the parameter `rate`, 1)')
     parser.add_argument('-l', '--loop', action='store_true',
                         help='begin again at the end; --clock goes on')
@@ -94,7 +71,7 @@ def _parser() -> argparse.ArgumentParser:
                         help='begin S seconds after the begin of the log')
     parser.add_argument('--topics', nargs='+', default=[], metavar='T',
                         help='play these only, by their recorded names')
-    parser.add_argument('--clock', type=_positive, nargs='?', const=CLOCK_RATE, default=0.0,
+    parser.add_argument('--clock', type=_not_negative, nargs='?', const=CLOCK_RATE, default=0.0,
                         metavar='HZ', help="publish the log's time on /clock, HZ times a second "
                         f'(default {CLOCK_RATE:g}), instead of a recorded /clock')
     parser.add_argument('--partial', action='store_true',
@@ -108,16 +85,9 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _positive(text: str) -> float:
-    value = float(text)
-    if not (math.isfinite(value) and value > 0.0):
-        raise argparse.ArgumentTypeError(f'{text}: must be a finite number > 0')
-    return value
-
-
 def _not_negative(text: str) -> float:
     value = float(text)
-    if not (math.isfinite(value) and value >= 0.0):
+    if not 0.0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f'{text}: must be a finite number >= 0')
     return value
 

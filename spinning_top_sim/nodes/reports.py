@@ -7,8 +7,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -20,38 +19,14 @@ if TYPE_CHECKING:
     from spinning_top_sim.nodes.tick_loop import TickLoop
     from spinning_top_sim.streams.pipeline import Simulation
 
-OK, WARN, ERROR = 0, 1, 2
-
-
-class Speedometer:
-    """Measures the real-time factor, simulated over real time between two readings."""
-
-    # Shortest time to measure [s]: reports that were held up follow each other at once.
-    SHORTEST = 0.1
-
-    def __init__(self) -> None:
-        self.begin(0)
-
-    def begin(self, simulated_ns: int) -> None:
-        """Measure from here on, as after a reset."""
-        self._real, self._simulated = time.monotonic(), simulated_ns
-        self.factor = 0.0
-
-    def read(self, simulated_ns: int) -> float:
-        """Return the factor since the reading before."""
-        elapsed, advanced = time.monotonic() - self._real, simulated_ns - self._simulated
-        if elapsed >= self.SHORTEST:
-            self.begin(simulated_ns)
-            self.factor = max(0.0, advanced / 1e9 / elapsed)
-        return self.factor
-
 
 class MotionReport:
     """Describes a running simulation; the caller holds the simulation's lock."""
 
     def __init__(self, simulation: Simulation, loop: TickLoop, session: RecordingSession) -> None:
         self._simulation, self._loop, self._session = simulation, loop, session
-        self.speed = Speedometer()
+        self._speed = 0.0                       # simulated over real time, at the last reading
+        self._read_at, self._read_ns = time.monotonic(), 0
         self._described: object = None          # the motion that `_regime` names
         self._regime = ''
 
@@ -59,56 +34,62 @@ class MotionReport:
         """
         Return the message for /diagnostics; its level is that of the worst problem.
 
-        Parameters
-        ----------
-        stamp, name
-            Time of the message, and what it calls the node.
-        max_error
-            Largest orientation error [rad] that is no problem; 0: the error is not computed.
-
+        max_error : largest orientation error that is no problem; 0: it is not computed [rad]
         """
         simulation, loop = self._simulation, self._loop
-        error = math.nan if max_error == 0.0 else simulation.orientation_error
-        skipped = sum(stream.skipped for stream in simulation.streams)
-        problems = []
-        if loop.paused:
-            problems.append((OK, 'paused'))
-        if skipped or loop.counters.slipped_ns:
-            problems.append((WARN, 'this machine cannot keep up'))
+        error = simulation.orientation_error if max_error else math.nan
+        problems = [(DiagnosticStatus.OK, 'paused' if loop.paused else 'running')]
+        if self.overloaded:
+            problems.append((DiagnosticStatus.WARN, 'this machine cannot keep up'))
         if error > max_error > 0.0:
-            problems.append((WARN, f'orientation error {error:.3g} rad: more than max_error = '
-                                   f'{max_error:g} rad'))
+            problems.append((DiagnosticStatus.WARN, f'orientation error {error:.3g} rad: more '
+                                                    f'than max_error = {max_error:g} rad'))
         if self._session.error:
-            problems.append((ERROR, f'recording: {self._session.error}'))
+            problems.append((DiagnosticStatus.ERROR, f'recording: {self._session.error}'))
         if loop.failure:
-            problems.append((ERROR, loop.failure))
-        level, message = max(problems, key=lambda problem: problem[0], default=(OK, 'running'))
-        values = {**self._numbers(error, skipped), **self._session.numbers()}
+            problems.append((DiagnosticStatus.ERROR, loop.failure))
+        level, message = max(problems, key=lambda problem: problem[0])
         array = DiagnosticArray(status=[DiagnosticStatus(
-            level=bytes([level]), name=name, hardware_id='none', message=message,
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])])
+            level=level, name=name, hardware_id='none', message=message,
+            values=[KeyValue(key=key, value=str(value))
+                    for key, value in self._numbers(error).items()])])
         array.header.stamp = stamp
         return array
 
-    def _numbers(self, error: float, skipped: int) -> dict[str, object]:
-        simulation, counters, now_ns = self._simulation, self._loop.counters, self._loop.now_ns
+    @property
+    def overloaded(self) -> bool:
+        """Whether samples have come too late to be published, or the clock has slipped."""
+        return self._loop.slipped_ns > 0 or self._total('skipped') > 0
+
+    def _total(self, count: str) -> int:
+        return sum(getattr(stream, count) for stream in self._simulation.streams)
+
+    def _numbers(self, error: float) -> dict[str, object]:
+        simulation, loop, now_ns = self._simulation, self._loop, self._loop.now_ns
         return {
             'simulated time [s]': f'{now_ns / NANOSECONDS:.6f}',
-            'real-time factor': f'{self.speed.read(now_ns):.3f}',
-            'late ticks': counters.late_ticks,
-            'skipped ticks': counters.skipped_ticks,
-            'published messages': self._sent(),
-            'skipped samples': skipped,
-            'clock slip [s]': f'{counters.slipped_ns / NANOSECONDS:.3f}',
+            'real-time factor': f'{self._measure_speed(now_ns):.3f}',
+            'late ticks': loop.late_ticks,
+            'skipped ticks': loop.skipped_ticks,
+            'published messages': self._total('sent'),
+            'skipped samples': self._total('skipped'),
+            'clock slip [s]': f'{loop.slipped_ns / NANOSECONDS:.3f}',
             'orientation error [rad]': f'{error:.3g}',
-            'commands': counters.commands,
-            'rejected commands': counters.rejected_commands,
+            'commands': loop.commands,
+            'rejected commands': loop.rejected_commands,
             'integration steps': simulation.steps,
             'evaluations': simulation.evaluations,
+            **self._session.numbers(),
         }
 
-    def _sent(self) -> int:
-        return sum(stream.sent for stream in self._simulation.streams)
+    def _measure_speed(self, now_ns: int) -> float:
+        """Return simulated over real time since the reading before, or since a reset."""
+        elapsed = time.monotonic() - self._read_at
+        if elapsed > 0.1:       # reports that were held up follow each other at once
+            since_ns = self._read_ns if self._read_ns <= now_ns else 0
+            self._speed = (now_ns - since_ns) / NANOSECONDS / elapsed
+            self._read_at, self._read_ns = self._read_at + elapsed, now_ns
+        return self._speed
 
     def new_motion(self) -> str | None:
         """Return the present motion in numbers if that was not said yet."""
@@ -123,30 +104,13 @@ class MotionReport:
     def status_line(self) -> str:
         """Return the line for the terminal, with the angle in degrees."""
         simulation, loop, size = self._simulation, self._loop, self._session.size
-        state = simulation.state()
+        theta = math.degrees(float(simulation.state().theta[0]))
         flag = ' FAILED' if loop.failure else ' paused' if loop.paused else ''
-        log = '' if size is None else f' | log {human_readable(size)}'
+        log = f' | log {size}' if size else ''
         return (f't {loop.now_ns / NANOSECONDS:9.2f} s{flag} | {self._regime} | '
-                f'theta {math.degrees(float(state.theta[0])):6.2f} deg | '
-                f'L3 {simulation.l3:.4g} Lz {simulation.lz:.4g} | x{self.speed.factor:.2f} | '
-                f'dE/E {simulation.energy_drift:+.0e} | {self._sent()} msgs{log}')
-
-
-def impossible_body(values: Mapping[str, Any]) -> str:
-    """Return the warning of moments of inertia that no rigid body has."""
-    return (f'top.lambda3 = {values["top.lambda3"]!r} kg m^2: no rigid body has this with '
-            f'top.lambda1 = {values["top.lambda1"]!r}, top.mass = {values["top.mass"]!r} and '
-            f'top.com_distance = {values["top.com_distance"]!r} (lambda3 <= 2 (lambda1 - M R^2)); '
-            'simulated all the same')
-
-
-def human_readable(count: float) -> str:
-    """Return a number of bytes as a size such as 1.2 MB."""
-    for unit in ('B', 'kB', 'MB'):
-        if count < 1000.0:
-            return f'{count:.0f} {unit}' if unit == 'B' else f'{count:.1f} {unit}'
-        count /= 1000.0
-    return f'{count:.1f} GB'
+                f'theta {theta:6.2f} deg | L3 {simulation.l3:.4g} Lz {simulation.lz:.4g} | '
+                f'x{self._speed:.2f} | dE/E {simulation.energy_drift:+.0e} | '
+                f"{self._total('sent')} msgs{log}")
 
 
 class Terminal:
@@ -154,7 +118,7 @@ class Terminal:
 
     def __init__(self) -> None:
         self._overwrites = sys.stdout.isatty()
-        self._open = False
+        self._open = False              # the cursor stands behind a line
 
     def show(self, line: str) -> None:
         """Show the newest line."""

@@ -30,27 +30,17 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _prepare(argv: list[str]) -> Callable[[], Simulator] | None:
-    if '--help' in argv[1:] or '-h' in argv[1:]:
-        _show_help()
-        return None
-    return _make_node
-
-
-def _make_node() -> Simulator:
-    from spinning_top_sim.nodes.simulator import Simulator  # noqa: PLC0415
-
-    return Simulator()
-
-
-def _show_help() -> None:
+    if not {'--help', '-h'}.intersection(argv[1:]):
+        from spinning_top_sim.nodes.simulator import Simulator  # noqa: PLC0415
+        return Simulator
     from spinning_top_sim.streams import parameters  # noqa: PLC0415
-
     print(USAGE)
     for parameter in parameters.TABLE:
         default = parameter.default
         shown = list(default) if isinstance(default, tuple) else default
         print(f'  {parameter.name}  (default {"unset" if shown is None else shown})\n'
               f'      {parameter.description}')
+    return None
 
 
 if __name__ == '__main__':
