@@ -206,7 +206,7 @@ def test_streams_of_one_rate_share_the_states(method):
 def test_a_column_that_nobody_needs_is_not_computed(method, monkeypatch):
     """A pose needs no angle and no rate, joints no body rate, odometry no angle."""
     computed = set()
-    samples = {'rk45': rk45._TransportSamples, 'exact': exact._ExactSamples}[method]
+    samples = {'rk45': rk45._TransportStates, 'exact': exact._ExactStates}[method]
 
     def watch(name):
         original = getattr(samples, name)

@@ -112,11 +112,6 @@ class PhaseUnwrapper:
         # Phases of alpha and beta less the line, and theta/2 [rad], at the begins of steps.
         self.begins = np.array([[self.alpha.start], [self.beta.start], [0.5 * start.theta]])
 
-    @property
-    def crosses(self) -> bool:
-        """Whether the axis may pass a pole exactly."""
-        return self.alpha.crosses or self.beta.crosses
-
     def extend(self, t: Column, alpha: NDArray[np.complex128],
                beta: NDArray[np.complex128]) -> None:
         """Follow the phases over the begins of further steps at t [s]."""
