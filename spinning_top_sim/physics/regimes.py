@@ -72,12 +72,16 @@ COINCIDE = 1e-12
 def swing(top: Top, state: State) -> tuple[float, float]:
     """Return the least and the greatest cos(theta) between which the axis swings."""
     sin_half, cos_half = math.sin(0.5 * state.theta), math.cos(0.5 * state.theta)
-    f0, f1, f2, f3 = nutation_cubic(top.lambda1, top.gravity_torque, state.l3, state.lz,
-                                    state.theta_dot, sin_half, cos_half)
+    cubic = nutation_cubic(top.lambda1, top.gravity_torque, state.l3, state.lz, state.theta_dot,
+                           sin_half, cos_half)
+    scale = max(map(abs, cubic))
+    if not math.isfinite(scale):        # next to a pole that it cannot reach: thrown far away
+        return -1.0, 1.0
+    f0, f1, f2, f3 = (x / (scale or 1.0) for x in cubic)
     down, up = -2.0 * cos_half ** 2, 2.0 * sin_half ** 2        # to u = -1 and u = 1
     if f0:
         low, high = _bisect(f0, f1, f2, f3, down), _bisect(f0, f1, f2, f3, up)
-    else:                                   # theta' = 0: one end is here; f1 says which way it goes
+    else:       # theta' = 0: one end is here, and f1 says on which side the other is
         ahead = [y for y in _quadratic_roots(f1, f2, f3) if (y > 0.0) == (f1 > 0.0)]
         other = min(max(min(ahead, key=abs, default=0.0), down), up) if f1 else 0.0
         low, high = min(0.0, other), max(0.0, other)

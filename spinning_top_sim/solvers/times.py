@@ -54,12 +54,14 @@ class Times:
         """
         try:
             count = np.arange(ns.start, ns.stop, ns.step, dtype=np.int64) if isinstance(
-                ns, range) else np.asarray(ns)
+                ns, range) else np.array(ns)
         except OverflowError as error:
             raise ValueError(f'times_ns = {ns!r}: must be within int64') from error
         if count.ndim != 1 or (count.size and count.dtype.kind not in 'iu'):
             raise ValueError(f'times_ns has shape {count.shape} and type {count.dtype}: must be '
                              '(n,) integer nanoseconds')
+        if not isinstance(ns, range):
+            ns = count          # not the caller's: columns are computed later
         if not count.size or max(abs(int(count.min())), abs(int(count.max()))) <= 2 ** 53:
             return cls(count.astype(np.float64), np.broadcast_to(0.0, len(count)), ns)
         upper = (count >> 20).astype(np.float64) * 2.0 ** 20
