@@ -21,14 +21,9 @@ from spinning_top_sim.streams.topics import Stream
 
 class PastAxis:
     """
-    Where the symmetry axis was, over all segments of a run, by the exact solution.
+    Where the symmetry axis was in the last `length_ns`, over all segments, by the exact solution.
 
     Each segment is followed from its start to the command that ended it, that instant included.
-
-    Parameters
-    ----------
-    length_ns : int
-        How far back the trace goes [ns].
     """
 
     def __init__(self, length_ns: int) -> None:
