@@ -98,15 +98,16 @@ class ExactSolution:
             raise ValueError(f'm1 = {motion.m1:.3e} for {top} from {start}: the motion is closer '
                              f'to the separatrix than {LEAST_M1}')
         self.m, self.m1 = float(motion.m), float(motion.m1)
-        period = motion.nutation_period
-        self.nutation_period = None if period is None else float(period)
+        # 2 K/w, two quarter periods
+        self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
         alpha, beta = motion.alpha, motion.beta
+        precession, spin = alpha.rate + beta.rate, alpha.rate - beta.rate
         for name, value in (('the rate of the nutation', motion.quarter_rate),
                             ('the rate of (phi + psi)/2', alpha.rate),
                             ('the rate of (phi - psi)/2', beta.rate)):
             in_range(name, value)
-        self.mean_precession_rate = in_range('mean precession rate', motion.mean_precession_rate)
-        self.mean_spin_rate = in_range('mean spin rate', motion.mean_spin_rate)
+        self.mean_precession_rate = in_range('mean precession rate', precession)
+        self.mean_spin_rate = in_range('mean spin rate', spin)
         self.theta_min, self.theta_max = (float(x) for x in motion.theta_bounds)
 
         two_lambda1, two_pi = 2 * Decimal(top.lambda1), 2 * pi()
@@ -114,8 +115,7 @@ class ExactSolution:
         self._top_rate = in_range('(lz - l3)/(2 lambda1)', motion.a_minus / two_lambda1)
         in_range('l3/lambda3', Decimal(start.l3) / Decimal(top.lambda3))
         self._nutation = Nutation(motion, start.theta)
-        self._precession, self._spin = (
-            Rate(motion.mean_precession_rate), Rate(motion.mean_spin_rate))
+        self._precession, self._spin = Rate(precession), Rate(spin)
         # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
         self._phi_phase = float(Decimal(start.phi) - alpha.start_argument - beta.start_argument)
         self._psi_phase = float(Decimal(start.psi) - alpha.start_argument + beta.start_argument)
