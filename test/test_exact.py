@@ -468,7 +468,7 @@ def test_columns_belong_to_the_times_that_were_given():
     for times, ask in ((np.array([1.0, 2.0]), solution.states_at_seconds),
                        (np.array([1, 2]), solution.states)):
         expected, states = ask(times.copy()), ask(times)
-        times += 5
+        times[:] += 5
         for name in ('t', 'theta', 'quaternion'):
             assert (getattr(states, name) == getattr(expected, name)).all(), name
 

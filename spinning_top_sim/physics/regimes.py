@@ -100,8 +100,6 @@ def nutation_cubic(lambda1: Real, torque: Real, l3: Real, lz: Real, theta_dot: R
     """
     Return f0 .. f3 of u'^2 = f0 + f1 y + f2 y^2 + f3 y^3, y = u - u0, u = cos(theta).
 
-    Parameters
-    ----------
     lambda1, torque, l3, lz, theta_dot : constants, and the nutation rate at the start
     sin_half, cos_half : of theta/2 at the start; they stand for theta, so that nothing cancels at
         either pole

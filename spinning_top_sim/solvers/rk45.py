@@ -148,7 +148,6 @@ class SteppedMotion(ABC):
         steps = self._kept[first:int(numbers[-1]) + 1] if len(t) else self._kept[:1]
         return self._read(Interpolants.of(steps, self._equations), numbers - first, t, first)
 
-    @abstractmethod
     def _read(self, interpolants: Interpolants, numbers: NDArray[np.int64], t: Column,
               first: int) -> Rows:
         """
@@ -156,6 +155,7 @@ class SteppedMotion(ABC):
 
         first : place of the first of these steps among those that are kept
         """
+        return interpolants.at(numbers, t)
 
     @abstractmethod
     def _states_of(self, t: Column, rows: Rows) -> States:
@@ -167,10 +167,6 @@ class EulerMotion(SteppedMotion):
 
     def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
         super().__init__(top, start, EulerEquations(top, start, rtol, atol))
-
-    def _read(self, interpolants: Interpolants, numbers: NDArray[np.int64], t: Column,
-              first: int) -> Rows:
-        return interpolants.at(numbers, t)
 
     def _states_of(self, t: Column, rows: Rows) -> States:
         return _StatesOfAngles(self.top, self.start, t, rows)
@@ -226,7 +222,7 @@ class TransportMotion(SteppedMotion):
     def _read(self, interpolants: Interpolants, numbers: NDArray[np.int64], t: Column,
               first: int) -> Rows:
         self._unwrap()
-        return np.concatenate((interpolants.at(numbers, t),
+        return np.concatenate((super()._read(interpolants, numbers, t, first),
                                self._phases.begins[:, first:].take(numbers, axis=1)))
 
     def _states_of(self, t: Column, rows: Rows) -> States:

@@ -43,8 +43,6 @@ class Rotations:
     The whole steps of an angle are looked up in a table; the rest, less than half a step, is put
     on by the addition theorem.  numpy's own cosine and sine take twice the time.
 
-    Parameters
-    ----------
     angles : pairs of rate [turns/s] and start [turns]
     """
 

@@ -31,10 +31,7 @@ class Times:
     """
     Times since the start of a motion, in nanoseconds, as exact sums high + low.
 
-    Attributes
-    ----------
-    high : (n,) nearest doubles [ns]
-    low : (n,) what they leave out [ns]
+    high, low : (n,) nearest doubles, and what they leave out [ns]
     ns : the same times, where they are given as integers [ns]
     """
 
@@ -44,14 +41,7 @@ class Times:
 
     @classmethod
     def from_ns(cls, ns: NDArray[np.int64] | range) -> Times:
-        """
-        Return the times of integer nanoseconds.
-
-        Raises
-        ------
-        ValueError
-            If `ns` is not one-dimensional, not of integers, or beyond int64.
-        """
+        """Return the times of integer nanoseconds (n,); raise ValueError for anything else."""
         try:
             count = np.arange(ns.start, ns.stop, ns.step, dtype=np.int64) if isinstance(
                 ns, range) else np.array(ns)
@@ -92,13 +82,7 @@ class Times:
 
 
 class Rate:
-    """
-    A rate as a sum of two doubles; its product with a time has no error that grows with the time.
-
-    Parameters
-    ----------
-    per_second : the rate [1/s]
-    """
+    """A rate [1/s] as two doubles; its product with a time has no error that grows with it."""
 
     def __init__(self, per_second: Decimal) -> None:
         self.high, self.low = double_double(per_second * Decimal('1e-9'))

@@ -53,8 +53,6 @@ class Winding:
     """
     How one Cayley-Klein parameter turns.
 
-    Attributes
-    ----------
     momentum : Lz + L3 of alpha, Lz - L3 of beta; its sign is the sense of turning
     sign : of the modulus, where theta is continued out of [0, pi]
     start : phase at t = 0 [rad]
@@ -70,11 +68,7 @@ class Winding:
         return self.momentum == 0.0
 
     def modulus(self, real: Column, imag: Column, line: Column) -> Column:
-        """
-        Return the signed modulus of the parameter.
-
-        line : what the uniform spin adds to the phase [rad]
-        """
+        """Return the signed modulus; `line` is what the uniform spin adds to the phase [rad]."""
         if self.crosses:
             phase = self.start + line
             return real * np.cos(phase) + imag * np.sin(phase)
@@ -96,9 +90,6 @@ class PhaseUnwrapper:
     """
     The windings of alpha and beta of a motion, and their phases at the begins of its steps.
 
-    Parameters
-    ----------
-    start : State
     line_rate : what the uniform spin of the stepped frame adds to the phase of alpha [rad/s], and
         takes from that of beta
     """
