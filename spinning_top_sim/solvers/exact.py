@@ -70,9 +70,7 @@ class ExactSolution:
     F. Klein, A. Sommerfeld, *Ueber die Theorie des Kreisels*, ch. VI; see `theta_setup`.
     """
 
-    steps = 0
-    evaluations = 0
-    earliest_ns = 0
+    steps = evaluations = 0
     latest_ns = LATEST_NS
 
     def __init__(self, top: Top, start: State) -> None:

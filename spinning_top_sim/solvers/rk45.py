@@ -44,7 +44,6 @@ class SteppedMotion(ABC):
     top : Top
     start : where it begins, at t = 0
     steps, evaluations : integration steps taken, evaluations of the right-hand side
-    earliest_ns : the first nanosecond that can still be read; steps go forward only
     latest_ns : the last nanosecond that can be read without further steps
     """
 
@@ -61,12 +60,6 @@ class SteppedMotion(ABC):
     @property
     def evaluations(self) -> int:
         return self._integrator.evaluations
-
-    @property
-    def earliest_ns(self) -> int:
-        begin = self._kept[0].t0
-        ns = math.ceil(begin * NANOSECONDS)
-        return ns if ns / NANOSECONDS >= begin else ns + 1
 
     @property
     def latest_ns(self) -> int:
@@ -87,22 +80,10 @@ class SteppedMotion(ABC):
             taken += 1
         return True
 
-    def _refuse_too_far(self, t: float) -> None:
-        """Raise IntegrationError if `t` is more than MOST_STEPS away."""
-        newest = self._kept[-1]
-        length = newest.t1 - newest.t0
-        if t - newest.t1 > MOST_STEPS * length:
-            raise IntegrationError(
-                f't = {t:.9g} s is more than {MOST_STEPS:.0e} steps of {length:.3g} s away: '
-                "use method = 'exact'")
-
     def release(self, before_ns: int) -> None:
         """Forget the steps that only states before this time need."""
-        self._release(before_ns / NANOSECONDS)
-
-    def _release(self, before: float) -> None:
-        count = bisect_left(self._kept, before, key=attrgetter('t1'))
-        self._forget(min(count, len(self._kept) - 1))
+        self._forget(bisect_left(self._kept, before_ns / NANOSECONDS, hi=len(self._kept) - 1,
+                                 key=attrgetter('t1')))
 
     def _forget(self, count: int) -> None:
         """Forget the oldest steps."""
@@ -112,8 +93,8 @@ class SteppedMotion(ABC):
         """
         Return the states at integer nanoseconds (n,) after the start, in ascending order.
 
-        Raises ValueError if a time lies before `earliest_ns`, and IntegrationError if the steps
-        cannot go on to the last time, or it is too many of them away.
+        Raises ValueError if a time lies before the steps that are kept, and IntegrationError if
+        the steps cannot go on to the last time, or it is too many of them away.
         """
         return self.states_at_seconds(Times.from_ns(times_ns).seconds)
 
@@ -129,15 +110,20 @@ class SteppedMotion(ABC):
         parts, begin = [], 0
         while begin < len(t):
             while not self._reach(t[begin], STEPS_AT_ONCE):
-                self._refuse_too_far(t[begin])
-                self._release(self._kept[-1].t1)
+                newest = self._kept[-1]
+                length = newest.t1 - newest.t0
+                if t[begin] - newest.t1 > MOST_STEPS * length:
+                    raise IntegrationError(
+                        f't = {t[begin]:.9g} s is more than {MOST_STEPS:.0e} steps of '
+                        f"{length:.3g} s away: use method = 'exact'")
+                self._forget(len(self._kept) - 1)
             while self._kept[-1].t1 < t[-1] and len(self._kept) < STEPS_AT_ONCE:
                 self._kept.append(self._integrator.step())
             end = int(np.searchsorted(t, self._kept[-1].t1, 'right'))
             parts.append(self._rows(t[begin:end]))
             begin = end
             if begin < len(t):
-                self._release(self._kept[-1].t1)
+                self._forget(len(self._kept) - 1)
         rows = np.concatenate(parts, axis=1) if parts else self._rows(t[:0])
         return self._states_of(t.copy(), rows)
 
