@@ -163,8 +163,10 @@ def _set_up(top: Top, start: State) -> ThetaMotion:
         angles = ((Decimal(start.phi) + Decimal(start.psi)) / 2,
                   (Decimal(start.phi) - Decimal(start.psi)) / 2)
     alpha_turns, beta_turns = (reduced_turns(x) for x in (angles[::-1] if upside_down else angles))
-    motion = _Orbit(lambda1, lambda3, gravity_torque, l3, lz, sin_half, cos_half,
-                    theta_dot).motion(alpha_turns, beta_turns)
+    orbit = _Orbit(lambda1, lambda3, gravity_torque, l3, lz, sin_half, cos_half, theta_dot)
+    cubic = nutation_cubic(lambda1, gravity_torque, l3, lz, theta_dot, sin_half, cos_half)
+    motion = (orbit.nutating(cubic, alpha_turns, beta_turns) if cubic[0] or cubic[1] else
+              orbit.resting(alpha_turns, beta_turns))
     return _upside_down(motion) if upside_down else motion
 
 
@@ -260,6 +262,7 @@ class _Orbit:
     The motion of a top with P >= 0.
 
     Squares of sin and cos of theta0/2 stand for theta0, so that nothing cancels at either pole.
+    alpha_turns and beta_turns are the arguments of alpha and beta at t = 0.
     """
 
     lambda1: Decimal
@@ -283,14 +286,6 @@ class _Orbit:
     def excess_spin(self) -> Decimal:
         """What turns the body and not its axis: L3 (1/lambda3 - 1/lambda1)."""
         return self.l3 * (1 / self.lambda3 - 1 / self.lambda1)
-
-    def motion(self, alpha_turns: Decimal, beta_turns: Decimal) -> ThetaMotion:
-        """Return the motion; alpha_turns, beta_turns: arguments of alpha and beta at t = 0."""
-        cubic = nutation_cubic(self.lambda1, self.gravity_torque, self.l3, self.lz, self.theta_dot,
-                               self.sin_half, self.cos_half)
-        if cubic[0] == 0 and cubic[1] == 0:
-            return self.resting(alpha_turns, beta_turns)
-        return self.nutating(cubic, alpha_turns, beta_turns)
 
     def resting(self, alpha_turns: Decimal, beta_turns: Decimal) -> ThetaMotion:
         """

@@ -9,7 +9,7 @@ from decimal import Decimal
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.attitude import Column
+from spinning_top_sim.physics.attitude import Column, Number
 from spinning_top_sim.solvers.decimal_math import double_double
 
 NANOSECONDS = 1_000_000_000
@@ -19,7 +19,7 @@ LATEST_NS = 2 ** 63 - NANOSECONDS
 SPLITTER = 134217729.0
 
 
-def halves(x: Column) -> tuple[Column, Column]:
+def halves(x: Number) -> tuple[Number, Number]:
     """Split doubles into two of 26 bits each; products of such halves are exact."""
     big = SPLITTER * x
     high = big - (big - x)
@@ -86,9 +86,7 @@ class Rate:
 
     def __init__(self, per_second: Decimal) -> None:
         self.high, self.low = double_double(per_second * Decimal('1e-9'))
-        big = SPLITTER * self.high
-        self._first = big - (big - self.high)
-        self._second = self.high - self._first
+        self._first, self._second = halves(self.high)
 
     def product(self, times: Times) -> tuple[Column, Column]:
         """Return rate * t as nearest doubles and what they leave out."""
