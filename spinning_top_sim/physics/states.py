@@ -49,7 +49,6 @@ class States:
 
     @cached_property
     def t(self) -> Column:
-        """Times (n,) since the start of the motion [s]."""
         raise NotImplementedError
 
     @cached_property
@@ -59,7 +58,6 @@ class States:
 
     @cached_property
     def theta_dot(self) -> Column:
-        """Nutation rate (n,) [rad/s]."""
         raise NotImplementedError
 
     @cached_property
@@ -79,24 +77,20 @@ class States:
 
     @cached_property
     def l3(self) -> Column:
-        """L . e3 (n,) [kg m^2/s]: a constant of the motion."""
         return np.full(len(self), self._l3)
 
     # ------------------------------------------------------------------------------ angles
 
     @property
     def phi(self) -> Column:
-        """Precession angle (n,), unwrapped [rad]."""
         return self.angles[0]
 
     @property
     def theta(self) -> Column:
-        """Tilt (n,), continued through the poles [rad]."""
         return self.angles[1]
 
     @property
     def psi(self) -> Column:
-        """Spin angle (n,), unwrapped [rad]."""
         return self.angles[2]
 
     @cached_property
@@ -112,7 +106,6 @@ class States:
 
     @cached_property
     def theta_folded(self) -> Column:
-        """Tilt (n,) in [0, pi] [rad]."""
         cos2, sin2 = self.half_angle_squares
         return 2.0 * np.arctan2(np.sqrt(sin2), np.sqrt(cos2))
 
@@ -120,12 +113,10 @@ class States:
 
     @cached_property
     def quaternion(self) -> NDArray[np.float64]:
-        """Attitude q(world <- body) (n, 4): x, y, z, w."""
         return np.stack(self.rows_quaternion, axis=-1)
 
     @cached_property
     def norm_error(self) -> Column:
-        """|q| - 1 (n,)."""
         x, y, z, w = self.rows_quaternion
         return np.sqrt((x * x + y * y) + (z * z + w * w)) - 1.0
 
@@ -148,7 +139,6 @@ class States:
 
     @cached_property
     def angular_velocity(self) -> NDArray[np.float64]:
-        """Angular velocity (n, 3) in the body frame [rad/s]."""
         return np.stack(np.broadcast_arrays(*self.rows_angular_velocity), axis=-1)
 
     @cached_property
@@ -159,7 +149,6 @@ class States:
 
     @cached_property
     def angular_acceleration(self) -> NDArray[np.float64]:
-        """Angular acceleration (n, 3) in the body frame [rad/s^2]."""
         return np.stack(np.broadcast_arrays(*self.rows_angular_acceleration), axis=-1)
 
     def specific_force(self, point: tuple[float, float, float]) -> Vector:
@@ -173,7 +162,6 @@ class States:
 
     @cached_property
     def energy(self) -> Column:
-        """Kinetic energy + P cos(theta) (n,) [J]."""
         omega1, omega2, _ = self.rows_angular_velocity
         return (0.5 * self.top.lambda1 * (omega1 * omega1 + omega2 * omega2)
                 + 0.5 * self._l3 * self._l3 / self.top.lambda3
@@ -181,5 +169,4 @@ class States:
 
     @cached_property
     def lz(self) -> Column:
-        """L . z (n,) [kg m^2/s]: a constant of the motion."""
         return np.full(len(self), self._lz)

@@ -34,7 +34,6 @@ from spinning_top_sim.solvers.times import LATEST_NS, Rate, Times
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
 MOST_TURNS = 2.0 ** 52
-LATEST_SECONDS = 1e290
 # Closer to the separatrix hyperbolic functions overflow.
 LEAST_M1 = Decimal('1e-290')
 
@@ -122,9 +121,8 @@ class ExactSolution:
             for factor in (alpha, beta))
         fastest = max(abs(motion.quarter_rate), abs(alpha.rate / two_pi), abs(beta.rate / two_pi),
                       Decimal('1e-300'))
-        limit = Decimal(MOST_TURNS) / fastest
-        self.time_limit = min(float(min(limit, MOST)), LATEST_SECONDS)
-        self.ns_limit = min(int(min(limit, MOST) * 10 ** 9), LATEST_NS)
+        limit = min(Decimal(MOST_TURNS) / fastest, MOST)
+        self.time_limit, self.ns_limit = float(limit), min(int(limit * 10 ** 9), LATEST_NS)
 
     def _check_start(self) -> None:
         """Refuse constants so far apart that doubles lose the start among them."""

@@ -57,9 +57,6 @@ class _RootsTooCloseError(ArithmeticError):
     """Two roots of the cubic agree to most of the digits at hand."""
 
 
-# ------------------------------------------------------------------------------- what is handed on
-
-
 @dataclass(frozen=True)
 class Branch:
     """A Cayley-Klein parameter, less its rotation and the denominator, near u1 or near u2."""
@@ -182,9 +179,6 @@ def _upside_down(motion: ThetaMotion) -> ThetaMotion:
         theta_bounds=(pi() - high, pi() - low))
 
 
-# -------------------------------------------------------------------------------------- the cubic
-
-
 class _Roots(NamedTuple):
     """
     The roots y1 <= 0 <= y2 <= y3 of u'^2 in y = u - u0, and their distances, none by subtraction.
@@ -251,9 +245,6 @@ def _cubic_roots(f0: Decimal, f1: Decimal, f2: Decimal, f3: Decimal) -> _Roots:
     if side < 0:
         return _Roots(y, low, high, low - y, gap)
     return _Roots(low, high, y, gap, y - high)
-
-
-# --------------------------------------------------------------------------------------- the orbit
 
 
 @dataclass(frozen=True)

@@ -102,7 +102,6 @@ class TransportEquations:
 
     @property
     def first_step(self) -> float:
-        """A careful first step [s]: the control finds the right one within a few."""
         top = self.top
         rate = (self._scale + (abs(self.l3) + abs(self.lz)) / top.lambda1
                 + math.sqrt(abs(top.gravity_torque) / top.lambda1))
