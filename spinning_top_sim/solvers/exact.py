@@ -107,10 +107,11 @@ class ExactSolution:
         self.mean_spin_rate = in_range('mean spin rate', spin)
         self.theta_min, self.theta_max = (float(x) for x in motion.theta_bounds)
 
+        l3, lz = Decimal(start.l3), Decimal(start.lz)
         two_lambda1, two_pi = 2 * Decimal(top.lambda1), 2 * pi()
-        self._bottom_rate = in_range('(lz + l3)/(2 lambda1)', motion.a_plus / two_lambda1)
-        self._top_rate = in_range('(lz - l3)/(2 lambda1)', motion.a_minus / two_lambda1)
-        in_range('l3/lambda3', Decimal(start.l3) / Decimal(top.lambda3))
+        self._bottom_rate = in_range('(lz + l3)/(2 lambda1)', (lz + l3) / two_lambda1)
+        self._top_rate = in_range('(lz - l3)/(2 lambda1)', (lz - l3) / two_lambda1)
+        in_range('l3/lambda3', l3 / Decimal(top.lambda3))
         self._nutation = Nutation(motion, start.theta)
         self._precession, self._spin = Rate(precession), Rate(spin)
         # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
@@ -164,10 +165,7 @@ class ExactSolution:
         Raises ValueError if `times_ns` is not of that kind, or a time is too far away.
         """
         times = Times.from_ns(times_ns)
-        if len(times):
-            latest = max(float(times.high.max()), -float(times.high.min()))
-            if latest > self.ns_limit:
-                raise self._too_far(f'{latest:.0f} ns')
+        self._refuse_beyond(self.ns_limit, times.high, 'ns')
         return _ExactStates(self, times)
 
     def states_at_seconds(self, t: Column) -> States:
@@ -176,15 +174,15 @@ class ExactSolution:
 
         Raises ValueError if a time is not finite or too far away.
         """
-        if len(t):
-            latest = max(float(t.max()), -float(t.min()))
-            if not latest <= self.time_limit:       # catches NaN too
-                raise self._too_far(f'{latest!r} s')
+        self._refuse_beyond(self.time_limit, t, 's')
         return _ExactStates(self, Times.from_seconds(t), t.copy())
 
-    def _too_far(self, time: str) -> ValueError:
-        return ValueError(f't = {time}: must be finite and within {self.time_limit:.6g} s, '
-                          f'where a phase of this motion reaches 2^52 turns')
+    def _refuse_beyond(self, limit: float, t: Column, unit: str) -> None:
+        latest = max(float(t.max()), -float(t.min())) if len(t) else 0.0
+        if not latest <= limit:         # catches NaN too
+            raise ValueError(f't = {latest!r} {unit}: must be finite and within '
+                             f'{self.time_limit:.6g} s, where a phase of this motion reaches '
+                             '2^52 turns')
 
 
 class _ExactStates(States):

@@ -112,8 +112,6 @@ class ThetaMotion:
     u_dot: tuple[Decimal, Decimal]      # u' = u_dot u_dot_series(2y)/D^4 over even and odd N
     u_dot_series: Series
     turning: tuple[int, int] | None     # planar rotation: theta/2 follows (pi/2)(i + j Z)
-    a_plus: Decimal             # Lz + L3
-    a_minus: Decimal            # Lz - L3
     m: Decimal
     m1: Decimal                 # 1 - m, without cancellation: the distance to the separatrix
     theta_bounds: tuple[Decimal, Decimal]
@@ -173,8 +171,7 @@ def _upside_down(motion: ThetaMotion) -> ThetaMotion:
     even, odd = motion.u_dot
     turning = motion.turning
     return replace(
-        motion, alpha=motion.beta, beta=motion.alpha,
-        a_plus=motion.a_minus, a_minus=motion.a_plus, u_dot=(-even, -odd),
+        motion, alpha=motion.beta, beta=motion.alpha, u_dot=(-even, -odd),
         turning=turning and (1 - turning[0], -turning[1]),
         theta_bounds=(pi() - high, pi() - low))
 
@@ -296,8 +293,7 @@ class _Orbit:
             imaginary=False, full_circle=Series('cos even', (ONE,)),
             stretch=ONE, quarter_rate=ZERO, quarter0=0, offset0=ZERO,
             u_dot=(ZERO, ZERO), u_dot_series=Series('sin odd', (ONE,)), turning=None,
-            a_plus=self.a_plus, a_minus=self.a_minus, m=ZERO, m1=ONE,
-            theta_bounds=(theta, theta))
+            m=ZERO, m1=ONE, theta_bounds=(theta, theta))
 
     def nutating(self, cubic: tuple[Decimal, Decimal, Decimal, Decimal], alpha_turns: Decimal,
                  beta_turns: Decimal) -> ThetaMotion:
@@ -365,7 +361,7 @@ class _Orbit:
             u_dot=(w * gap21 * slope_even, w * gap21 * slope_odd), u_dot_series=form.theta1(),
             turning=(beta.sign, -alpha.sign * beta.sign)
             if alpha.crosses and beta.crosses else None,
-            a_plus=self.a_plus, a_minus=self.a_minus, m=m, m1=m1,
+            m=m, m1=m1,
             theta_bounds=(2 * atan2(from_top2.sqrt(), from_bottom2.sqrt()),
                           2 * atan2(from_top1.sqrt(), from_bottom1.sqrt())))
 

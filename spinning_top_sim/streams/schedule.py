@@ -122,18 +122,14 @@ class Schedule:
                 return True
             span_ns = min((self._block - 1) * self._shortest_ns, LONGEST_BLOCK_NS)
             self._block = min(2 * self._block, LARGEST_BLOCK)
-            self._begin(now_ns, max(until_ns, due_ns + span_ns))
+            self._work = self._pieces(now_ns, max(until_ns, due_ns + span_ns))
         return self._go_on(None if budget_ns is None else time.monotonic_ns() + budget_ns)
 
     def compute(self, now_ns: int, until_ns: int) -> None:
         """Compute a block up to `until_ns` at the most, or finish the one under way."""
         if self._work is None:
-            self._begin(now_ns, until_ns)
+            self._work = self._pieces(now_ns, until_ns)
         self._go_on(None)
-
-    def _begin(self, now_ns: int, until_ns: int) -> None:
-        farthest_ns = self.next_due(now_ns) + (LARGEST_BLOCK - 1) * self._shortest_ns
-        self._work = self._pieces(now_ns, min(until_ns, farthest_ns))
 
     def _go_on(self, end_ns: int | None) -> bool:
         """Compute pieces of the block under way until a time; return whether it is complete."""
@@ -150,6 +146,8 @@ class Schedule:
 
     def _pieces(self, now_ns: int, until_ns: int) -> Iterator[None]:
         """Compute a block, as far as the steps allow, in pieces of some 0.1 ms."""
+        until_ns = min(until_ns,
+                       self.next_due(now_ns) + (LARGEST_BLOCK - 1) * self._shortest_ns)
         segment = self._segment
         solver, start_ns = segment.solver, segment.start_ns
         solver.release(now_ns - start_ns)
