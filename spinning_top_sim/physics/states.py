@@ -45,7 +45,7 @@ class States:
         """Return n."""
         return self._n
 
-    # --------------------------------------------------------------- columns of the solvers
+    # ------------------------------------------------------- the columns of a solver's subclass
 
     @cached_property
     def t(self) -> Column:
@@ -79,7 +79,7 @@ class States:
     def l3(self) -> Column:
         return np.full(len(self), self._l3)
 
-    # ------------------------------------------------------------------------------ angles
+    # ------------------------------------------------------------------ what follows from them
 
     @property
     def phi(self) -> Column:
@@ -109,8 +109,6 @@ class States:
         cos2, sin2 = self.half_angle_squares
         return 2.0 * np.arctan2(np.sqrt(sin2), np.sqrt(cos2))
 
-    # ---------------------------------------------------------------------------- attitude
-
     @cached_property
     def quaternion(self) -> NDArray[np.float64]:
         return np.stack(self.rows_quaternion, axis=-1)
@@ -129,8 +127,6 @@ class States:
     def rows_vertical(self) -> tuple[Column, Column, Column]:
         """Upward vertical in the body frame."""
         return attitude.vertical_in_body(self.rows_quaternion)
-
-    # ------------------------------------------------------------------------------ motion
 
     @cached_property
     def rows_angular_velocity(self) -> Vector:

@@ -160,13 +160,9 @@ class Sensor:
         return self._newest[1]
 
     def _of_block(self, block: int) -> Rows:
-        """Return white noise and bias of a block, (512, 12); the newest one is kept."""
-        if self._block[0] != block:
-            self._block = block, self._draw(block)
-        return self._block[1]
-
-    def _draw(self, block: int) -> Rows:
-        """Draw a block, by way of those before it whose last bias is not kept."""
+        """Return a block (512, 12), by way of those before it whose last bias is not kept."""
+        if self._block[0] == block:
+            return self._block[1]
         starts = self._bias_starts
         nearest = max(b for b in starts if b <= block)
         start = starts[nearest]
@@ -180,7 +176,8 @@ class Sensor:
         starts[block + 1] = starts.pop(block + 1, start)
         if len(starts) > self.STARTS_KEPT:
             del starts[list(starts)[1]]                 # the oldest; that of block 0 stays
-        return np.hstack((normal[:, :6] * self._white, bias))
+        self._block = block, np.hstack((normal[:, :6] * self._white, bias))
+        return self._block[1]
 
     def _normal(self, block: int, columns: int, turn_on: bool = False) -> Rows:
         """Draw the normal numbers of a block (512, columns), or the turn-on bias (1, columns)."""

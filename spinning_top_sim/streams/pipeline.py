@@ -23,10 +23,9 @@ from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.propagator import Propagator, propagate
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.all_streams import all_streams
-from spinning_top_sim.streams.markers import Markers
 from spinning_top_sim.streams.schedule import Instant, Schedule
 from spinning_top_sim.streams.segment import Segment
-from spinning_top_sim.streams.topics import Invariants, Stream
+from spinning_top_sim.streams.topics import Stream
 
 # Integration steps between two looks at whether to give way: about 5 ms.
 STEPS_AT_ONCE = 500
@@ -91,16 +90,14 @@ class Simulation:
             new.sent, new.skipped = old.sent, old.skipped
         self.streams = streams
         self._schedule = Schedule(streams, segment, epoch_ns)
-        self._invariants = next(s for s in streams if isinstance(s, Invariants))
-        self._markers = next(s for s in streams if isinstance(s, Markers))
         self._begin(segment)
 
     def _begin(self, segment: Segment) -> None:
         self.segment = segment
         self.l3, self.lz = segment.l3, segment.lz
         self._schedule.follow(segment)
-        self._invariants.segment = segment
-        self._markers.past.begin(segment.reference)
+        for stream in self.streams:
+            stream.follow(segment)
 
     # -------------------------------------------------------------------------- the present
 

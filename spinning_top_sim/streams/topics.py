@@ -66,6 +66,9 @@ class Stream:
             self._publish = sink
             self.on_change()
 
+    def follow(self, segment: Segment) -> None:
+        """Begin with the samples of a motion, or of the one after a command."""
+
     def set_rate(self, rate: float) -> None:
         """Put the samples on the grid of another rate [Hz]."""
         self.period_ns = max(1, round(NANOSECONDS / rate))
@@ -219,14 +222,15 @@ class Invariants(Stream):
     """
 
     parameter, topic, type_name = 'invariants', '~/invariants', 'std_msgs/msg/Float64MultiArray'
-    segment: Segment            # the present motion; the simulation sets it
-
     def __init__(self, values: Mapping[str, Any]) -> None:
         super().__init__(values)
         self.template = messages.float64_multi_array(INVARIANTS)
 
+    def follow(self, segment: Segment) -> None:
+        self._segment = segment
+
     def fields(self, states: States, times: range) -> Sequence[Field]:
-        segment = self.segment
+        segment = self._segment
         now = (states.energy, states.l3, states.lz)
         drifts = [(values - start) / (abs(start) or 1.0) for values, start in zip(
             now, (segment.energy, segment.l3, segment.lz), strict=True)]
