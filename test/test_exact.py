@@ -10,6 +10,7 @@ promises: 5e-15, relative for what is larger than 1.
 import gc
 import itertools
 import math
+import pickle
 import random
 import subprocess
 import sys
@@ -464,10 +465,24 @@ def test_no_times_and_a_repeated_time():
 
 def test_columns_belong_to_the_times_that_were_given():
     solution = ExactSolution(*REGIMES['looping'])
-    t = np.array([1.0, 2.0])
-    states = solution.states_at_seconds(t)
-    t += 5.0
-    assert (states.theta == solution.states_at_seconds(np.array([1.0, 2.0])).theta).all()
+    for times, ask in ((np.array([1.0, 2.0]), solution.states_at_seconds),
+                       (np.array([1, 2]), solution.states)):
+        expected, states = ask(times.copy()), ask(times)
+        times[:] += 5
+        for name in ('t', 'theta', 'quaternion'):
+            assert (getattr(states, name) == getattr(expected, name)).all(), name
+
+
+@pytest.mark.parametrize('asked', [False, True])
+@pytest.mark.parametrize('settings', [
+    {'method': 'exact'}, {'method': 'rk45'}, {'method': 'rk45', 'equations': 'euler'}])
+def test_states_can_be_pickled(settings, asked):
+    states = solve(*REGIMES['looping'], [0.0, 1.0], **settings)
+    if asked:
+        assert states.phi.shape == (2,)
+    copy = pickle.loads(pickle.dumps(states))
+    for name in ('t', 'phi', 'theta_dot', 'quaternion', 'angular_velocity', 'energy', 'l3'):
+        assert getattr(copy, name).tobytes() == getattr(states, name).tobytes(), name
 
 
 @pytest.mark.parametrize('name', ['looping', 'through the top', 'fast', 'nothing moves'])

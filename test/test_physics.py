@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Constants and states of the top, attitude mathematics, regimes: no ROS, no solver."""
+"""Constants and states of the top, attitude mathematics, regimes: no ROS."""
 
 import math
 
@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.regimes import regime, swing
+from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.pipeline import Simulation
 
@@ -248,22 +249,67 @@ def test_the_extremes_are_those_of_the_motion(theta, theta_dot, l3, lz):
             < description.precession_max)
 
 
+RESTING = {
+    'steady_slow': ({}, 'steady precession: theta = '),
+    'steady_fast': ({}, 'steady precession: theta = '),
+    'sleeping': ({}, 'sleeping: theta = 0 deg'),
+    'cusp': ({'initial.theta': math.pi, 'spin.l3': 1.6, 'spin.lz': -1.6},
+             'hanging: theta = 180 deg'),
+    'looping': ({'initial.theta': 1e-170, 'spin.l3': 2.0, 'spin.lz': 2.0}, 'sleeping: theta')}
+
+
+@pytest.mark.parametrize(('scene', 'changed', 'begin'), [(k, *v) for k, v in RESTING.items()])
+def test_a_resting_axis_is_one_for_the_regime_the_description_and_the_solver(scene, changed,
+                                                                             begin):
+    simulation = Simulation(parameters.checked({**scene_parameters(scene), **changed}))
+    description = simulation.describe()
+    assert description.nutation_period is None
+    assert description.theta_min == description.theta_max
+    assert str(description).startswith(begin) and ' to ' not in str(description)
+    assert isinstance(simulation.segment.solver, ExactSolution)
+
+
+@pytest.mark.parametrize('distance', [0.15, -0.15])
+@pytest.mark.parametrize('l3', [0.0, 1.6, 3.0])
+@pytest.mark.parametrize('lz', [0.0, 1.6, 3.0])
+@pytest.mark.parametrize('theta', [1e-300, 1e-170, 1e-162, 1e-9, math.pi - 4e-16])
+def test_starts_next_to_a_pole_are_described(theta, l3, lz, distance):
+    top, start = Top(**{**TOP, 'com_distance': distance}), State(theta=theta, l3=l3, lz=lz)
+    try:
+        solution = ExactSolution(top, start)
+    except ValueError:
+        assert theta < 1e-100               # beyond what doubles hold
+        return
+    description = solution.describe()
+    assert str(description)
+    if description.nutation_period is None:
+        assert solution.theta_max - solution.theta_min < 2e-6
+
+
+def test_ends_of_a_range_show_no_rounding_dust():
+    description, _, _ = described()
+    assert description.name == 'cusps' and description.precession_max > 1.0
+    assert '(0 to ' in str(description)
+    assert 0.0 < abs(description.precession_min) < 1e-12
+
+
 def test_swing_contains_every_reference_tilt():
     """Two roots that nearly meet are known to the square root of a rounding only."""
     for case in CASES.values():
         if case['regime'] in ('planar', 'pole-crossing') or case['name'] == 'hang-pi-double':
             continue
-        at = swing(top_of(case), start_of(case))
+        low, high = swing(top_of(case), start_of(case))
         for state in case['states']:
             u = math.cos(float(state['theta_folded']))
             slack = 2e-8 if case['regime'] == 'separatrix' else 1e-12
-            assert at.low - slack <= u <= at.high + slack, case['name']
+            assert low - slack <= u <= high + slack, case['name']
 
 
 @pytest.mark.parametrize(('name', 'value'), [
     ('top.lambda1', 0.0), ('top.lambda1', 'big'), ('pose.rate', -5.0), ('pose.rate', 1e5),
     ('solver.method', 'rk4'), ('pacing', 'often'), ('imu.lever_arm', (1.0, 2.0)),
-    ('seed', 1.5), ('pose.enabled', 1), ('record.streams', ('pose', 'poses')), ('spin.l3', None),
+    ('seed', 1.5), ('seed', 10 ** 400), ('pose.enabled', 1), ('spin.l3', None),
+    ('record.streams', ('pose', 'poses')),
     ('step.count', 0), ('initial.theta', 3.2), ('tick_rate', math.nan), ('no.such', 1.0)])
 def test_a_bad_parameter_is_refused_by_name_and_value(name, value):
     with pytest.raises(ValueError, match=name.replace('.', r'\.')) as error:

@@ -28,7 +28,7 @@ from helpers.node_logs import (
     stamps_of,
     the_log,
 )
-from helpers.recorded import recorded
+from helpers.simulations import record
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
 from rosbags.highlevel import AnyReader
@@ -127,9 +127,9 @@ def test_a_reset_begins_again_and_stamps_go_on(peer, served):
     (first,) = np.flatnonzero(stamps == epoch)
     assert first >= count
     offline = Simulation(parameters.checked({}), epoch)
-    rows = recorded(offline, ['pose'])
+    taken = record(offline, 'pose')
     offline.advance(int(stamps[-1]) - epoch)
-    expected = dict(rows['pose'])
+    expected = {epoch + t_ns: data for _, t_ns, data in taken}
     assert all(expected[stamp] == data
                for stamp, data in zip(stamps[first:], pose.raw[first:len(stamps)], strict=True))
     assert peer.get(node, 'spin.l3', 'spin.lz') == [1.6, 1.6 * math.cos(math.radians(30.0))]

@@ -6,8 +6,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from helpers.recorded import recorded
 from helpers.reference import ROOT, SCENES, scene_parameters
+from helpers.simulations import record
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.physics.shape import shape_of
@@ -53,9 +53,10 @@ def test_the_joint_states_put_base_link_where_the_pose_is(tmp_path, scene):
     simulation = Simulation(parameters.checked(values))
     pose = next(s for s in simulation.streams if isinstance(s, Pose))
     joints = next(s for s in simulation.streams if isinstance(s, JointStates))
-    rows = recorded(simulation, [pose.topic, joints.topic])
+    taken = record(simulation, pose.topic, joints.topic)
     simulation.advance(5 * SECOND)
-    poses, positions = ([stream.template.decode(data)[0][0] for _, data in rows[stream.topic]]
+    poses, positions = ([stream.template.decode(data)[0][0] for topic, _, data in taken
+                         if topic == stream.topic]
                         for stream in (pose, joints))
     assert len(poses) == len(positions) == 501
     assert model.actuated_joint_names == list(JOINTS)

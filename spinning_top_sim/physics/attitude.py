@@ -93,8 +93,6 @@ def angular_acceleration(top: Top, omega: Vector, vertical: Vector,
     """
     Return omega_1' and omega_2' [rad/s^2] in the body frame by Euler's equations; omega_3' = 0.
 
-    Parameters
-    ----------
     omega : angular velocity in the body frame [rad/s]
     vertical : upward vertical in the body frame
     """
@@ -111,8 +109,6 @@ def specific_force(gravity: float, point: tuple[float, float, float], omega: Vec
 
     f = omega' x r + omega x (omega x r) + g z: at rest +g upwards, as REP-145 has it.
 
-    Parameters
-    ----------
     gravity : [m/s^2]
     point : r in the body frame [m]
     omega, acceleration : angular velocity [rad/s] and acceleration [rad/s^2], body frame

@@ -4,53 +4,15 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
-from spinning_top_sim.physics.top import Top
+from spinning_top_sim.physics.top import State, Top
 
 PIVOT = (0.0, 0.0, 0.0)
-
-
-class Samples(Protocol):
-    """
-    What a solver evaluates itself at n times; every other column of `States` follows from it.
-
-    All arrays have shape (n,).  A property computes its values at each access: `States` keeps
-    what it has asked for.
-    """
-
-    @property
-    def t(self) -> Column:
-        """Times since the start of the motion [s]."""
-
-    @property
-    def quaternion(self) -> Quaternion:
-        """Attitude q(world <- body) as x, y, z, w, its sign continuous in time."""
-
-    @property
-    def half_angle_squares(self) -> tuple[Column, Column]:
-        """cos^2 and sin^2 of theta/2."""
-
-    @property
-    def angles(self) -> tuple[Column, Column, Column]:
-        """phi, theta and psi [rad], unwrapped and continued through the poles."""
-
-    @property
-    def theta_dot(self) -> Column:
-        """Nutation rate [rad/s]."""
-
-    @property
-    def transverse_velocity(self) -> tuple[Column, Column]:
-        """Angular velocity about the first two body axes [rad/s]."""
-
-    @property
-    def l3(self) -> Column:
-        """Angular momentum along the symmetry axis, as the samples have it [kg m^2/s]."""
 
 
 class States:
@@ -58,7 +20,8 @@ class States:
     States of a top at n times.
 
     Each column is computed when it is first asked for, so that a pose costs no angle and an angle
-    no angular velocity.  A value depends on its own time only, never on the other times.
+    no angular velocity.  A value depends on its own time only, never on the other times.  A solver
+    has a subclass with the columns that raise NotImplementedError here; all others follow.
 
     Attributes
     ----------
@@ -75,81 +38,83 @@ class States:
     rows_... : the same as tuples of (n,) components, which cost no copy
     """
 
-    def __init__(self, top: Top, l3: float, lz: float, n: int, samples: Samples) -> None:
-        self.top, self._n = top, n
-        self._l3, self._lz, self._samples = l3, lz, samples
+    def __init__(self, top: Top, start: State, n: int) -> None:
+        self.top, self._l3, self._lz, self._n = top, start.l3, start.lz, n
 
     def __len__(self) -> int:
         """Return n."""
         return self._n
 
+    # ------------------------------------------------------- the columns of a solver's subclass
+
     @cached_property
     def t(self) -> Column:
-        """Times (n,) since the start of the motion [s]."""
-        return self._samples.t
-
-    # ------------------------------------------------------------------------------ angles
+        raise NotImplementedError
 
     @cached_property
-    def _angles(self) -> tuple[Column, Column, Column]:
-        return self._samples.angles
-
-    @property
-    def phi(self) -> Column:
-        """Precession angle (n,), unwrapped [rad]."""
-        return self._angles[0]
-
-    @property
-    def theta(self) -> Column:
-        """Tilt (n,), continued through the poles [rad]."""
-        return self._angles[1]
-
-    @property
-    def psi(self) -> Column:
-        """Spin angle (n,), unwrapped [rad]."""
-        return self._angles[2]
+    def angles(self) -> tuple[Column, Column, Column]:
+        """phi, theta and psi (n,) [rad], unwrapped and continued through the poles."""
+        raise NotImplementedError
 
     @cached_property
     def theta_dot(self) -> Column:
-        """Nutation rate (n,) [rad/s]."""
-        return self._samples.theta_dot
-
-    @cached_property
-    def _half_angle_squares(self) -> tuple[Column, Column]:
-        return self._samples.half_angle_squares
-
-    @cached_property
-    def phi_dot(self) -> Column:
-        """Precession rate (n,) [rad/s], eq. (31) of "Analysis of Symmetric Spinning Top"."""
-        return attitude.precession_rate(self.top, self._l3, self._lz, *self._half_angle_squares)
-
-    @cached_property
-    def psi_dot(self) -> Column:
-        """Spin rate (n,) [rad/s], eq. (32)."""
-        cos2, sin2 = self._half_angle_squares
-        return self._l3 / self.top.lambda3 - self.phi_dot * (cos2 - sin2)
-
-    @cached_property
-    def theta_folded(self) -> Column:
-        """Tilt (n,) in [0, pi] [rad]."""
-        cos2, sin2 = self._half_angle_squares
-        return 2.0 * np.arctan2(np.sqrt(sin2), np.sqrt(cos2))
-
-    # ---------------------------------------------------------------------------- attitude
+        raise NotImplementedError
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:
         """Attitude q(world <- body): x, y, z, w."""
-        return self._samples.quaternion
+        raise NotImplementedError
+
+    @cached_property
+    def half_angle_squares(self) -> tuple[Column, Column]:
+        """cos^2 and sin^2 of theta/2, (n,) each."""
+        raise NotImplementedError
+
+    @cached_property
+    def transverse_velocity(self) -> tuple[Column, Column]:
+        """Angular velocity about the first two body axes, (n,) each [rad/s]."""
+        raise NotImplementedError
+
+    @cached_property
+    def l3(self) -> Column:
+        return np.full(len(self), self._l3)
+
+    # ------------------------------------------------------------------ what follows from them
+
+    @property
+    def phi(self) -> Column:
+        return self.angles[0]
+
+    @property
+    def theta(self) -> Column:
+        return self.angles[1]
+
+    @property
+    def psi(self) -> Column:
+        return self.angles[2]
+
+    @cached_property
+    def phi_dot(self) -> Column:
+        """Precession rate (n,) [rad/s], eq. (31) of "Analysis of Symmetric Spinning Top"."""
+        return attitude.precession_rate(self.top, self._l3, self._lz, *self.half_angle_squares)
+
+    @cached_property
+    def psi_dot(self) -> Column:
+        """Spin rate (n,) [rad/s], eq. (32)."""
+        cos2, sin2 = self.half_angle_squares
+        return self._l3 / self.top.lambda3 - self.phi_dot * (cos2 - sin2)
+
+    @cached_property
+    def theta_folded(self) -> Column:
+        cos2, sin2 = self.half_angle_squares
+        return 2.0 * np.arctan2(np.sqrt(sin2), np.sqrt(cos2))
 
     @cached_property
     def quaternion(self) -> NDArray[np.float64]:
-        """Attitude q(world <- body) (n, 4): x, y, z, w."""
         return np.stack(self.rows_quaternion, axis=-1)
 
     @cached_property
     def norm_error(self) -> Column:
-        """|q| - 1 (n,)."""
         x, y, z, w = self.rows_quaternion
         return np.sqrt((x * x + y * y) + (z * z + w * w)) - 1.0
 
@@ -163,17 +128,14 @@ class States:
         """Upward vertical in the body frame."""
         return attitude.vertical_in_body(self.rows_quaternion)
 
-    # ------------------------------------------------------------------------------ motion
-
     @cached_property
     def rows_angular_velocity(self) -> Vector:
         """Angular velocity in the body frame [rad/s]; the third component is constant."""
-        return (*self._samples.transverse_velocity, self._l3 / self.top.lambda3)
+        return (*self.transverse_velocity, self._l3 / self.top.lambda3)
 
     @cached_property
     def angular_velocity(self) -> NDArray[np.float64]:
-        """Angular velocity (n, 3) in the body frame [rad/s]."""
-        return _stacked(self.rows_angular_velocity, len(self))
+        return np.stack(np.broadcast_arrays(*self.rows_angular_velocity), axis=-1)
 
     @cached_property
     def rows_angular_acceleration(self) -> Vector:
@@ -183,8 +145,7 @@ class States:
 
     @cached_property
     def angular_acceleration(self) -> NDArray[np.float64]:
-        """Angular acceleration (n, 3) in the body frame [rad/s^2]."""
-        return _stacked(self.rows_angular_acceleration, len(self))
+        return np.stack(np.broadcast_arrays(*self.rows_angular_acceleration), axis=-1)
 
     def specific_force(self, point: tuple[float, float, float]) -> Vector:
         """Return the specific force at a point r of the body [m], in the body frame [m/s^2]."""
@@ -197,26 +158,11 @@ class States:
 
     @cached_property
     def energy(self) -> Column:
-        """Kinetic energy + P cos(theta) (n,) [J]."""
         omega1, omega2, _ = self.rows_angular_velocity
         return (0.5 * self.top.lambda1 * (omega1 * omega1 + omega2 * omega2)
                 + 0.5 * self._l3 * self._l3 / self.top.lambda3
                 + self.top.gravity_torque * self.rows_vertical[2])
 
     @cached_property
-    def l3(self) -> Column:
-        """L . e3 (n,) [kg m^2/s]: a constant of the motion, as the samples have it."""
-        return self._samples.l3
-
-    @cached_property
     def lz(self) -> Column:
-        """L . z (n,) [kg m^2/s]: a constant of the motion."""
         return np.full(len(self), self._lz)
-
-
-def _stacked(rows: Vector, n: int) -> NDArray[np.float64]:
-    """Return (n, 3) of components, each a column or one number for all."""
-    result = np.empty((n, 3))
-    for k, row in enumerate(rows):
-        result[:, k] = row
-    return result

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a state moves in time: one protocol, a file per method.  numpy at most; no ROS, no I/O."""
+"""How a state moves in time, a file per method.  numpy at most; no ROS, no I/O."""
 
 from __future__ import annotations
 
@@ -18,32 +18,27 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
 
     Parameters
     ----------
-    top : Top
-    start : State
-    t : (n,) array_like of float64
-        Times [s]: in any order and of any sign for 'exact', from 0 on and never decreasing for
-        'rk45'.
-    method : {'exact', 'rk45'}
-        The closed form, or Dormand-Prince steps of tolerance rtol and atol.
-    rtol, atol : float
-        Tolerated error of a step; atol is rtol/10 by default.
-    equations : {'transport', 'euler'}
-        Of the steps: regular everywhere, or to the letter of the paper, for study.
+    t : (n,) times [s]: in any order and of any sign for 'exact', from 0 on and never decreasing
+        for 'rk45'
+    method : 'exact', the closed form, or 'rk45', Dormand-Prince steps
+    rtol, atol : tolerated error of a step; atol is rtol/10 by default
+    equations : of the steps: 'transport', regular everywhere, or 'euler', to the letter of the
+        paper, for study
 
     Returns
     -------
-    States
-        Its columns are computed when they are first asked for.
+    States, whose columns are computed when they are first asked for
 
     Raises
     ------
-    ValueError
-        Naming the argument, its value and what is allowed.
-    IntegrationError
-        Where the 'euler' equations cannot go on.
+    ValueError : naming the argument, its value and what is allowed
+    IntegrationError : where the 'euler' equations cannot go on
     """
     try:
-        times = np.asarray(t, dtype=np.float64)
+        given = np.asarray(t)
+        if given.dtype.kind in 'mM':
+            raise TypeError(f'{given.dtype} has a unit of its own')
+        times = given.astype(np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f't = {t!r}: must be (n,) numbers, in s') from error
     if times.ndim != 1:

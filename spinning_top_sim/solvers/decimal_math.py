@@ -10,7 +10,6 @@ here.  DLMF is the Digital Library of Mathematical Functions, https://dlmf.nist.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from decimal import Context, Decimal, getcontext, localcontext
 from functools import lru_cache
@@ -55,27 +54,16 @@ def sign(x: Decimal) -> int:
     return int(x > 0) - int(x < 0)
 
 
-def sum_until_negligible(terms: Iterable[Decimal]) -> Decimal:
-    """Sum a fast-falling series, up to the first term that no longer counts."""
-    total = ZERO
-    for term in terms:
-        total += term
-        if not term or term.adjusted() < total.adjusted() - getcontext().prec:
-            break
-    return total
-
-
 def _odd_power_series(x: Decimal, sense: int) -> Decimal:
-    """Return sum_k sense^k x^(2k+1)/(2k+1)!: sin x (sense -1) or sinh x (+1)."""
+    """Return sum_k sense^k x^(2k+1)/(2k+1)!: sin x (sense -1) or sinh x (+1), of a small x."""
     square = sense * x * x
-
-    def terms() -> Iterable[Decimal]:
-        term, n = x, 1
-        while True:
-            yield term
-            term = term * square / ((n + 1) * (n + 2))
-            n += 2
-    return sum_until_negligible(terms())
+    total = term = x
+    n = 1
+    while term and term.adjusted() >= total.adjusted() - getcontext().prec:
+        term = term * square / ((n + 1) * (n + 2))
+        n += 2
+        total += term
+    return total
 
 
 def sin_cos(x: Decimal) -> tuple[Decimal, Decimal]:

@@ -24,22 +24,21 @@ from numpy.typing import NDArray
 Vector = tuple[complex, ...]
 Rows = NDArray[np.float64]
 
-STAGES: tuple[tuple[Fraction, ...], ...] = (
-    (Fraction(1, 5),),
-    (Fraction(3, 40), Fraction(9, 40)),
-    (Fraction(44, 45), Fraction(-56, 15), Fraction(32, 9)),
-    (Fraction(19372, 6561), Fraction(-25360, 2187), Fraction(64448, 6561), Fraction(-212, 729)),
-    (Fraction(9017, 3168), Fraction(-355, 33), Fraction(46732, 5247), Fraction(49, 176),
-     Fraction(-5103, 18656)),
-    (Fraction(35, 384), Fraction(0), Fraction(500, 1113), Fraction(125, 192),
-     Fraction(-2187, 6784), Fraction(11, 84)),
-)
-NODES = (Fraction(0), Fraction(1, 5), Fraction(3, 10), Fraction(4, 5), Fraction(8, 9),
-         Fraction(1), Fraction(1))
-FOURTH_ORDER = (Fraction(5179, 57600), Fraction(0), Fraction(7571, 16695), Fraction(393, 640),
-                Fraction(-92097, 339200), Fraction(187, 2100), Fraction(1, 40))
-ERROR = tuple(fifth - fourth for fifth, fourth in zip((*STAGES[-1], Fraction(0)), FOURTH_ORDER,
-                                                      strict=True))
+
+def _fractions(text: str) -> tuple[Fraction, ...]:
+    return tuple(map(Fraction, text.split()))
+
+
+STAGES = tuple(map(_fractions, (
+    '1/5',
+    '3/40 9/40',
+    '44/45 -56/15 32/9',
+    '19372/6561 -25360/2187 64448/6561 -212/729',
+    '9017/3168 -355/33 46732/5247 49/176 -5103/18656',
+    '35/384 0 500/1113 125/192 -2187/6784 11/84')))
+FOURTH_ORDER = _fractions('5179/57600 0 7571/16695 393/640 -92097/339200 187/2100 1/40')
+ERROR = tuple(fifth - fourth
+              for fifth, fourth in zip((*STAGES[-1], Fraction(0)), FOURTH_ORDER, strict=True))
 
 # Hairer et al. eq. (4.13): aim a little below the tolerance and change the step within limits.
 SAFETY = 0.9
@@ -53,27 +52,29 @@ class IntegrationError(RuntimeError):
 
 
 class Equations(Protocol):
-    """Equations of motion y' = f(y) in some chart, with what the step control needs to know."""
+    """
+    Equations of motion y' = f(y) in some chart, with what the step control needs to know.
+
+    name, is_complex : of the equations; whether the unknowns are complex numbers
+    start : the unknowns at t = 0
+    first_step : a careful first step [s]: the control finds the right one within a few
+    derivative : takes the unknowns one by one; returns y'
+    """
 
     @property
-    def name(self) -> str:
-        """Of the equations."""
+    def name(self) -> str: ...
 
     @property
-    def is_complex(self) -> bool:
-        """Whether the unknowns are complex numbers."""
+    def is_complex(self) -> bool: ...
 
     @property
-    def start(self) -> Vector:
-        """The unknowns at t = 0."""
+    def start(self) -> Vector: ...
 
     @property
-    def first_step(self) -> float:
-        """A careful first step [s]: the control finds the right one within a few."""
+    def first_step(self) -> float: ...
 
     @property
-    def derivative(self) -> Callable[..., Vector]:
-        """Takes the unknowns one by one; returns y'."""
+    def derivative(self) -> Callable[..., Vector]: ...
 
     def second_derivative(self, y: Rows, derivative: Rows) -> Rows:
         """Return y'' from y and y': rows of components (k, n), real and imaginary parts apart."""
@@ -124,15 +125,7 @@ def unrolled_step(size: int, is_complex: bool) -> StepFunction:
 
 
 class Step(NamedTuple):
-    """
-    One accepted step.
-
-    Attributes
-    ----------
-    t0, t1 : its ends [s]
-    y0, y1 : the unknowns there
-    derivative0, derivative1 : their derivatives there
-    """
+    """One accepted step: times [s], unknowns and their derivatives at both ends."""
 
     t0: float
     y0: Vector
@@ -146,16 +139,8 @@ class Integrator:
     """
     Takes steps forward from t = 0.
 
-    Parameters
-    ----------
-    equations : Equations
-
-    Attributes
-    ----------
-    newest : Step
-        The latest one; before the first, one of no length.
-    steps, rejected : accepted and rejected steps so far
-    evaluations : evaluations of the right-hand side so far
+    newest : the latest step, one of no length before the first
+    steps, evaluations : counts
     """
 
     def __init__(self, equations: Equations) -> None:
@@ -165,7 +150,7 @@ class Integrator:
         derivative = equations.derivative(*start)
         self.newest = Step(0.0, start, derivative, 0.0, start, derivative)
         self._next_step = equations.first_step
-        self.steps = self.rejected = 0
+        self.steps = 0
         self.evaluations = 1
 
     def step(self) -> Step:
@@ -186,7 +171,6 @@ class Integrator:
             if error <= 1.0:
                 break
             # A NaN compares false everywhere: it lands here and shrinks the step until collapse.
-            self.rejected += 1
             grow = 1.0
             shrink = SAFETY * error ** -0.2 if error < math.inf else SHRINK
             self._next_step = h * max(SHRINK, shrink)
@@ -204,8 +188,6 @@ class Interpolants(NamedTuple):
     """
     The quintic Hermite polynomials of n steps in s = (t - begin)/length.
 
-    Attributes
-    ----------
     begin, length : (n,) [s]
     coefficients : (6, k, n) by power and component, real and imaginary parts apart
     """

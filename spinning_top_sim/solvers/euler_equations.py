@@ -39,7 +39,6 @@ class EulerEquations:
 
     @property
     def first_step(self) -> float:
-        """A careful first step [s]: the control finds the right one within a few."""
         top = self.top
         rate = (abs(self.start[1]) + (abs(self.l3) + abs(self.lz)) / top.lambda1
                 + abs(self.l3) / top.lambda3 + math.sqrt(abs(top.gravity_torque) / top.lambda1))

@@ -18,7 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column, Quaternion
-from spinning_top_sim.physics.regimes import Description, precession_extremes, regime
+from spinning_top_sim.physics.regimes import (
+    Description,
+    axis_rests,
+    precession_extremes,
+    regime,
+)
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.decimal_math import pi, precision
@@ -29,7 +34,6 @@ from spinning_top_sim.solvers.times import LATEST_NS, Rate, Times
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
 MOST_TURNS = 2.0 ** 52
-LATEST_SECONDS = 1e290
 # Closer to the separatrix hyperbolic functions overflow.
 LEAST_M1 = Decimal('1e-290')
 
@@ -45,34 +49,27 @@ class ExactSolution:
     Parameters
     ----------
     top : Top
-    start : State
-        Or a `ContinuedState`, whose theta may be any real number.
+    start : State, or a `ContinuedState`, whose theta may be any real number
 
     Attributes
     ----------
     top : Top
-    start : State
-        The same start with theta in [0, pi].
-    nutation_period : [s], None if the nutation rests
+    start : the same start with theta in [0, pi]
+    nutation_period : [s], None if theta is constant
     mean_precession_rate, mean_spin_rate : [rad/s], over a nutation
     theta_min, theta_max : [rad], of theta folded into [0, pi]
     m, m1 : parameter of the elliptic functions and m1 = 1 - m, which is 0 on the separatrix
     time_limit, ns_limit : the farthest time either way [s], [ns]
 
-    Raises
-    ------
-    ValueError
-        For motions whose constants doubles cannot hold, and, from every evaluation, for times at
-        which a phase exceeds 2^52 turns.
+    Raises ValueError for motions whose constants doubles cannot hold, and, from every evaluation,
+    for times at which a phase exceeds 2^52 turns.
 
     Notes
     -----
     F. Klein, A. Sommerfeld, *Ueber die Theorie des Kreisels*, ch. VI; see `theta_setup`.
     """
 
-    steps = 0
-    evaluations = 0
-    earliest_ns = 0
+    steps = evaluations = 0
     latest_ns = LATEST_NS
 
     def __init__(self, top: Top, start: State) -> None:
@@ -98,37 +95,35 @@ class ExactSolution:
             raise ValueError(f'm1 = {motion.m1:.3e} for {top} from {start}: the motion is closer '
                              f'to the separatrix than {LEAST_M1}')
         self.m, self.m1 = float(motion.m), float(motion.m1)
-        period = motion.nutation_period
-        self.nutation_period = None if period is None else float(period)
+        # 2 K/w, two quarter periods
+        self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
         alpha, beta = motion.alpha, motion.beta
+        precession, spin = alpha.rate + beta.rate, alpha.rate - beta.rate
         for name, value in (('the rate of the nutation', motion.quarter_rate),
                             ('the rate of (phi + psi)/2', alpha.rate),
                             ('the rate of (phi - psi)/2', beta.rate)):
             in_range(name, value)
-        self.mean_precession_rate = in_range('mean precession rate', motion.mean_precession_rate)
-        self.mean_spin_rate = in_range('mean spin rate', motion.mean_spin_rate)
+        self.mean_precession_rate = in_range('mean precession rate', precession)
+        self.mean_spin_rate = in_range('mean spin rate', spin)
         self.theta_min, self.theta_max = (float(x) for x in motion.theta_bounds)
 
+        l3, lz = Decimal(start.l3), Decimal(start.lz)
         two_lambda1, two_pi = 2 * Decimal(top.lambda1), 2 * pi()
-        self._bottom_rate = in_range('(lz + l3)/(2 lambda1)', motion.a_plus / two_lambda1)
-        self._top_rate = in_range('(lz - l3)/(2 lambda1)', motion.a_minus / two_lambda1)
-        in_range('l3/lambda3', Decimal(start.l3) / Decimal(top.lambda3))
+        self._bottom_rate = in_range('(lz + l3)/(2 lambda1)', (lz + l3) / two_lambda1)
+        self._top_rate = in_range('(lz - l3)/(2 lambda1)', (lz - l3) / two_lambda1)
+        in_range('l3/lambda3', l3 / Decimal(top.lambda3))
         self._nutation = Nutation(motion, start.theta)
-        self._precession, self._spin = (
-            Rate(motion.mean_precession_rate), Rate(motion.mean_spin_rate))
+        self._precession, self._spin = Rate(precession), Rate(spin)
         # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
-        self._phi_phase = float(
-            Decimal(start.phi) - alpha.start_argument - beta.start_argument)
-        self._psi_phase = float(
-            Decimal(start.psi) - alpha.start_argument + beta.start_argument)
+        self._phi_phase = float(Decimal(start.phi) - alpha.start_argument - beta.start_argument)
+        self._psi_phase = float(Decimal(start.psi) - alpha.start_argument + beta.start_argument)
         self._rotations = tuple(
             (Rate(factor.rate / two_pi), float(two_pi * factor.phase_turns))
             for factor in (alpha, beta))
         fastest = max(abs(motion.quarter_rate), abs(alpha.rate / two_pi), abs(beta.rate / two_pi),
                       Decimal('1e-300'))
-        limit = Decimal(MOST_TURNS) / fastest
-        self.time_limit = min(float(min(limit, MOST)), LATEST_SECONDS)
-        self.ns_limit = min(int(min(limit, MOST) * 10 ** 9), LATEST_NS)
+        limit = min(Decimal(MOST_TURNS) / fastest, MOST)
+        self.time_limit, self.ns_limit = float(limit), min(int(limit * 10 ** 9), LATEST_NS)
 
     def _check_start(self) -> None:
         """Refuse constants so far apart that doubles lose the start among them."""
@@ -143,170 +138,135 @@ class ExactSolution:
     def describe(self) -> Description:
         """Return the motion in the numbers that a physicist asks for."""
         top, start = self.top, self.start
-        slowest, fastest = precession_extremes(top, start, self.theta_min, self.theta_max)
+        rests = axis_rests(top, start)
+        low, high = 2 * (start.theta,) if rests else (self.theta_min, self.theta_max)
+        slowest, fastest = precession_extremes(top, start, low, high)
         weight = 4.0 * top.lambda1 * abs(top.gravity_torque)
         return Description(
-            name=regime(top, start), nutation_period=self.nutation_period,
-            theta_min=self.theta_min, theta_max=self.theta_max,
-            mean_precession_rate=self.mean_precession_rate,
-            precession_min=slowest, precession_max=fastest,
-            mean_spin_rate=self.mean_spin_rate, separatrix_distance=self.m1,
+            name=regime(top, start), nutation_period=None if rests else self.nutation_period,
+            theta_min=low, theta_max=high, mean_precession_rate=self.mean_precession_rate,
+            precession_min=slowest, precession_max=fastest, mean_spin_rate=self.mean_spin_rate,
+            separatrix_distance=self.m1,
             gyroscopic_ratio=start.l3 * start.l3 / weight if weight else math.inf)
 
     # ------------------------------------------------------------------------- evaluation
 
     def reach(self, ns: int, max_steps: int | None = None) -> bool:
-        """Compute what the state at `ns` needs: nothing.  Returns True; see `Propagator`."""
+        """Return True: there are no steps to take."""
         return True
 
     def release(self, before_ns: int) -> None:
-        """Forget what only states before a time need: nothing; see `Propagator`."""
+        """Do nothing: there are no steps to forget."""
 
     def states(self, times_ns: NDArray[np.int64] | range) -> States:
         """
-        Return the states at integer nanoseconds after the start, in any order and of any sign.
+        Return the states at integer nanoseconds (n,) after the start, in any order, of any sign.
 
-        Parameters
-        ----------
-        times_ns : (n,) int64, or a range [ns]
-
-        Raises
-        ------
-        ValueError
-            If `times_ns` is not of that kind, or a time is too far away.
+        Raises ValueError if `times_ns` is not of that kind, or a time is too far away.
         """
         times = Times.from_ns(times_ns)
-        if len(times):
-            latest = max(float(times.high.max()), -float(times.high.min()))
-            if latest > float(self.ns_limit):       # as rounded as the times
-                raise ValueError(f't = {latest:.0f} ns: must be within {self.ns_limit} ns, where '
-                                 f'a phase of this motion reaches 2^52 turns or int64 ends')
-        return self._states(times)
+        self._refuse_beyond(self.ns_limit, times.high, 'ns')
+        return _ExactStates(self, times)
 
     def states_at_seconds(self, t: Column) -> States:
         """
         Return the states at t (n,) [s] after the start, in any order and of any sign.
 
-        Raises
-        ------
-        ValueError
-            If a time is not finite or too far away.
+        Raises ValueError if a time is not finite or too far away.
         """
-        if len(t):
-            latest = max(float(t.max()), -float(t.min()))
-            if not latest <= self.time_limit:       # catches NaN too
-                raise ValueError(f't = {latest!r} s: must be finite and within '
-                                 f'{self.time_limit:.6g} s, where a phase of this motion reaches '
-                                 f'2^52 turns')
-        return self._states(Times.from_seconds(t), t.copy())
+        self._refuse_beyond(self.time_limit, t, 's')
+        return _ExactStates(self, Times.from_seconds(t), t.copy())
 
-    def _states(self, times: Times, seconds: Column | None = None) -> States:
-        """Return the states at times within the limits; `seconds` are the same times [s]."""
-        return States(self.top, self.start.l3, self.start.lz, len(times),
-                      _ExactSamples(self, times, seconds))
+    def _refuse_beyond(self, limit: float, t: Column, unit: str) -> None:
+        latest = max(float(t.max()), -float(t.min())) if len(t) else 0.0
+        if not latest <= float(limit):  # rounded as the times are; catches NaN too
+            raise ValueError(f't = {latest!r} {unit}: must be finite and within '
+                             f'{self.time_limit:.6g} s, where a phase of this motion reaches '
+                             '2^52 turns')
 
-    def quaternion(self, times: Times, nutation: NutationColumns | None) -> Quaternion:
-        """Return x, y, z, w at n times, from the series or, where there are none, `nutation`."""
-        if self._series is not None:
-            x, y, z, w = self._series.quaternion(times)
-        else:
-            assert nutation is not None
-            scale = 1.0 / np.hypot(nutation.alpha, nutation.beta)
-            cos_half, sin_half = scale * nutation.alpha, scale * nutation.beta
-            alpha, beta = self.rotation_angles(times, nutation)
-            x, y = -sin_half * np.sin(beta), sin_half * np.cos(beta)
-            z, w = cos_half * np.sin(alpha), cos_half * np.cos(alpha)
-        return (-x, -y, -z, -w) if self._turns % 2 else (x, y, z, w)
 
-    @property
-    def has_series(self) -> bool:
-        """Whether the quaternion does without the nutation."""
-        return self._series is not None
+class _ExactStates(States):
+    """The states of an exact solution, on the branch of its start."""
 
-    def nutation(self, times: Times) -> NutationColumns:
-        """Return where the axis is, of the motion with theta in [0, pi] at the start."""
-        return self._nutation.at(times)
+    def __init__(self, solution: ExactSolution, times: Times, seconds: Column | None = None,
+                 ) -> None:
+        super().__init__(solution.top, solution.start, len(times))
+        self._solution, self._times = solution, times
+        if seconds is not None:
+            self.t = seconds
 
-    def rotation_angles(self, times: Times, nutation: NutationColumns) -> tuple[Column, Column]:
+    @cached_property
+    def t(self) -> Column:
+        return self._times.seconds
+
+    @cached_property
+    def _nutation(self) -> NutationColumns:
+        """The nutation of the motion with theta in [0, pi] at the start."""
+        return self._solution._nutation.at(self._times)
+
+    @cached_property
+    def _half_angle(self) -> tuple[Column, Column]:
+        """Cosine and sine of theta/2."""
+        scale = 1.0 / np.hypot(self._nutation.alpha, self._nutation.beta)
+        return scale * self._nutation.alpha, scale * self._nutation.beta
+
+    def _rotation_angles(self) -> tuple[Column, Column]:
         """Return the arguments of alpha and beta [rad], less whole turns."""
         angles = []
         for (rate, start), argument in zip(
-                self._rotations, (nutation.alpha_argument, nutation.beta_argument), strict=True):
-            turns, rest = rate.fraction(times)
+                self._solution._rotations,
+                (self._nutation.alpha_argument, self._nutation.beta_argument), strict=True):
+            turns, rest = rate.fraction(self._times)
             angles.append(2.0 * math.pi * (turns + rest) + (start + argument))
         return angles[0], angles[1]
 
-    def angles(self, times: Times, nutation: NutationColumns) -> tuple[Column, Column, Column]:
-        """Return phi, theta, psi [rad], unwrapped and on the branch of the start."""
-        half_turn = math.pi if self._mirrored else 0.0
+    @cached_property
+    def rows_quaternion(self) -> Quaternion:
+        if self._solution._series is not None:
+            x, y, z, w = self._solution._series.quaternion(self._times)
+        else:
+            cosine, sine = self._half_angle
+            alpha, beta = self._rotation_angles()
+            x, y = -sine * np.sin(beta), sine * np.cos(beta)
+            z, w = cosine * np.sin(alpha), cosine * np.cos(alpha)
+        return (-x, -y, -z, -w) if self._solution._turns % 2 else (x, y, z, w)
+
+    @cached_property
+    def half_angle_squares(self) -> tuple[Column, Column]:
+        cosine, sine = self._half_angle
+        return cosine * cosine, sine * sine
+
+    @cached_property
+    def angles(self) -> tuple[Column, Column, Column]:
+        solution, nutation = self._solution, self._nutation
+        half_turn = math.pi if solution._mirrored else 0.0
         alpha, beta = nutation.alpha_argument, nutation.beta_argument
-        phi, phi_rest = self._precession.product(times)
-        psi, psi_rest = self._spin.product(times)
+        phi, phi_rest = solution._precession.product(self._times)
+        psi, psi_rest = solution._spin.product(self._times)
         theta = 2.0 * nutation.half_theta
-        return (phi + (phi_rest + ((self._phi_phase - half_turn) + (alpha + beta))),
-                (-theta if self._mirrored else theta) + self._turns * math.tau,
-                psi + (psi_rest + ((self._psi_phase + half_turn) + (alpha - beta))))
+        return (phi + (phi_rest + ((solution._phi_phase - half_turn) + (alpha + beta))),
+                (-theta if solution._mirrored else theta) + solution._turns * math.tau,
+                psi + (psi_rest + ((solution._psi_phase + half_turn) + (alpha - beta))))
 
-    def theta_dot(self, nutation: NutationColumns) -> Column:
-        """Return the nutation rate [rad/s] on the branch of the start."""
-        return -nutation.theta_dot if self._mirrored else nutation.theta_dot
+    @cached_property
+    def theta_dot(self) -> Column:
+        return -self._nutation.theta_dot if self._solution._mirrored else self._nutation.theta_dot
 
-    def transverse_velocity(self, times: Times, nutation: NutationColumns,
-                            ) -> tuple[Column, Column]:
+    @cached_property
+    def transverse_velocity(self) -> tuple[Column, Column]:
         """
-        Return omega_1 and omega_2 [rad/s], eq. (4) of "Analysis of Symmetric Spinning Top".
+        omega_1 and omega_2 [rad/s], eq. (4) of "Analysis of Symmetric Spinning Top".
 
         phi' sin(theta) is Lz - L3 cos(theta) over lambda1 sin(theta), in half angles: nothing
         cancels, and at a pole that can be reached the singular term is absent.
         """
+        solution, nutation = self._solution, self._nutation
         precession = 0.0 * nutation.alpha
-        if self._bottom_rate:
-            precession = precession + self._bottom_rate * (nutation.beta / nutation.alpha)
-        if self._top_rate:
-            precession = precession + self._top_rate * (nutation.alpha / nutation.beta)
-        alpha, beta = self.rotation_angles(times, nutation)
+        if solution._bottom_rate:
+            precession = precession + solution._bottom_rate * (nutation.beta / nutation.alpha)
+        if solution._top_rate:
+            precession = precession + solution._top_rate * (nutation.alpha / nutation.beta)
+        alpha, beta = self._rotation_angles()
         cos_psi, sin_psi = np.cos(alpha - beta), np.sin(alpha - beta)
         return (nutation.theta_dot * sin_psi - precession * cos_psi,
                 nutation.theta_dot * cos_psi + precession * sin_psi)
-
-
-class _ExactSamples:
-    """What `States` asks for, of an exact solution at some times; see `physics.states.Samples`."""
-
-    def __init__(self, solution: ExactSolution, times: Times, seconds: Column | None) -> None:
-        self._solution, self._times, self._seconds = solution, times, seconds
-
-    @property
-    def t(self) -> Column:
-        return self._times.seconds if self._seconds is None else self._seconds
-
-    @cached_property
-    def _nutation(self) -> NutationColumns:
-        return self._solution.nutation(self._times)
-
-    @property
-    def quaternion(self) -> Quaternion:
-        return self._solution.quaternion(
-            self._times, None if self._solution.has_series else self._nutation)
-
-    @property
-    def half_angle_squares(self) -> tuple[Column, Column]:
-        scale = 1.0 / np.hypot(self._nutation.alpha, self._nutation.beta)
-        cosine, sine = scale * self._nutation.alpha, scale * self._nutation.beta
-        return cosine * cosine, sine * sine
-
-    @property
-    def angles(self) -> tuple[Column, Column, Column]:
-        return self._solution.angles(self._times, self._nutation)
-
-    @property
-    def theta_dot(self) -> Column:
-        return self._solution.theta_dot(self._nutation)
-
-    @property
-    def transverse_velocity(self) -> tuple[Column, Column]:
-        return self._solution.transverse_velocity(self._times, self._nutation)
-
-    @property
-    def l3(self) -> Column:
-        return np.full(len(self._times), self._solution.start.l3)

@@ -1,19 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One protocol for every method that moves a state in time, and the choice among them."""
+"""The choice among the methods that move a state in time."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from spinning_top_sim.physics.attitude import Column
-from spinning_top_sim.physics.regimes import nutation_rests
-from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.regimes import axis_rests
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.solvers.rk45 import EulerMotion, TransportMotion
+from spinning_top_sim.solvers.rk45 import EulerMotion, SteppedMotion, TransportMotion
 
 METHODS = ('rk45', 'exact')
 EQUATIONS = ('transport', 'euler')
@@ -21,52 +18,8 @@ EQUATIONS = ('transport', 'euler')
 MOST = 1e290
 
 
-class Propagator(Protocol):
-    """
-    A motion that begins at t = 0, read in blocks of times.
-
-    A method that takes steps goes forward only; it can be read from the steps that it keeps.
-    """
-
-    @property
-    def top(self) -> Top:
-        """The top that moves."""
-
-    @property
-    def start(self) -> State:
-        """Where it begins."""
-
-    @property
-    def steps(self) -> int:
-        """Integration steps taken."""
-
-    @property
-    def evaluations(self) -> int:
-        """Evaluations of the right-hand side."""
-
-    @property
-    def earliest_ns(self) -> int:
-        """The first nanosecond that can still be read."""
-
-    @property
-    def latest_ns(self) -> int:
-        """The last nanosecond that can be read without further steps."""
-
-    def reach(self, ns: int, max_steps: int | None = None) -> bool:
-        """Take steps up to `ns`; return False if `max_steps` were too few."""
-
-    def release(self, before_ns: int) -> None:
-        """Forget the steps that only states before this time need."""
-
-    def states(self, times_ns: NDArray[np.int64] | range) -> States:
-        """
-        Return the states at ascending integer nanoseconds after the start.
-
-        A value depends on its own time only: any split of the times gives the same bits.
-        """
-
-    def states_at_seconds(self, t: Column) -> States:
-        """Return the states at ascending times t (n,) [s] after the start."""
+# A motion that begins at t = 0, read in blocks of times; `SteppedMotion` says what each offers.
+Propagator: TypeAlias = ExactSolution | SteppedMotion
 
 
 def check_settings(method: str, equations: str, rtol: float, atol: float) -> None:
@@ -88,20 +41,14 @@ def propagate(top: Top, start: State, *, method: str, equations: str = 'transpor
 
     Parameters
     ----------
-    top : Top
-    start : State
     method : 'exact', the closed form, or 'rk45', Dormand-Prince steps.  Motions without torque
         or nutation take no steps: 'rk45' hands them to the closed form too.
     equations : of the steps, 'transport' (regular everywhere) or 'euler' (for study)
     rtol, atol : tolerated error of a step.  The transport equations scale their unknowns to 1, so
         there the two add up; the Euler equations tolerate atol + rtol |angle|.
 
-    Raises
-    ------
-    ValueError
-        For a bad setting, or a motion that doubles cannot hold.
-    IntegrationError
-        If the Euler equations cannot start.
+    Raises ValueError for a bad setting, or a motion that doubles cannot hold, and IntegrationError
+    if the Euler equations cannot start.
     """
     check_settings(method, equations, rtol, atol)
     if method == 'exact':
@@ -123,7 +70,7 @@ def propagate(top: Top, start: State, *, method: str, equations: str = 'transpor
 def _stepped(top: Top, start: State, equations: str, rtol: float, atol: float) -> Propagator:
     if equations == 'euler':
         return EulerMotion(top, start, rtol, atol)
-    if top.gravity_torque == 0.0 or nutation_rests(top, start):
+    if top.gravity_torque == 0.0 or axis_rests(top, start):
         try:
             return ExactSolution(top, start)
         except ValueError:      # beyond its range, steps go on

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion
-from spinning_top_sim.physics.states import Samples, States
+from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.dormand_prince import (
     Equations,
@@ -37,13 +37,14 @@ Rows = NDArray[np.float64]
 
 class SteppedMotion(ABC):
     """
-    A motion by steps; see `propagator.Propagator`.
+    A motion by the steps of some equations.
 
-    Parameters
+    Attributes
     ----------
     top : Top
-    start : State
-    equations : the equations of motion, with their start and first step
+    start : where it begins, at t = 0
+    steps, evaluations : integration steps taken, evaluations of the right-hand side
+    latest_ns : the last nanosecond that can be read without further steps
     """
 
     def __init__(self, top: Top, start: State, equations: Equations) -> None:
@@ -54,24 +55,14 @@ class SteppedMotion(ABC):
 
     @property
     def steps(self) -> int:
-        """Integration steps taken."""
         return self._integrator.steps
 
     @property
     def evaluations(self) -> int:
-        """Evaluations of the right-hand side."""
         return self._integrator.evaluations
 
     @property
-    def earliest_ns(self) -> int:
-        """The first nanosecond that can still be read."""
-        begin = self._kept[0].t0
-        ns = math.ceil(begin * NANOSECONDS)
-        return ns if ns / NANOSECONDS >= begin else ns + 1
-
-    @property
     def latest_ns(self) -> int:
-        """The last nanosecond that can be read without further steps."""
         end = self._kept[-1].t1
         ns = math.floor(end * NANOSECONDS)
         return ns if ns / NANOSECONDS <= end else ns - 1
@@ -89,22 +80,10 @@ class SteppedMotion(ABC):
             taken += 1
         return True
 
-    def _refuse_too_far(self, t: float) -> None:
-        """Raise IntegrationError if `t` is more than MOST_STEPS away."""
-        newest = self._kept[-1]
-        length = newest.t1 - newest.t0
-        if t - newest.t1 > MOST_STEPS * length:
-            raise IntegrationError(
-                f't = {t:.9g} s is more than {MOST_STEPS:.0e} steps of {length:.3g} s away: '
-                "use method = 'exact'")
-
     def release(self, before_ns: int) -> None:
         """Forget the steps that only states before this time need."""
-        self._release(before_ns / NANOSECONDS)
-
-    def _release(self, before: float) -> None:
-        count = bisect_left(self._kept, before, key=attrgetter('t1'))
-        self._forget(min(count, len(self._kept) - 1))
+        self._forget(bisect_left(self._kept, before_ns / NANOSECONDS, hi=len(self._kept) - 1,
+                                 key=attrgetter('t1')))
 
     def _forget(self, count: int) -> None:
         """Forget the oldest steps."""
@@ -112,14 +91,10 @@ class SteppedMotion(ABC):
 
     def states(self, times_ns: NDArray[np.int64] | range) -> States:
         """
-        Return the states at integer nanoseconds after the start, in ascending order.
+        Return the states at integer nanoseconds (n,) after the start, in ascending order.
 
-        Raises
-        ------
-        ValueError
-            If a time lies before `earliest_ns`.
-        IntegrationError
-            If the steps cannot go on to the last time, or it is too many of them away.
+        Raises ValueError if a time lies before the steps that are kept, and IntegrationError if
+        the steps cannot go on to the last time, or it is too many of them away.
         """
         return self.states_at_seconds(Times.from_ns(times_ns).seconds)
 
@@ -135,27 +110,30 @@ class SteppedMotion(ABC):
         parts, begin = [], 0
         while begin < len(t):
             while not self._reach(t[begin], STEPS_AT_ONCE):
-                self._refuse_too_far(t[begin])
-                self._release(self._kept[-1].t1)
+                newest = self._kept[-1]
+                length = newest.t1 - newest.t0
+                if t[begin] - newest.t1 > MOST_STEPS * length:
+                    raise IntegrationError(
+                        f't = {t[begin]:.9g} s is more than {MOST_STEPS:.0e} steps of '
+                        f"{length:.3g} s away: use method = 'exact'")
+                self._forget(len(self._kept) - 1)
             while self._kept[-1].t1 < t[-1] and len(self._kept) < STEPS_AT_ONCE:
                 self._kept.append(self._integrator.step())
             end = int(np.searchsorted(t, self._kept[-1].t1, 'right'))
             parts.append(self._rows(t[begin:end]))
             begin = end
             if begin < len(t):
-                self._release(self._kept[-1].t1)
+                self._forget(len(self._kept) - 1)
         rows = np.concatenate(parts, axis=1) if parts else self._rows(t[:0])
-        return States(self.top, self.start.l3, self.start.lz, len(t),
-                      self._samples(t.copy(), rows))
+        return self._states_of(t.copy(), rows)
 
     def _rows(self, t: Column) -> Rows:
-        """Return what `_samples` needs at times [s] within the steps that are kept."""
+        """Return what `_states_of` needs at times [s] within the steps that are kept."""
         numbers = np.array([step.t1 for step in self._kept]).searchsorted(t)
         first = int(numbers[0]) if len(t) else 0
         steps = self._kept[first:int(numbers[-1]) + 1] if len(t) else self._kept[:1]
         return self._read(Interpolants.of(steps, self._equations), numbers - first, t, first)
 
-    @abstractmethod
     def _read(self, interpolants: Interpolants, numbers: NDArray[np.int64], t: Column,
               first: int) -> Rows:
         """
@@ -163,10 +141,11 @@ class SteppedMotion(ABC):
 
         first : place of the first of these steps among those that are kept
         """
+        return interpolants.at(numbers, t)
 
     @abstractmethod
-    def _samples(self, t: Column, rows: Rows) -> Samples:
-        """Return the samples at times [s] from all their rows."""
+    def _states_of(self, t: Column, rows: Rows) -> States:
+        """Return the states at times [s] from all their rows."""
 
 
 class EulerMotion(SteppedMotion):
@@ -175,45 +154,33 @@ class EulerMotion(SteppedMotion):
     def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
         super().__init__(top, start, EulerEquations(top, start, rtol, atol))
 
-    def _read(self, interpolants: Interpolants, numbers: NDArray[np.int64], t: Column,
-              first: int) -> Rows:
-        return interpolants.at(numbers, t)
-
-    def _samples(self, t: Column, rows: Rows) -> Samples:
-        return _AngleSamples(self.top, self.start, t, rows)
+    def _states_of(self, t: Column, rows: Rows) -> States:
+        return _StatesOfAngles(self.top, self.start, t, rows)
 
 
-class _AngleSamples:
-    """Samples known by their Euler angles; see `physics.states.Samples`."""
+class _StatesOfAngles(States):
+    """States known by their Euler angles."""
 
     def __init__(self, top: Top, start: State, t: Column, rows: Rows) -> None:
-        self._top, self._l3, self._lz, self.t = top, start.l3, start.lz, t
-        self._theta, self.theta_dot, self._phi, self._psi = rows
+        super().__init__(top, start, len(t))
+        theta, theta_dot, phi, psi = rows
+        self.t, self.theta_dot, self.angles = t, theta_dot, (phi, theta, psi)
 
-    @property
-    def angles(self) -> tuple[Column, Column, Column]:
-        return self._phi, self._theta, self._psi
+    @cached_property
+    def rows_quaternion(self) -> Quaternion:
+        return attitude.quaternion_of_angles(*self.angles)
 
-    @property
-    def quaternion(self) -> Quaternion:
-        return attitude.quaternion_of_angles(self._phi, self._theta, self._psi)
-
-    @property
+    @cached_property
     def half_angle_squares(self) -> tuple[Column, Column]:
-        cosine, sine = np.cos(0.5 * self._theta), np.sin(0.5 * self._theta)
+        cosine, sine = np.cos(0.5 * self.theta), np.sin(0.5 * self.theta)
         return cosine * cosine, sine * sine
 
-    @property
+    @cached_property
     def transverse_velocity(self) -> tuple[Column, Column]:
         """omega_1 + i omega_2 = (-phi' sin(theta) + i theta') exp(-i psi), eq. (4)."""
-        across = attitude.precession_rate(
-            self._top, self._l3, self._lz, *self.half_angle_squares) * np.sin(self._theta)
-        cosine, sine = np.cos(self._psi), np.sin(self._psi)
+        across = self.phi_dot * np.sin(self.theta)
+        cosine, sine = np.cos(self.psi), np.sin(self.psi)
         return self.theta_dot * sine - across * cosine, self.theta_dot * cosine + across * sine
-
-    @property
-    def l3(self) -> Column:
-        return np.full(len(self._theta), self._l3)
 
 
 class TransportMotion(SteppedMotion):
@@ -241,42 +208,40 @@ class TransportMotion(SteppedMotion):
     def _read(self, interpolants: Interpolants, numbers: NDArray[np.int64], t: Column,
               first: int) -> Rows:
         self._unwrap()
-        return np.concatenate((interpolants.at(numbers, t),
+        return np.concatenate((super()._read(interpolants, numbers, t, first),
                                self._phases.begins[:, first:].take(numbers, axis=1)))
 
-    def _samples(self, t: Column, rows: Rows) -> Samples:
-        return _TransportSamples(self._transport, self._phases, self.top, self.start, t, rows)
+    def _states_of(self, t: Column, rows: Rows) -> States:
+        return _TransportStates(self._transport, self._phases, self.start, t, rows)
 
 
-class _TransportSamples:
+class _TransportStates(States):
     """
-    Samples known by alpha, beta and the momentum; see `physics.states.Samples`.
+    States known by alpha, beta and the momentum.
 
     rows : the six unknowns in the stepped frame, and the phases of alpha and beta and theta/2 at
         the begin of the step that a sample lies in
     """
 
-    def __init__(self, equations: TransportEquations, phases: PhaseUnwrapper, top: Top,
-                 start: State, t: Column, rows: Rows) -> None:
-        self._equations, self._top, self._lz, self.t = equations, top, start.lz, t
-        self._alpha, self._beta, self._crosses = phases.alpha, phases.beta, phases.crosses
-        self._stepped = Unknowns(*rows[:6])
-        self._begins = rows[6:]
-        self._spin_phase = 0.5 * spin_excess(top, start.l3) * t
+    def __init__(self, equations: TransportEquations, phases: PhaseUnwrapper, start: State,
+                 t: Column, rows: Rows) -> None:
+        super().__init__(equations.top, start, len(t))
+        self.t, self._equations = t, equations
+        self._alpha, self._beta = phases.alpha, phases.beta
+        self._stepped, self._begins = Unknowns(*rows[:6]), rows[6:]
 
     @cached_property
     def _projected(self) -> Unknowns:
         """The unknowns on the invariants, in the frame that has all of the spin."""
-        spin = 0.5 * self._equations.spin_rate * self.t
-        stepped = self._stepped
-        if self._crosses:
-            cosine, sine, alpha_phase, beta_phase = self._moduli_and_phases(
-                stepped, -0.5 * self._equations.spin_carried / self._top.lambda1 * self.t)
-            projected = self._equations.project_through_poles(
-                stepped, cosine, sine, alpha_phase, beta_phase)
+        equations = self._equations
+        if self._alpha.crosses or self._beta.crosses:
+            carried = -0.5 * equations.spin_carried / self.top.lambda1 * self.t
+            projected = equations.project_through_poles(
+                self._stepped, *self._moduli_and_phases(self._stepped, carried))
         else:
-            projected = self._equations.project_columns(stepped)
+            projected = equations.project_columns(self._stepped)
         a, b, c, d, m_real, m_imag = projected
+        spin = 0.5 * equations.spin_rate * self.t
         cosine, sine = np.cos(spin), np.sin(spin)
         return Unknowns(a * cosine - b * sine, b * cosine + a * sine,
                         c * cosine + d * sine, d * cosine - c * sine, m_real, m_imag)
@@ -289,19 +254,19 @@ class _TransportSamples:
                 self._alpha.phase(y.alpha_real, y.alpha_imag, self._begins[0], spin_phase),
                 self._beta.phase(y.beta_real, y.beta_imag, self._begins[1], -spin_phase))
 
-    @property
-    def quaternion(self) -> Quaternion:
+    @cached_property
+    def rows_quaternion(self) -> Quaternion:
         y = self._projected
         return -y.beta_imag, y.beta_real, y.alpha_imag, y.alpha_real
 
-    @property
+    @cached_property
     def half_angle_squares(self) -> tuple[Column, Column]:
-        return attitude.half_angle_squares(self.quaternion)
+        return attitude.half_angle_squares(self.rows_quaternion)
 
     @cached_property
     def angles(self) -> tuple[Column, Column, Column]:
         cosine, sine, half_sum, half_difference = self._moduli_and_phases(
-            self._projected, self._spin_phase)
+            self._projected, 0.5 * spin_excess(self.top, self._l3) * self.t)
         half = np.arctan2(sine, cosine)
         # theta/2 turns by less than half a turn within a step.
         half = half + math.tau * np.rint((self._begins[2] - half) / math.tau)
@@ -310,23 +275,23 @@ class _TransportSamples:
     @cached_property
     def _momentum(self) -> tuple[Column, Column]:
         """L_x and L_y in the world frame [kg m^2/s]."""
-        unit = 2.0 * self._top.lambda1
+        unit = 2.0 * self.top.lambda1
         return unit * self._projected.m_imag, -unit * self._projected.m_real
 
-    @property
+    @cached_property
     def theta_dot(self) -> Column:
         """The momentum across the meridian plane, over lambda1."""
         lx, ly = self._momentum
-        phi = self.angles[0]
-        return (ly * np.cos(phi) - lx * np.sin(phi)) / self._top.lambda1
+        return (ly * np.cos(self.phi) - lx * np.sin(self.phi)) / self.top.lambda1
 
-    @property
+    @cached_property
     def transverse_velocity(self) -> tuple[Column, Column]:
-        first, second = attitude.transverse_in_body(self.quaternion, (*self._momentum, self._lz))
-        return first / self._top.lambda1, second / self._top.lambda1
+        first, second = attitude.transverse_in_body(self.rows_quaternion,
+                                                    (*self._momentum, self._lz))
+        return first / self.top.lambda1, second / self.top.lambda1
 
-    @property
+    @cached_property
     def l3(self) -> Column:
-        x, y, z = attitude.axis_in_world(self.quaternion)
+        x, y, z = self.rows_axis
         lx, ly = self._momentum
         return lx * x + ly * y + self._lz * z

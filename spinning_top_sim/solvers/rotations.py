@@ -9,7 +9,7 @@ from decimal import Decimal
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.solvers.times import NANOSECONDS, SPLITTER, Rate, Times, halves
+from spinning_top_sim.solvers.times import NANOSECONDS, Rate, Times, halves
 
 Rows = NDArray[np.float64]
 
@@ -43,8 +43,6 @@ class Rotations:
     The whole steps of an angle are looked up in a table; the rest, less than half a step, is put
     on by the addition theorem.  numpy's own cosine and sine take twice the time.
 
-    Parameters
-    ----------
     angles : pairs of rate [turns/s] and start [turns]
     """
 
@@ -52,9 +50,7 @@ class Rotations:
         first, second, start_steps, start_rests = [], [], [], []
         for rate, start in angles:
             in_steps = rate * STEPS / 10 ** 9
-            nearest = float(in_steps)
-            big = SPLITTER * nearest
-            first.append(big - (big - nearest))
+            first.append(halves(float(in_steps))[0])
             second.append(float(in_steps - Decimal(first[-1])))
             start_in_steps = (start - start.to_integral_value()) * STEPS
             start_steps.append(float(start_in_steps.to_integral_value()))

@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from decimal import Decimal, DecimalException, getcontext, localcontext
+from typing import NamedTuple
 
 from spinning_top_sim.physics.regimes import nutation_cubic
 from spinning_top_sim.physics.top import State, Top
@@ -54,9 +55,6 @@ FULL_CIRCLE_M1 = Decimal('2e-4')    # below, the series of the real form cancels
 
 class _RootsTooCloseError(ArithmeticError):
     """Two roots of the cubic agree to most of the digits at hand."""
-
-
-# ------------------------------------------------------------------------------- what is handed on
 
 
 @dataclass(frozen=True)
@@ -114,26 +112,9 @@ class ThetaMotion:
     u_dot: tuple[Decimal, Decimal]      # u' = u_dot u_dot_series(2y)/D^4 over even and odd N
     u_dot_series: Series
     turning: tuple[int, int] | None     # planar rotation: theta/2 follows (pi/2)(i + j Z)
-    a_plus: Decimal             # Lz + L3
-    a_minus: Decimal            # Lz - L3
     m: Decimal
     m1: Decimal                 # 1 - m, without cancellation: the distance to the separatrix
     theta_bounds: tuple[Decimal, Decimal]
-
-    @property
-    def nutation_period(self) -> Decimal | None:
-        """2K/w [s]; None if the nutation rests."""
-        return 2 / self.quarter_rate if self.quarter_rate else None
-
-    @property
-    def mean_precession_rate(self) -> Decimal:
-        """[rad/s], of phi over a nutation period."""
-        return self.alpha.rate + self.beta.rate
-
-    @property
-    def mean_spin_rate(self) -> Decimal:
-        """[rad/s], of psi over a nutation period."""
-        return self.alpha.rate - self.beta.rate
 
 
 def set_up(top: Top, start: State) -> ThetaMotion:
@@ -177,8 +158,10 @@ def _set_up(top: Top, start: State) -> ThetaMotion:
         angles = ((Decimal(start.phi) + Decimal(start.psi)) / 2,
                   (Decimal(start.phi) - Decimal(start.psi)) / 2)
     alpha_turns, beta_turns = (reduced_turns(x) for x in (angles[::-1] if upside_down else angles))
-    motion = _Orbit(lambda1, lambda3, gravity_torque, l3, lz, sin_half, cos_half,
-                    theta_dot).motion(alpha_turns, beta_turns)
+    orbit = _Orbit(lambda1, lambda3, gravity_torque, l3, lz, sin_half, cos_half, theta_dot)
+    cubic = nutation_cubic(lambda1, gravity_torque, l3, lz, theta_dot, sin_half, cos_half)
+    motion = (orbit.nutating(cubic, alpha_turns, beta_turns) if cubic[0] or cubic[1] else
+              orbit.resting(alpha_turns, beta_turns))
     return _upside_down(motion) if upside_down else motion
 
 
@@ -188,17 +171,12 @@ def _upside_down(motion: ThetaMotion) -> ThetaMotion:
     even, odd = motion.u_dot
     turning = motion.turning
     return replace(
-        motion, alpha=motion.beta, beta=motion.alpha,
-        a_plus=motion.a_minus, a_minus=motion.a_plus, u_dot=(-even, -odd),
+        motion, alpha=motion.beta, beta=motion.alpha, u_dot=(-even, -odd),
         turning=turning and (1 - turning[0], -turning[1]),
         theta_bounds=(pi() - high, pi() - low))
 
 
-# -------------------------------------------------------------------------------------- the cubic
-
-
-@dataclass(frozen=True)
-class _Roots:
+class _Roots(NamedTuple):
     """
     The roots y1 <= 0 <= y2 <= y3 of u'^2 in y = u - u0, and their distances, none by subtraction.
 
@@ -266,15 +244,13 @@ def _cubic_roots(f0: Decimal, f1: Decimal, f2: Decimal, f3: Decimal) -> _Roots:
     return _Roots(low, high, y, gap, y - high)
 
 
-# --------------------------------------------------------------------------------------- the orbit
-
-
 @dataclass(frozen=True)
 class _Orbit:
     """
     The motion of a top with P >= 0.
 
     Squares of sin and cos of theta0/2 stand for theta0, so that nothing cancels at either pole.
+    alpha_turns and beta_turns are the arguments of alpha and beta at t = 0.
     """
 
     lambda1: Decimal
@@ -285,14 +261,6 @@ class _Orbit:
     sin_half: Decimal
     cos_half: Decimal
     theta_dot: Decimal
-
-    @property
-    def s0(self) -> Decimal:
-        return self.sin_half ** 2
-
-    @property
-    def c0(self) -> Decimal:
-        return self.cos_half ** 2
 
     @property
     def a_plus(self) -> Decimal:
@@ -306,17 +274,6 @@ class _Orbit:
     def excess_spin(self) -> Decimal:
         """What turns the body and not its axis: L3 (1/lambda3 - 1/lambda1)."""
         return self.l3 * (1 / self.lambda3 - 1 / self.lambda1)
-
-    def motion(self, alpha_turns: Decimal, beta_turns: Decimal) -> ThetaMotion:
-        coefficients = self.cubic()
-        if coefficients[0] == 0 and coefficients[1] == 0:
-            return self.resting(alpha_turns, beta_turns)
-        return self.nutating(_cubic_roots(*coefficients), coefficients, alpha_turns, beta_turns)
-
-    def cubic(self) -> tuple[Decimal, Decimal, Decimal, Decimal]:
-        """Coefficients of u'^2 in powers of u - u0."""
-        return nutation_cubic(self.lambda1, self.gravity_torque, self.l3, self.lz, self.theta_dot,
-                              self.sin_half, self.cos_half)
 
     def resting(self, alpha_turns: Decimal, beta_turns: Decimal) -> ThetaMotion:
         """
@@ -336,26 +293,25 @@ class _Orbit:
             imaginary=False, full_circle=Series('cos even', (ONE,)),
             stretch=ONE, quarter_rate=ZERO, quarter0=0, offset0=ZERO,
             u_dot=(ZERO, ZERO), u_dot_series=Series('sin odd', (ONE,)), turning=None,
-            a_plus=self.a_plus, a_minus=self.a_minus, m=ZERO, m1=ONE,
-            theta_bounds=(theta, theta))
+            m=ZERO, m1=ONE, theta_bounds=(theta, theta))
 
-    def nutating(self, roots: _Roots, coefficients: tuple[Decimal, ...],
-                 alpha_turns: Decimal, beta_turns: Decimal) -> ThetaMotion:
-        y1, y2, y3 = roots.y1, roots.y2, roots.y3
-        gap21, gap32 = roots.gap21, roots.gap32
+    def nutating(self, cubic: tuple[Decimal, Decimal, Decimal, Decimal], alpha_turns: Decimal,
+                 beta_turns: Decimal) -> ThetaMotion:
+        s0, c0 = self.sin_half ** 2, self.cos_half ** 2
+        y1, y2, y3, gap21, gap32 = _cubic_roots(*cubic)
         # w is the frequency of sn(w t); `strength` is f3, with the factor u3 - u1 if that is
         # infinite.  `reach` = 1 + u3 and above_top = u3 - 1 then are 1, relative to u3 - u1.
         if y3 is None:
             gap31, m, m1 = ONE, ZERO, ONE
-            strength, reach, above_top = -coefficients[2], ONE, ONE
+            strength, reach, above_top = -cubic[2], ONE, ONE
         else:
             gap31 = y3 - y1
             m, m1 = gap21 / gap31, gap32 / gap31
-            strength, reach, above_top = coefficients[3], y3 + 2 * self.c0, y3 - 2 * self.s0
+            strength, reach, above_top = cubic[3], y3 + 2 * c0, y3 - 2 * s0
         w = (strength * gap31 / 4).sqrt()
         # Distances to the poles.  u'^2 at u = -1 and u = 1 is -(A+-/lambda1)^2, so the product of
         # three distances is known, and the smallest of them needs no difference.
-        from_bottom2, from_top1, from_top2 = 2 * self.c0 + y2, 2 * self.s0 - y1, 2 * self.s0 - y2
+        from_bottom2, from_top1, from_top2 = 2 * c0 + y2, 2 * s0 - y1, 2 * s0 - y2
         scale = self.lambda1 ** 2 * strength
         from_bottom1 = self.a_plus ** 2 / (scale * from_bottom2 * reach)
         if from_top2 <= above_top:
@@ -373,7 +329,7 @@ class _Orbit:
 
         quarter0, offset0 = self.start_phase(
             -y1 / gap21, y2 / gap21, ONE if y3 is None else y3 / gap31, m1, form.K)
-        clock = _StartPhase(form, quarter0, pi() / 2 * offset0)
+        start = form, quarter0, pi() / 2 * offset0
         size_alpha, size_beta = (from_bottom2 / 2).sqrt(), (from_top1 / 2).sqrt()
         beta_branches = _beta_dn if beta_is_dn else _beta
         s_alpha, s_beta = sign(self.a_plus), sign(self.a_minus)
@@ -386,13 +342,13 @@ class _Orbit:
 
         slope_even, slope_odd = form.slopes_of_sn2()
         full_form = form.real() if m1 >= FULL_CIRCLE_M1 else None
-        alpha = clock.factor(
-            s_alpha, a, _alpha(form, s_alpha, a, size_alpha),
+        alpha = _factor(
+            *start, s_alpha, a, _alpha(form, s_alpha, a, size_alpha),
             _alpha(full_form, s_alpha, a, size_alpha)[0] if full_form else None,
             rate=rate(self.excess_spin, self.a_plus, from_bottom2, a),
             turns=alpha_turns, derivative=-self.sin_half * self.theta_dot)
-        beta = clock.factor(
-            s_beta, b, beta_branches(form, s_beta, b, size_beta),
+        beta = _factor(
+            *start, s_beta, b, beta_branches(form, s_beta, b, size_beta),
             beta_branches(full_form, s_beta, b, size_beta)[0] if full_form else None,
             rate=rate(-self.excess_spin, self.a_minus, from_top1, b),
             turns=beta_turns, derivative=self.cos_half * self.theta_dot)
@@ -405,7 +361,7 @@ class _Orbit:
             u_dot=(w * gap21 * slope_even, w * gap21 * slope_odd), u_dot_series=form.theta1(),
             turning=(beta.sign, -alpha.sign * beta.sign)
             if alpha.crosses and beta.crosses else None,
-            a_plus=self.a_plus, a_minus=self.a_minus, m=m, m1=m1,
+            m=m, m1=m1,
             theta_bounds=(2 * atan2(from_top2.sqrt(), from_bottom2.sqrt()),
                           2 * atan2(from_top1.sqrt(), from_bottom1.sqrt())))
 
@@ -425,25 +381,26 @@ class _Orbit:
         return falling, -falling * from_quarter
 
 
+def _branch(series: tuple[Series, Series], scale: Decimal, s: int, crossing: int) -> Branch:
+    """Return R + i s J scaled; through a pole exactly (s = 0) R, or crossing * J, is all of it."""
+    real, imag = series
+    if s:
+        return Branch(real.scaled(scale), imag.scaled(scale))
+    return Branch(imag.scaled(crossing * scale) if crossing else real.scaled(scale), None)
+
+
 def _alpha(form: ThetaForm, s: int, a: Decimal, size: Decimal) -> tuple[Branch, Branch]:
     """theta1 over even, theta2 over odd quarter periods; |alpha| = size at u = u2."""
-    (R1, J1), (R2, J2) = form.shifted_theta1(a), form.shifted_theta2(a)
-    scale = size * form.denominator_odd().at_zero / R2.at_zero
-    if not s:                           # through the bottom pole exactly: alpha is real
-        return Branch(J1.scaled(scale), None), Branch(R2.scaled(scale), None)
-    return (Branch(R1.scaled(scale), J1.scaled(scale)),
-            Branch(R2.scaled(scale), J2.scaled(scale)))
+    theta1, theta2 = form.shifted_theta1(a), form.shifted_theta2(a)
+    scale = size * form.denominator_odd().at_zero / theta2[0].at_zero
+    return _branch(theta1, scale, s, 1), _branch(theta2, scale, s, 0)
 
 
 def _beta(form: ThetaForm, s: int, b: Decimal, size: Decimal) -> tuple[Branch, Branch]:
     """theta2 over even, theta1 over odd quarter periods; |beta| = size at u = u1."""
-    (R1, J1), (R2, J2) = form.shifted_theta1(b), form.shifted_theta2(b)
-    scale = size * form.denominator_even().at_zero / R2.at_zero
-    odd_scale = scale * form.odd_over_even
-    if not s:                           # through the top pole exactly: beta is real
-        return Branch(R2.scaled(scale), None), Branch(J1.scaled(-odd_scale), None)
-    return (Branch(R2.scaled(scale), J2.scaled(scale)),
-            Branch(R1.scaled(odd_scale), J1.scaled(odd_scale)))
+    theta1, theta2 = form.shifted_theta1(b), form.shifted_theta2(b)
+    scale = size * form.denominator_even().at_zero / theta2[0].at_zero
+    return _branch(theta2, scale, s, 0), _branch(theta1, scale * form.odd_over_even, s, -1)
 
 
 def _beta_dn(form: ThetaForm, s: int, b: Decimal, size: Decimal) -> tuple[Branch, Branch]:
@@ -453,35 +410,29 @@ def _beta_dn(form: ThetaForm, s: int, b: Decimal, size: Decimal) -> tuple[Branch
     return Branch(odd.scaled(scale), None), Branch(even.scaled(scale * form.odd_over_even), None)
 
 
-@dataclass(frozen=True)
-class _StartPhase:
-    """Where the nutation is at t = 0: alpha and beta must have the start's arguments there."""
+def _factor(form: ThetaForm, quarters: int, y: Decimal, s: int, pole: Decimal,
+            branches: tuple[Branch, Branch], full_circle: Branch | None, *, rate: Decimal,
+            turns: Decimal, derivative: Decimal) -> Factor:
+    """
+    Return alpha or beta with its argument at t = 0.
 
-    form: ThetaForm
-    quarters: int
-    y: Decimal
-
-    def factor(self, s: int, pole: Decimal, branches: tuple[Branch, Branch],
-               full_circle: Branch | None, *, rate: Decimal, turns: Decimal, derivative: Decimal
-               ) -> Factor:
-        """`turns`: the argument at t = 0; `derivative`: of a real factor that starts at zero."""
-        drift = s * (pole / self.form.K_prime - 1) if self.form.imaginary else Decimal(-s)
-        branch = branches[self.quarters % 2]
-        if self.form.imaginary:
-            sin, cos = sinh_cosh(self.y * self.form.K / self.form.K_prime)
-            xi = -sin * sin
-        else:
-            sin, cos = sin_cos(self.y)
-            xi = sin * sin
-        real = branch.real(sin, cos, xi)
-        crosses = any(x.has_zero for x in branches)
-        start_sign = 1
-        argument = ZERO
-        if branch.imag is not None:
-            argument = drift * self.y + s * atan2(branch.imag(sin, cos, xi), real)
-        elif crosses:
-            flip = 1 if self.quarters % 4 < 2 else -1
-            growing = flip * branch.real.weights[0]     # if it is zero now, it leaves with y
-            start_sign = sign(flip * real) or sign(growing) * sign(derivative) or 1
-        return Factor(s, rate, turns - argument / (2 * pi()), argument, drift, crosses,
-                      start_sign, *branches, full_circle)
+    quarters, y : phase of the nutation at t = 0
+    turns : argument at t = 0
+    derivative : of a real factor that starts at zero
+    """
+    drift = s * (pole / form.K_prime - 1) if form.imaginary else Decimal(-s)
+    branch = branches[quarters % 2]
+    sin, cos = sinh_cosh(y * form.K / form.K_prime) if form.imaginary else sin_cos(y)
+    xi = -sin * sin if form.imaginary else sin * sin
+    real = branch.real(sin, cos, xi)
+    crosses = any(x.has_zero for x in branches)
+    start_sign = 1
+    argument = ZERO
+    if branch.imag is not None:
+        argument = drift * y + s * atan2(branch.imag(sin, cos, xi), real)
+    elif crosses:
+        flip = 1 if quarters % 4 < 2 else -1
+        growing = flip * branch.real.weights[0]     # if it is zero now, it leaves with y
+        start_sign = sign(flip * real) or sign(growing) * sign(derivative) or 1
+    return Factor(s, rate, turns - argument / (2 * pi()), argument, drift, crosses,
+                  start_sign, *branches, full_circle)

@@ -9,7 +9,7 @@ from decimal import Decimal
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.attitude import Column
+from spinning_top_sim.physics.attitude import Column, Number
 from spinning_top_sim.solvers.decimal_math import double_double
 
 NANOSECONDS = 1_000_000_000
@@ -19,7 +19,7 @@ LATEST_NS = 2 ** 63 - NANOSECONDS
 SPLITTER = 134217729.0
 
 
-def halves(x: Column) -> tuple[Column, Column]:
+def halves(x: Number) -> tuple[Number, Number]:
     """Split doubles into two of 26 bits each; products of such halves are exact."""
     big = SPLITTER * x
     high = big - (big - x)
@@ -31,10 +31,7 @@ class Times:
     """
     Times since the start of a motion, in nanoseconds, as exact sums high + low.
 
-    Attributes
-    ----------
-    high : (n,) nearest doubles [ns]
-    low : (n,) what they leave out [ns]
+    high, low : (n,) nearest doubles, and what they leave out [ns]
     ns : the same times, where they are given as integers [ns]
     """
 
@@ -44,18 +41,13 @@ class Times:
 
     @classmethod
     def from_ns(cls, ns: NDArray[np.int64] | range) -> Times:
-        """
-        Return the times of integer nanoseconds.
-
-        Raises
-        ------
-        ValueError
-            If `ns` is not one-dimensional, not of integers, or beyond int64.
-        """
-        count = _integers(ns) if isinstance(ns, range) else np.asarray(ns)
+        """Return the times of integer nanoseconds (n,); raise ValueError for anything else."""
+        count = _integers(ns) if isinstance(ns, range) else np.array(ns)
         if count.ndim != 1 or (count.size and count.dtype.kind not in 'iu'):
             raise ValueError(f'times_ns has shape {count.shape} and type {count.dtype}: must be '
                              '(n,) integer nanoseconds')
+        if not isinstance(ns, range):
+            ns = count          # not the caller's: columns are computed later
         if not count.size or max(abs(int(count.min())), abs(int(count.max()))) <= 2 ** 53:
             return cls(count.astype(np.float64), np.broadcast_to(0.0, len(count)), ns)
         upper = (count >> 20).astype(np.float64) * 2.0 ** 20
@@ -94,19 +86,11 @@ def _integers(times: range) -> NDArray[np.int64]:
 
 
 class Rate:
-    """
-    A rate as a sum of two doubles; its product with a time has no error that grows with the time.
-
-    Parameters
-    ----------
-    per_second : the rate [1/s]
-    """
+    """A rate [1/s] as two doubles; its product with a time has no error that grows with it."""
 
     def __init__(self, per_second: Decimal) -> None:
         self.high, self.low = double_double(per_second * Decimal('1e-9'))
-        big = SPLITTER * self.high
-        self._first = big - (big - self.high)
-        self._second = self.high - self._first
+        self._first, self._second = halves(self.high)
 
     def product(self, times: Times) -> tuple[Column, Column]:
         """Return rate * t as nearest doubles and what they leave out."""

@@ -50,27 +50,16 @@ class Unknowns(NamedTuple):
     m_imag: Column
 
 
-class _Functions(NamedTuple):
-    """What the projection takes from numpy for columns, from `math` for one state."""
-
-    sqrt: Callable[[Any], Any]
-    copysign: Callable[[Any, Any], Any]
-    where: Callable[[Any, Any, Any], Any]
-
-
-COLUMNS = _Functions(np.sqrt, np.copysign, np.where)
-# numpy would take ten times as long for one state.
-ONE_STATE = _Functions(math.sqrt, math.copysign, lambda condition, x, y: x if condition else y)
+# The functions sqrt, copysign and where of the projection, for columns and for one state, where
+# numpy would take ten times as long.
+COLUMNS = np.sqrt, np.copysign, np.where
+ONE_STATE = math.sqrt, math.copysign, lambda condition, x, y: x if condition else y
 
 
 class TransportEquations:
     """
     The equations above for one top and one motion; see `dormand_prince.Equations`.
 
-    Parameters
-    ----------
-    top : Top
-    start : State
     rtol, atol : tolerated error of a step; the unknowns are scaled to 1, so the two add up
     spin_carried_share : c/L3
     """
@@ -113,7 +102,6 @@ class TransportEquations:
 
     @property
     def first_step(self) -> float:
-        """A careful first step [s]: the control finds the right one within a few."""
         top = self.top
         rate = (self._scale + (abs(self.l3) + abs(self.lz)) / top.lambda1
                 + math.sqrt(abs(top.gravity_torque) / top.lambda1))
@@ -157,12 +145,13 @@ class TransportEquations:
         """Return y with |q| = 1, then L.e3 = L3, then the energy restored along theta'."""
         return Unknowns(*self._project(y, COLUMNS))
 
-    def _project(self, y: tuple[Any, ...], functions: _Functions) -> tuple[Any, ...]:
+    def _project(self, y: tuple[Any, ...], functions: tuple[Callable[..., Any], ...],
+                 ) -> tuple[Any, ...]:
+        sqrt, copysign, where = functions
         alpha_real, alpha_imag, beta_real, beta_imag, m_real, m_imag = y
-        where = functions.where
         cos2 = alpha_real * alpha_real + alpha_imag * alpha_imag
         sin2 = beta_real * beta_real + beta_imag * beta_imag
-        shrink = 1.0 / functions.sqrt(cos2 + sin2)
+        shrink = 1.0 / sqrt(cos2 + sin2)
         alpha_real, alpha_imag = alpha_real * shrink, alpha_imag * shrink
         beta_real, beta_imag = beta_real * shrink, beta_imag * shrink
         share = shrink * shrink
@@ -177,8 +166,7 @@ class TransportEquations:
         wanted = (self._energy - self.top.gravity_torque * cos_theta) / (2.0 * lambda1) * square
         root = wanted - v * v
         mended = (u * u > self._large_enough * square) & (root > 0.0)
-        u = where(mended, functions.copysign(
-            functions.sqrt(where(root > 0.0, root, 0.0)), u), u)
+        u = where(mended, copysign(sqrt(where(root > 0.0, root, 0.0)), u), u)
         at_pole = square <= POLE_SHARE
         divisor = where(at_pole, 1.0, square)
         return (
@@ -191,9 +179,6 @@ class TransportEquations:
         """
         Return what `project_columns` does, for a top that passes a pole: Lz = L3 or Lz = -L3.
 
-        Parameters
-        ----------
-        y : Unknowns
         cosine, sine : signed moduli of alpha and beta
         alpha_phase, beta_phase : their phases [rad].  That of a parameter which can vanish is
             known without the steps; so the meridian of the axis is known at a pole too.

@@ -53,8 +53,6 @@ class CayleyKleinPhase:
     """
     How one Cayley-Klein parameter turns.
 
-    Attributes
-    ----------
     momentum : Lz + L3 of alpha, Lz - L3 of beta; its sign is the sense of turning
     sign : of the modulus, where theta is continued out of [0, pi]
     start : phase at t = 0 [rad]
@@ -70,11 +68,7 @@ class CayleyKleinPhase:
         return self.momentum == 0.0
 
     def modulus(self, real: Column, imag: Column, spin_phase: Column) -> Column:
-        """
-        Return the signed modulus of the parameter.
-
-        spin_phase : what the uniform spin adds to the phase [rad]
-        """
+        """Return the signed modulus; `spin_phase` is what the uniform spin adds to the phase."""
         if self.crosses:
             phase = self.start + spin_phase
             return real * np.cos(phase) + imag * np.sin(phase)
@@ -101,9 +95,6 @@ class PhaseUnwrapper:
     """
     The phases of alpha and beta of a motion at the begins of its steps.
 
-    Parameters
-    ----------
-    start : State
     spin_rate : what the uniform spin of the stepped frame adds to the phase of alpha [rad/s], and
         takes from that of beta
 
@@ -121,11 +112,6 @@ class PhaseUnwrapper:
                                      0.5 * (start.phi - start.psi))
         self._spin_rate = spin_rate
         self.begins = np.array([[self.alpha.start], [self.beta.start], [half]])
-
-    @property
-    def crosses(self) -> bool:
-        """Whether the axis may pass a pole exactly."""
-        return self.alpha.crosses or self.beta.crosses
 
     def extend(self, t: Column, alpha: NDArray[np.complex128],
                beta: NDArray[np.complex128]) -> None:

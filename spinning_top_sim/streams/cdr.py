@@ -11,7 +11,7 @@ equal messages are equal bytes.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,8 @@ class CdrWriter:
     def __init__(self) -> None:
         self.buffer = bytearray(ENCAPSULATION)
 
-    def _append(self, code: str, *values: float) -> int:
-        """Append numbers of one type one after the other; return the first one's offset."""
+    def append(self, code: str, *values: float) -> int:
+        """Append numbers of one type, a code of `struct`; return the offset of the first."""
         if values:
             size = struct.calcsize('<' + code)
             self.buffer += bytes(-(len(self.buffer) - len(ENCAPSULATION)) % size)
@@ -38,44 +38,28 @@ class CdrWriter:
         self.buffer += struct.pack(f'<{len(values)}{code}', *values)
         return at
 
-    def uint32(self, value: int) -> int:
-        """Append a uint32."""
-        return self._append('I', value)
-
-    def int32(self, value: int) -> int:
-        """Append an int32."""
-        return self._append('i', value)
-
-    def flag(self, value: bool) -> int:
-        """Append a bool."""
-        return self._append('?', value)
-
-    def floats(self, values: Iterable[float]) -> int:
-        """Append single precision floats (a fixed array)."""
-        return self._append('f', *values)
-
-    def doubles(self, values: Iterable[float]) -> int:
-        """Append doubles (a fixed array)."""
-        return self._append('d', *values)
+    def doubles(self, *values: float) -> int:
+        """Append a fixed array of doubles."""
+        return self.append('d', *values)
 
     def double_sequence(self, values: Sequence[float]) -> int:
         """Append a sequence of doubles."""
-        self.uint32(len(values))
-        return self.doubles(values)
+        self.append('I', len(values))
+        return self.doubles(*values)
 
     def stamp(self) -> int:
         """Append a builtin_interfaces/Time of zero."""
-        return self._append('I', 0, 0)
+        return self.append('I', 0, 0)
 
     def string(self, text: str) -> None:
         """Append a string."""
         data = text.encode() + b'\0'
-        self.uint32(len(data))
+        self.append('I', len(data))
         self.buffer += data
 
     def strings(self, texts: Sequence[str]) -> None:
         """Append a sequence of strings."""
-        self.uint32(len(texts))
+        self.append('I', len(texts))
         for text in texts:
             self.string(text)
 
@@ -92,12 +76,9 @@ class Template:
 
     Parameters
     ----------
-    writer : CdrWriter
-        The message.
-    stamps_at : sequence of int
-        Offsets of its stamps: none, one, or one of each part of an array.
-    fields : sequence of (int, int)
-        Offset and number of the doubles of each field.
+    writer : the message
+    stamps_at : offsets of its stamps: none, one, or one of each part of an array
+    fields : offset and number of the doubles of each field
     """
 
     def __init__(self, writer: CdrWriter, stamps_at: Sequence[int],
@@ -105,7 +86,14 @@ class Template:
         self._buffer = writer.buffer
         self._stamps_at = tuple(stamps_at)
         self._fields = tuple(fields)
-        self._row_type = self._make_row_type()
+        # A message as a numpy type: the fields, and the stamps if there are any.
+        columns = [(f'field{i}', f'({count},)f8', at)
+                   for i, (at, count) in enumerate(self._fields)]
+        for at in self._stamps_at:
+            columns += [(f'sec{at}', '<i4', at), (f'nanosec{at}', '<u4', at + 4)]
+        names, formats, offsets = zip(*columns, strict=True) if columns else ((), (), ())
+        self._row_type = np.dtype({'names': names, 'formats': formats, 'offsets': offsets,
+                                   'itemsize': len(self._buffer)})
         self._rows: NDArray[np.void] = np.empty(0, self._row_type)
 
     def __len__(self) -> int:
@@ -114,18 +102,10 @@ class Template:
 
     def encode(self, stamps_ns: NDArray[np.int64], *values: Field) -> NDArray[np.uint8]:
         """
-        Return n messages as rows of bytes, valid until the next call.
+        Return n messages as rows of bytes (n, size), valid until the next call.
 
-        Parameters
-        ----------
-        stamps_ns : (n,) int64
-            Stamps [ns].
-        *values : Field
-            The numbers of each field.
-
-        Returns
-        -------
-        (n, size) uint8
+        stamps_ns : (n,) [ns]
+        values : the numbers of each field
         """
         count = len(stamps_ns)
         if len(self._rows) < count:
@@ -152,19 +132,6 @@ class Template:
         """Return the fields, (n, count) each, of n messages one after the other."""
         rows = np.frombuffer(data, self._row_type)
         return tuple(rows[f'field{i}'] for i in range(len(self._fields)))
-
-    def _make_row_type(self) -> np.dtype[np.void]:
-        """Return a message as a numpy type: the fields, and the stamps if there are any."""
-        names = [f'field{i}' for i in range(len(self._fields))]
-        formats: list[str | tuple[str, tuple[int]]] = [
-            ('<f8', (number,)) for _, number in self._fields]
-        offsets = [at for at, _ in self._fields]
-        for at in self._stamps_at:
-            names += [f'sec{at}', f'nanosec{at}']
-            formats += ['<i4', '<u4']
-            offsets += [at, at + 4]
-        return np.dtype({'names': names, 'formats': formats, 'offsets': offsets,
-                         'itemsize': len(self._buffer)})
 
     def field_at(self, at: int) -> tuple[int, int, int] | None:
         """Return field, element and offset of what holds a byte: field -1 is the stamp."""

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
 
@@ -35,15 +34,8 @@ class Imu:
 
     What it measures there is `true`; what it reads, `sensor(period_ns).read`.
 
-    Parameters
-    ----------
-    values : mapping
-        Checked parameters, see `parameters.checked`.
-
-    Attributes
-    ----------
-    sensor : callable
-        Takes a sampling period [ns]; returns the `Sensor`, the same for all streams of that rate.
+    Its `sensor` takes a sampling period [ns] and returns the `Sensor`, which all streams of that
+    rate share.
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
@@ -76,85 +68,74 @@ class Imu:
         return rates, force
 
 
-@dataclass(frozen=True)
 class Axes:
     """
-    The errors of three axes of one kind, in samples `period` [s] apart.
+    The errors of three axes of one kind, `imu.<kind>_...`, in samples `period` [s] apart.
 
-    white: standard deviation of one sample's noise, density/sqrt(period)
-    walk: of the bias' change from one sample to the next, random walk x sqrt(period)
-    turn_on: of the bias at the start;  limit: largest reading, inf for none
-    resolution: readings are multiples of this, 0 for any number
+    white : standard deviation of one sample's noise, density/sqrt(period)
+    walk : of the bias' change from one sample to the next, random walk x sqrt(period)
+    turn_on : of the bias at the start
+    variance : of what is added to a sample besides the bias: white noise and rounding
+
     (kalibr, "IMU Noise Model"; N. Trawny, S. Roumeliotis, "Indirect Kalman filter for 3D attitude
     estimation", 2005, eqs. 133, 140)
     """
 
-    white: float
-    walk: float
-    turn_on: float
-    limit: float
-    resolution: float
-
-    @classmethod
-    def of(cls, values: Mapping[str, Any], kind: str, period: float) -> Axes:
-        """Return those of `imu.<kind>_...`."""
-        return cls(white=values[f'imu.{kind}_noise_density'] / math.sqrt(period),
-                   walk=values[f'imu.{kind}_random_walk'] * math.sqrt(period),
-                   turn_on=values[f'imu.{kind}_turn_on_bias'],
-                   limit=values[f'imu.{kind}_range'] or math.inf,
-                   resolution=values[f'imu.{kind}_resolution'])
-
-    @property
-    def is_random(self) -> bool:
-        """Whether anything is drawn."""
-        return bool(self.white or self.walk or self.turn_on)
-
-    @property
-    def variance(self) -> float:
-        """Of what is added to a sample besides the bias: white noise and rounding."""
-        return self.white ** 2 + self.resolution ** 2 / 12.0
+    def __init__(self, values: Mapping[str, Any], kind: str, period: float) -> None:
+        self.white: float = values[f'imu.{kind}_noise_density'] / math.sqrt(period)
+        self.walk: float = values[f'imu.{kind}_random_walk'] * math.sqrt(period)
+        self.turn_on: float = values[f'imu.{kind}_turn_on_bias']
+        self._limit: float = values[f'imu.{kind}_range'] or math.inf
+        self._resolution: float = values[f'imu.{kind}_resolution']
+        self.is_random = bool(self.white or self.walk or self.turn_on)
+        self.is_perfect = not (self.is_random or self._resolution) and self._limit == math.inf
+        self.variance = self.white ** 2 + self._resolution ** 2 / 12.0
 
     def read(self, exact: Vector, white: Rows, bias: Rows) -> Vector:
         """Return the readings: noise and bias added, cut at the range, rounded."""
-        x, y, z = (np.clip(value + noise + offset, -self.limit, self.limit)
+        x, y, z = (np.clip(value + noise + offset, -self._limit, self._limit)
                    for value, noise, offset in zip(exact, white, bias, strict=True))
-        step = self.resolution
+        step = self._resolution
         if step:        # + 0.0: no reading is -0
             return tuple((np.rint(one / step) + 0.0) * step for one in (x, y, z))
         return x, y, z
-
-
-PERFECT = Axes(white=0.0, walk=0.0, turn_on=0.0, limit=math.inf, resolution=0.0)
 
 
 class Sensor:
     """
     What the IMU reads at a rate: noise of sample k depends on the seed and on k alone.
 
-    Attributes
-    ----------
-    gyroscope, accelerometer : Axes
+    Block b of 512 samples is drawn from a generator keyed by seed and b (Philox, counter-based:
+    Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC11), so that samples can be
+    read from anywhere.  The bias at the start of a block is the sum over the blocks before it.
+    It is kept for the newest few blocks; older blocks are summed again from 0.
     """
+
+    BLOCK = 512
+    STARTS_KEPT = 4
 
     def __init__(self, values: Mapping[str, Any], period_ns: int) -> None:
         period = period_ns * 1e-9
-        self.gyroscope = Axes.of(values, 'gyroscope', period)
-        self.accelerometer = Axes.of(values, 'accelerometer', period)
-        self._perfect = self.gyroscope == self.accelerometer == PERFECT
-        self._noise: Noise | None = None
-        if self.gyroscope.is_random or self.accelerometer.is_random:
-            self._noise = Noise(values['seed'], self.gyroscope, self.accelerometer)
+        self.gyroscope = Axes(values, 'gyroscope', period)
+        self.accelerometer = Axes(values, 'accelerometer', period)
+        kinds = (self.gyroscope, self.accelerometer)
+        self._perfect = all(kind.is_perfect for kind in kinds)
+        self._random = any(kind.is_random for kind in kinds)
+        self._seed: int = values['seed']
+        self._white = np.repeat([kind.white for kind in kinds], 3)
+        self._walk = np.repeat([kind.walk for kind in kinds], 3)
+        # Where the bias of block b begins; that of block 0 is the turn-on bias.
+        self._bias_starts = {0: np.repeat([kind.turn_on for kind in kinds], 3)
+                             * self._normal(0, 6, turn_on=True)[0]}
+        self._block: tuple[int, Rows] = -1, np.empty((0, 12))
+        self._newest: tuple[range, Rows] = range(0), np.empty((12, 0))
 
     def read(self, exact: tuple[Vector, Vector], indices: range) -> tuple[Vector, Vector]:
         """
         Return the readings of rates [rad/s] and force [m/s^2] in consecutive samples.
 
-        Parameters
-        ----------
-        exact : pair of Vector
-            What an ideal sensor reads there.
-        indices : range
-            Numbers k of the samples.
+        exact : what an ideal sensor reads there
+        indices : numbers k of the samples
         """
         if self._perfect:
             return exact
@@ -168,35 +149,9 @@ class Sensor:
         return (drawn[6], drawn[7], drawn[8]), (drawn[9], drawn[10], drawn[11])
 
     def _drawn(self, indices: range) -> Rows:
-        return NO_NOISE if self._noise is None else self._noise.samples(indices)
-
-
-class Noise:
-    """
-    White noise and wandering bias of both kinds of axes, by sample number.
-
-    Block b of 512 samples is drawn from a generator keyed by seed and b (Philox, counter-based:
-    Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC11), so that samples can be
-    read from anywhere.  The bias at the start of a block is the sum over the blocks before it.
-    It is kept for the newest few blocks; older blocks are summed again from 0.
-    """
-
-    BLOCK = 512
-    STARTS_KEPT = 4
-
-    def __init__(self, seed: int, gyroscope: Axes, accelerometer: Axes) -> None:
-        self._seed = seed
-        kinds = (gyroscope, accelerometer)
-        self._white = np.repeat([kind.white for kind in kinds], 3)
-        self._walk = np.repeat([kind.walk for kind in kinds], 3)
-        # Where the bias of block b begins; that of block 0 is the turn-on bias.
-        self._bias_starts = {0: np.repeat([kind.turn_on for kind in kinds], 3)
-                             * self._normal(0, 6, turn_on=True)[0]}
-        self._block: tuple[int, Rows] = -1, np.empty((0, 12))
-        self._newest: tuple[range, Rows] = range(0), np.empty((12, 0))
-
-    def samples(self, indices: range) -> Rows:
         """Return white noise (rates, force) and bias (rates, force) of samples, (12, n)."""
+        if not self._random:
+            return NO_NOISE
         if self._newest[0] != indices:      # streams of one rate ask for the same ones
             first, last = indices[0] // self.BLOCK, indices[-1] // self.BLOCK
             drawn = np.vstack([self._of_block(block) for block in range(first, last + 1)])
@@ -205,13 +160,9 @@ class Noise:
         return self._newest[1]
 
     def _of_block(self, block: int) -> Rows:
-        """Return white noise and bias of a block, (512, 12)."""
-        if self._block[0] != block:
-            self._block = block, self._drawn(block)
-        return self._block[1]
-
-    def _drawn(self, block: int) -> Rows:
-        """Draw a block, by way of those before it whose last bias is not kept."""
+        """Return a block (512, 12), by way of those before it whose last bias is not kept."""
+        if self._block[0] == block:
+            return self._block[1]
         starts = self._bias_starts
         nearest = max(b for b in starts if b <= block)
         start = starts[nearest]
@@ -225,7 +176,8 @@ class Noise:
         starts[block + 1] = starts.pop(block + 1, start)
         if len(starts) > self.STARTS_KEPT:
             del starts[list(starts)[1]]                 # the oldest; that of block 0 stays
-        return np.hstack((normal[:, :6] * self._white, bias))
+        self._block = block, np.hstack((normal[:, :6] * self._white, bias))
+        return self._block[1]
 
     def _normal(self, block: int, columns: int, turn_on: bool = False) -> Rows:
         """Draw the normal numbers of a block (512, columns), or the turn-on bias (1, columns)."""

@@ -56,17 +56,11 @@ def event(name: str, t_ns: int, sent_ns: int, **details: Any) -> bytes:
     """
     Return an event as it is logged: std_msgs/String of JSON.
 
-    Parameters
-    ----------
-    name : str
-        What happened.
-    t_ns : int
-        Simulated time [ns].
-    sent_ns : int
-        Up to there all samples had been sent (-1: not even that of t = 0), of the motion that a
-        reset ended [ns].
-    **details
-        Further members of the JSON object.
+    name : what happened
+    t_ns : simulated time [ns]
+    sent_ns : up to there all samples had been sent (-1: not even that of t = 0), of the motion
+        that a reset ended [ns]
+    details : further members of the JSON object
     """
     return messages.string(json.dumps(
         {'event': name, 't_ns': t_ns, 'sent_ns': sent_ns, **details}, default=list))

@@ -15,20 +15,15 @@ from spinning_top_sim.physics.shape import shape_of
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams import messages, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS, Field
-from spinning_top_sim.streams.segment import Axis, Reference
+from spinning_top_sim.streams.segment import Axis, Reference, Segment
 from spinning_top_sim.streams.topics import Stream
 
 
 class PastAxis:
     """
-    Where the symmetry axis was, over all segments of a run, by the exact solution.
+    Where the symmetry axis was in the last `length_ns`, over all segments, by the exact solution.
 
     Each segment is followed from its start to the command that ended it, that instant included.
-
-    Parameters
-    ----------
-    length_ns : int
-        How far back the trace goes [ns].
     """
 
     def __init__(self, length_ns: int) -> None:
@@ -86,6 +81,9 @@ class Markers(Stream):
         self.template = messages.markers(
             values['world_frame'], (2.0 * shape.radius, 2.0 * shape.radius, shape.height), lines,
             0.02 * abs(shape.tip), self._count + 1 if self._count else 0)
+
+    def follow(self, segment: Segment) -> None:
+        self.past.begin(segment.reference)
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         axis = states.rows_axis

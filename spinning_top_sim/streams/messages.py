@@ -36,8 +36,8 @@ def _header(frame_id: str) -> tuple[CdrWriter, int]:
 def pose_stamped(frame_id: str) -> Template:
     """geometry_msgs/PoseStamped at the origin; fields: orientation x, y, z, w."""
     writer, stamp_at = _header(frame_id)
-    writer.doubles((0.0, 0.0, 0.0))
-    return Template(writer, [stamp_at], [(writer.doubles((0.0, 0.0, 0.0, 1.0)), 4)])
+    writer.doubles(0.0, 0.0, 0.0)
+    return Template(writer, [stamp_at], [(writer.doubles(0.0, 0.0, 0.0, 1.0), 4)])
 
 
 def joint_state(names: Sequence[str]) -> Template:
@@ -55,12 +55,12 @@ def imu(frame_id: str, orientation_covariance: Sequence[float],
         linear_acceleration_covariance: Sequence[float]) -> Template:
     """sensor_msgs/Imu; fields: orientation x, y, z, w, angular velocity, linear acceleration."""
     writer, stamp_at = _header(frame_id)
-    fields = [(writer.doubles((0.0, 0.0, 0.0, 1.0)), 4)]
-    writer.doubles(orientation_covariance)
-    fields.append((writer.doubles(3 * (0.0,)), 3))
-    writer.doubles(angular_velocity_covariance)
-    fields.append((writer.doubles(3 * (0.0,)), 3))
-    writer.doubles(linear_acceleration_covariance)
+    fields = [(writer.doubles(0.0, 0.0, 0.0, 1.0), 4)]
+    writer.doubles(*orientation_covariance)
+    fields.append((writer.doubles(0.0, 0.0, 0.0), 3))
+    writer.doubles(*angular_velocity_covariance)
+    fields.append((writer.doubles(0.0, 0.0, 0.0), 3))
+    writer.doubles(*linear_acceleration_covariance)
     return Template(writer, [stamp_at], fields)
 
 
@@ -68,23 +68,23 @@ def odometry(frame_id: str, child_frame_id: str) -> Template:
     """nav_msgs/Odometry of a fixed point, covariances zero; fields: orientation, body rates."""
     writer, stamp_at = _header(frame_id)
     writer.string(child_frame_id)
-    writer.doubles(3 * (0.0,))
-    fields = [(writer.doubles((0.0, 0.0, 0.0, 1.0)), 4)]
-    writer.doubles(36 * (0.0,))
-    writer.doubles(3 * (0.0,))                              # linear velocity: the pivot is fixed
-    fields.append((writer.doubles(3 * (0.0,)), 3))
-    writer.doubles(36 * (0.0,))
+    writer.doubles(0.0, 0.0, 0.0)
+    fields = [(writer.doubles(0.0, 0.0, 0.0, 1.0), 4)]
+    writer.doubles(*(36 * (0.0,)))
+    writer.doubles(0.0, 0.0, 0.0)                           # linear velocity: the pivot is fixed
+    fields.append((writer.doubles(0.0, 0.0, 0.0), 3))
+    writer.doubles(*(36 * (0.0,)))
     return Template(writer, [stamp_at], fields)
 
 
 def float64_multi_array(labels: Sequence[str]) -> Template:
     """std_msgs/Float64MultiArray, one dimension labelled with its columns; fields: the data."""
     writer = CdrWriter()
-    writer.uint32(1)
+    writer.append('I', 1)
     writer.string(','.join(labels))
-    writer.uint32(len(labels))                              # size
-    writer.uint32(len(labels))                              # stride
-    writer.uint32(0)                                        # data offset
+    writer.append('I', len(labels))                         # size
+    writer.append('I', len(labels))                         # stride
+    writer.append('I', 0)                                   # data offset
     return Template(writer, [],
                     [(writer.double_sequence(len(labels) * (0.0,)), len(labels))])
 
@@ -102,21 +102,13 @@ def markers(frame_id: str, size: Sequence[float], lines: Sequence[float], line_w
 
     Fields: position and orientation of the cylinder, orientation of the lines, the trace's points.
 
-    Parameters
-    ----------
-    frame_id : str
-        Of the world.
-    size : (3,) sequence of float
-        Diameters and height of the cylinder [m].
-    lines : sequence of float
-        x, y and z of begin and end of each line, in the body frame [m].
-    line_width : float
-        [m]; the trace is half as wide.
-    trace_points : int
-        How many, 0 for no trace.
+    size : diameters and height of the cylinder [m]
+    lines : x, y and z of begin and end of each line, in the body frame [m]
+    line_width : [m]; the trace is half as wide
+    trace_points : how many, 0 for no trace
     """
     writer = CdrWriter()
-    writer.uint32(3 if trace_points else 2)
+    writer.append('I', 3 if trace_points else 2)
     body = _marker(writer, frame_id, 'body', CYLINDER, size, BODY_COLOR)
     axis = _marker(writer, frame_id, 'axis', LINE_LIST, (line_width, 0.0, 0.0), AXIS_COLOR, lines)
     placed = [body, axis]
@@ -150,29 +142,29 @@ def _marker(writer: CdrWriter, frame_id: str, namespace: str, kind: int, scale: 
     stamp_at = writer.stamp()
     writer.string(frame_id)
     writer.string(namespace)
-    writer.int32(0)                                         # id
-    writer.int32(kind)
-    writer.int32(0)                                         # action: add, or modify
-    position_at = writer.doubles((0.0, 0.0, 0.0))
-    orientation_at = writer.doubles((0.0, 0.0, 0.0, 1.0))
-    writer.doubles(scale)
-    writer.floats(color)
+    writer.append('i', 0)                                   # id
+    writer.append('i', kind)
+    writer.append('i', 0)                                   # action: add, or modify
+    position_at = writer.doubles(0.0, 0.0, 0.0)
+    orientation_at = writer.doubles(0.0, 0.0, 0.0, 1.0)
+    writer.doubles(*scale)
+    writer.append('f', *color)
     writer.stamp()                                          # lifetime: for ever
-    writer.flag(False)                                      # frame_locked
-    writer.uint32(len(points) // 3)
-    points_at = writer.doubles(points)
-    writer.uint32(0)                                        # colors
+    writer.append('?', False)                               # frame_locked
+    writer.append('I', len(points) // 3)
+    points_at = writer.doubles(*points)
+    writer.append('I', 0)                                   # colors
     writer.string('')                                       # texture_resource
     writer.stamp()                                          # texture: header, format, data
     writer.string('')
     writer.string('')
-    writer.uint32(0)
-    writer.uint32(0)                                        # uv_coordinates
+    writer.append('I', 0)
+    writer.append('I', 0)                                   # uv_coordinates
     writer.string('')                                       # text
     writer.string('')                                       # mesh_resource
     writer.string('')                                       # mesh_file: filename, data
-    writer.uint32(0)
-    writer.flag(False)                                      # mesh_use_embedded_materials
+    writer.append('I', 0)
+    writer.append('?', False)                               # mesh_use_embedded_materials
     return _Marker(stamp_at, position_at, orientation_at, points_at)
 
 

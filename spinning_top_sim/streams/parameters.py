@@ -8,6 +8,7 @@ The defaults are the cusp scene: a bicycle wheel on a pivot, spun about its axis
 
 from __future__ import annotations
 
+import contextlib
 import enum
 import math
 from collections.abc import Mapping
@@ -79,46 +80,33 @@ class Parameter:
         """Return the value in its own type.  Raises ValueError with name, value, allowed."""
         if value is None and self.default is None:
             return None
-        checked = self._convert(value)
-        if checked is None:
-            raise ValueError(f'{self.name} = {value!r}: {self.allowed}')
-        return checked
+        with contextlib.suppress(TypeError, OverflowError):
+            if self._is_allowed(value):
+                if isinstance(self.default, tuple):
+                    return tuple(type(self.default[0])(item) for item in value)
+                return float(value) if self.is_double else value
+        raise ValueError(f'{self.name} = {value!r}: {self.allowed}')
 
-    def _convert(self, value: Value) -> Value:
-        """Return the value in the type of the default, or None where it is not allowed."""
+    def _is_allowed(self, value: Value) -> bool:
         default = self.default
         if isinstance(default, tuple):
-            return self._convert_list(value)
-        if isinstance(default, bool | str):
-            good = isinstance(value, type(default)) and (not self.choices or value in self.choices)
-            return value if good else None
-        kinds = (int, float) if self.is_double else (int,)
-        if isinstance(value, bool) or not isinstance(value, kinds):
-            return None
-        try:
-            number = float(value) if self.is_double else value
-        except OverflowError:
-            return None
-        return number if self._in_range(number) else None
-
-    def _in_range(self, number: float) -> bool:
-        return (math.isfinite(number)
-                and (self.above is None or number > self.above)
-                and (self.minimum is None or number >= self.minimum)
-                and (self.maximum is None or number <= self.maximum))
-
-    def _convert_list(self, value: Value) -> Value:
-        if isinstance(value, str | bytes):
-            return None
-        try:
             items = tuple(value)
-        except TypeError:
-            return None
-        if isinstance(self.default[0], str):
-            return items if all(isinstance(item, str) for item in items) else None
-        numbers = all(isinstance(item, int | float) and not isinstance(item, bool)
-                      and math.isfinite(item) for item in items)
-        return tuple(map(float, items)) if numbers and len(items) == len(self.default) else None
+            if isinstance(value, str | bytes):
+                return False
+            if isinstance(default[0], str):
+                return all(isinstance(item, str) for item in items)
+            return len(items) == len(default) and all(map(_is_number, items))
+        if isinstance(default, bool | str):
+            return isinstance(value, type(default)) and (not self.choices or value in self.choices)
+        return (_is_number(value) and (self.is_double or isinstance(value, int))
+                and (self.above is None or value > self.above)
+                and (self.minimum is None or value >= self.minimum)
+                and (self.maximum is None or value <= self.maximum))
+
+
+def _is_number(value: Value) -> bool:
+    return (isinstance(value, int | float) and not isinstance(value, bool)
+            and math.isfinite(value))
 
 
 # name, default rate [Hz], on by default, what it is

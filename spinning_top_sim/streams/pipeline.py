@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -22,10 +23,9 @@ from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.propagator import Propagator, propagate
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.all_streams import all_streams
-from spinning_top_sim.streams.markers import Markers
 from spinning_top_sim.streams.schedule import Instant, Schedule
 from spinning_top_sim.streams.segment import Segment
-from spinning_top_sim.streams.topics import Invariants, Stream
+from spinning_top_sim.streams.topics import Stream
 
 # Integration steps between two looks at whether to give way: about 5 ms.
 STEPS_AT_ONCE = 500
@@ -46,10 +46,8 @@ class Simulation:
 
     Parameters
     ----------
-    values : mapping
-        Checked parameters, see `parameters.checked`.
-    epoch_ns : int
-        Stamp of t = 0 [ns].
+    values : checked parameters, see `parameters.checked`
+    epoch_ns : stamp of t = 0 [ns]
 
     Attributes
     ----------
@@ -60,10 +58,7 @@ class Simulation:
     history : applied commands since the start as (t_ns, l3, lz)
     segment : the motion since the last command
 
-    Raises
-    ------
-    ValueError, IntegrationError
-        If there is no motion from the start state of the parameters.
+    Raises ValueError or IntegrationError where there is no motion from the start state.
     """
 
     def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
@@ -95,16 +90,14 @@ class Simulation:
             new.sent, new.skipped = old.sent, old.skipped
         self.streams = streams
         self._schedule = Schedule(streams, segment, epoch_ns)
-        self._invariants = next(s for s in streams if isinstance(s, Invariants))
-        self._markers = next(s for s in streams if isinstance(s, Markers))
         self._begin(segment)
 
     def _begin(self, segment: Segment) -> None:
         self.segment = segment
         self.l3, self.lz = segment.l3, segment.lz
         self._schedule.follow(segment)
-        self._invariants.segment = segment
-        self._markers.past.begin(segment.reference)
+        for stream in self.streams:
+            stream.follow(segment)
 
     # -------------------------------------------------------------------------- the present
 
@@ -158,12 +151,7 @@ class Simulation:
         """
         Record these streams from now on; no streams: record nothing.
 
-        Parameters
-        ----------
-        write : Log
-            A stream has the number there that it has in `streams`.
-        streams : sequence of Stream
-            Those to record.
+        A stream has the number in the log that it has in `streams`.
         """
         self._log = write
         for stream in self.streams:
@@ -179,20 +167,12 @@ class Simulation:
         """
         Send every sample due up to `target_ns`; return whether that was reached.
 
-        Parameters
-        ----------
-        target_ns : int
-            Simulated time [ns].
-        publish_from_ns : int
-            Earlier samples are recorded, not published: they are too late.
-        give_way : callable
-            Asked between samples, and within long integrations; True ends the call early.
+        target_ns : simulated time [ns]
+        publish_from_ns : earlier samples are recorded, not published: they are too late
+        give_way : asked between samples, and within long integrations; True ends the call early.
             Nothing is lost: the next call goes on there.
 
-        Raises
-        ------
-        IntegrationError
-            If the equations cannot go on.
+        Raises IntegrationError if the equations cannot go on.
         """
         if self.now_ns < publish_from_ns:
             for stream in self.streams:
@@ -278,12 +258,8 @@ class Simulation:
         """
         Send every sample of the recorded streams up to `target_ns`, a block of a stream at a time.
 
-        The same bytes as `advance` sends, in another order; for offline use.
-
-        Raises
-        ------
-        IntegrationError
-            If the equations cannot go on; the samples before that are sent.
+        The same bytes as `advance` sends, in another order; for offline use.  Raises
+        IntegrationError if the equations cannot go on; the samples before that are sent.
         """
         self._schedule.invalidate()
         solver, start_ns = self.segment.solver, self.segment.start_ns
@@ -294,15 +270,11 @@ class Simulation:
             except IntegrationError as error:
                 failure = error
             until_ns = min(target_ns, start_ns + solver.latest_ns)
-            # By begin, end and period: ranges of one time are equal whatever their period.
-            states: dict[tuple[int, int, int], States] = {}
+            states = cache(self.segment.states)
             for stream in self.streams:
                 times = stream.times(self.now_ns, until_ns)
                 if stream.log_index is not None and times:
-                    key = times.start, times.stop, times.step
-                    if key not in states:
-                        states[key] = self.segment.states(times)
-                    rows = stream.encode(states[key], self.epoch_ns, times)
+                    rows = stream.encode(states(times), self.epoch_ns, times)
                     send(stream, self.epoch_ns + np.arange(times.start, times.stop, times.step),
                          rows)
             self.now_ns = max(self.now_ns, until_ns)
@@ -316,17 +288,13 @@ class Simulation:
         """
         Let L3 and Lz jump now [kg m^2/s]: an impulsive torque.  Angles and theta' stay.
 
-        Raises
-        ------
-        ValueError
-            Naming what is off; then the motion goes on unchanged.
+        Raises ValueError naming what is off; then the motion goes on unchanged.
         """
         for name, value in (('l3', l3), ('lz', lz)):
             if not math.isfinite(value):
                 raise ValueError(f'{name} = {value!r} kg m^2/s: must be finite')
         at_ns = max(self.now_ns, 0)
-        if at_ns > self.now_ns:
-            self.advance(at_ns)
+        self.advance(at_ns)
         now = self.segment.states(range(at_ns, at_ns + 1))
         theta = float(now.theta[0])
         pole = pole_momentum(abs(theta), l3)

@@ -7,9 +7,9 @@ import contextlib
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
+from functools import cache
 from typing import TypeVar
 
-from spinning_top_sim.physics.states import States
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.segment import Segment
@@ -121,19 +121,9 @@ class Schedule:
         """
         Compute a block if there are samples due up to `until_ns` that are not computed.
 
-        Parameters
-        ----------
-        now_ns : int
-            Simulated time up to which everything is sent [ns].
-        until_ns : int
-            Simulated time [ns].
-        budget_ns : int, optional
-            Time after which to stop [ns]; the next call goes on there.
-
-        Returns
-        -------
-        bool
-            False if the time ended before the block was complete.
+        now_ns : simulated time up to which everything is sent [ns]
+        until_ns : simulated time [ns]
+        budget_ns : time after which to stop and return False [ns]; the next call goes on there
         """
         if self._work is None:
             due_ns = self.next_due(now_ns)
@@ -141,18 +131,14 @@ class Schedule:
                 return True
             span_ns = min((self._block - 1) * self._shortest_ns, LONGEST_BLOCK_NS)
             self._block = min(2 * self._block, LARGEST_BLOCK)
-            self._begin(now_ns, max(until_ns, due_ns + span_ns))
+            self._work = self._pieces(now_ns, max(until_ns, due_ns + span_ns))
         return self._go_on(None if budget_ns is None else time.monotonic_ns() + budget_ns)
 
     def compute(self, now_ns: int, until_ns: int) -> None:
         """Compute a block up to `until_ns` at the most, or finish the one under way."""
         if self._work is None:
-            self._begin(now_ns, until_ns)
+            self._work = self._pieces(now_ns, until_ns)
         self._go_on(None)
-
-    def _begin(self, now_ns: int, until_ns: int) -> None:
-        farthest_ns = self.next_due(now_ns) + (LARGEST_BLOCK - 1) * self._shortest_ns
-        self._work = self._pieces(now_ns, min(until_ns, farthest_ns))
 
     def _go_on(self, end_ns: int | None) -> bool:
         """Compute pieces of the block under way until a time; return whether it is complete."""
@@ -169,6 +155,8 @@ class Schedule:
 
     def _pieces(self, now_ns: int, until_ns: int) -> Iterator[None]:
         """Compute a block, as far as the steps allow, in pieces of some 0.1 ms."""
+        until_ns = min(until_ns,
+                       self.next_due(now_ns) + (LARGEST_BLOCK - 1) * self._shortest_ns)
         segment = self._segment
         solver, start_ns = segment.solver, segment.start_ns
         solver.release(now_ns - start_ns)
@@ -180,8 +168,7 @@ class Schedule:
                 yield
         self.reached_ns = max(self.reached_ns, start_ns + solver.latest_ns)
         until_ns = min(until_ns, self.reached_ns)
-        # By begin, end and period: ranges of one time are equal whatever their period.
-        states: dict[tuple[int, int, int], States] = {}
+        states = cache(segment.states)
         instants: dict[int, tuple[list[int], list[bytes]]] = {}
         next_ns = []
         for place, (stream, first_ns) in enumerate(zip(self._active, self._next_ns, strict=True)):
@@ -189,27 +176,22 @@ class Schedule:
             next_ns.append(first_ns + len(times) * stream.period_ns)
             if not times:
                 continue
-            key = times.start, times.stop, times.step
-            if key not in states:
-                states[key] = segment.states(times)
+            states(times)
             yield
-            data = stream.encode(states[key], self.epoch_ns, times).tobytes()
+            data = stream.encode(states(times), self.epoch_ns, times).tobytes()
             size = len(stream.template)
             for number, t_ns in enumerate(times):
                 places, messages = instants.setdefault(t_ns, ([], []))
                 places.append(place)
                 messages.append(data[number * size:(number + 1) * size])
             yield
-        self.ready.extend((t_ns, self._delivery(tuple(places)), messages)
-                          for t_ns, (places, messages) in sorted(instants.items()))
+        for t_ns, (places, messages) in sorted(instants.items()):
+            key = tuple(places)
+            if key not in self._deliveries:
+                self._deliveries[key] = Delivery([self._active[k] for k in places])
+            self.ready.append((t_ns, self._deliveries[key], messages))
         self._next_ns = next_ns
         self.computed_ns = min(next_ns, default=NEVER_NS)
-
-    def _delivery(self, places: tuple[int, ...]) -> Delivery:
-        delivery = self._deliveries.get(places)
-        if delivery is None:
-            delivery = self._deliveries[places] = Delivery([self._active[k] for k in places])
-        return delivery
 
 
 def offline_block_ns(streams: Sequence[Stream]) -> int:

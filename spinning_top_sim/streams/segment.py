@@ -20,19 +20,10 @@ Axis = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 class Reference:
     """
-    The exact solution of a motion, set up when it is first asked for.
+    The exact solution of the motion of a top from `start` at the simulated time `start_ns` [ns].
 
-    Setting it up takes milliseconds and may run in another thread than the simulation.
-
-    Parameters
-    ----------
-    top : Top
-    start : State
-        Where the motion begins.
-    start_ns : int
-        When it begins, in simulated time [ns].
-    solution : ExactSolution, optional
-        If it is set up already.
+    It is set up when it is first asked for, unless it is given: that takes milliseconds and may
+    run in another thread than the simulation.
     """
 
     def __init__(self, top: Top, start: State, start_ns: int,
@@ -57,7 +48,7 @@ class Reference:
         """
         Return the symmetry axis in the world at simulated times (n,) [ns].
 
-        Without an exact solution it stands as it does at the start.
+        Without an exact solution it stands still.
         """
         if self.solution is not None:
             return self.solution.states(times_ns - self.start_ns).rows_axis
@@ -72,11 +63,10 @@ class Segment:
 
     Attributes
     ----------
-    solver : Propagator
-        Its t = 0 is `start_ns`.
+    solver : its t = 0 is `start_ns`
     start_ns : simulated time at which it begins [ns]
     energy, l3, lz : constants of the motion, as it began
-    reference : Reference
+    reference : the exact solution of the same motion
     """
 
     def __init__(self, solver: Propagator, start: State, start_ns: int) -> None:

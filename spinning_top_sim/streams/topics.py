@@ -30,10 +30,6 @@ class Stream:
     """
     One topic: samples at t = k * period, k = 0, 1, 2.., whoever listens and however ticks fall.
 
-    Parameters
-    ----------
-    values : checked parameters, see `parameters.checked`
-
     Attributes
     ----------
     parameter : prefix of its parameters
@@ -70,6 +66,9 @@ class Stream:
             self._publish = sink
             self.on_change()
 
+    def follow(self, segment: Segment) -> None:
+        """Begin with the samples of a motion, or of the one after a command."""
+
     def set_rate(self, rate: float) -> None:
         """Put the samples on the grid of another rate [Hz]."""
         self.period_ns = max(1, round(NANOSECONDS / rate))
@@ -98,20 +97,11 @@ class Stream:
 
     def encode(self, states: States, epoch_ns: int, times: range) -> NDArray[np.uint8]:
         """
-        Return the messages at sample times as rows of bytes, valid until the next call.
+        Return the messages at sample times as rows of bytes (n, size), valid until the next call.
 
-        Parameters
-        ----------
-        states : States
-            The states at `times`.
-        epoch_ns : int
-            Stamp of t = 0 [ns].
-        times : range
-            Times of n samples [ns]; see `times`.
-
-        Returns
-        -------
-        (n, size) uint8
+        states : the states at `times`
+        epoch_ns : stamp of t = 0 [ns]
+        times : of n samples [ns]; see `times`
         """
         stamps_ns = np.arange(epoch_ns + times.start, epoch_ns + times.stop, times.step)
         return self.template.encode(stamps_ns, *self.fields(states, times))
@@ -171,7 +161,7 @@ class ImuStream(Stream):
     """What all IMU topics share: the mounting, and the sensor at the stream's rate."""
 
     type_name = 'sensor_msgs/msg/Imu'
-    has_orientation = True
+    has_orientation, is_noisy = True, False
 
     def __init__(self, values: Mapping[str, Any], imu: Imu) -> None:
         self._frame_id: str = values['imu.frame_id']
@@ -182,24 +172,17 @@ class ImuStream(Stream):
         super().set_rate(rate)
         # A density says how much noise a sample has at a rate.
         self._sensor = self._imu.sensor(self.period_ns)
-        gyroscope, accelerometer = self._variances()
+        kinds = self._sensor.gyroscope, self._sensor.accelerometer
         self.template = messages.imu(
             self._frame_id,
             messages.EXACT if self.has_orientation else messages.UNKNOWN_ORIENTATION,
-            messages.diagonal(gyroscope), messages.diagonal(accelerometer))
-
-    def _variances(self) -> tuple[float, float]:
-        """Return the variances of angular velocity and linear acceleration."""
-        return 0.0, 0.0
+            *(messages.diagonal(kind.variance if self.is_noisy else 0.0) for kind in kinds))
 
 
 class ImuRaw(ImuStream):
     """What the sensor reads, without an orientation (REP-145)."""
 
-    parameter, topic, has_orientation = 'imu', 'imu/data_raw', False
-
-    def _variances(self) -> tuple[float, float]:
-        return self._sensor.gyroscope.variance, self._sensor.accelerometer.variance
+    parameter, topic, has_orientation, is_noisy = 'imu', 'imu/data_raw', False, True
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         orientation = self._imu.orientation(states) if self.has_orientation else IDENTITY
@@ -236,22 +219,18 @@ class Invariants(Stream):
 
     A drift is relative to the value that the motion began with (absolute where that is 0); the
     orientation error [rad] is against the exact solution.
-
-    Attributes
-    ----------
-    segment : Segment
-        The present motion; the simulation sets it.
     """
 
     parameter, topic, type_name = 'invariants', '~/invariants', 'std_msgs/msg/Float64MultiArray'
-    segment: Segment
-
     def __init__(self, values: Mapping[str, Any]) -> None:
         super().__init__(values)
         self.template = messages.float64_multi_array(INVARIANTS)
 
+    def follow(self, segment: Segment) -> None:
+        self._segment = segment
+
     def fields(self, states: States, times: range) -> Sequence[Field]:
-        segment = self.segment
+        segment = self._segment
         now = (states.energy, states.l3, states.lz)
         drifts = [(values - start) / (abs(start) or 1.0) for values, start in zip(
             now, (segment.energy, segment.l3, segment.lz), strict=True)]

@@ -16,7 +16,7 @@ from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import Imu, JointState
 
 from helpers.node_harness import LIFETIME_S
-from helpers.recorded import recorded
+from helpers.simulations import record
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.pipeline import Simulation
 
@@ -133,11 +133,11 @@ def the_log(folder):
 
 def simulated(log, metadata, until_ns):
     """Compute the run of a log in this process; return {topic: [(stamp, bytes)]}."""
-    record = metadata['spinning_top_sim']
+    run = metadata['spinning_top_sim']
     assert 0 <= until_ns < LIFETIME_S * SECOND, 'the stamp of t = 0 in the log is wrong'
-    simulation = Simulation(parameters.checked(json.loads(record['parameters'])),
-                            int(record['epoch_ns']))
-    taken = recorded(simulation)
+    epoch_ns = int(run['epoch_ns'])
+    simulation = Simulation(parameters.checked(json.loads(run['parameters'])), epoch_ns)
+    taken = record(simulation)
     for event in events_in(log):
         if event['event'] in ('command', 'parameters'):
             simulation.advance(event['t_ns'])
@@ -148,7 +148,10 @@ def simulated(log, metadata, until_ns):
             if event['event'] == 'parameters' and rate is not None:
                 stream.set_rate(rate)
     simulation.advance(until_ns)
-    return taken
+    rows = {stream.topic: [] for stream in simulation.streams}
+    for topic, t_ns, data in taken:
+        rows[topic].append((epoch_ns + t_ns, data))
+    return rows
 
 
 def events_in(log):

@@ -23,12 +23,12 @@ def stream(simulation, topic):
 
 def record(simulation, *topics):
     """Record these streams, all where none is named, from now on: [(topic, t_ns, bytes)]."""
-    taken = []
+    taken, epoch_ns = [], simulation.epoch_ns
     recorded = [one.topic for one in simulation.streams if not topics or one.topic in topics]
 
     def write(numbers, stamp_ns, messages, size):
         assert size == sum(map(len, messages))
-        taken.extend((recorded[number], stamp_ns - EPOCH_NS, bytes(message))
+        taken.extend((recorded[number], stamp_ns - epoch_ns, bytes(message))
                      for number, message in zip(numbers, messages, strict=True))
 
     simulation.log_to(write, [stream(simulation, topic) for topic in recorded])
