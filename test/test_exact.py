@@ -550,7 +550,7 @@ def test_bad_times_in_nanoseconds_are_refused():
             solution.states(bad)
     for far in (range(10 ** 400, 10 ** 400 + 1), range(-10 ** 30, 1, 10 ** 30),
                 np.array([0, 2 ** 63 - 1])):
-        with pytest.raises(ValueError, match=r't = .* must be within|times_ns = .* int64'):
+        with pytest.raises(ValueError, match=r't = .* within|times_ns = .* int64'):
             solution.states(far)
 
 

@@ -180,9 +180,8 @@ class ExactSolution:
     def _refuse_beyond(self, limit: float, t: Column, unit: str) -> None:
         latest = max(float(t.max()), -float(t.min())) if len(t) else 0.0
         if not latest <= float(limit):  # rounded as the times are; catches NaN too
-            raise ValueError(f't = {latest!r} {unit}: must be finite and within '
-                             f'{self.time_limit:.6g} s, where a phase of this motion reaches '
-                             '2^52 turns')
+            raise ValueError(f't = {latest!r} {unit}: must be finite and within {limit:.6g} {unit}, '
+                             'where a phase of this motion reaches 2^52 turns or int64 ends')
 
 
 class _ExactStates(States):

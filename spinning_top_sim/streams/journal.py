@@ -52,7 +52,7 @@ def command(l3: float, lz: float) -> bytes:
     return messages.float64_multi_array(('l3', 'lz')).encode_one(0, (l3, lz))
 
 
-def event(name: str, t_ns: int, sent_ns: int, **details: Any) -> bytes:
+def event(name: str, t_ns: int, sent_ns: int, **details: object) -> bytes:
     """
     Return an event as it is logged: std_msgs/String of JSON.
 
