@@ -15,7 +15,7 @@ from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.all_streams import all_streams
 from spinning_top_sim.streams.cdr import ENCAPSULATION
 from spinning_top_sim.streams.pipeline import Rows, Simulation
-from spinning_top_sim.streams.schedule import NEVER_NS, offline_block_ns, offline_targets
+from spinning_top_sim.streams.schedule import offline_block_ns, offline_targets
 
 EVENT_NAMES = ('start', 'command', 'parameters', 'reset')
 
@@ -164,8 +164,8 @@ class Rerun:
             if event is not None and event.name == 'start':
                 continue
             stop_ns = end_ns - simulation.epoch_ns if event is None else event.sent_ns
-            block_ns = NEVER_NS if self._send is None else offline_block_ns(
-                [stream for stream in simulation.streams if stream.has_sinks])
+            block_ns = offline_block_ns([stream for stream in simulation.streams
+                                         if stream.has_sinks])
             for target_ns, item in offline_targets(
                     max(simulation.now_ns, 0), [(stop_ns, event)], block_ns):
                 # Without samples states are only needed where a command finds them.
