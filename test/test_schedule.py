@@ -29,7 +29,9 @@ def schedule_of(*topics, **values):
     """Return a schedule whose streams of these topics have subscribers."""
     simulation = simulate(**values)
     publish(simulation, *topics)
-    return Schedule(simulation.streams, simulation.segment, 0), simulation
+    schedule = Schedule(simulation.streams, 0)
+    schedule.follow(simulation.segment)
+    return schedule, simulation
 
 
 def times_of(schedule):

@@ -46,12 +46,6 @@ def product(p: Quaternion, q: Quaternion) -> Quaternion:
             d * z + a * y - b * x + c * w, d * w - a * x - b * y - c * z)
 
 
-def half_angle_squares(q: Quaternion) -> tuple[Column, Column]:
-    """Return cos^2 and sin^2 of theta/2."""
-    x, y, z, w = q
-    return w * w + z * z, x * x + y * y
-
-
 def axis_in_world(q: Quaternion) -> tuple[Column, Column, Column]:
     """Return the symmetry axis e3 in the world frame."""
     x, y, z, w = q

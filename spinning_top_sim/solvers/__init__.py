@@ -36,8 +36,8 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
     """
     try:
         given = np.asarray(t)
-        if given.dtype.kind in 'mM':
-            raise TypeError(f'{given.dtype} has a unit of its own')
+        if given.dtype.kind in 'cmM':           # complex, timedelta64, datetime64
+            raise TypeError(f'{given.dtype} is no number of seconds')
         times = given.astype(np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f't = {t!r}: must be (n,) numbers, in s') from error

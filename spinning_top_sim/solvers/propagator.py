@@ -10,12 +10,11 @@ import numpy as np
 from spinning_top_sim.physics.regimes import axis_rests
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.solvers.nutation import MOST
 from spinning_top_sim.solvers.rk45 import EulerMotion, SteppedMotion, TransportMotion
 
 METHODS = ('rk45', 'exact')
 EQUATIONS = ('transport', 'euler')
-# Larger energies and rates leave no room for their products in doubles.
-MOST = 1e290
 
 
 # A motion that begins at t = 0, read in blocks of times; `SteppedMotion` says what each offers.

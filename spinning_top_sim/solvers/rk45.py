@@ -261,7 +261,8 @@ class _TransportStates(States):
 
     @cached_property
     def half_angle_squares(self) -> tuple[Column, Column]:
-        return attitude.half_angle_squares(self.rows_quaternion)
+        x, y, z, w = self.rows_quaternion
+        return w * w + z * z, x * x + y * y
 
     @cached_property
     def angles(self) -> tuple[Column, Column, Column]:

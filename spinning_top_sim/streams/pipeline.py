@@ -89,7 +89,7 @@ class Simulation:
             new.publish, new.log_index = old.publish, old.log_index
             new.sent, new.skipped = old.sent, old.skipped
         self.streams = streams
-        self._schedule = Schedule(streams, segment, epoch_ns)
+        self._schedule = Schedule(streams, epoch_ns)
         self._begin(segment)
 
     def _begin(self, segment: Segment) -> None:

@@ -65,7 +65,7 @@ class Schedule:
     The messages of the streams of one run, in order of time.
 
     Blocks are computed where there is time: `prepare` in pieces after a tick, `compute` at once.
-    What is sent does not depend on it.
+    What is sent does not depend on it.  It begins with `follow`.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class Schedule:
     reached_ns : the solver needs no further steps up to this time [ns]
     """
 
-    def __init__(self, streams: Sequence[Stream], segment: Segment, epoch_ns: int) -> None:
+    def __init__(self, streams: Sequence[Stream], epoch_ns: int) -> None:
         self._streams, self.epoch_ns = streams, epoch_ns
         self.ready: deque[Instant] = deque()
         # Streams with sinks, and the first sample of each that is not computed.
@@ -83,7 +83,6 @@ class Schedule:
         self._next_ns: list[int] = []
         self._deliveries: dict[tuple[int, ...], Delivery] = {}      # by places in `_active`
         self._shortest_ns = NEVER_NS
-        self.follow(segment)
         for stream in streams:
             stream.on_change = self.invalidate
 
