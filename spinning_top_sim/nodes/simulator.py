@@ -130,8 +130,7 @@ class Simulator(Node):
         if not self._follows:
             time.sleep((epoch_ns - now_ns) / NANOSECONDS)
         self._loop.start()
-        records = self._values['record.enabled']
-        open_log = self._session.start(self._values) if records else None
+        open_log = self._session.start(self._values) if self._values['record.enabled'] else None
         self._pacer.start()
         if open_log is not None:
             try:
