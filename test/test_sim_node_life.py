@@ -488,6 +488,7 @@ def test_a_full_disk_and_a_new_recording_when_there_is_room(
         assert peer.set_together(node, record__uri=str(small_disk / 'second.mcap')).successful
         assert peer.switch(node, 'record', True).success
         diagnostics.wait_for(node, 'no error', lambda s: s.level == b'\x00')
+        poses.wait_more(50)
         assert_clean_end(node, node.end())
         peer.stop_listening(poses)
     for name in ('first', 'second'):

@@ -122,11 +122,8 @@ class Terminal:
 
     def show(self, line: str) -> None:
         """Show the newest line."""
-        if self._overwrites:
-            self._write(f'\r\x1b[K{line}')
-            self._open = True
-        else:
-            self._write(f'{line}\n')
+        self._write(f'\r\x1b[K{line}' if self._overwrites else f'{line}\n')
+        self._open = self._overwrites
 
     def tell(self, line: str) -> None:
         """Show a line that stays."""

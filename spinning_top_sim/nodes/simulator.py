@@ -7,7 +7,7 @@ import functools
 import sys
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -56,7 +56,7 @@ class Simulator(Node):
         # A reset goes back to this; an unset spin.lz is the cusp of the tilt that there is then.
         self._start_spin = {name: values[name] for name in SPIN}
         self._values = {**values, 'spin.lz': simulation.lz}
-        self._showing_spin = False
+        self._resetting = False
         self.add_pre_set_parameters_callback(ros_parameters.with_doubles)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         # Another node's /clock is followed, but not one that this node publishes.
@@ -130,8 +130,7 @@ class Simulator(Node):
         if not self._follows:
             time.sleep((epoch_ns - now_ns) / NANOSECONDS)
         self._loop.start()
-        records = self._values['record.enabled']
-        open_log = self._session.start(self._values) if records else None
+        open_log = self._session.start(self._values) if self._values['record.enabled'] else None
         self._pacer.start()
         if open_log is not None:
             try:
@@ -200,32 +199,20 @@ class Simulator(Node):
             return False, f'{type(error).__name__}: {error}'
 
     def _on_command(self, message: Float64MultiArray) -> None:
-        accepted, text = self._outcome(self._take_command, message.data)
-        if accepted:
-            self._show_spin()
+        """Set both parameters of the spin, as a command is a change of these."""
+        if len(message.data) == len(SPIN):
+            reason = self.set_parameters_atomically([
+                Parameter(name, value=message.data[k]) for k, name in enumerate(SPIN)]).reason
         else:
             self._loop.rejected_commands += 1
-            self.get_logger().warning(f'~/commands: refused: {text}')
-
-    def _take_command(self, data: Sequence[float]) -> None:
-        if len(data) != 2:
-            raise ValueError(f'data has {len(data)} values: must be [L3, Lz]')
-        with self._lock:
-            self._loop.command(*data)
-
-    def _show_spin(self) -> None:
-        """Have the parameters show the spin that a command or a reset has set."""
-        self._values |= {'spin.l3': self._simulation.l3, 'spin.lz': self._simulation.lz}
-        self._showing_spin = True
-        try:
-            self.set_parameters([Parameter(name, value=self._values[name]) for name in SPIN])
-        finally:
-            self._showing_spin = False
+            reason = f'data has {len(message.data)} values: must be [L3, Lz]'
+        if reason:
+            self.get_logger().warning(f'~/commands: refused: {reason}')
 
     def _on_set_parameters(self, given: list[Parameter]) -> SetParametersResult:
         """Apply all changes together or none."""
         changes = {p.name: p.value for p in given if p.name in parameters.BY_NAME}
-        if self._showing_spin or not changes:
+        if self._resetting or not changes:
             return SetParametersResult(successful=True)
         successful, reason = self._outcome(self._change, changes)
         if not (successful or changes.keys().isdisjoint(SPIN)):
@@ -285,7 +272,12 @@ class Simulator(Node):
             self._check_started()
             # Back to the spin it was started with, whatever was commanded since.
             self._loop.reset({**self._values, **self._start_spin}, self._date_ns())
-        self._show_spin()
+        self._values |= {'spin.l3': self._simulation.l3, 'spin.lz': self._simulation.lz}
+        self._resetting = True
+        try:
+            self.set_parameters([Parameter(name, value=self._values[name]) for name in SPIN])
+        finally:
+            self._resetting = False
         return f'at t = 0, stamps go on from {self._simulation.epoch_ns} ns'
 
     def _record(self, request: SetBool.Request) -> str:
