@@ -165,7 +165,7 @@ class ExactSolution:
         Raises ValueError if `times_ns` is not of that kind, or a time is too far away.
         """
         times = Times.from_ns(times_ns)
-        self._refuse_beyond(self.ns_limit, times.high, 'ns')
+        self._refuse_beyond(self.ns_limit, times.latest, 'ns')
         return _ExactStates(self, times)
 
     def states_at_seconds(self, t: Column) -> States:
@@ -174,25 +174,22 @@ class ExactSolution:
 
         Raises ValueError if a time is not finite or too far away.
         """
-        self._refuse_beyond(self.time_limit, t, 's')
-        return _ExactStates(self, Times.from_seconds(t), t.copy())
+        times = Times.from_seconds(t)
+        self._refuse_beyond(self.time_limit, times.latest, 's')
+        return _ExactStates(self, times)
 
-    def _refuse_beyond(self, limit: float, t: Column, unit: str) -> None:
-        latest = max(float(t.max()), -float(t.min())) if len(t) else 0.0
+    def _refuse_beyond(self, limit: float, latest: float, unit: str) -> None:
         if not latest <= float(limit):  # rounded as the times are; catches NaN too
-            raise ValueError(f't = {latest!r} {unit}: must be finite and within {limit:.6g} {unit}, '
-                             'where a phase of this motion reaches 2^52 turns or int64 ends')
+            raise ValueError(f't = {latest!r} {unit}: must be finite and within {limit:.6g} '
+                             f'{unit}, where a phase of this motion reaches 2^52 turns or int64 ends')
 
 
 class _ExactStates(States):
     """The states of an exact solution, on the branch of its start."""
 
-    def __init__(self, solution: ExactSolution, times: Times, seconds: Column | None = None,
-                 ) -> None:
+    def __init__(self, solution: ExactSolution, times: Times) -> None:
         super().__init__(solution.top, solution.start, len(times))
         self._solution, self._times = solution, times
-        if seconds is not None:
-            self.t = seconds
 
     @cached_property
     def t(self) -> Column:

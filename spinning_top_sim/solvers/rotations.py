@@ -124,18 +124,17 @@ class Rotations:
         major += minor
         more = major + WHOLE
         major -= more - WHOLE
-        major *= STEP_ANGLE
         index = whole.view(np.int64)
         index += more.view(np.int64)
         index &= STEPS - 1
         table_cosine, table_sine = COSINES.take(index), SINES.take(index)
         square = np.multiply(major, major, out=minor)
-        cosine = np.multiply(square, 1.0 / 24.0, out=more)
-        cosine -= 0.5
+        cosine = np.multiply(square, STEP_ANGLE ** 4 / 24.0, out=more)
+        cosine -= STEP_ANGLE ** 2 / 2.0
         cosine *= square
         cosine += 1.0
-        sine = np.multiply(square, -1.0 / 6.0, out=square)
-        sine += 1.0
+        sine = np.multiply(square, -STEP_ANGLE ** 3 / 6.0, out=square)
+        sine += STEP_ANGLE
         sine *= major
         cosines = np.multiply(table_cosine, cosine, out=major)
         cosines -= table_sine * sine
@@ -146,15 +145,14 @@ class Rotations:
 
     def _in_steps(self, times: Times, start: Rows) -> tuple[Rows, Rows]:
         """Return the angles in steps, less whole ones at the start: exact values and rests."""
-        t1, t2 = halves(times.high)
+        t1, t2 = times.halves
         major = self._first * t1
-        minor = self._first * t2
+        minor = self._first * (t2 + times.low)
         minor += self._second * times.high
-        minor += (self._first + self._second) * times.low
         minor += start
         far = np.abs(times.high) > self._short_ns
         if far.any():
-            distant = Times(times.high[far], times.low[far])
+            distant = times[far]
             for k, rate in enumerate(self._rates):
                 turns, rest = rate.fraction(distant)
                 major[k, far] = STEPS * turns

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from decimal import Decimal
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,63 +26,104 @@ def halves(x: Number) -> tuple[Number, Number]:
     return high, x - high
 
 
-@dataclass(frozen=True, eq=False)
 class Times:
     """
-    Times since the start of a motion, in nanoseconds, as exact sums high + low.
+    Times since the start of a motion, as exact sums of two doubles [ns].
 
-    high, low : (n,) nearest doubles, and what they leave out [ns]
-    ns : the same times, where they are given as integers [ns]
+    The sums are computed when they are first asked for: those of a block stay in the cache.
+
+    ns : (n,) integers [ns], None where the times are given as doubles
+    t : (n,) doubles [s]
     """
 
-    high: Column
-    low: Column
-    ns: NDArray[np.int64] | range | None = None
+    def __init__(self, ns: NDArray[np.int64] | range | None, t: Column | None = None) -> None:
+        self.ns, self._t = ns, t
 
     @classmethod
     def from_ns(cls, ns: NDArray[np.int64] | range) -> Times:
         """Return the times of integer nanoseconds (n,); raise ValueError for anything else."""
-        count = _integers(ns) if isinstance(ns, range) else np.array(ns)
+        if isinstance(ns, range):
+            if any(not -2 ** 63 <= extreme < 2 ** 63 for extreme in (
+                    *ns[:1], *ns[-1:], ns.step)):
+                raise ValueError(f'times_ns = {ns!r}: must be within int64')
+            return cls(ns)
+        count = np.array(ns)        # not the caller's: columns are computed later
         if count.ndim != 1 or (count.size and count.dtype.kind not in 'iu'):
             raise ValueError(f'times_ns has shape {count.shape} and type {count.dtype}: must be '
                              '(n,) integer nanoseconds')
-        if not isinstance(ns, range):
-            ns = count          # not the caller's: columns are computed later
-        if not count.size or max(abs(int(count.min())), abs(int(count.max()))) <= 2 ** 53:
-            return cls(count.astype(np.float64), np.broadcast_to(0.0, len(count)), ns)
-        upper = (count >> 20).astype(np.float64) * 2.0 ** 20
-        lower = (count & (2 ** 20 - 1)).astype(np.float64)
-        high = upper + lower
-        return cls(high, lower - (high - upper), ns)
+        return cls(count.astype(np.int64))
 
     @classmethod
     def from_seconds(cls, t: Column) -> Times:
         """Return the times of doubles [s]."""
-        first, second = halves(t)
-        high = t * 1e9                          # 1e9 has 21 bits
-        return cls(high, (first * 1e9 - high) + second * 1e9)
+        return cls(None, t.copy())
+
+    @property
+    def latest(self) -> float:
+        """The largest time either way, as given: [ns] or [s]."""
+        given = self._given
+        if not len(given):
+            return 0.0
+        if isinstance(given, range):
+            return float(max(abs(given[0]), abs(given[-1])))
+        return max(float(given.max()), -float(given.min()))
+
+    @cached_property
+    def _sums(self) -> tuple[Column, Column]:
+        """Nearest doubles, and what they leave out [ns]."""
+        ns = self.ns
+        if ns is None:
+            first, second = halves(self.seconds)
+            high = self.seconds * 1e9               # 1e9 has 21 bits
+            return high, (first * 1e9 - high) + second * 1e9
+        count = _integers(ns) if isinstance(ns, range) else ns
+        if self.latest <= 2.0 ** 53:
+            return count.astype(np.float64), np.broadcast_to(0.0, len(count))
+        upper = (count >> 20).astype(np.float64) * 2.0 ** 20
+        lower = (count & (2 ** 20 - 1)).astype(np.float64)
+        high = upper + lower
+        return high, lower - (high - upper)
+
+    @property
+    def high(self) -> Column:
+        """Nearest doubles (n,) [ns]."""
+        return self._sums[0]
+
+    @property
+    def low(self) -> Column:
+        """What the nearest doubles leave out (n,) [ns]."""
+        return self._sums[1]
+
+    @cached_property
+    def halves(self) -> tuple[Column, Column]:
+        """The nearest doubles, split; see `halves`."""
+        return halves(self.high)
 
     @property
     def seconds(self) -> Column:
         """(n,) [s]."""
-        return self.high / 1e9 + self.low / 1e9
+        return self.high / 1e9 + self.low / 1e9 if self._t is None else self._t
 
     def __len__(self) -> int:
         """Return n."""
-        return len(self.high)
+        return len(self._given)
 
-    def __getitem__(self, block: slice) -> Times:
+    def __getitem__(self, part: slice | NDArray[np.bool_]) -> Times:
         """Return a part of the times."""
-        return Times(self.high[block], self.low[block],
-                     None if self.ns is None else self.ns[block])
+        if self.ns is None:
+            return Times(None, self.seconds[part])
+        if isinstance(self.ns, range) and isinstance(part, slice):
+            return Times(self.ns[part])
+        return Times(np.asarray(self.ns)[part])
+
+    @property
+    def _given(self) -> NDArray[np.int64] | range | Column:
+        return self.seconds if self.ns is None else self.ns
 
 
 def _integers(times: range) -> NDArray[np.int64]:
     """Return a range as an array; `numpy.arange` takes its length from doubles."""
-    if any(not -2 ** 63 <= ns < 2 ** 63 for ns in (*times[:1], *times[-1:], times.step)):
-        raise ValueError(f'times_ns = {times!r}: must be within int64')
-    start = times.start if times else 0
-    return start + times.step * np.arange(len(times), dtype=np.int64)
+    return (times.start if times else 0) + times.step * np.arange(len(times), dtype=np.int64)
 
 
 class Rate:
@@ -94,7 +135,7 @@ class Rate:
 
     def product(self, times: Times) -> tuple[Column, Column]:
         """Return rate * t as nearest doubles and what they leave out."""
-        t1, t2 = halves(times.high)
+        t1, t2 = times.halves
         high = self.high * times.high
         rest = ((self._first * t1 - high) + self._first * t2 + self._second * t1)
         return high, (rest + self._second * t2) + (self.low * times.high + self.high * times.low)

@@ -54,7 +54,7 @@ class Attitudes:
     def __init__(self, stamps_ns: NDArray[np.int64], rows: Reals) -> None:
         self.stamps_ns, self.rows = stamps_ns, rows
         x, y, z, w = self.quaternion = tuple(rows[:4])
-        self.cos2, self.sin2 = attitude.half_angle_squares((x, y, z, w))
+        self.cos2, self.sin2 = w * w + z * z, x * x + y * y
         tip_x, tip_y, self.height = attitude.axis_in_world((x, y, z, w))
         self.up = attitude.vertical_in_body((x, y, z, w))
         self.tip, self.body_tip = tip_x + 1j * tip_y, -self.up[0] + 1j * self.up[1]
