@@ -180,8 +180,9 @@ class ExactSolution:
 
     def _refuse_beyond(self, limit: float, latest: float, unit: str) -> None:
         if not latest <= float(limit):  # rounded as the times are; catches NaN too
-            raise ValueError(f't = {latest!r} {unit}: must be finite and within {limit:.6g} '
-                             f'{unit}, where a phase of this motion reaches 2^52 turns or int64 ends')
+            raise ValueError(
+                f't = {latest!r} {unit}: must be finite and within {limit:.6g} {unit}, where a '
+                'phase of this motion reaches 2^52 turns or int64 ends')
 
 
 class _ExactStates(States):
