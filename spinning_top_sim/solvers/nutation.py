@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The nutation of the exact motion, accurate relative to itself next to a pole.
+The nutation of the exact motion, to full relative precision next to a pole.
 
 The phase of the nutation is counted from the nearest quarter period, where the theta functions are
 short polynomials; even and odd quarter periods have series of their own (`theta_setup`).
@@ -48,7 +48,7 @@ class NutationColumns(NamedTuple):
     half_theta: Column
 
 
-class _Factor(NamedTuple):
+class _FactorSeries(NamedTuple):
     """
     Alpha or beta over even or odd quarter periods, in doubles.
 
@@ -67,7 +67,7 @@ class _Factor(NamedTuple):
 
     def at(self, y: Column, flip: Column, xi: Column, prefactors: tuple[Column | float, ...],
            ) -> tuple[Column, Column, Column]:
-        """Return modulus (signed if real), argument, and the modulus less the factor sin y."""
+        """Return modulus (signed if real), argument, and the modulus without its factor sin y."""
         polynomial = _horner(self.real, xi)
         if not self.sense:
             if self.crosses:
@@ -80,11 +80,11 @@ class _Factor(NamedTuple):
         return modulus, self.drift * y + self.sense * np.arctan2(imag, real), modulus
 
 
-class _Branch(NamedTuple):
+class _Quarter(NamedTuple):
     """Both factors and cos(theta)' over even or odd quarter periods."""
 
-    alpha: _Factor
-    beta: _Factor
+    alpha: _FactorSeries
+    beta: _FactorSeries
     u_dot: float                    # times `magnifier`, a power of 2: near a pole all is small
     magnifier: float
     u_dot_series: tuple[float, ...]
@@ -105,17 +105,17 @@ class _Branch(NamedTuple):
             xi = s * s
         c = np.sqrt(1.0 - xi)           # cos y > 0, or cosh x
         prefactors = (1.0, c, s, s * c)
-        alpha, alpha_argument, alpha_slope = self.alpha.at(y, flip, xi, prefactors)
-        beta, beta_argument, beta_slope = self.beta.at(y, flip, xi, prefactors)
+        alpha, alpha_argument, alpha_without_sin = self.alpha.at(y, flip, xi, prefactors)
+        beta, beta_argument, beta_without_sin = self.beta.at(y, flip, xi, prefactors)
         if not self.u_dot:              # resting, perhaps at a pole
             return alpha, beta, alpha_argument, beta_argument, 0.0 * y
-        # theta' = -u'/sin(theta), with the zero that u' shares with a factor at a pole divided
-        # out.
-        sin_2y = 2.0 * c if self.alpha.has_zero or self.beta.has_zero else 2.0 * s * c
-        theta1 = sin_2y * _horner(self.u_dot_series, 4.0 * xi * (1.0 - xi))
+        # theta' = -u'/sin(theta), and u' is a theta series of 2y.  Where alpha or beta has a zero,
+        # its factor sin y is divided out of both.
+        prefactor = 2.0 * c if self.alpha.has_zero or self.beta.has_zero else 2.0 * s * c
+        u_dot = prefactor * _horner(self.u_dot_series, 4.0 * xi * (1.0 - xi))
         # In this order nothing overflows on the separatrix, where all grow like cosh x.
-        theta_dot = (-0.5 * self.u_dot * (theta1 / (alpha * alpha + beta * beta))
-                     / (self.magnifier * alpha_slope * beta_slope))
+        theta_dot = (-0.5 * self.u_dot * (u_dot / (alpha * alpha + beta * beta))
+                     / (self.magnifier * alpha_without_sin * beta_without_sin))
         return alpha, beta, alpha_argument, beta_argument, theta_dot
 
 
@@ -130,8 +130,9 @@ class Nutation:
     """
 
     def __init__(self, motion: ThetaMotion, start_theta: float) -> None:
-        self._branches = _branch(motion, 0), _branch(motion, 1)
-        self._quarters = Rate(motion.quarter_rate)
+        # Even and odd quarter periods.
+        self._kinds = _quarter(motion, 0), _quarter(motion, 1)
+        self._quarter_rate = Rate(motion.quarter_rate)
         self._quarter0 = motion.quarter0
         self._offset, self._offset_rest = double_double(motion.offset0)
         self._turning = motion.turning
@@ -154,11 +155,11 @@ class Nutation:
         place = quarters.astype(np.int64) & 3
         flip = np.where(place < 2, 1.0, -1.0)
         odd = (place & 1).astype(bool)
-        for branch, here in zip(self._branches, (~odd, odd), strict=True):
+        for quarter, here in zip(self._kinds, (~odd, odd), strict=True):
             if here.all():
-                out[:5] = branch.at(y, flip)
+                out[:5] = quarter.at(y, flip)
             elif here.any():
-                out[:5, here] = branch.at(y[here], flip[here])
+                out[:5, here] = quarter.at(y[here], flip[here])
         half_theta = np.arctan2(out[1], out[0])
         if self._turning:
             half_theta += 2.0 * math.pi * np.rint(self._turns(quarters, y, half_theta))
@@ -168,9 +169,9 @@ class Nutation:
         """
         Return the nearest whole number of quarter periods, and the angle y from there.
 
-        y is accurate relative to itself: a top races past a pole that it misses by little.
+        y has full relative precision: a top races past a pole that it misses by little.
         """
-        high, rest = self._quarters.product(times)
+        high, rest = self._quarter_rate.product(times)
         whole = np.rint(high)
         part = high - whole
         # Knuth's sum of part and offset: `nearest` with what it leaves out.
@@ -184,7 +185,7 @@ class Nutation:
 
     def _turns(self, quarters: Column, y: Column, half_theta: Column) -> Column:
         """
-        Return how many turns theta/2, known up to a turn, lacks: near a whole number.
+        Return the whole turns to add to `half_theta`, before rounding.
 
         In a planar rotation, which passes both poles, theta/2 stays within a quarter turn of
         (pi/2) (intercept + slope Z), Z in quarter periods.
@@ -203,21 +204,22 @@ def in_range(name: str, value: Decimal) -> float:
     return float(value)
 
 
-def _branch(motion: ThetaMotion, odd: int) -> _Branch:
-    """Round one branch to doubles."""
-    def factor(which: str) -> _Factor:
+def _quarter(motion: ThetaMotion, odd: int) -> _Quarter:
+    """Return the even or odd quarter periods of a motion in doubles."""
+    def series(which: str) -> _FactorSeries:
         factor = motion.alpha if which == 'alpha' else motion.beta
         branch = factor.odd if odd else factor.even
         real = _coefficients(branch.real.scaled(Decimal(factor.sign)), which)
         imag = branch.imag or Series('cos even', (ZERO,))
-        return _Factor(branch.real.prefactor, real, imag.prefactor, _coefficients(imag),
-                       factor.sense, float(factor.drift), factor.crosses, branch.has_zero)
-    alpha, beta = factor('alpha'), factor('beta')
+        return _FactorSeries(
+            branch.real.prefactor, real, imag.prefactor, _coefficients(imag),
+            factor.sense, float(factor.drift), factor.crosses, branch.has_zero)
+    alpha, beta = series('alpha'), series('beta')
     smallest = min(max(map(abs, x.real + x.imag)) for x in (alpha, beta))
     magnifier = 2.0 ** -math.frexp(smallest)[1] if smallest else 1.0
     u_dot = in_range("cos(theta)'", motion.u_dot[odd] * Decimal(magnifier))
-    return _Branch(alpha, beta, u_dot, magnifier, _coefficients(motion.u_dot_series),
-                   motion.imaginary, float(motion.stretch))
+    return _Quarter(alpha, beta, u_dot, magnifier, _coefficients(motion.u_dot_series),
+                    motion.imaginary, float(motion.stretch))
 
 
 def _coefficients(series: Series, checked: str = '') -> tuple[float, ...]:

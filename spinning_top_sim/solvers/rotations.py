@@ -13,13 +13,14 @@ from spinning_top_sim.solvers.times import NANOSECONDS, Rate, Times, halves
 
 Rows = NDArray[np.float64]
 
-STEPS = 2048                # of a turn; within half a step the fifth power of the rest is 7e-17
+# Steps of a turn: within half a step r the first neglected term of the sine, r^5/120, is 7e-17.
+STEPS = 2048
 STEP_ANGLE = 2.0 * np.pi / STEPS
-# Within so many turns the first product of halves is exact to a small share of a step.
+# Within so many turns the rest of an angle is rounded by less than 1e-16 rad.
 SHORT_TURNS = 2.0 ** 22
 # Grids of shorter steps have too many times in a second to keep.
 SHORTEST_STEP_NS, GRIDS_KEPT = 50_000, 16
-# 1.5 * 2^52: doubles of its size are whole numbers, whose last bits are those of the mantissa.
+# 1.5 * 2^52: doubles of this size are whole numbers k + WHOLE; their last bits are those of k.
 WHOLE = 1.5 * 2.0 ** 52
 
 
@@ -40,24 +41,30 @@ class Rotations:
     """
     k angles, each a rate times t plus a start.
 
-    The whole steps of an angle are looked up in a table; the rest, less than half a step, is put
-    on by the addition theorem.  numpy's own cosine and sine take twice the time.
+    An angle is s = exact + rest in steps of STEP_ANGLE, where `exact` is a product of two halves
+    of doubles, without rounding.  With the nearest step j and r = (s - j) STEP_ANGLE,
+
+        cos(s) = cos(j) cos(r) - sin(j) sin(r),   sin(s) = sin(j) cos(r) + cos(j) sin(r):
+
+    cos(j) and sin(j) come from a table, cos(r) and sin(r) from three terms of their series.
+    numpy's cosine and sine take twice the time.
 
     angles : pairs of rate [turns/s] and start [turns]
     """
 
     def __init__(self, angles: Sequence[tuple[Decimal, Decimal]]) -> None:
-        first, second, start_steps, start_rests = [], [], [], []
+        rate_high, rate_low, start_steps, start_rests = [], [], [], []
         for rate, start in angles:
             in_steps = rate * STEPS / 10 ** 9
-            first.append(halves(float(in_steps))[0])
-            second.append(float(in_steps - Decimal(first[-1])))
+            rate_high.append(halves(float(in_steps))[0])
+            rate_low.append(float(in_steps - Decimal(rate_high[-1])))
             start_in_steps = (start - start.to_integral_value()) * STEPS
             start_steps.append(float(start_in_steps.to_integral_value()))
             start_rests.append(float(start_in_steps - Decimal(start_steps[-1])))
-        self._first, self._second, self._whole, self._start = (
+        self._rate_high, self._rate_low, self._whole, self._start_rest = (
             np.array(numbers)[:, np.newaxis]
-            for numbers in (first, second, [WHOLE + steps for steps in start_steps], start_rests))
+            for numbers in (rate_high, rate_low, [WHOLE + steps for steps in start_steps],
+                            start_rests))
         self._rates = [Rate(rate) for rate, _ in angles]
         fastest = max(abs(rate.high) for rate in self._rates)
         self._short_ns = SHORT_TURNS / fastest if fastest else np.inf
@@ -66,7 +73,7 @@ class Rotations:
 
     def cosines_and_sines(self, times: Times) -> tuple[Rows, Rows]:
         """Return cos and sin of the angles, (k, n) each."""
-        return self._of_steps(*self._in_steps(times, self._start), self._whole)
+        return self._of_steps(*self._in_steps(times, self._start_rest), self._whole)
 
     def at_ns(self, ns: NDArray[np.int64] | range) -> tuple[Rows, Rows]:
         """
@@ -101,7 +108,7 @@ class Rotations:
         sines += row_cosine * sine
         begin = (grid.start - first * NANOSECONDS) // step
         part = slice(begin, begin + len(grid))
-        count = len(self._start)
+        count = len(self._whole)
         return cosines.reshape(count, -1)[:, part], sines.reshape(count, -1)[:, part]
 
     def _at_seconds(self, seconds: NDArray[np.int64]) -> tuple[Rows, Rows]:
@@ -109,52 +116,55 @@ class Rotations:
 
     def _within_second(self, ns: NDArray[np.int64]) -> tuple[Rows, Rows]:
         """Return cos and sin of what the angles grow by in less than a second."""
-        return self._of_steps(*self._in_steps(Times.from_ns(ns), np.zeros_like(self._start)),
+        return self._of_steps(*self._in_steps(Times.from_ns(ns), np.zeros_like(self._start_rest)),
                               WHOLE)
 
-    def _of_steps(self, major: Rows, minor: Rows, start: Rows | float) -> tuple[Rows, Rows]:
+    def _of_steps(self, exact: Rows, rest: Rows, whole_start: Rows | float) -> tuple[Rows, Rows]:
         """
-        Return cos and sin of angles in steps; in place, as memory costs as much as sums.
+        Return cos and sin of angles in steps; both arguments are overwritten.
 
-        start : WHOLE and the whole steps of the angles at t = 0
+        In place, as fresh memory costs as much as the sums.
+
+        whole_start : WHOLE and the whole steps of the angles at t = 0
         """
-        # Adding WHOLE rounds to whole steps; taking it away again is exact.
-        whole = major + start
-        major -= whole - start
-        major += minor
-        more = major + WHOLE
-        major -= more - WHOLE
-        index = whole.view(np.int64)
-        index += more.view(np.int64)
+        # Adding WHOLE rounds to whole steps, and taking it away again is exact.  `rest` may have
+        # whole steps too, so the last bits of both sums together are those of the step j.
+        step = exact + whole_start
+        remainder = exact
+        remainder -= step - whole_start
+        remainder += rest
+        more_steps = remainder + WHOLE
+        remainder -= more_steps - WHOLE
+        index = step.view(np.int64)
+        index += more_steps.view(np.int64)
         index &= STEPS - 1
         table_cosine, table_sine = COSINES.take(index), SINES.take(index)
-        square = np.multiply(major, major, out=minor)
-        cosine = np.multiply(square, STEP_ANGLE ** 4 / 24.0, out=more)
+        square = np.multiply(remainder, remainder, out=rest)
+        cosine = np.multiply(square, STEP_ANGLE ** 4 / 24.0, out=more_steps)
         cosine -= STEP_ANGLE ** 2 / 2.0
         cosine *= square
         cosine += 1.0
         sine = np.multiply(square, -STEP_ANGLE ** 3 / 6.0, out=square)
         sine += STEP_ANGLE
-        sine *= major
-        cosines = np.multiply(table_cosine, cosine, out=major)
+        sine *= remainder
+        cosines = np.multiply(table_cosine, cosine, out=remainder)
         cosines -= table_sine * sine
-        table_sine *= cosine
-        table_cosine *= sine
-        table_sine += table_cosine
-        return cosines, table_sine
+        sines = np.multiply(table_sine, cosine, out=table_sine)
+        sines += np.multiply(table_cosine, sine, out=table_cosine)
+        return cosines, sines
 
-    def _in_steps(self, times: Times, start: Rows) -> tuple[Rows, Rows]:
-        """Return the angles in steps, less whole ones at the start: exact values and rests."""
-        t1, t2 = times.halves
-        major = self._first * t1
-        minor = self._first * (t2 + times.low)
-        minor += self._second * times.high
-        minor += start
+    def _in_steps(self, times: Times, start_rest: Rows) -> tuple[Rows, Rows]:
+        """Return `exact` and `rest` of the angles, without the whole steps at t = 0."""
+        time_high, time_low = times.halves
+        exact = self._rate_high * time_high
+        rest = self._rate_high * (time_low + times.low)
+        rest += self._rate_low * times.high
+        rest += start_rest
         far = np.abs(times.high) > self._short_ns
         if far.any():
             distant = times[far]
             for k, rate in enumerate(self._rates):
-                turns, rest = rate.fraction(distant)
-                major[k, far] = STEPS * turns
-                minor[k, far] = STEPS * rest + start[k]
-        return major, minor
+                turns, turns_rest = rate.fraction(distant)
+                exact[k, far] = STEPS * turns
+                rest[k, far] = STEPS * turns_rest + start_rest[k]
+        return exact, rest

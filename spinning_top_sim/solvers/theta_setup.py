@@ -249,8 +249,8 @@ class _Orbit:
     """
     The motion of a top with P >= 0.
 
-    Squares of sin and cos of theta0/2 stand for theta0, so that nothing cancels at either pole.
-    alpha_turns and beta_turns are the arguments of alpha and beta at t = 0.
+    sin and cos of theta0/2 stand for theta0, so that nothing cancels at either pole.  Methods take
+    alpha_turns and beta_turns, the arguments of alpha and beta at t = 0 [turns].
     """
 
     lambda1: Decimal

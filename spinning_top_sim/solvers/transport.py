@@ -11,9 +11,9 @@ m = i (L_x + i L_y)/(2 lambda1).  From q' = (1/2) omega q and L' = torque,
 
 Here the body frame turns about e3 at its true rate less chi: the known uniform
 spin exp(+-i chi t/2), chi = L3/lambda3 - (L3 - c)/lambda1, is put on when a state is read, so the
-step size follows the nutation and not the spin.  c = 0 carries the whole transverse rotation,
-c = L3 transports the frame parallel; c = L3/2 centres the spectrum of alpha and beta about zero
-and takes the fewest evaluations on cusps, the commonest of motions (docs/gauge.md).
+step size follows the nutation and not the spin.  With c = 0 the frame keeps the whole transverse
+rotation, with c = L3 it is transported parallel; c = L3/2 centres the spectrum of alpha and beta
+about zero and takes the fewest evaluations on cusps, the commonest of motions (docs/gauge.md).
 
 The invariants |q| = 1, L.e3 = L3 and the energy are restored after each step and in each sample
 (projection, Hairer, Lubich & Wanner, *Geometric Numerical Integration*, sect. IV.4).
@@ -129,7 +129,9 @@ class TransportEquations:
     def error(self, y: Vector, y_new: Vector, difference: Vector) -> float:
         """Return the largest of the three errors, each over its scale and the tolerance."""
         da, db, dm = difference
-        return max(abs(da), abs(db), abs(dm) / self._scale) / self._tolerance
+        errors = abs(da), abs(db), abs(dm) / self._scale
+        # A NaN may be any of them, and `max` finds only the first.
+        return (max(errors) if sum(errors) < math.inf else math.inf) / self._tolerance
 
     def check_step(self, y: Vector, y_new: Vector) -> None:
         """Nothing can go wrong silently in these equations."""
@@ -147,28 +149,30 @@ class TransportEquations:
 
     def _project(self, y: tuple[Any, ...], functions: tuple[Callable[..., Any], ...],
                  ) -> tuple[Any, ...]:
+        # m conj(alpha beta) = u + i v, where v carries L.e3 and u the nutation rate: v follows from
+        # L3 and Lz, and u^2 from |u + i v|^2, which the energy tells.
         sqrt, copysign, where = functions
         alpha_real, alpha_imag, beta_real, beta_imag, m_real, m_imag = y
         cos2 = alpha_real * alpha_real + alpha_imag * alpha_imag
         sin2 = beta_real * beta_real + beta_imag * beta_imag
-        shrink = 1.0 / sqrt(cos2 + sin2)
-        alpha_real, alpha_imag = alpha_real * shrink, alpha_imag * shrink
-        beta_real, beta_imag = beta_real * shrink, beta_imag * shrink
-        share = shrink * shrink
-        cos_theta = (cos2 - sin2) * share
-        square = cos2 * sin2 * (share * share)
-        # (e3_x + i e3_y)/2 = alpha beta; m conj(alpha beta) = u + i v: v carries L.e3, u theta'.
+        inverse_norm = 1.0 / sqrt(cos2 + sin2)
+        alpha_real, alpha_imag = alpha_real * inverse_norm, alpha_imag * inverse_norm
+        beta_real, beta_imag = beta_real * inverse_norm, beta_imag * inverse_norm
+        inverse_square = inverse_norm * inverse_norm
+        cos_theta = (cos2 - sin2) * inverse_square
+        sine_squared = cos2 * sin2 * (inverse_square * inverse_square)
+        # alpha beta = (e3_x + i e3_y)/2, of length sin(theta)/2.
         axis_real = alpha_real * beta_real - alpha_imag * beta_imag
         axis_imag = alpha_real * beta_imag + alpha_imag * beta_real
         lambda1 = self.top.lambda1
         v = 0.25 * (self.l3 - self.lz * cos_theta) / lambda1
         u = m_real * axis_real + m_imag * axis_imag
-        wanted = (self._energy - self.top.gravity_torque * cos_theta) / (2.0 * lambda1) * square
-        root = wanted - v * v
-        mended = (u * u > self._large_enough * square) & (root > 0.0)
-        u = where(mended, copysign(sqrt(where(root > 0.0, root, 0.0)), u), u)
-        at_pole = square <= POLE_SHARE
-        divisor = where(at_pole, 1.0, square)
+        modulus_squared = (self._energy - self.top.gravity_torque * cos_theta) / (2.0 * lambda1) * sine_squared
+        u_squared = modulus_squared - v * v
+        from_energy = (u * u > self._large_enough * sine_squared) & (u_squared > 0.0)
+        u = where(from_energy, copysign(sqrt(where(u_squared > 0.0, u_squared, 0.0)), u), u)
+        at_pole = sine_squared <= POLE_SHARE
+        divisor = where(at_pole, 1.0, sine_squared)
         return (
             alpha_real, alpha_imag, beta_real, beta_imag,
             where(at_pole, m_real, (u * axis_real - v * axis_imag) / divisor),
@@ -201,10 +205,10 @@ class TransportEquations:
         u = np.where(away, (y.m_real * axis_real + y.m_imag * axis_imag)
                      / np.where(away, half_axis, 1.0),
                      y.m_real * meridian_cos + y.m_imag * meridian_sin)
-        root = (self._energy - self.top.gravity_torque * (cosine - sine) * (cosine + sine)
+        u_squared = (self._energy - self.top.gravity_torque * (cosine - sine) * (cosine + sine)
                 ) / (2.0 * lambda1) - v * v
-        mended = (u * u > self._large_enough) & (root > 0.0)
-        u = np.where(mended, np.copysign(np.sqrt(np.where(root > 0.0, root, 0.0)), u), u)
+        from_energy = (u * u > self._large_enough) & (u_squared > 0.0)
+        u = np.where(from_energy, np.copysign(np.sqrt(np.where(u_squared > 0.0, u_squared, 0.0)), u), u)
         return Unknowns(
             cosine * np.cos(alpha_phase), cosine * np.sin(alpha_phase),
             sine * np.cos(beta_phase), sine * np.sin(beta_phase),

@@ -3,8 +3,8 @@
 Unwrapped angles of a stepped motion, from the phases of the Cayley-Klein parameters.
 
 arg(alpha) - (Omega/2) t turns one way only, in the sense of Lz + L3, and arg(beta) + (Omega/2) t
-in that of Lz - L3 (Omega = L3/lambda3 - L3/lambda1; each rate is its momentum over a square).  So
-a phase follows from its value modulo 2 pi and from the phase at the begin of its step.  Where one
+in that of Lz - L3 (Omega = L3/lambda3 - L3/lambda1): their rates are (Lz + L3)/(4 lambda1
+cos^2(theta/2)) and (Lz - L3)/(4 lambda1 sin^2(theta/2)).  So a phase follows from its value modulo 2 pi and from the phase at the begin of its step.  Where one
 of these momenta vanishes, the axis may cross that pole exactly: then the parameter moves on a
 straight line through zero, whose phase is known, and its modulus changes sign.
 """
@@ -95,7 +95,7 @@ class PhaseUnwrapper:
     """
     The phases of alpha and beta of a motion at the begins of its steps.
 
-    spin_rate : what the uniform spin of the stepped frame adds to the phase of alpha [rad/s], and
+    frame_rate : what the uniform spin of the stepped frame adds to the phase of alpha [rad/s], and
         takes from that of beta
 
     Attributes
@@ -104,13 +104,13 @@ class PhaseUnwrapper:
     begins : (3, n) phases of alpha and beta, less that of the spin, and theta/2 [rad]
     """
 
-    def __init__(self, start: State, spin_rate: float) -> None:
+    def __init__(self, start: State, frame_rate: float) -> None:
         half = 0.5 * start.theta
         self.alpha = CayleyKleinPhase(start.lz + start.l3, math.copysign(1.0, math.cos(half)),
                                       0.5 * (start.phi + start.psi))
         self.beta = CayleyKleinPhase(start.lz - start.l3, math.copysign(1.0, math.sin(half)),
                                      0.5 * (start.phi - start.psi))
-        self._spin_rate = spin_rate
+        self._frame_rate = frame_rate
         self.begins = np.array([[self.alpha.start], [self.beta.start], [half]])
 
     def extend(self, t: Column, alpha: NDArray[np.complex128],
@@ -118,7 +118,7 @@ class PhaseUnwrapper:
         """Follow the phases over the begins of further steps at t [s]."""
         more = np.empty((3, len(t)))
         moduli = []
-        turned = self._spin_rate * t
+        turned = self._frame_rate * t
         for k, (parameter, z, spin_phase) in enumerate((
                 (self.alpha, alpha, turned), (self.beta, beta, -turned))):
             real, imag = z.real.copy(), z.imag.copy()

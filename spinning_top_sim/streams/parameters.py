@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from spinning_top_sim.physics.top import State, Top, cusp_momentum
+from spinning_top_sim.solvers.propagator import EQUATIONS, METHODS
 
 Value = Any
 
@@ -168,9 +169,9 @@ TABLE: tuple[Parameter, ...] = (
     Parameter('spin.lz', None, 'Angular momentum along the vertical; a change is a command',
               'kg m^2/s'),
     Parameter('solver.method', 'rk45', 'Dormand-Prince steps or the closed form',
-              choices=('rk45', 'exact'), effect=Effect.RESET),
+              choices=METHODS, effect=Effect.RESET),
     Parameter('solver.equations', 'transport', "rk45: regular form, or the paper's to the letter",
-              choices=('transport', 'euler'), effect=Effect.RESET),
+              choices=EQUATIONS, effect=Effect.RESET),
     Parameter('solver.rtol', 1e-11, 'rk45: relative tolerance of a step', minimum=1e-14,
               maximum=1e-2, effect=Effect.RESET),
     Parameter('solver.atol', 1e-12, 'rk45: absolute tolerance of a step', minimum=0.0,

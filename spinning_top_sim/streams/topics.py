@@ -2,8 +2,8 @@
 """
 The streams: for each a topic, a message type, a rate, and how states become bytes.
 
-A new stream is a subclass of `Stream` here, a template in messages.py and a line in
-parameters.STREAM_DEFAULTS.
+A new stream is a subclass of `Stream` here, a template in messages.py, its place in all_streams.py
+and a line in parameters.STREAM_DEFAULTS.
 """
 
 from __future__ import annotations
