@@ -231,12 +231,9 @@ class Simulator(Node):
         self._values = values
 
     def _put_into_effect(self, values: dict[str, Any], changed: list[str]) -> None:
-        streams = self._simulation.streams
-        for stream in streams:
-            if f'{stream.parameter}.rate' in changed:
-                stream.set_rate(values[f'{stream.parameter}.rate'])
+        self._simulation.apply(values)
         if any(name.endswith('.enabled') for name in changed):
-            self._outputs.open(streams, values)
+            self._outputs.open(self._simulation.streams, values)
         if 'status_period' in changed:
             self._set_status_period(values['status_period'])
         if 'tick_rate' in changed:

@@ -149,8 +149,8 @@ class TransportEquations:
 
     def _project(self, y: tuple[Any, ...], functions: tuple[Callable[..., Any], ...],
                  ) -> tuple[Any, ...]:
-        # m conj(alpha beta) = u + i v, where v carries L.e3 and u the nutation rate: v follows from
-        # L3 and Lz, and u^2 from |u + i v|^2, which the energy tells.
+        # m conj(alpha beta) = u + i v, where v carries L.e3 and u the nutation rate: v follows
+        # from L3 and Lz, and u^2 from |u + i v|^2, which the energy tells.
         sqrt, copysign, where = functions
         alpha_real, alpha_imag, beta_real, beta_imag, m_real, m_imag = y
         cos2 = alpha_real * alpha_real + alpha_imag * alpha_imag
@@ -167,7 +167,8 @@ class TransportEquations:
         lambda1 = self.top.lambda1
         v = 0.25 * (self.l3 - self.lz * cos_theta) / lambda1
         u = m_real * axis_real + m_imag * axis_imag
-        modulus_squared = (self._energy - self.top.gravity_torque * cos_theta) / (2.0 * lambda1) * sine_squared
+        modulus_squared = sine_squared * (
+            self._energy - self.top.gravity_torque * cos_theta) / (2.0 * lambda1)
         u_squared = modulus_squared - v * v
         from_energy = (u * u > self._large_enough * sine_squared) & (u_squared > 0.0)
         u = where(from_energy, copysign(sqrt(where(u_squared > 0.0, u_squared, 0.0)), u), u)

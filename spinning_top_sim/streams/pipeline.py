@@ -37,7 +37,7 @@ STEPS_IN_A_BLOCK = 2000
 Log = Callable[[Sequence[int], int, Sequence[bytes], int], object]
 # Takes a block of samples of a stream: stamps (n,) [ns], and messages as rows of bytes (n, size),
 # valid until it returns.
-Rows = Callable[[Stream, NDArray[np.int64], NDArray[np.uint8]], object]
+TakeRows = Callable[[Stream, NDArray[np.int64], NDArray[np.uint8]], object]
 
 
 class Simulation:
@@ -79,18 +79,24 @@ class Simulation:
         self._steps_before, self._evaluations_before = counts
 
     def _load(self, values: Mapping[str, Any], epoch_ns: int) -> None:
+        # All that may be refused, before anything changes.
         top, start = parameters.top_of(values), parameters.start_state(values)
         segment = Segment(_propagate(top, start, values), start, 0)
+        streams = all_streams(values)
         self.values, self.top = dict(values), top
         self.history: list[tuple[int, float, float]] = []
         self.now_ns = -1
-        streams = all_streams(values)
         for new, old in zip(streams, self.streams, strict=False):
             new.publish, new.log_index = old.publish, old.log_index
             new.sent, new.skipped = old.sent, old.skipped
         self.streams = streams
         self._schedule = Schedule(streams, epoch_ns)
         self._begin(segment)
+
+    def apply(self, values: Mapping[str, Any]) -> None:
+        """Take over the parameters of streams that take effect at once; see `Stream.apply`."""
+        for stream in self.streams:
+            stream.apply(values)
 
     def _begin(self, segment: Segment) -> None:
         self.segment = segment
@@ -254,7 +260,7 @@ class Simulation:
             else:
                 stream.skipped += 1
 
-    def advance_in_blocks(self, target_ns: int, send: Rows) -> None:
+    def advance_in_blocks(self, target_ns: int, send: TakeRows) -> None:
         """
         Send every sample of the recorded streams up to `target_ns`, a block of a stream at a time.
 

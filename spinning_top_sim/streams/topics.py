@@ -38,7 +38,7 @@ class Stream:
     period_ns : of its samples [ns]
     log_index : its number in the log that records it, None for no log; see `Simulation.log_to`
     sent, skipped : counts of samples published, and of those that came too late for that
-    on_change : called when it is published, recorded or sampled otherwise than before
+    on_change : called when its sinks, its rate or the numbers in its samples change
     """
 
     parameter: str
@@ -69,9 +69,19 @@ class Stream:
     def follow(self, segment: Segment) -> None:
         """Begin with the samples of a motion, or of the one after a command."""
 
+    def apply(self, values: Mapping[str, Any]) -> None:
+        """
+        Take over parameters that take effect at once: the rate, where it is among `values`.
+
+        A stream with others of its own takes them here too, and calls `on_change`.
+        """
+        rate = values.get(f'{self.parameter}.rate')
+        if rate is not None and _period_ns(rate) != self.period_ns:
+            self.set_rate(rate)
+
     def set_rate(self, rate: float) -> None:
         """Put the samples on the grid of another rate [Hz]."""
-        self.period_ns = max(1, round(NANOSECONDS / rate))
+        self.period_ns = _period_ns(rate)
         self.on_change()
 
     @property
@@ -114,6 +124,10 @@ class Stream:
         """Return the numbers k of the samples at these times."""
         first = times.start // self.period_ns
         return range(first, first + len(times))
+
+
+def _period_ns(rate: float) -> int:
+    return max(1, round(NANOSECONDS / rate))
 
 
 class Pose(Stream):

@@ -14,7 +14,7 @@ from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.all_streams import all_streams
 from spinning_top_sim.streams.cdr import ENCAPSULATION
-from spinning_top_sim.streams.pipeline import Rows, Simulation
+from spinning_top_sim.streams.pipeline import Simulation, TakeRows
 from spinning_top_sim.streams.schedule import offline_block_ns, offline_targets
 
 EVENT_NAMES = ('start', 'command', 'parameters', 'reset')
@@ -132,7 +132,7 @@ class Rerun:
     Raises DepartureError where there is no motion with these parameters and commands.
     """
 
-    def __init__(self, run: RunDescription, send: Rows | None = None) -> None:
+    def __init__(self, run: RunDescription, send: TakeRows | None = None) -> None:
         self.run, self._send = run, send
         self._stopped = False       # the equations could not go on
         try:
@@ -146,8 +146,7 @@ class Rerun:
             self._reach(run.begun_ns)
         # -1: commands before the first sample.
         simulation.now_ns = -1 if run.begun_ns < 0 else max(run.begun_ns, simulation.now_ns)
-        self._set_rates({name: value for name, value in run.now.items()
-                         if value != run.values[name]})
+        simulation.apply(run.now)
         if send is not None:
             simulation.record_blocks(
                 [stream for stream in simulation.streams if stream.topic in run.topics])
@@ -194,7 +193,8 @@ class Rerun:
                 if applied_ns != event.t_ns:
                     raise ValueError(f'applied at {applied_ns} ns')
             elif event.name == 'parameters':
-                self._set_rates(details)
+                self.simulation.apply({name: parameters.BY_NAME[name].check(value)
+                                       for name, value in details.items()})
             else:
                 self.simulation.restart(parameters.checked(details['parameters']))
                 self.simulation.epoch_ns = int(details['epoch_ns'])
@@ -202,9 +202,3 @@ class Rerun:
         except (KeyError, TypeError, ValueError, IntegrationError) as error:
             raise DepartureError(f'{event.name} at t = {event.t_ns} ns: '
                                  f'{type(error).__name__}: {error}') from error
-
-    def _set_rates(self, changed: Mapping[str, Any]) -> None:
-        for stream in self.simulation.streams:
-            name = f'{stream.parameter}.rate'
-            if name in changed:
-                stream.set_rate(parameters.BY_NAME[name].check(changed[name]))
