@@ -5,16 +5,13 @@ from __future__ import annotations
 
 import re
 
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Chunk
 
 from spinning_top_sim.recording.chunks import MESSAGE_FIELDS
 from spinning_top_sim.recording.records import (
-    CHUNK_HEAD,
     HEAD,
     DamagedError,
-    StrictStream,
     TooLargeError,
     open_chunk,
     parse,
@@ -23,8 +20,9 @@ from spinning_top_sim.recording.summary import McapSource
 
 # What may begin a chunk, a schema, a channel or metadata: opcode and a length below 2^40.
 _CANDIDATE = re.compile(rb'[\x03\x04\x06\x0c](?=.{5}\x00\x00\x00)', re.DOTALL)
-# Where the length of the name is in the content.
-_NAME_OFFSETS: dict[int, int] = {Opcode.SCHEMA: 2, Opcode.CHANNEL: 4, Opcode.METADATA: 0}
+# Where the length of the first text is in the content; a chunk's is followed by that of the data.
+_NAME_OFFSETS: dict[int, int] = {
+    Opcode.SCHEMA: 2, Opcode.CHANNEL: 4, Opcode.METADATA: 0, Opcode.CHUNK: 28}
 
 _LOOK_BYTES = 64                # of the content, enough for a chunk's fields before its data
 _MAX_NAME = 1 << 12
@@ -38,12 +36,7 @@ class RecordFinder:
     """
     Finds records that prove themselves by their inner lengths and, if chunks, their checksum.
 
-    Parameters
-    ----------
-    source : McapSource
-    limit : int
-        Where the data section ends.
-
+    limit : where the data section ends
     """
 
     def __init__(self, source: McapSource, limit: int) -> None:
@@ -56,20 +49,20 @@ class RecordFinder:
         opcode = 0
         try:
             while offset < self._limit:
-                opcode, length = self._source.head(offset, self._limit)
+                opcode, end = self._source.head(offset, self._limit)
                 if opcode <= Opcode.DATA_END:
                     break
-                offset += HEAD.size + length
-            if offset == self._limit:
-                return True
+                offset = end
+            else:
+                return offset == self._limit
             if opcode == Opcode.MESSAGE:
-                return length >= MESSAGE_FIELDS
+                return end - offset >= HEAD.size + MESSAGE_FIELDS
             if opcode == Opcode.ATTACHMENT:
-                self._source.attachment(offset, length)
-            elif opcode == Opcode.CHUNK or opcode in _NAME_OFFSETS:
+                self._source.attachment(offset, end)
+            elif opcode in _NAME_OFFSETS:
                 self._prove(offset)
             else:
-                self._source.record(offset, self._limit)
+                self._source.record(offset, end)
         except TooLargeError:
             return opcode == Opcode.CHUNK
         except DamagedError:
@@ -102,14 +95,15 @@ class RecordFinder:
 
         Raises DamagedError if it is none, TooLargeError if it might be one.
         """
-        opcode, length = self._source.head(offset, self._limit)
+        opcode, end = self._source.head(offset, self._limit)
         # First what needs no more than a look: most candidates are none.
-        if not _looks_right(opcode, length, self._source.read(offset + HEAD.size, _LOOK_BYTES)):
+        start = offset + HEAD.size
+        if not _looks_right(opcode, end - start, self._source.read(start, _LOOK_BYTES)):
             raise DamagedError('its lengths do not fit')
-        self._effort -= length
+        self._effort -= end - start
         if self._effort < 0:
             raise DamagedError('the file has candidates everywhere')
-        record, extra = parse(opcode, self._source.content(offset, length))
+        record, extra = parse(opcode, self._source.content(offset, end))
         if not isinstance(record, Chunk):
             return extra
         contents = open_chunk(record, self._source.max_bytes)
@@ -120,14 +114,10 @@ class RecordFinder:
 
 def _looks_right(opcode: int, length: int, start: bytes) -> bool:
     """Return whether a chunk, schema, channel or metadata of this length may start so."""
+    name_start = _NAME_OFFSETS[opcode] + 4
+    name_size = int.from_bytes(start[name_start - 4:name_start], 'little')
     if opcode == Opcode.CHUNK:
-        stream = StrictStream(start[CHUNK_HEAD.size:])
-        try:
-            stream.read_prefixed_string()
-            data_size = stream.read8()
-        except (McapError, UnicodeDecodeError):
-            return False
-        return 0 <= length - (CHUNK_HEAD.size + stream.count + data_size) <= _MAX_EXTRA
-    offset = _NAME_OFFSETS[opcode]
-    name_size = int.from_bytes(start[offset:offset + 4], 'little')
+        data_start = name_start + name_size + 8
+        data_size = int.from_bytes(start[data_start - 8:data_start], 'little')
+        return 0 <= length - data_start - data_size <= _MAX_EXTRA
     return 0 < name_size < _MAX_NAME and length <= _MAX_DECLARATION
