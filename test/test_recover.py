@@ -688,7 +688,7 @@ def test_a_bag_of_rosbags_is_recovered(tmp_path):
     assert code == ALL_KEPT, (out, err)
     output = tmp_path / 'whole.mcap'
     assert seen_by_rosbags(output) == seen_by_mcap(output) == seen_by_us(output) == expected
-    assert 'name: "/number"' in metadata_of(output)['rosbag2']['serialized_metadata']
+    assert 'name: /number\n' in metadata_of(output)['rosbag2']['serialized_metadata']
 
 
 def test_what_rosbag2_wrote_of_the_distribution_stays(tmp_path):
