@@ -289,7 +289,6 @@ def test_a_channel_that_stands_behind_its_messages_is_enough(tmp_path):
     assert seen_by_us(path) == seen_by_us(output) == seen_by_mcap(output) == [('/a', 5, b'x')]
     with LogReader(path) as reader:
         assert reader.damage.lossless
-        assert reader.damage.messages == {'/a': 1}
 
 
 @pytest.mark.parametrize('kind', STRANGERS)

@@ -36,13 +36,11 @@ class Damage:
     truncated: bool                 # the file does not end as an MCAP file ends
     losses: tuple[Loss, ...]        # in the order of the file
     defects: tuple[str, ...]        # what is wrong but known from elsewhere in the file
-    messages: Mapping[str, int]     # whole messages per topic
     # Lost messages per topic ('' if unknown): exact if `missing_exactly`, else a lower bound from
     # gaps in sequence numbers and from the indexes of lost chunks.
     missing: Mapping[str, int]
     missing_exactly: bool
-    start_ns: int                   # the earliest log time of the whole messages; 0 without any
-    end_ns: int                     # the latest
+    end_ns: int                     # the latest log time of the whole messages; 0 without any
 
     @property
     def lossless(self) -> bool:
@@ -63,12 +61,6 @@ class Damage:
     def missing_messages(self) -> int:
         """Lost messages: exact if `missing_exactly`, else a lower bound."""
         return sum(self.missing.values())
-
-    @property
-    def missing_spans(self) -> tuple[tuple[int, int], ...]:
-        """The earliest and the latest log time of each lost chunk [ns]."""
-        return tuple((loss.start_ns, loss.end_ns) for loss in self.losses
-                     if loss.start_ns is not None and loss.end_ns is not None)
 
     def lines(self) -> list[str]:
         """Return a human-readable report: the sums if something is lost, then each loss."""

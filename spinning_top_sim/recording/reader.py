@@ -25,12 +25,11 @@ from spinning_top_sim.recording.chunks import time_span
 from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.errors import NotMcapError
 from spinning_top_sim.recording.records import (
-    HEAD,
     MAX_BYTES,
+    ChunkContents,
     DamagedError,
-    StoredMessage,
+    break_up,
     open_chunk,
-    parse_message,
 )
 from spinning_top_sim.recording.rosbag2 import Qos, parse_offered_qos
 from spinning_top_sim.recording.scanner import Scanner
@@ -177,13 +176,14 @@ class LogReader:
             ready = bisect.bisect_left(pending, span.start_ns, key=itemgetter(0))
             yield from map(itemgetter(3), pending[:ready])
             del pending[:ready]
-            plain, stored = self._read(span)
-            for number, (time_ns, channel, sequence, publish_ns, begin, stop) in enumerate(stored):
+            contents = self._read(span)
+            for number, (time_ns, channel, sequence, publish_ns, begin, stop) in enumerate(
+                    contents.messages):
                 if (channel in channels and (start is None or time_ns >= start)
                         and (end is None or time_ns < end)):
                     pending.append((time_ns, span.offset, number, LogMessage(
-                        channels[channel], time_ns, publish_ns, sequence, plain[begin:stop],
-                        channel)))
+                        channels[channel], time_ns, publish_ns, sequence,
+                        contents.plain[begin:stop], channel)))
         pending.sort()
         yield from map(itemgetter(3), pending)
 
@@ -236,20 +236,18 @@ class LogReader:
             raise NotMcapError(f'cannot read {self.path}: it is no MCAP file')
         return Header(profile='ros2', library='')
 
-    def _read(self, span: _Span) -> tuple[bytes, list[StoredMessage]]:
-        """Return the messages of a span and the bytes they are in; none if it is damaged."""
+    def _read(self, span: _Span) -> ChunkContents:
+        """Return the messages of a span; none if it is damaged."""
         try:
             if self.source.read(span.offset, 1) == bytes([Opcode.MESSAGE]):
-                content = self.source.read(span.offset, span.end - span.offset)
-                return content, list(_single_messages(content))
+                return break_up(self.source.read(span.offset, span.end - span.offset))
             chunk = self.source.record(span.offset, span.end)
             if isinstance(chunk, Chunk):
-                contents = open_chunk(chunk, self.source.max_bytes)
-                return contents.plain, contents.messages
+                return open_chunk(chunk, self.source.max_bytes)
         except DamagedError:
             pass
         self.left_out += 1
-        return b'', []
+        return ChunkContents(b'')
 
 
 def _scan_all(scanner: Scanner) -> _Index:
@@ -273,16 +271,6 @@ def _scan_all(scanner: Scanner) -> _Index:
             run = span
             spans.append(run)
     return _Index(sorted(spans), metadata)
-
-
-def _single_messages(records: bytes) -> Iterator[StoredMessage]:
-    """Yield the messages of message records that stand one after the other."""
-    offset = 0
-    while offset < len(records):
-        _, length = HEAD.unpack_from(records, offset)
-        offset += HEAD.size
-        yield parse_message(records, offset, offset + length)
-        offset += length
 
 
 def qos_profiles(channel: Channel) -> tuple[Qos, ...]:

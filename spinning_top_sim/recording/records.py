@@ -65,7 +65,7 @@ class StoredMessage(NamedTuple):
 
 @dataclass
 class ChunkContents:
-    """The content of a chunk whose checksum is right, or a single message."""
+    """The content of a chunk whose checksum is right, or of messages outside of chunks."""
 
     plain: bytes    # uncompressed
     messages: list[StoredMessage] = field(default_factory=list)     # in the order of the file
@@ -126,15 +126,6 @@ def parse(opcode: int, content: bytes) -> tuple[McapRecord, int]:
     return record, len(content) - stream.count
 
 
-def parse_message(content: bytes, start: int, end: int) -> StoredMessage:
-    """Return the message whose record has its fields and data there; raises DamagedError."""
-    if end - start < MESSAGE_FIELDS:
-        raise DamagedError('a message is shorter than a message can be')
-    channel_id, sequence, log_time, publish_time = _FIELDS.unpack_from(content, start)
-    return StoredMessage(
-        log_time, channel_id, sequence, publish_time, start + MESSAGE_FIELDS, end)
-
-
 def open_chunk(chunk: Chunk, max_bytes: int = MAX_BYTES) -> ChunkContents:
     """
     Decompress and check a chunk; raises DamagedError.
@@ -146,6 +137,11 @@ def open_chunk(chunk: Chunk, max_bytes: int = MAX_BYTES) -> ChunkContents:
         raise DamagedError('it has not the size that it says it has')
     if chunk.uncompressed_crc and zlib.crc32(plain) != chunk.uncompressed_crc:
         raise DamagedError('its checksum is wrong')
+    return break_up(plain)
+
+
+def break_up(plain: bytes) -> ChunkContents:
+    """Return the messages and declarations among records that stand one after the other."""
     contents = ChunkContents(plain)
     size = len(plain)
     offset = 0
@@ -158,7 +154,11 @@ def open_chunk(chunk: Chunk, max_bytes: int = MAX_BYTES) -> ChunkContents:
         if offset > size:
             raise DamagedError('a record in it leads beyond its end')
         if opcode == _MESSAGE_OPCODE:
-            contents.messages.append(parse_message(plain, start, offset))
+            if length < MESSAGE_FIELDS:
+                raise DamagedError('a message is shorter than a message can be')
+            channel_id, sequence, log_time, publish_time = _FIELDS.unpack_from(plain, start)
+            contents.messages.append(StoredMessage(
+                log_time, channel_id, sequence, publish_time, start + MESSAGE_FIELDS, offset))
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             record, _ = parse(opcode, plain[start:offset])
             assert isinstance(record, Schema | Channel)

@@ -28,7 +28,7 @@ _LOOK_BYTES = 64                # of the content, enough for a chunk's fields be
 _MAX_NAME = 1 << 12
 _MAX_DECLARATION = 1 << 24
 _MAX_EXTRA = 1 << 10
-_FIRST_BLOCK, _MAX_BLOCK = 1 << 13, 1 << 20
+_BLOCK = 1 << 16                # searched at a time
 _MAX_EFFORT = 4                 # bytes of candidates read, as a multiple of the file's size
 
 
@@ -46,27 +46,23 @@ class RecordFinder:
 
     def is_record(self, offset: int) -> bool:
         """Return whether a record of a known kind begins there, or the data section ends."""
-        opcode = 0
         try:
-            while offset < self._limit:
-                opcode, end = self._source.head(offset, self._limit)
-                if opcode <= Opcode.DATA_END:
-                    break
+            opcode, end = self._source.head(offset, self._limit)
+            while opcode > Opcode.DATA_END:
                 offset = end
-            else:
-                return offset == self._limit
+                opcode, end = self._source.head(offset, self._limit)
             if opcode == Opcode.MESSAGE:
                 return end - offset >= HEAD.size + MESSAGE_FIELDS
             if opcode == Opcode.ATTACHMENT:
                 self._source.attachment(offset, end)
             elif opcode in _NAME_OFFSETS:
-                self._prove(offset)
+                self._prove(opcode, offset, end)
             else:
                 self._source.record(offset, end)
         except TooLargeError:
             return opcode == Opcode.CHUNK
         except DamagedError:
-            return False
+            return offset == self._limit
         return True
 
     def find(self, offset: int) -> int:
@@ -75,27 +71,17 @@ class RecordFinder:
 
         Single messages are not looked for: nothing in them tells them from chance.
         """
-        size = _FIRST_BLOCK
         while offset < self._limit:
-            block = self._source.read(offset, size + HEAD.size)
-            for match in _CANDIDATE.finditer(block, 0, size + HEAD.size - 1):
+            block = self._source.read(offset, _BLOCK + HEAD.size)
+            for match in _CANDIDATE.finditer(block, 0, _BLOCK + HEAD.size - 1):
                 place = offset + match.start()
-                try:
-                    if not self._prove(place):
-                        return place
-                except DamagedError:
-                    continue
-            offset += size
-            size = min(2 * size, _MAX_BLOCK)
+                if self.is_record(place):
+                    return place
+            offset += _BLOCK
         return self._limit
 
-    def _prove(self, offset: int) -> int:
-        """
-        Return how many bytes the record has behind its known fields, 0 for a chunk.
-
-        Raises DamagedError if it is none, TooLargeError if it might be one.
-        """
-        opcode, end = self._source.head(offset, self._limit)
+    def _prove(self, opcode: int, offset: int, end: int) -> None:
+        """Raise DamagedError unless it is a chunk, schema, channel or metadata."""
         # First what needs no more than a look: most candidates are none.
         start = offset + HEAD.size
         if not _looks_right(opcode, end - start, self._source.read(start, _LOOK_BYTES)):
@@ -103,13 +89,11 @@ class RecordFinder:
         self._effort -= end - start
         if self._effort < 0:
             raise DamagedError('the file has candidates everywhere')
-        record, extra = parse(opcode, self._source.content(offset, end))
-        if not isinstance(record, Chunk):
-            return extra
-        contents = open_chunk(record, self._source.max_bytes)
-        if not contents.messages and not contents.declared:
-            raise DamagedError('it is empty')       # zeros in data look like that
-        return 0
+        record, _ = parse(opcode, self._source.content(offset, end))
+        if isinstance(record, Chunk):
+            contents = open_chunk(record, self._source.max_bytes)
+            if not contents.messages and not contents.declared:
+                raise DamagedError('it is empty')       # zeros in data look like that
 
 
 def _looks_right(opcode: int, length: int, start: bytes) -> bool:

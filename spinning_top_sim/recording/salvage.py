@@ -129,8 +129,10 @@ class _Copy:
     def put_rest(self) -> None:
         """Write what is left: messages, and channels that only the summary tells."""
         self._writer.write_chunk()
-        for record in (*self._scanner.schemas.values(), *self._scanner.channels.values()):
-            self._declare(record)
+        for schema in self._scanner.schemas.values():
+            self._declare(schema)
+        for channel in self._scanner.channels.values():
+            self._declare(channel)
 
     def _put_messages(self, scanned: ScannedRecord) -> None:
         contents = scanned.contents

@@ -42,10 +42,10 @@ from spinning_top_sim.recording.records import (
     ChunkContents,
     DamagedError,
     TooLargeError,
+    break_up,
     name_of,
     open_chunk,
     parse,
-    parse_message,
 )
 from spinning_top_sim.recording.resync import RecordFinder
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA
@@ -100,11 +100,9 @@ class Scanner:
         # What should follow a chunk: its message indexes by channel; what a lost one held.
         self._expected: dict[int, bytes] = {}
         self._lost_chunk: Loss | None = None
-        self._chunks_seen = False
-        self._data_until = 0    # a record of the data section stands there
 
         self._found: Counter[int] = Counter()           # whole messages by channel
-        self._start_ns = self._end_ns = 0               # their earliest and latest log time
+        self._end_ns = 0                                # their latest log time
         self._in_lost_chunks: Counter[int] = Counter()  # messages by channel
         self._gaps: Counter[int] = Counter()            # by sequence numbers
         self._next_sequence: dict[int, int] = {}
@@ -114,20 +112,26 @@ class Scanner:
         if self._source.read(0, MAGIC_SIZE) != MCAP0_MAGIC:
             self._defects.append('the first eight bytes are not those of an MCAP file')
         offset = MAGIC_SIZE
+        in_summary = False      # whose beginning nothing told
         # The last bytes before a summary can only be the end record.
         while offset < self._limit - (_DATA_END_SIZE if self._has_limit else 0):
             try:
                 scanned = self._scan(offset)
             except DamagedError as damage:
+                if in_summary:
+                    break
                 offset = self._skip(offset, damage)
                 continue
             if scanned is None:
                 break
-            if scanned.opcode != Opcode.MESSAGE_INDEX:
-                self._expected, self._lost_chunk = {**scanned.indexes}, None
-            for block in self.blocks(scanned):
-                self._crc = zlib.crc32(block, self._crc)
-            yield scanned
+            in_summary = scanned.opcode in _SUMMARY_KINDS or (
+                in_summary and scanned.opcode in (Opcode.SCHEMA, Opcode.CHANNEL))
+            if not in_summary:
+                if scanned.opcode != Opcode.MESSAGE_INDEX:
+                    self._expected, self._lost_chunk = {**scanned.indexes}, None
+                for block in self.blocks(scanned):
+                    self._crc = zlib.crc32(block, self._crc)
+                yield scanned
             offset = scanned.end
         self._check_end(offset)
 
@@ -160,13 +164,10 @@ class Scanner:
         missing: Counter[str] = Counter()
         for number, messages in sorted((+lost).items()):
             missing[self.channels[number].topic if self._summary.knows(number) else ''] += messages
-        found: Counter[str] = Counter()
-        for number, channel in self.channels.items():
-            found[channel.topic] += self._found[number]
         return Damage(
             truncated=not self._summary.closed, losses=tuple(losses),
-            defects=tuple(self._defects), messages=dict(found), missing=dict(missing),
-            missing_exactly=statistics is not None, start_ns=self._start_ns, end_ns=self._end_ns)
+            defects=tuple(self._defects), missing=dict(missing),
+            missing_exactly=statistics is not None, end_ns=self._end_ns)
 
     # Reading records.  All of these raise DamagedError.
 
@@ -196,11 +197,12 @@ class Scanner:
         # Nothing but what follows proves that bytes behind the known fields belong to the record.
         if extra and (self._ours or not self._finder.is_record(end)):
             raise DamagedError('its length is not that of its content')
-        if opcode == Opcode.DATA_END or opcode in _SUMMARY_KINDS:
-            certain = opcode == Opcode.DATA_END and (
-                end == self._limit if self._has_limit else not extra)
-            if certain or (not self._has_limit and self._is_data_over(end)):
-                return None
+        if opcode == Opcode.DATA_END and (
+                end == self._limit if self._has_limit else not extra):
+            return None
+        # Without extra fields, what belongs to a summary is no chunk of a damaged kind.
+        if opcode == Opcode.DATA_END or (
+                opcode in _SUMMARY_KINDS and (self._has_limit or extra)):
             raise DamagedError('it has no place before the end of the data section')
         scanned = ScannedRecord(opcode, offset, end, record, raw)
         if isinstance(record, Chunk):
@@ -226,12 +228,11 @@ class Scanner:
             self._defects.append(f'the chunk at byte {scanned.offset} has wrong times in its head')
             chunk = replace(chunk, message_start_time=start_ns, message_end_time=end_ns)
             raw = raw[:HEAD.size] + record_bytes(chunk)[HEAD.size:] + extra
-        self._chunks_seen = True
         return self._take_messages(contents, replace(
             scanned, record=chunk, raw=raw, indexes=message_indexes(contents.entries)))
 
     def _scan_message(self, offset: int, raw: bytes) -> ScannedRecord:
-        message = parse_message(raw, HEAD.size, len(raw))
+        contents = break_up(raw)
         if self._all_in_chunks:
             raise DamagedError('all messages of the file are in chunks')
         end = offset + len(raw)
@@ -242,7 +243,7 @@ class Scanner:
             except DamagedError:
                 raise DamagedError('no record follows it') from None
         return self._take_messages(
-            ChunkContents(raw, [message]), ScannedRecord(Opcode.MESSAGE, offset, end, raw=raw))
+            contents, ScannedRecord(Opcode.MESSAGE, offset, end, raw=raw))
 
     def _scan_attachment(self, offset: int, end: int) -> ScannedRecord:
         index, crc_offset = self._source.attachment(offset, end)
@@ -271,17 +272,18 @@ class Scanner:
         unknown = {number for number in contents.entries if not self._summary.knows(number)}
         if unknown:
             for message in contents.messages:
-                if message.channel_id in unknown:
-                    self._lose_message(scanned.offset, message.channel_id,
-                                       message.end - message.start)
+                number = message.channel_id
+                if number in unknown:
+                    loss = self._unknown.setdefault(number, Loss(
+                        scanned.offset, 0, f'messages of channel {number}',
+                        'the record of their channel or schema is lost'))
+                    loss.bytes += message.end - message.start
+                    loss.messages = (loss.messages or 0) + 1
             contents = ChunkContents(contents.plain, [
                 message for message in contents.messages if message.channel_id not in unknown])
-        if contents.messages:
-            start_ns, end_ns = time_span(contents.entries)
-            self._start_ns = min(start_ns, self._start_ns) if self._found else start_ns
-            self._end_ns = max(end_ns, self._end_ns)
-            for number, entries in contents.entries.items():
-                self._found[number] += len(entries) // 2
+        self._end_ns = max(self._end_ns, time_span(contents.entries)[1])
+        for number, entries in contents.entries.items():
+            self._found[number] += len(entries) // 2
         if self._ours:
             for message in contents.messages:
                 number = message.channel_id
@@ -372,39 +374,14 @@ class Scanner:
                 if 0 < start_ns <= end_ns:
                     loss.start_ns, loss.end_ns = start_ns, end_ns
         if loss.what == name_of(Opcode.CHUNK):
-            self._chunks_seen = True
             self._lost_chunk = loss
-
-    def _lose_message(self, offset: int, channel_id: int, size: int) -> None:
-        """Note that a message of an unknown channel is lost."""
-        loss = self._unknown.setdefault(channel_id, Loss(
-            offset, 0, f'messages of channel {channel_id}',
-            'the record of their channel or schema is lost', messages=0))
-        loss.bytes += size
-        loss.messages = (loss.messages or 0) + 1
 
     def _is_redundant(self, offset: int, opcode: int) -> bool:
         """Return whether a truncated record tells nothing of its own."""
         if opcode == Opcode.METADATA:
             name = record_bytes(Metadata(BAG_METADATA, {}))[HEAD.size:-4]
-            start = self._source.read(offset + HEAD.size, len(name))
-            # Files of this package have no other metadata behind their chunks.
-            return start == name or (self._ours and self._chunks_seen)
+            return name.startswith(self._source.read(offset + HEAD.size, len(name)))
         return opcode == Opcode.DATA_END or opcode in _SUMMARY_KINDS
-
-    def _is_data_over(self, offset: int) -> bool:
-        """Return whether no record of a data section follows, up to what is damaged."""
-        while self._data_until < offset < self._limit:
-            try:
-                opcode, end = self._source.head(offset, self._limit)
-            except DamagedError:
-                break
-            if opcode <= Opcode.DATA_END and opcode not in (
-                    Opcode.SCHEMA, Opcode.CHANNEL, *_SUMMARY_KINDS):
-                self._data_until = offset       # so that all looks together take linear time
-                return False
-            offset = end
-        return offset > self._data_until
 
     def _next_place(self, offset: int) -> int:
         """Return where the next record stands that the summary indexes, or the limit."""

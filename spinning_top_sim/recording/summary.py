@@ -7,9 +7,11 @@ import contextlib
 import os
 import stat
 import zlib
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -218,7 +220,7 @@ def read_summary(source: McapSource) -> Summary:
 
 def _read_section(source: McapSource, start: int, end: int) -> Summary:
     """Return the summary between two offsets; raises DamagedError if it does not fit the file."""
-    summary = Summary(start, closed=True)
+    found: dict[type, list[Any]] = defaultdict(list)
     offset = start
     while offset < end:
         try:
@@ -227,18 +229,13 @@ def _read_section(source: McapSource, start: int, end: int) -> Summary:
         except DamagedError as damage:
             raise DamagedError(f'the summary is damaged: {damage}') from None
         offset = record_end
-        if isinstance(record, Schema):
-            summary.schemas[record.id] = record
-        elif isinstance(record, Channel):
-            summary.channels[record.id] = record
-        elif isinstance(record, Statistics):
-            summary.statistics = record
-        elif isinstance(record, ChunkIndex):
-            summary.chunks[record.chunk_start_offset] = record
-        elif isinstance(record, MetadataIndex):
-            summary.metadata.append(record)
-        elif isinstance(record, AttachmentIndex):
-            summary.attachments.append(record)
+        found[type(record)].append(record)
+    summary = Summary(
+        start, closed=True, schemas={schema.id: schema for schema in found[Schema]},
+        channels={channel.id: channel for channel in found[Channel]},
+        statistics=next(reversed(found[Statistics]), None),
+        chunks={index.chunk_start_offset: index for index in found[ChunkIndex]},
+        metadata=found[MetadataIndex], attachments=found[AttachmentIndex])
     if any(index.chunk_start_offset + index.chunk_length > start
            for index in summary.chunks.values()):
         raise DamagedError(
