@@ -262,14 +262,13 @@ def _scan_all(scanner: Scanner) -> _Index:
             continue
         start_ns, end_ns = time_span(scanned.contents.entries)
         span = _Span(start_ns, scanned.offset, scanned.end, end_ns)
-        if scanned.record is not None:
-            spans.append(span)
-        elif run is not None and run.end == span.offset and run.end - run.offset < _RUN_BYTES:
+        if (scanned.record is None and run is not None and run.end == span.offset
+                and run.end - run.offset < _RUN_BYTES):
             run = spans[-1] = _Span(min(run.start_ns, start_ns), run.offset, span.end,
                                     max(run.end_ns, end_ns))
-        else:
-            run = span
-            spans.append(run)
+            continue
+        spans.append(span)
+        run = span if scanned.record is None else None
     return _Index(sorted(spans), metadata)
 
 

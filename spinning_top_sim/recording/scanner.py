@@ -52,6 +52,7 @@ from spinning_top_sim.recording.rosbag2 import BAG_METADATA
 from spinning_top_sim.recording.summary import MAGIC_SIZE, McapSource, Summary
 
 _DATA_END_SIZE = HEAD.size + 4
+_TIMES = struct.Struct('<QQ')       # of a chunk, behind its head
 _INDEX_HEAD = HEAD.size + 2 + 4     # of a message index, before its entries
 _SUMMARY_KINDS = (Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.METADATA_INDEX,
                   Opcode.ATTACHMENT_INDEX, Opcode.SUMMARY_OFFSET, Opcode.FOOTER)
@@ -160,7 +161,6 @@ class Scanner:
             if not losses:
                 # A whole file that was made of a truncated one still tells what that had lost.
                 lost.update(self._gaps)
-
         missing: Counter[str] = Counter()
         for number, messages in sorted((+lost).items()):
             missing[self.channels[number].topic if self._summary.knows(number) else ''] += messages
@@ -206,7 +206,7 @@ class Scanner:
             raise DamagedError('it has no place before the end of the data section')
         scanned = ScannedRecord(opcode, offset, end, record, raw)
         if isinstance(record, Chunk):
-            return self._scan_chunk(scanned, record, content[len(content) - extra:])
+            return self._scan_chunk(scanned, record)
         if isinstance(record, MessageIndex):
             self._check_message_index(offset, record)
         elif isinstance(record, Schema | Channel):
@@ -217,7 +217,7 @@ class Scanner:
             raise DamagedError('it has no place but at the beginning')
         return scanned
 
-    def _scan_chunk(self, scanned: ScannedRecord, chunk: Chunk, extra: bytes) -> ScannedRecord:
+    def _scan_chunk(self, scanned: ScannedRecord, chunk: Chunk) -> ScannedRecord:
         contents = open_chunk(chunk, self._source.max_bytes)
         for record in contents.declared:
             self._declare(scanned.offset, record)
@@ -227,7 +227,7 @@ class Scanner:
                 chunk.message_start_time, chunk.message_end_time):
             self._defects.append(f'the chunk at byte {scanned.offset} has wrong times in its head')
             chunk = replace(chunk, message_start_time=start_ns, message_end_time=end_ns)
-            raw = raw[:HEAD.size] + record_bytes(chunk)[HEAD.size:] + extra
+            raw = raw[:HEAD.size] + _TIMES.pack(start_ns, end_ns) + raw[HEAD.size + _TIMES.size:]
         return self._take_messages(contents, replace(
             scanned, record=chunk, raw=raw, indexes=message_indexes(contents.entries)))
 
@@ -236,12 +236,9 @@ class Scanner:
         if self._all_in_chunks:
             raise DamagedError('all messages of the file are in chunks')
         end = offset + len(raw)
-        # Nothing in a message proves its length but the record that follows.
+        # Nothing in a message proves its length but the record that follows, perhaps truncated.
         if end < self._limit and not 0 < self._source.read(end, 1)[0] <= Opcode.DATA_END:
-            try:
-                self._source.head(end, self._limit)
-            except DamagedError:
-                raise DamagedError('no record follows it') from None
+            self._source.head(end, self._limit)
         return self._take_messages(
             contents, ScannedRecord(Opcode.MESSAGE, offset, end, raw=raw))
 
@@ -368,11 +365,10 @@ class Scanner:
         if index is not None:
             loss.start_ns, loss.end_ns = index.message_start_time, index.message_end_time
         elif opcode == Opcode.CHUNK:
-            times = self._source.read(offset + HEAD.size, 8 + 8)
-            if len(times) == 8 + 8:
-                start_ns, end_ns = struct.unpack('<QQ', times)
-                if 0 < start_ns <= end_ns:
-                    loss.start_ns, loss.end_ns = start_ns, end_ns
+            times = self._source.read(offset + HEAD.size, _TIMES.size)
+            start_ns, end_ns = _TIMES.unpack(times) if len(times) == _TIMES.size else (0, 0)
+            if 0 < start_ns <= end_ns:
+                loss.start_ns, loss.end_ns = start_ns, end_ns
         if loss.what == name_of(Opcode.CHUNK):
             self._lost_chunk = loss
 

@@ -198,19 +198,18 @@ def read_summary(source: McapSource) -> Summary:
         return Summary(source.size, problem='the file does not end as an MCAP file ends')
     try:
         footer = source.record(footer_offset, magic_offset)
-        if not isinstance(footer, Footer):
-            raise DamagedError('no footer')
     except DamagedError:
+        footer = None
+    if not isinstance(footer, Footer):
         return Summary(source.size, problem='the footer is damaged')
-    start = footer.summary_start
+    start, size = footer.summary_start, source.size - footer.summary_start
     if start == 0:
         return Summary(footer_offset, closed=True)
     try:
         if not MAGIC_SIZE <= start <= footer_offset:
             raise DamagedError('the footer leads to no summary')
-        if source.size - start > source.max_bytes:
-            raise DamagedError(
-                f'the summary is not read: {TooLargeError(source.size - start, source.max_bytes)}')
+        if size > source.max_bytes:
+            raise DamagedError(f'the summary is not read: {TooLargeError(size, source.max_bytes)}')
         if footer.summary_crc not in (0, source.crc(start, magic_offset - 4)):
             raise DamagedError('the checksum of the summary is wrong')
         return _read_section(source, start, footer_offset)
@@ -225,11 +224,12 @@ def _read_section(source: McapSource, start: int, end: int) -> Summary:
     while offset < end:
         try:
             opcode, record_end = source.head(offset, end)
-            record = source.record(offset, end) if opcode <= Opcode.DATA_END else None
+            if opcode <= Opcode.DATA_END:
+                record, _ = parse(opcode, source.content(offset, record_end))
+                found[type(record)].append(record)
         except DamagedError as damage:
             raise DamagedError(f'the summary is damaged: {damage}') from None
         offset = record_end
-        found[type(record)].append(record)
     summary = Summary(
         start, closed=True, schemas={schema.id: schema for schema in found[Schema]},
         channels={channel.id: channel for channel in found[Channel]},
