@@ -126,7 +126,7 @@ def parse(opcode: int, content: bytes) -> tuple[McapRecord, int]:
     return record, len(content) - stream.count
 
 
-def open_chunk(chunk: Chunk, max_bytes: int = MAX_BYTES) -> ChunkContents:
+def open_chunk(chunk: Chunk, max_bytes: int) -> ChunkContents:
     """
     Decompress and check a chunk; raises DamagedError.
 

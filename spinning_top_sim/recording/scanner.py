@@ -49,11 +49,10 @@ from spinning_top_sim.recording.records import (
 )
 from spinning_top_sim.recording.resync import RecordFinder
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA
-from spinning_top_sim.recording.summary import MAGIC_SIZE, McapSource, Summary
+from spinning_top_sim.recording.summary import INDEX_SIZE, MAGIC_SIZE, McapSource, Summary
 
 _DATA_END_SIZE = HEAD.size + 4
 _TIMES = struct.Struct('<QQ')       # of a chunk, behind its head
-_INDEX_HEAD = HEAD.size + 2 + 4     # of a message index, before its entries
 _SUMMARY_KINDS = (Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.METADATA_INDEX,
                   Opcode.ATTACHMENT_INDEX, Opcode.SUMMARY_OFFSET, Opcode.FOOTER)
 
@@ -302,7 +301,7 @@ class Scanner:
         expected = self._expected.get(index.channel_id)
         # The entries may be in any order, and a channel without messages may have an index.
         if messages and (expected is None or sorted(index.records) != sorted(
-                struct.iter_unpack('<QQ', expected[_INDEX_HEAD:]))):
+                struct.iter_unpack('<QQ', expected[INDEX_SIZE:]))):
             if self._damaged_indexes_end(offset):
                 raise DamagedError('it does not agree with its chunk')
             self._defects.append(f'the message index at byte {offset} is wrong')

@@ -37,11 +37,11 @@ from spinning_top_sim.recording.records import (
 )
 
 MAGIC_SIZE = len(MCAP0_MAGIC)
+INDEX_SIZE = HEAD.size + 2 + 4  # of a message index without its entries, 16 bytes each
 
 _FOOTER_SIZE = HEAD.size + 8 + 8 + 4
 _BLOCK = 1 << 20  # bytes read at a time where a record is not needed whole
 _ATTACHMENT_HEAD = 1 << 16  # bytes; more than any name and media type
-_INDEX_SIZE = HEAD.size + 2 + 4  # of a message index without its entries, 16 bytes each
 
 
 class McapSource:
@@ -169,7 +169,7 @@ class Summary:
     def indexes_all_messages(self) -> bool:
         """Whether the chunk indexes lead to as many messages as the statistics count."""
         indexed = sum(
-            (index.message_index_length - _INDEX_SIZE * len(index.message_index_offsets)) // 16
+            (index.message_index_length - INDEX_SIZE * len(index.message_index_offsets)) // 16
             for index in self.chunks.values())
         return self.statistics is not None and indexed == self.statistics.message_count
 
