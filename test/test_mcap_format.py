@@ -267,16 +267,18 @@ def test_a_record_of_another_kind_costs_no_other_chunk(tmp_path, bit):
             message for message in messages if message[1] not in lost], (opcode, start)
 
 
-@pytest.mark.parametrize('flip', [False, True])
-def test_a_summary_behind_a_damaged_end_of_the_data_is_no_data(tmp_path, flip):
-    """In a truncated file nothing else tells where it begins; it may be damaged itself."""
+@pytest.mark.parametrize('truncated', [False, True])
+def test_a_summary_behind_a_damaged_end_of_the_data_is_no_data(tmp_path, truncated):
+    """Nothing else tells where it begins if the file is truncated, or it is damaged itself."""
     path = tmp_path / 'a.mcap'
     messages = write_stranger(path, {})
-    content = bytearray(path.read_bytes()[:-10])
-    records = records_of(path.read_bytes())
+    content = bytearray(path.read_bytes())
+    records = records_of(content)
     end = next(start for opcode, start, _ in records if opcode == Opcode.DATA_END)
     content[end + 1] ^= 1
-    if flip:
+    if truncated:
+        del content[-10:]
+    else:
         index = next(start for opcode, start, _ in records if opcode == Opcode.ATTACHMENT_INDEX)
         content[index + 4] ^= 1
     path.write_bytes(content)
