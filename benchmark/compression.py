@@ -56,7 +56,10 @@ def chunks_at(rate: float, count: int) -> list[bytes]:
         simulation.log_to(lambda *messages: taken.append(messages), streams)
         for k in range(1, count + 1):
             simulation.advance(k * CHUNK_NS)
-            file.append_all(taken)
+            for indices, stamp_ns, messages, _ in taken:
+                for index, message in zip(indices, messages, strict=True):
+                    file.append(index, stamp_ns, message)
+            file.write_chunk()
             taken.clear()
         file.finish()
         with path.open('rb') as log:

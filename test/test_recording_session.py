@@ -179,11 +179,11 @@ def test_a_second_start_and_a_second_stop_do_nothing(tmp_path):
     assert recorded.session.stop() is None
 
 
-def test_a_recording_that_fails_is_closed_and_says_why(tmp_path, monkeypatch):
+def test_a_recording_that_fails_is_closed_and_says_why(tmp_path):
     recorded = Recorded(tmp_path / 'one.mcap')
     recorded.start()
     assert recorded.session.check() is None
-    monkeypatch.setattr(McapRecorder, 'error', 'the disk is gone')
+    recorded.session._recorder.error = 'the disk is gone'
     assert recorded.session.check() == 'the disk is gone'
     assert recorded.session.check() is None
     assert recorded.session.error == 'the disk is gone'

@@ -217,7 +217,6 @@ def test_a_cut_file_can_be_read(tmp_path, log):
             read = [(message.topic, message.log_time, message.data)
                     for message in reader.messages()]
             assert read == log.messages[:whole_chunks * MESSAGES_PER_CHUNK], size
-            assert sum(reader.damage.messages.values()) == len(read)
             if size >= log.chunks[0][1]:
                 assert reader.metadata['spinning_top_sim'] == METADATA
                 assert [(topic.name, topic.type_name) for topic in reader.topics] == [
@@ -377,8 +376,9 @@ def test_a_lost_chunk_is_told_in_numbers(tmp_path, log, has_summary):
     assert (damage.lost_chunks, damage.lost_bytes) == (1, end - start)
     assert damage.missing == {'/top/point': 8, '/top/number': 4}
     assert damage.missing_exactly == has_summary
-    assert damage.missing_spans == ((log.messages[first][1], log.messages[last][1]),)
-    assert damage.losses[0].messages == MESSAGES_PER_CHUNK
+    (loss,) = damage.losses
+    assert (loss.start_ns, loss.end_ns) == (log.messages[first][1], log.messages[last][1])
+    assert loss.messages == MESSAGES_PER_CHUNK
     code, out, _ = run(broken)
     assert code == SOME_LOST
     least = '' if has_summary else 'at least '
@@ -688,7 +688,7 @@ def test_a_bag_of_rosbags_is_recovered(tmp_path):
     assert code == ALL_KEPT, (out, err)
     output = tmp_path / 'whole.mcap'
     assert seen_by_rosbags(output) == seen_by_mcap(output) == seen_by_us(output) == expected
-    assert 'name: "/number"' in metadata_of(output)['rosbag2']['serialized_metadata']
+    assert 'name: /number\n' in metadata_of(output)['rosbag2']['serialized_metadata']
 
 
 def test_what_rosbag2_wrote_of_the_distribution_stays(tmp_path):

@@ -261,7 +261,8 @@ def test_a_full_disk_leaves_a_readable_log(tmp_path):
     path = tmp_path / 'run.mcap'
 
     def small_files():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
+        # Here the chunk that does not fit leaves enough room for the summary.
+        resource.setrlimit(resource.RLIMIT_FSIZE, (950_000, 950_000))
     run = subprocess.run(
         [sys.executable, '-c', 'import signal, sys\nsignal.signal(signal.SIGXFSZ, signal.SIG_IGN)'
          '\nfrom spinning_top_sim.tools.simulate import main\nsys.exit(main())',

@@ -4,39 +4,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 
 @dataclass
 class Loss:
-    """
-    A part of a file that is not used.
-
-    Attributes
-    ----------
-    offset, bytes : int
-        Where it is and its size.
-    what : str
-        The kind of record it was, as far as that is known.
-    reason : str
-        Why it is not used.
-    start_ns, end_ns : int or None
-        The earliest and the latest log time of its messages; None if unknown.
-    messages : int or None
-        How many it held; None if unknown.
-    refused : bool
-        It may be right, but it is larger than what is read into memory.
-
-    """
+    """A part of a file that is not used, as far as is known what it was."""
 
     offset: int
     bytes: int
-    what: str
+    what: str                       # the kind of record
     reason: str
-    start_ns: int | None = None
-    end_ns: int | None = None
-    messages: int | None = None
-    refused: bool = False
+    start_ns: int | None = None     # the earliest log time of its messages
+    end_ns: int | None = None       # the latest
+    messages: int | None = None     # how many it held
+    refused: bool = False           # larger than what is read into memory, else perhaps right
 
     def __str__(self) -> str:
         text = f'{self.what} at byte {self.offset} ({self.bytes} bytes): {self.reason}'
@@ -49,35 +31,16 @@ class Loss:
 
 @dataclass(frozen=True)
 class Damage:
-    """
-    What a scan of a whole file found.
+    """What a scan of a whole file found."""
 
-    Attributes
-    ----------
-    truncated : bool
-        The file does not end as an MCAP file ends.
-    losses : tuple of Loss
-        What is not used, in the order of the file.
-    defects : tuple of str
-        What is wrong but known from other parts of the file (indexes, summary): nothing is lost.
-    messages : mapping of str to int
-        Whole messages per topic.
-    missing : mapping of str to int
-        Lost messages per topic ('' if unknown): exact if `missing_exactly`, else a lower bound
-        from gaps in sequence numbers and from the indexes of lost chunks.
-    start_ns, end_ns : int
-        The earliest and the latest log time of the whole messages; 0 without any.
-
-    """
-
-    truncated: bool
-    losses: tuple[Loss, ...] = ()
-    defects: tuple[str, ...] = ()
-    messages: Mapping[str, int] = field(default_factory=dict)
-    missing: Mapping[str, int] = field(default_factory=dict)
-    missing_exactly: bool = False
-    start_ns: int = 0
-    end_ns: int = 0
+    truncated: bool                 # the file does not end as an MCAP file ends
+    losses: tuple[Loss, ...]        # in the order of the file
+    defects: tuple[str, ...]        # what is wrong but known from elsewhere in the file
+    # Lost messages per topic ('' if unknown): exact if `missing_exactly`, else a lower bound from
+    # gaps in sequence numbers and from the indexes of lost chunks.
+    missing: Mapping[str, int]
+    missing_exactly: bool
+    end_ns: int                     # the latest log time of the whole messages; 0 without any
 
     @property
     def lossless(self) -> bool:
@@ -98,12 +61,6 @@ class Damage:
     def missing_messages(self) -> int:
         """Lost messages: exact if `missing_exactly`, else a lower bound."""
         return sum(self.missing.values())
-
-    @property
-    def missing_spans(self) -> tuple[tuple[int, int], ...]:
-        """The earliest and the latest log time of each lost chunk [ns]."""
-        return tuple((loss.start_ns, loss.end_ns) for loss in self.losses
-                     if loss.start_ns is not None and loss.end_ns is not None)
 
     def lines(self) -> list[str]:
         """Return a human-readable report: the sums if something is lost, then each loss."""

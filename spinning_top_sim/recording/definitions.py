@@ -30,34 +30,18 @@ _PRIMITIVES = frozenset({
 
 @dataclass(frozen=True)
 class MessageDefinition:
-    """
-    What a log says about one message type.
+    """What a log says about one message type."""
 
-    Attributes
-    ----------
-    type_name : str
-        'package/msg/Type'.
-    text : str
-        Its `ros2msg` schema: the definition followed by those it depends on.
-    type_hash : str
-        'RIHS01_' and 64 hexadecimal digits (REP-2011).
-
-    """
-
-    type_name: str
-    text: str
-    type_hash: str
+    type_name: str  # 'package/msg/Type'
+    text: str       # its `ros2msg` schema: the definition followed by those it depends on
+    type_hash: str  # 'RIHS01_' and 64 hexadecimal digits (REP-2011)
 
 
 def find_definition(type_name: str) -> MessageDefinition:
     """
     Look up a type such as 'geometry_msgs/msg/PoseStamped' in the installed packages.
 
-    Raises
-    ------
-    DefinitionNotFoundError
-        Naming the type and the places searched.
-
+    Raises DefinitionNotFoundError, naming the type and the places searched.
     """
     if not re.fullmatch(r'[a-zA-Z0-9_]+/msg/[a-zA-Z0-9_]+', type_name, re.ASCII):
         raise DefinitionNotFoundError(

@@ -10,10 +10,6 @@ from collections.abc import Iterable, Mapping
 from importlib import metadata
 from typing import Any
 
-# Version of these keys.
-FORMAT = '1'
-LIBRARIES = ('numpy', 'mcap', 'rclpy')
-
 
 def provenance(values: Mapping[str, Any], epoch_ns: int, begun_ns: int,
                history: Iterable[tuple[int, float, float]],
@@ -21,12 +17,14 @@ def provenance(values: Mapping[str, Any], epoch_ns: int, begun_ns: int,
     """
     Return the `spinning_top_sim` metadata record.
 
-    values: parameters at the start of the motion (the last reset);  now: as they are, with later
-    changes;  epoch_ns: stamp of t = 0;  begun_ns: simulated time at which the recording begins;
-    history: commands applied before, as (t_ns, l3, lz)
+    values : parameters at the start of the motion (the last reset)
+    epoch_ns : stamp of t = 0
+    begun_ns : simulated time at which the recording begins
+    history : commands applied before, as (t_ns, l3, lz)
+    now : parameters as they are, with later changes
     """
     return {
-        'format': FORMAT,
+        'format': '1',      # version of these keys
         'parameters': json.dumps(dict(values), default=list, sort_keys=True),
         'parameters_now': json.dumps(dict(now), default=list, sort_keys=True),
         'seed': str(values['seed']),
@@ -40,15 +38,16 @@ def provenance(values: Mapping[str, Any], epoch_ns: int, begun_ns: int,
 def surroundings() -> dict[str, str]:
     """Return what else decides the last bits: this package's version, machine, libraries."""
     return {
-        'version': _version('spinning_top_sim'),
+        'version': version('spinning_top_sim'),
         'platform': f'{platform.machine()} {platform.system()} '
                     f'{platform.python_implementation()} {platform.python_version()} '
                     f'{sys.byteorder}',
-        'libraries': json.dumps({name: _version(name) for name in LIBRARIES}),
+        'libraries': json.dumps({name: version(name) for name in ('numpy', 'mcap', 'rclpy')}),
     }
 
 
-def _version(distribution: str) -> str:
+def version(distribution: str) -> str:
+    """Return the version of an installed distribution, or 'unknown'."""
     try:
         return metadata.version(distribution)
     except metadata.PackageNotFoundError:

@@ -19,53 +19,26 @@ from io import BytesIO
 from typing import BinaryIO, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
+import mcap.records
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.records import (
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    MessageIndex,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
+from mcap.records import Channel, Chunk, McapRecord, Schema
 
 from spinning_top_sim.recording.chunks import MESSAGE, MESSAGE_FIELDS, Entries
 from spinning_top_sim.recording.mcap_writer import record_bytes
 
 MAX_BYTES = 256 << 20               # of one record or one uncompressed chunk in memory
 HEAD = struct.Struct('<BQ')         # of every record: opcode, length of what follows
-CHUNK_HEAD = struct.Struct('<QQQI')  # start and end time, uncompressed size and checksum
 
 _BLOCK = 1 << 20    # bytes decompressed at a time
 _MESSAGE_OPCODE = int(Opcode.MESSAGE)   # compares faster
 _FIELDS = struct.Struct('<HIQQ')    # of a message: channel, sequence, log and publish time
-_INDEX_FIELDS = struct.Struct('<HI')  # of a message index: channel, length of the entries
-
-_KINDS: dict[int, type[McapRecord]] = {
-    Opcode.HEADER: Header,
-    Opcode.FOOTER: Footer,
-    Opcode.SCHEMA: Schema,
-    Opcode.CHANNEL: Channel,
-    Opcode.CHUNK: Chunk,
-    Opcode.CHUNK_INDEX: ChunkIndex,
-    Opcode.ATTACHMENT_INDEX: AttachmentIndex,
-    Opcode.STATISTICS: Statistics,
-    Opcode.METADATA: Metadata,
-    Opcode.METADATA_INDEX: MetadataIndex,
-    Opcode.SUMMARY_OFFSET: SummaryOffset,
-    Opcode.DATA_END: DataEnd,
-}
+# mcap's class of each kind that is parsed as a whole: that of CHUNK_INDEX is ChunkIndex.
+_CLASSES: dict[int, type[McapRecord]] = {
+    opcode: getattr(mcap.records, opcode.name.title().replace('_', ''))
+    for opcode in Opcode if opcode not in (Opcode.MESSAGE, Opcode.ATTACHMENT)}
 
 
 class DamagedError(Exception):
@@ -92,11 +65,11 @@ class StoredMessage(NamedTuple):
 
 @dataclass
 class ChunkContents:
-    """The content of a chunk whose checksum is right, or a single message."""
+    """The content of a chunk whose checksum is right, or of messages outside of chunks."""
 
     plain: bytes    # uncompressed
-    declared: list[Schema | Channel] = field(default_factory=list)
     messages: list[StoredMessage] = field(default_factory=list)     # in the order of the file
+    declared: list[Schema | Channel] = field(default_factory=list)
 
     @functools.cached_property
     def entries(self) -> Entries:
@@ -127,26 +100,22 @@ class StrictStream(ReadDataStream):
 
 def name_of(opcode: int) -> str:
     """Return what a kind of record is called in reports."""
-    try:
+    if opcode in _CLASSES or opcode in (Opcode.MESSAGE, Opcode.ATTACHMENT):
         return Opcode(opcode).name.lower().replace('_', ' ')
-    except ValueError:
-        return f'record of unknown kind {opcode:#04x}'
+    return f'record of unknown kind {opcode:#04x}'
 
 
 def parse(opcode: int, content: bytes) -> tuple[McapRecord, int]:
     """
     Return the record with this content, and how many bytes stand behind its known fields.
 
-    Raises DamagedError.  Not for messages and attachments.
+    Raises DamagedError, also for messages and attachments.
     """
-    if opcode == Opcode.MESSAGE_INDEX:
-        return _parse_message_index(content)
-    kind = _KINDS.get(opcode)
-    if kind is None:
+    if opcode not in _CLASSES:
         raise DamagedError('there is no such kind of record')
     stream = StrictStream(content)
     try:
-        record: McapRecord = kind.read(stream)  # type: ignore[attr-defined]
+        record: McapRecord = _CLASSES[opcode].read(stream)  # type: ignore[attr-defined]
     except McapError:
         raise DamagedError('a length inside of it leads beyond its end') from None
     except UnicodeDecodeError:
@@ -157,50 +126,23 @@ def parse(opcode: int, content: bytes) -> tuple[McapRecord, int]:
     return record, len(content) - stream.count
 
 
-def _parse_message_index(content: bytes) -> tuple[MessageIndex, int]:
-    """As mcap does it, number by number, this would be most of the time that reading takes."""
-    if len(content) < _INDEX_FIELDS.size:
-        raise DamagedError('it is shorter than an index can be')
-    channel_id, size = _INDEX_FIELDS.unpack_from(content)
-    extra = len(content) - _INDEX_FIELDS.size - size
-    if extra < 0 or size % 16:
-        raise DamagedError('its length is not that of its content')
-    entries = content[_INDEX_FIELDS.size:_INDEX_FIELDS.size + size]
-    return MessageIndex(channel_id, list(struct.iter_unpack('<QQ', entries))), extra
-
-
-def parse_message(content: bytes, start: int, end: int) -> StoredMessage:
-    """Return the message whose record has its fields and data there; raises DamagedError."""
-    if end - start < MESSAGE_FIELDS:
-        raise DamagedError('a message is shorter than a message can be')
-    channel_id, sequence, log_time, publish_time = _FIELDS.unpack_from(content, start)
-    return StoredMessage(
-        log_time, channel_id, sequence, publish_time, start + MESSAGE_FIELDS, end)
-
-
-def open_chunk(chunk: Chunk, max_bytes: int = MAX_BYTES) -> ChunkContents:
+def open_chunk(chunk: Chunk, max_bytes: int) -> ChunkContents:
     """
-    Decompress and check a chunk.
+    Decompress and check a chunk; raises DamagedError.
 
     A chunk without checksum (0) is right when it decompresses and breaks up into records.
-
-    Raises
-    ------
-    TooLargeError
-        If it says that it is larger than `max_bytes`.
-    DamagedError
-        If anything about it is wrong.
-
     """
-    if chunk.uncompressed_size > max_bytes:
-        raise TooLargeError(chunk.uncompressed_size, max_bytes)
-    plain = _decompress(chunk)
+    plain = _decompress(chunk, max_bytes)
     if len(plain) != chunk.uncompressed_size:
         raise DamagedError('it has not the size that it says it has')
     if chunk.uncompressed_crc and zlib.crc32(plain) != chunk.uncompressed_crc:
         raise DamagedError('its checksum is wrong')
+    return break_up(plain)
+
+
+def break_up(plain: bytes) -> ChunkContents:
+    """Return the messages and declarations among records that stand one after the other."""
     contents = ChunkContents(plain)
-    messages = contents.messages
     size = len(plain)
     offset = 0
     while offset < size:
@@ -212,7 +154,11 @@ def open_chunk(chunk: Chunk, max_bytes: int = MAX_BYTES) -> ChunkContents:
         if offset > size:
             raise DamagedError('a record in it leads beyond its end')
         if opcode == _MESSAGE_OPCODE:
-            messages.append(parse_message(plain, start, offset))
+            if length < MESSAGE_FIELDS:
+                raise DamagedError('a message is shorter than a message can be')
+            channel_id, sequence, log_time, publish_time = _FIELDS.unpack_from(plain, start)
+            contents.messages.append(StoredMessage(
+                log_time, channel_id, sequence, publish_time, start + MESSAGE_FIELDS, offset))
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             record, _ = parse(opcode, plain[start:offset])
             assert isinstance(record, Schema | Channel)
@@ -220,8 +166,10 @@ def open_chunk(chunk: Chunk, max_bytes: int = MAX_BYTES) -> ChunkContents:
     return contents
 
 
-def _decompress(chunk: Chunk) -> bytes:
+def _decompress(chunk: Chunk, max_bytes: int) -> bytes:
     """Return the uncompressed bytes of all frames, but never many more than the chunk states."""
+    if chunk.uncompressed_size > max_bytes:
+        raise TooLargeError(chunk.uncompressed_size, max_bytes)
     if chunk.compression == '':
         return chunk.data
     stream: BinaryIO
@@ -231,12 +179,10 @@ def _decompress(chunk: Chunk) -> bytes:
         stream = lz4.frame.open(BytesIO(chunk.data))
     else:
         raise DamagedError(f'its compression {chunk.compression[:20]!r} is unknown')
-    blocks = []
-    size = 0
+    plain = bytearray()
     try:
-        while size <= chunk.uncompressed_size and (block := stream.read(_BLOCK)):
-            blocks.append(block)
-            size += len(block)
+        while len(plain) <= chunk.uncompressed_size and (block := stream.read(_BLOCK)):
+            plain += block
     except (zstandard.ZstdError, RuntimeError, EOFError, ValueError, MemoryError):
         raise DamagedError('it cannot be decompressed') from None
-    return b''.join(blocks)
+    return bytes(plain)

@@ -5,16 +5,13 @@ from __future__ import annotations
 
 import re
 
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Chunk
 
 from spinning_top_sim.recording.chunks import MESSAGE_FIELDS
 from spinning_top_sim.recording.records import (
-    CHUNK_HEAD,
     HEAD,
     DamagedError,
-    StrictStream,
     TooLargeError,
     open_chunk,
     parse,
@@ -23,14 +20,15 @@ from spinning_top_sim.recording.summary import McapSource
 
 # What may begin a chunk, a schema, a channel or metadata: opcode and a length below 2^40.
 _CANDIDATE = re.compile(rb'[\x03\x04\x06\x0c](?=.{5}\x00\x00\x00)', re.DOTALL)
-# Where the length of the name is in the content.
-_NAME_OFFSETS: dict[int, int] = {Opcode.SCHEMA: 2, Opcode.CHANNEL: 4, Opcode.METADATA: 0}
+# Where the length of the first text is in the content; a chunk's is followed by that of the data.
+_NAME_OFFSETS: dict[int, int] = {
+    Opcode.SCHEMA: 2, Opcode.CHANNEL: 4, Opcode.METADATA: 0, Opcode.CHUNK: 28}
 
 _LOOK_BYTES = 64                # of the content, enough for a chunk's fields before its data
 _MAX_NAME = 1 << 12
 _MAX_DECLARATION = 1 << 24
 _MAX_EXTRA = 1 << 10
-_FIRST_BLOCK, _MAX_BLOCK = 1 << 13, 1 << 20
+_BLOCK = 1 << 16                # searched at a time
 _MAX_EFFORT = 4                 # bytes of candidates read, as a multiple of the file's size
 
 
@@ -38,12 +36,7 @@ class RecordFinder:
     """
     Finds records that prove themselves by their inner lengths and, if chunks, their checksum.
 
-    Parameters
-    ----------
-    source : McapSource
-    limit : int
-        Where the data section ends.
-
+    limit : where the data section ends
     """
 
     def __init__(self, source: McapSource, limit: int) -> None:
@@ -53,27 +46,23 @@ class RecordFinder:
 
     def is_record(self, offset: int) -> bool:
         """Return whether a record of a known kind begins there, or the data section ends."""
-        opcode = 0
         try:
-            while offset < self._limit:
-                opcode, length = self._source.head(offset, self._limit)
-                if opcode <= Opcode.DATA_END:
-                    break
-                offset += HEAD.size + length
-            if offset == self._limit:
-                return True
+            opcode, end = self._source.head(offset, self._limit)
+            while opcode > Opcode.DATA_END:
+                offset = end
+                opcode, end = self._source.head(offset, self._limit)
             if opcode == Opcode.MESSAGE:
-                return length >= MESSAGE_FIELDS
+                return end - offset >= HEAD.size + MESSAGE_FIELDS
             if opcode == Opcode.ATTACHMENT:
-                self._source.attachment(offset, length)
-            elif opcode == Opcode.CHUNK or opcode in _NAME_OFFSETS:
-                self._prove(offset)
+                self._source.attachment(offset, end)
+            elif opcode in _NAME_OFFSETS:
+                self._prove(opcode, offset, end)
             else:
-                self._source.record(offset, self._limit)
+                self._source.record(offset, end)
         except TooLargeError:
             return opcode == Opcode.CHUNK
         except DamagedError:
-            return False
+            return offset == self._limit
         return True
 
     def find(self, offset: int) -> int:
@@ -82,52 +71,37 @@ class RecordFinder:
 
         Single messages are not looked for: nothing in them tells them from chance.
         """
-        size = _FIRST_BLOCK
         while offset < self._limit:
-            block = self._source.read(offset, size + HEAD.size)
-            for match in _CANDIDATE.finditer(block, 0, size + HEAD.size - 1):
+            block = self._source.read(offset, _BLOCK + HEAD.size)
+            for match in _CANDIDATE.finditer(block, 0, _BLOCK + HEAD.size - 1):
                 place = offset + match.start()
-                try:
-                    if not self._prove(place):
-                        return place
-                except DamagedError:
-                    continue
-            offset += size
-            size = min(2 * size, _MAX_BLOCK)
+                if self.is_record(place):
+                    return place
+            offset += _BLOCK
         return self._limit
 
-    def _prove(self, offset: int) -> int:
-        """
-        Return how many bytes the record has behind its known fields, 0 for a chunk.
-
-        Raises DamagedError if it is none, TooLargeError if it might be one.
-        """
-        opcode, length = self._source.head(offset, self._limit)
+    def _prove(self, opcode: int, offset: int, end: int) -> None:
+        """Raise DamagedError unless it is a chunk, schema, channel or metadata."""
         # First what needs no more than a look: most candidates are none.
-        if not _looks_right(opcode, length, self._source.read(offset + HEAD.size, _LOOK_BYTES)):
+        start = offset + HEAD.size
+        if not _looks_right(opcode, end - start, self._source.read(start, _LOOK_BYTES)):
             raise DamagedError('its lengths do not fit')
-        self._effort -= length
+        self._effort -= end - start
         if self._effort < 0:
             raise DamagedError('the file has candidates everywhere')
-        record, extra = parse(opcode, self._source.content(offset, length))
-        if not isinstance(record, Chunk):
-            return extra
-        contents = open_chunk(record, self._source.max_bytes)
-        if not contents.messages and not contents.declared:
-            raise DamagedError('it is empty')       # zeros in data look like that
-        return 0
+        record, _ = parse(opcode, self._source.content(offset, end))
+        if isinstance(record, Chunk):
+            contents = open_chunk(record, self._source.max_bytes)
+            if not contents.messages and not contents.declared:
+                raise DamagedError('it is empty')       # zeros in data look like that
 
 
 def _looks_right(opcode: int, length: int, start: bytes) -> bool:
     """Return whether a chunk, schema, channel or metadata of this length may start so."""
+    name_start = _NAME_OFFSETS[opcode] + 4
+    name_size = int.from_bytes(start[name_start - 4:name_start], 'little')
     if opcode == Opcode.CHUNK:
-        stream = StrictStream(start[CHUNK_HEAD.size:])
-        try:
-            stream.read_prefixed_string()
-            data_size = stream.read8()
-        except (McapError, UnicodeDecodeError):
-            return False
-        return 0 <= length - (CHUNK_HEAD.size + stream.count + data_size) <= _MAX_EXTRA
-    offset = _NAME_OFFSETS[opcode]
-    name_size = int.from_bytes(start[offset:offset + 4], 'little')
+        data_start = name_start + name_size + 8
+        data_size = int.from_bytes(start[data_start - 8:data_start], 'little')
+        return 0 <= length - data_start - data_size <= _MAX_EXTRA
     return 0 < name_size < _MAX_NAME and length <= _MAX_DECLARATION

@@ -2,18 +2,18 @@
 """
 The two YAML texts that rosbag2 (jazzy) expects in a log: offered QoS and bag metadata.
 
-Sources: rosbag2_storage, qos.cpp and yaml.hpp; rosbag2_storage_mcap, mcap_storage.cpp.  They are
-few fixed lines, written by hand so that a recording imports no YAML package.
+Sources: rosbag2_storage, qos.cpp and yaml.hpp; rosbag2_storage_mcap, mcap_storage.cpp.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeGuard
+
+import yaml
 
 # A profile: the keys of DEFAULT_QOS, integer policies as in rmw, durations as {'sec', 'nsec'}.
 Qos = Mapping[str, Any]
@@ -47,28 +47,11 @@ _POLICY_NAMES = {
 
 @dataclass(frozen=True)
 class RecordedTopic:
-    """
-    One topic of a recording.
+    """One topic of a recording.  Raises ValueError for a policy that rosbag2 does not know."""
 
-    Parameters
-    ----------
-    name : str
-        Resolved, such as '/imu/data_raw'.
-    type_name : str
-        'package/msg/Type'.
-    qos : mapping
-        What the publisher offers; a policy that is left out is as in DEFAULT_QOS.
-
-    Raises
-    ------
-    ValueError
-        Naming the key, its value and what is allowed.
-
-    """
-
-    name: str
-    type_name: str
-    qos: Qos = field(default_factory=dict)
+    name: str               # resolved, such as '/imu/data_raw'
+    type_name: str          # 'package/msg/Type'
+    qos: Qos = field(default_factory=dict)  # offered; what is left out is as in DEFAULT_QOS
 
     def __post_init__(self) -> None:
         for key, value in self.qos.items():
@@ -80,16 +63,15 @@ class RecordedTopic:
                     f'qos of {self.name}: {key} = {value!r}: must be in [0, {len(names) - 1}]')
 
 
-@dataclass(frozen=True)
+@dataclass
 class BagTopic:
     """What the bag metadata say of a topic."""
 
     name: str
     type_name: str
     type_hash: str              # 'RIHS01_...' or ''
+    encoding: str
     profiles: Sequence[Qos]     # what its publishers offer
-    messages: int
-    encoding: str = 'cdr'
 
 
 def offered_qos_yaml(topic: RecordedTopic) -> str:
@@ -98,7 +80,7 @@ def offered_qos_yaml(topic: RecordedTopic) -> str:
 
     Names would do for jazzy; integers are what older releases read, and jazzy too.
     """
-    return '\n'.join(_qos_lines(topic.qos, as_names=False))
+    return _dump([{**DEFAULT_QOS, **topic.qos}])
 
 
 def parse_offered_qos(text: str) -> list[Qos]:
@@ -108,10 +90,6 @@ def parse_offered_qos(text: str) -> list[Qos]:
     A policy that is missing or not understood is as in DEFAULT_QOS; a text that is no list of
     profiles has none.
     """
-    if not text:
-        return []
-    import yaml  # noqa: PLC0415 - a recording needs none
-
     try:
         profiles = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, TypeError, OverflowError, RecursionError):
@@ -128,13 +106,13 @@ def _parsed_policy(key: str, value: object) -> int | bool | Mapping[str, int]:
         parts = value if isinstance(value, Mapping) else {}
         right = all(_is_int64(parts.get(part)) for part in default)
         return {part: parts[part] for part in default} if right else default
-    if names is not None and value in names:
-        value = names.index(value)
-    if names is not None and not (
-            _is_int64(value) and 0 <= value < len(names) and names[value] != 'unknown'):
-        return default
     if isinstance(default, bool):
         return value if isinstance(value, bool) else default
+    if names is not None:
+        if value in names:
+            value = names.index(value)
+        if value not in range(len(names)) or value == names.index('unknown'):
+            return default
     return value if _is_int64(value) else default
 
 
@@ -143,71 +121,51 @@ def _is_int64(value: object) -> TypeGuard[int]:
 
 
 def bag_metadata_yaml(
-    topics: Sequence[BagTopic],
-    *,
-    file_name: str,
-    start_ns: int,
-    end_ns: int,
+    topics: Sequence[tuple[BagTopic, int]], *, file_name: str, start_ns: int, end_ns: int,
     former: str = '',
 ) -> str:
     """
     Return the `serialized_metadata` of the `rosbag2` record.
 
-    Parameters
-    ----------
-    topics : sequence of BagTopic
-        In the order of the file.
-    file_name : str
-        Without its directory.
-    start_ns, end_ns : int
-        The earliest and the latest stamp [ns since the epoch]; both 0 in an empty log.
-    former : str
-        The metadata of the log that this one is made from, whose ROS distribution and custom
-        data stay.
-
+    topics : with the number of their messages, in the order of the file
+    start_ns, end_ns : the earliest and the latest stamp; both 0 in an empty log
+    former : the metadata of the log that this one is made from; its ROS distribution and custom
+        data stay, as they are
     """
-    total = sum(topic.messages for topic in topics)
-    lines = [
-        f'version: {_METADATA_VERSION}',
-        'storage_identifier: mcap',
-        'duration:',
-        f'  nanoseconds: {end_ns - start_ns}',
-        'starting_time:',
-        f'  nanoseconds_since_epoch: {start_ns}',
-        f'message_count: {total}',
-        'topics_with_message_count:' if topics else 'topics_with_message_count: []',
-    ]
-    for topic in topics:
-        profiles = [line for profile in topic.profiles
-                    for line in _qos_lines(profile, as_names=True)]
-        lines += [
-            '  - topic_metadata:',
-            f'      name: {_quoted(topic.name)}',
-            f'      type: {_quoted(topic.type_name)}',
-            '      serialization_format: '
-            + (topic.encoding if topic.encoding == 'cdr' else _quoted(topic.encoding)),
-            '      offered_qos_profiles:' if profiles else '      offered_qos_profiles: []',
-            *(f'        {line}' for line in profiles),
-            f'      type_description_hash: {_quoted(topic.type_hash)}',
-            f'    message_count: {topic.messages}',
-        ]
-    lines += [
-        'compression_format: ""',
-        'compression_mode: ""',
-        'relative_file_paths:',
-        f'  - {_quoted(file_name)}',
-        'files:',
-        f'  - path: {_quoted(file_name)}',
-        '    starting_time:',
-        f'      nanoseconds_since_epoch: {start_ns}',
-        '    duration:',
-        f'      nanoseconds: {end_ns - start_ns}',
-        f'    message_count: {total}',
+    # A file name may hold bytes that are no text: they must not spoil the closing of a log.
+    file_name = file_name.encode(errors='replace').decode()
+    start = {'nanoseconds_since_epoch': start_ns}
+    duration = {'nanoseconds': end_ns - start_ns}
+    total = sum(messages for _, messages in topics)
+    return '\n'.join((
+        _dump({
+            'version': _METADATA_VERSION,
+            'storage_identifier': 'mcap',
+            'duration': duration,
+            'starting_time': start,
+            'message_count': total,
+            'topics_with_message_count': [
+                {'topic_metadata': {
+                    'name': topic.name,
+                    'type': topic.type_name,
+                    'serialization_format': topic.encoding,
+                    'offered_qos_profiles': [_named(profile) for profile in topic.profiles],
+                    'type_description_hash': topic.type_hash},
+                 'message_count': messages} for topic, messages in topics],
+            'compression_format': '',
+            'compression_mode': '',
+            'relative_file_paths': [file_name],
+            'files': [{'path': file_name, 'starting_time': start, 'duration': duration,
+                       'message_count': total}]}),
         _block(former, 'custom_data') or 'custom_data: ~',
         _block(former, 'ros_distro')
-        or f'ros_distro: {_quoted(os.environ.get("ROS_DISTRO") or "jazzy")}',
-    ]
-    return '\n'.join(lines)
+        or _dump({'ros_distro': os.environ.get('ROS_DISTRO') or 'jazzy'})))
+
+
+def _named(profile: Qos) -> Qos:
+    """Return a whole profile with its policies by name."""
+    return {key: _POLICY_NAMES[key][value] if key in _POLICY_NAMES else value
+            for key, value in {**DEFAULT_QOS, **profile}.items()}
 
 
 def _block(text: str, key: str) -> str:
@@ -216,24 +174,13 @@ def _block(text: str, key: str) -> str:
     return match.group() if match else ''
 
 
-def _qos_lines(profile: Qos, *, as_names: bool) -> list[str]:
-    """Return a profile as a YAML list of one, line by line."""
-    lines = []
-    for key, default in DEFAULT_QOS.items():
-        value = profile.get(key, default)
-        if isinstance(default, Mapping):
-            lines += [f'{key}:', f'  sec: {int(value["sec"])}', f'  nsec: {int(value["nsec"])}']
-        elif isinstance(default, bool):
-            lines.append(f'{key}: {"true" if value else "false"}')
-        elif as_names and key in _POLICY_NAMES:
-            lines.append(f'{key}: {_POLICY_NAMES[key][value]}')
-        else:
-            lines.append(f'{key}: {int(value)}')
-    return [('- ' if i == 0 else '  ') + line for i, line in enumerate(lines)]
+class _Dumper(yaml.SafeDumper):
+    def ignore_aliases(self, data: object) -> bool:
+        """Write what occurs twice twice: yaml-cpp writes no anchors."""
+        return True
 
 
-def _quoted(text: str) -> str:
-    """Return a double-quoted YAML scalar; JSON's escapes are a subset of YAML's."""
-    # A file name may hold bytes that are no text: they must not spoil the closing of a log.
-    printable = text.encode(errors='replace').decode()
-    return json.dumps(printable, ensure_ascii=False)
+def _dump(value: object) -> str:
+    text: str = yaml.dump(value, Dumper=_Dumper, sort_keys=False, allow_unicode=True,
+                          width=float('inf'))
+    return text.rstrip('\n')

@@ -7,10 +7,11 @@ import contextlib
 import itertools
 import os
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, Chunk, Header, Metadata, Schema
 
 from spinning_top_sim.recording.chunks import time_span
@@ -42,37 +43,23 @@ def recover(
     """
     Write everything that is whole in a log into a new file.
 
+    output : appears when it is complete and on the disk, never before
+    progress : told how many bytes of how many are done
+
     Chunks and records of unknown kinds are copied as they are, messages outside of chunks are put
     into some; message indexes, statistics, summary and the `rosbag2` record are made anew.
-
-    Parameters
-    ----------
-    reader : LogReader
-        The log.
-    output : path
-        The new file.  It appears when it is complete and on the disk, never before.
-    progress : callable
-        Told how many bytes of how many are done.
-
-    Raises
-    ------
-    OutputError
-        If the output exists or cannot be written.
-    NothingToSaveError
-        If a file that was not closed holds no whole message.
-    LogAccessError
-        If the log cannot be read.
-
+    Raises LogError: OutputError if the output exists or cannot be written, NothingToSaveError if
+    a file that was not closed holds no whole message.
     """
     output = Path(output)
     if os.path.lexists(output):
-        raise OutputError(_exists(output))
+        raise _exists(output)
     draft = output.with_name(f'.recover-{secrets.token_hex(8)}.tmp')
     try:
         try:
-            return _recover(reader, reader.scan(), output, draft, progress)
-        except _FoundLateError as late:
-            return _recover(reader, reader.scan(late.scanner), output, draft, progress)
+            return _recover(reader, output, draft, progress)
+        except _FoundLateError:
+            return _recover(reader, output, draft, progress)
     except FileNotFoundError as error:
         raise OutputError(
             f'cannot write {output}: there is no directory {output.parent}') from error
@@ -81,48 +68,42 @@ def recover(
 
 
 class _FoundLateError(Exception):
-    """Channels were found behind their messages: with what the scanner knows, scan again."""
-
-    def __init__(self, scanner: Scanner) -> None:
-        super().__init__()
-        self.scanner = scanner
+    """Channels were found behind their messages; another scan knows them from the beginning."""
 
 
 def _recover(
-    reader: LogReader, scanner: Scanner, output: Path, draft: Path,
-    progress: Callable[[int, int], None],
+    reader: LogReader, output: Path, draft: Path, progress: Callable[[int, int], None],
 ) -> Recovered:
+    scanner = reader.scan()
     records = iter(scanner)
     first = next(records, None)
     header = first.raw if first is not None and isinstance(first.record, Header) else b''
     writer = McapWriter(draft, profile=reader.profile, library=reader.library,
                         compression=_COMPRESSION, header=header)
     with writer.discarded_on_failure():
-        copy = _Copy(reader, scanner, writer)
-        for scanned in itertools.chain([first] if first is not None else [], records):
+        copy = _Copy(scanner, writer)
+        for scanned in filter(None, itertools.chain([first], records)):
             copy.put(scanned)
             progress(scanned.offset, reader.size)
         if scanner.found_late:
-            raise _FoundLateError(scanner)
+            raise _FoundLateError
         copy.put_rest()
         messages = sum(writer.message_counts.values())
-        damage = scanner.damage()
         if not messages and not reader.whole:
             raise NothingToSaveError(
                 f'nothing to save in {reader.path}: there is no whole message in it')
-        os.chmod(draft, reader.mode)
+        os.chmod(draft, reader.source.mode)
         writer.finish(bag=reader.profile == 'ros2' or bool(copy.former_bag),
                       file_name=output.name, former_bag=copy.former_bag)
         _publish(draft, output)
     progress(reader.size, reader.size)
-    return Recovered(output, writer.size, messages, writer.chunk_count, damage)
+    return Recovered(output, writer.size, messages, writer.chunk_count, scanner.damage())
 
 
 class _Copy:
     """Writes scanned records into a new file."""
 
-    def __init__(self, reader: LogReader, scanner: Scanner, writer: McapWriter) -> None:
-        self._reader = reader
+    def __init__(self, scanner: Scanner, writer: McapWriter) -> None:
         self._scanner = scanner
         self._writer = writer
         self._declared: set[tuple[type, int]] = set()
@@ -141,9 +122,9 @@ class _Copy:
             else:
                 self._writer.write_metadata(record, scanned.raw)
         elif isinstance(record, AttachmentIndex):
-            self._writer.copy_attachment(record, self._blocks(scanned))
-        elif record is None:
-            self._writer.copy_record(self._blocks(scanned))
+            self._writer.copy_attachment(record, self._scanner.blocks(scanned))
+        elif scanned.opcode > Opcode.DATA_END:
+            self._writer.copy_record(self._scanner.blocks(scanned))
 
     def put_rest(self) -> None:
         """Write what is left: messages, and channels that only the summary tells."""
@@ -152,9 +133,6 @@ class _Copy:
             self._declare(schema)
         for channel in self._scanner.channels.values():
             self._declare(channel)
-
-    def _blocks(self, scanned: ScannedRecord) -> Iterator[bytes]:
-        return self._reader.blocks(scanned.offset, scanned.length)
 
     def _put_messages(self, scanned: ScannedRecord) -> None:
         contents = scanned.contents
@@ -194,11 +172,11 @@ def _publish(draft: Path, output: Path) -> None:
     try:
         os.link(draft, output)
     except FileExistsError:
-        raise OutputError(_exists(output)) from None
+        raise _exists(output) from None
     except OSError:
         # A file system without links: between the look and the renaming nothing protects.
         if os.path.lexists(output):
-            raise OutputError(_exists(output)) from None
+            raise _exists(output) from None
         os.rename(draft, output)
     else:
         with contextlib.suppress(OSError):
@@ -206,5 +184,5 @@ def _publish(draft: Path, output: Path) -> None:
     sync_directory(output.parent)
 
 
-def _exists(output: Path) -> str:
-    return f'{output} exists, and nothing is overwritten'
+def _exists(output: Path) -> OutputError:
+    return OutputError(f'{output} exists, and nothing is overwritten')

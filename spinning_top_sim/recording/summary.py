@@ -6,12 +6,12 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
-import struct
 import zlib
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -25,13 +25,11 @@ from mcap.records import (
     Schema,
     Statistics,
 )
-from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording.errors import LogAccessError
 from spinning_top_sim.recording.records import (
     HEAD,
-    MAX_BYTES,
     DamagedError,
     StrictStream,
     TooLargeError,
@@ -39,31 +37,24 @@ from spinning_top_sim.recording.records import (
 )
 
 MAGIC_SIZE = len(MCAP0_MAGIC)
-FOOTER_SIZE = HEAD.size + 8 + 8 + 4
+INDEX_SIZE = HEAD.size + 2 + 4  # of a message index without its entries, 16 bytes each
 
+_FOOTER_SIZE = HEAD.size + 8 + 8 + 4
 _BLOCK = 1 << 20  # bytes read at a time where a record is not needed whole
 _ATTACHMENT_HEAD = 1 << 16  # bytes; more than any name and media type
-_INDEX_SIZE = HEAD.size + 2 + 4  # of a message index without its entries, 16 bytes each
 
 
 class McapSource:
     """
     Random access to a file, up to the size that it has now.
 
-    Parameters
-    ----------
-    path : Path
-    max_bytes : int
-        Largest record, and largest uncompressed chunk, that is read into memory.
+    max_bytes : largest record, and largest uncompressed chunk, that is read into memory
 
-    Raises
-    ------
-    LogAccessError
-        If the file cannot be opened or read; any method may raise it.
-
+    Any method may raise LogAccessError.  A record stands between `offset` and `end`; what reads
+    one raises DamagedError if it is not what it says it is.
     """
 
-    def __init__(self, path: Path, max_bytes: int = MAX_BYTES) -> None:
+    def __init__(self, path: Path, max_bytes: int) -> None:
         self._path = path
         self.max_bytes = max_bytes
         with self._access():
@@ -73,7 +64,7 @@ class McapSource:
             self._file = open(path, 'rb')  # noqa: SIM115
             status = os.fstat(self._file.fileno())
         self.size = status.st_size
-        self.mode = stat.S_IMODE(status.st_mode)
+        self.mode = stat.S_IMODE(status.st_mode)    # permission bits
 
     def close(self) -> None:
         """Close the file."""
@@ -96,68 +87,55 @@ class McapSource:
             self._file.seek(offset)
             return self._file.read(length)
 
-    def blocks(self, offset: int, length: int) -> Iterator[bytes]:
+    def blocks(self, offset: int, end: int) -> Iterator[bytes]:
         """Yield a stretch of the file in blocks."""
-        end = min(offset + length, self.size)
-        while offset < end:
-            block = self.read(offset, min(_BLOCK, end - offset))
-            if not block:
-                return
+        while block := self.read(offset, min(_BLOCK, end - offset)):
             offset += len(block)
             yield block
 
+    def crc(self, offset: int, end: int) -> int:
+        """Return the checksum of a stretch of the file."""
+        crc = 0
+        for block in self.blocks(offset, end):
+            crc = zlib.crc32(block, crc)
+        return crc
+
     def head(self, offset: int, limit: int) -> tuple[int, int]:
-        """
-        Return opcode and content length of the record there.
-
-        Raises DamagedError if no record can begin there that ends before `limit`.
-        """
+        """Return opcode and end of the record there, which ends before `limit`."""
         head = self.read(offset, HEAD.size)
-        if len(head) < HEAD.size or head[0] == 0:
-            raise DamagedError('no record can be read there')
-        opcode, length = HEAD.unpack(head)
-        if offset + HEAD.size + length > limit:
-            raise DamagedError('no record can be read there')
-        return opcode, length
+        if len(head) == HEAD.size and head[0] != 0:
+            opcode, length = HEAD.unpack(head)
+            if offset + HEAD.size + length <= limit:
+                return opcode, offset + HEAD.size + length
+        raise DamagedError('no record can be read there')
 
-    def content(self, offset: int, length: int) -> bytes:
-        """Return the content of a record whose head is there.  Raises TooLargeError."""
+    def content(self, offset: int, end: int) -> bytes:
+        """Return the content of a record.  Raises TooLargeError."""
+        length = end - offset - HEAD.size
         if length > self.max_bytes:
             raise TooLargeError(length, self.max_bytes)
         return self.read(offset + HEAD.size, length)
 
     def record(self, offset: int, limit: int) -> McapRecord:
-        """Return the record there, which is no message and no attachment; raises DamagedError."""
-        opcode, length = self.head(offset, limit)
-        record, _ = parse(opcode, self.content(offset, length))
-        return record
+        """Return the record there, which is no message and no attachment."""
+        opcode, end = self.head(offset, limit)
+        return parse(opcode, self.content(offset, end))[0]
 
-    def attachment(self, offset: int, length: int) -> tuple[AttachmentIndex, int]:
-        """
-        Return the index of the attachment there, and the offset of its checksum.
-
-        `length` is that of its content.  Raises DamagedError.
-        """
+    def attachment(self, offset: int, end: int) -> tuple[AttachmentIndex, int]:
+        """Return the index of the attachment there, and the offset of its checksum."""
         start = offset + HEAD.size
-        stream = StrictStream(self.read(start, min(length, _ATTACHMENT_HEAD)))
+        stream = StrictStream(self.read(start, min(end - start, _ATTACHMENT_HEAD)))
         try:
             index = AttachmentIndex(
-                offset=offset, length=HEAD.size + length, log_time=stream.read8(),
+                offset=offset, length=end - offset, log_time=stream.read8(),
                 create_time=stream.read8(), name=stream.read_prefixed_string(),
                 media_type=stream.read_prefixed_string(), data_size=stream.read8())
         except (McapError, UnicodeDecodeError):
             raise DamagedError('its name or its type cannot be read') from None
         crc_offset = start + stream.count + index.data_size
-        if crc_offset + 4 > start + length:
+        if crc_offset + 4 > end:
             raise DamagedError('its length is not that of its content')
         return index, crc_offset
-
-    def crc(self, offset: int, length: int) -> int:
-        """Return the checksum of a stretch of the file."""
-        crc = 0
-        for block in self.blocks(offset, length):
-            crc = zlib.crc32(block, crc)
-        return crc
 
 
 @dataclass
@@ -167,12 +145,20 @@ class Summary:
     data_limit: int         # no record of the data section ends behind this offset
     closed: bool = False    # the file ends with a footer and the closing magic
     problem: str = ''       # why there is no summary, '' also if the file was written without one
+    # By id.  Scans add what the data section declares, so that a second scan knows it from the
+    # beginning.
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     statistics: Statistics | None = None
     chunks: dict[int, ChunkIndex] = field(default_factory=dict)  # by offset
     metadata: list[MetadataIndex] = field(default_factory=list)
     attachments: list[AttachmentIndex] = field(default_factory=list)
+
+    def knows(self, channel_id: int) -> bool:
+        """Return whether the channel and its schema, if it has one, are known."""
+        channel = self.channels.get(channel_id)
+        return channel is not None and (
+            channel.schema_id == 0 or channel.schema_id in self.schemas)
 
     @property
     def indexes_all_chunks(self) -> bool:
@@ -183,9 +169,18 @@ class Summary:
     def indexes_all_messages(self) -> bool:
         """Whether the chunk indexes lead to as many messages as the statistics count."""
         indexed = sum(
-            (index.message_index_length - _INDEX_SIZE * len(index.message_index_offsets)) // 16
+            (index.message_index_length - INDEX_SIZE * len(index.message_index_offsets)) // 16
             for index in self.chunks.values())
         return self.statistics is not None and indexed == self.statistics.message_count
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether it leads to all messages and metadata, and tells all channels."""
+        return (
+            self.statistics is not None and self.indexes_all_messages
+            and len(self.metadata) == self.statistics.metadata_count
+            and len(self.channels) == self.statistics.channel_count
+            and all(map(self.knows, self.channels)))
 
     @property
     def places(self) -> dict[int, int]:
@@ -197,59 +192,55 @@ class Summary:
 
 def read_summary(source: McapSource) -> Summary:
     """Return the summary, or an empty one that says why there is none."""
-    footer_offset = source.size - MAGIC_SIZE - FOOTER_SIZE
-    if (footer_offset < MAGIC_SIZE
-            or source.read(source.size - MAGIC_SIZE, MAGIC_SIZE) != MCAP0_MAGIC):
+    magic_offset = source.size - MAGIC_SIZE
+    footer_offset = magic_offset - _FOOTER_SIZE
+    if footer_offset < MAGIC_SIZE or source.read(magic_offset, MAGIC_SIZE) != MCAP0_MAGIC:
         return Summary(source.size, problem='the file does not end as an MCAP file ends')
     try:
-        footer = source.record(footer_offset, source.size - MAGIC_SIZE)
-        if not isinstance(footer, Footer):
-            raise DamagedError('no footer')
+        footer = source.record(footer_offset, magic_offset)
     except DamagedError:
+        footer = None
+    if not isinstance(footer, Footer):
         return Summary(source.size, problem='the footer is damaged')
-    start = footer.summary_start
+    start, size = footer.summary_start, source.size - footer.summary_start
     if start == 0:
         return Summary(footer_offset, closed=True)
     try:
         if not MAGIC_SIZE <= start <= footer_offset:
             raise DamagedError('the footer leads to no summary')
-        if source.size - start > source.max_bytes:
-            raise DamagedError(
-                f'the summary is not read: {TooLargeError(source.size - start, source.max_bytes)}')
-        section = source.read(start, source.size - start)
-        if footer.summary_crc not in (0, zlib.crc32(section[:-MAGIC_SIZE - 4])):
+        if size > source.max_bytes:
+            raise DamagedError(f'the summary is not read: {TooLargeError(size, source.max_bytes)}')
+        if footer.summary_crc not in (0, source.crc(start, magic_offset - 4)):
             raise DamagedError('the checksum of the summary is wrong')
-        return _parse_summary(section, start)
+        return _read_section(source, start, footer_offset)
     except DamagedError as damage:
         return Summary(source.size, closed=True, problem=str(damage))
 
 
-def _parse_summary(section: bytes, start: int) -> Summary:
-    """Return the summary in the end of a file; raises DamagedError if it does not fit the file."""
-    summary = Summary(start, closed=True)
-    try:
-        for record in StreamReader(BytesIO(section), skip_magic=True, emit_chunks=True).records:
-            if isinstance(record, Schema):
-                summary.schemas[record.id] = record
-            elif isinstance(record, Channel):
-                summary.channels[record.id] = record
-            elif isinstance(record, Statistics):
-                summary.statistics = record
-            elif isinstance(record, ChunkIndex):
-                summary.chunks[record.chunk_start_offset] = record
-            elif isinstance(record, MetadataIndex):
-                summary.metadata.append(record)
-            elif isinstance(record, AttachmentIndex):
-                summary.attachments.append(record)
-    except (McapError, struct.error, ValueError, OverflowError, MemoryError) as error:
-        raise DamagedError(f'the summary is damaged: {error or "it is truncated"}') from None
+def _read_section(source: McapSource, start: int, end: int) -> Summary:
+    """Return the summary between two offsets; raises DamagedError if it does not fit the file."""
+    found: dict[type, list[Any]] = defaultdict(list)
+    offset = start
+    while offset < end:
+        try:
+            opcode, record_end = source.head(offset, end)
+            if opcode <= Opcode.DATA_END:
+                record, _ = parse(opcode, source.content(offset, record_end))
+                found[type(record)].append(record)
+        except DamagedError as damage:
+            raise DamagedError(f'the summary is damaged: {damage}') from None
+        offset = record_end
+    summary = Summary(
+        start, closed=True, schemas={schema.id: schema for schema in found[Schema]},
+        channels={channel.id: channel for channel in found[Channel]},
+        statistics=next(reversed(found[Statistics]), None),
+        chunks={index.chunk_start_offset: index for index in found[ChunkIndex]},
+        metadata=found[MetadataIndex], attachments=found[AttachmentIndex])
     if any(index.chunk_start_offset + index.chunk_length > start
            for index in summary.chunks.values()):
         raise DamagedError(
             'the summary is damaged: it places a chunk outside of the data section')
-    statistics = summary.statistics
-    if statistics is not None and summary.chunks and (
-            statistics.chunk_count != len(summary.chunks)):
+    if summary.statistics is not None and summary.chunks and not summary.indexes_all_chunks:
         raise DamagedError('the summary is damaged: its statistics and its indexes count '
                            'different numbers of chunks')
     return summary

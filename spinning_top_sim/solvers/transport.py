@@ -209,7 +209,8 @@ class TransportEquations:
         u_squared = (self._energy - self.top.gravity_torque * (cosine - sine) * (cosine + sine)
                 ) / (2.0 * lambda1) - v * v
         from_energy = (u * u > self._large_enough) & (u_squared > 0.0)
-        u = np.where(from_energy, np.copysign(np.sqrt(np.where(u_squared > 0.0, u_squared, 0.0)), u), u)
+        u = np.where(from_energy, np.copysign(
+            np.sqrt(np.where(u_squared > 0.0, u_squared, 0.0)), u), u)
         return Unknowns(
             cosine * np.cos(alpha_phase), cosine * np.sin(alpha_phase),
             sine * np.cos(beta_phase), sine * np.sin(beta_phase),

@@ -2,11 +2,12 @@
 """
 Unwrapped angles of a stepped motion, from the phases of the Cayley-Klein parameters.
 
-arg(alpha) - (Omega/2) t turns one way only, at the rate (Lz + L3)/(4 lambda1 cos^2(theta/2)), and
-arg(beta) + (Omega/2) t at (Lz - L3)/(4 lambda1 sin^2(theta/2)), with Omega = L3/lambda3 - L3/lambda1.
-So a phase follows from its value modulo 2 pi and from the phase at the beginning of its step.  Where
-Lz + L3 or Lz - L3 vanishes, the axis may cross that pole exactly: then the parameter moves on a
-straight line through zero, whose phase is known, and its modulus changes sign.
+With Omega = L3/lambda3 - L3/lambda1, arg(alpha) - (Omega/2) t turns one way only, at the rate
+(Lz + L3)/(4 lambda1 cos^2(theta/2)), and arg(beta) + (Omega/2) t at (Lz - L3)/(4 lambda1
+sin^2(theta/2)).  So a phase follows from its value modulo 2 pi and from the phase at the beginning
+of its step.  Where Lz + L3 or Lz - L3 vanishes, the axis may cross that pole exactly: then the
+parameter moves on a straight line through zero, whose phase is known, and its modulus changes
+sign.
 """
 
 from __future__ import annotations
