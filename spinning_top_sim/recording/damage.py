@@ -40,7 +40,9 @@ class Damage:
     # gaps in sequence numbers and from the indexes of lost chunks.
     missing: Mapping[str, int]
     missing_exactly: bool
-    end_ns: int                     # the latest log time of the whole messages; 0 without any
+    # The earliest and the latest log time of the whole messages; 0 without any.
+    start_ns: int
+    end_ns: int
 
     @property
     def lossless(self) -> bool:

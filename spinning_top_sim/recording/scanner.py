@@ -102,7 +102,7 @@ class Scanner:
         self._lost_chunk: Loss | None = None
 
         self._found: Counter[int] = Counter()           # whole messages by channel
-        self._end_ns = 0                                # their latest log time
+        self._span: tuple[int, int] | None = None       # their earliest and latest log time
         self._in_lost_chunks: Counter[int] = Counter()  # messages by channel
         self._gaps: Counter[int] = Counter()            # by sequence numbers
         self._next_sequence: dict[int, int] = {}
@@ -166,7 +166,9 @@ class Scanner:
         return Damage(
             truncated=not self._summary.closed, losses=tuple(losses),
             defects=tuple(self._defects), missing=dict(missing),
-            missing_exactly=statistics is not None, end_ns=self._end_ns)
+            missing_exactly=statistics is not None,
+            start_ns=self._span[0] if self._span else 0,
+            end_ns=self._span[1] if self._span else 0)
 
     # Reading records.  All of these raise DamagedError.
 
@@ -277,7 +279,10 @@ class Scanner:
                     loss.messages = (loss.messages or 0) + 1
             contents = ChunkContents(contents.plain, [
                 message for message in contents.messages if message.channel_id not in unknown])
-        self._end_ns = max(self._end_ns, time_span(contents.entries)[1])
+        if contents.messages:
+            first, last = time_span(contents.entries)
+            begin, end = self._span or (first, last)
+            self._span = min(begin, first), max(end, last)
         for number, entries in contents.entries.items():
             self._found[number] += len(entries) // 2
         if self._ours:
