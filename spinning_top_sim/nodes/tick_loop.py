@@ -46,7 +46,8 @@ class TickLoop:
 
     recording : where it has no room, nothing is sent
     update_subscribers : sets `publish` of each stream that has subscribers
-    align : takes the source's time of simulated time 0 [ns]; None while the clock stands
+    align : takes the time at which the source read, or will read, simulated time 0 [ns]; None
+        while the clock stands
     error : takes a text for the log
     source : returns the time that simulated time follows [ns]
     steady : returns steady time [ns]; decides which ticks are late and how long one may work
@@ -86,9 +87,9 @@ class TickLoop:
     def start(self) -> None:
         """Let simulated time run from 0 on, unless the motion is paused."""
         self.started = True
-        self._restart_clock()
+        self._sync_clock()
 
-    def _restart_clock(self) -> None:
+    def _sync_clock(self) -> None:
         """Let time go on from where samples are sent up to, or stand there if it is held."""
         self._fast_until_ns, self._late_from_ns = -1, NEVER_NS
         self._clock.stop(self.now_ns)
@@ -98,44 +99,45 @@ class TickLoop:
 
     def tick(self) -> bool:
         """Send what is due; return whether `idle` has something to do before the next tick."""
-        now_ns, late_from_ns = self._steady(), self._late_from_ns
-        self._late_from_ns = now_ns + self._late_after_ns
+        steady_ns, late_from_ns = self._steady(), self._late_from_ns
+        self._late_from_ns = steady_ns + self._late_after_ns
         due_ns = self._clock.now()
         # The fast path touches little memory: after a rest, little of it is in the caches.
-        if (due_ns < self._fast_until_ns and now_ns <= late_from_ns
+        if (due_ns < self._fast_until_ns and steady_ns <= late_from_ns
                 and self._simulation.send_ready(due_ns)):
             return self._computing
         if not self._clock.running:
             return False
-        if now_ns > late_from_ns:
+        if steady_ns > late_from_ns:
             self.late_ticks += 1
-            self.skipped_ticks += round(
-                (now_ns - late_from_ns + self._late_after_ns) / self._tick_period_ns) - 1
-        return self._slow_tick(now_ns)
+            since_last_ns = steady_ns - (late_from_ns - self._late_after_ns)
+            self.skipped_ticks += round(since_last_ns / self._tick_period_ns) - 1
+        return self._slow_tick(steady_ns)
 
     def idle(self) -> None:
         """Compute some of the samples that are due next, until about the next tick."""
         simulation = self._simulation
         self._computing = not simulation.prepare(
             simulation.now_ns + self._ahead_ns, int(BUSY_SHARE * self._tick_period_ns))
-        self._update_look_ahead()
+        self._set_fast_until()
 
-    def _slow_tick(self, now_ns: int) -> bool:
+    def _slow_tick(self, steady_ns: int) -> bool:
         """Send what is due, and do all that the fast path leaves out; return as `tick` does."""
-        if now_ns >= self._subscribers_due_ns:
+        if steady_ns >= self._subscribers_due_ns:
             self._update_subscribers()
-            self._subscribers_due_ns = now_ns + SUBSCRIBERS_PERIOD_NS
-        simulation, due_ns = self._simulation, self._advance()
+            self._subscribers_due_ns = steady_ns + SUBSCRIBERS_PERIOD_NS
+        due_ns = self._advance()
+        simulation = self._simulation
         if simulation.now_ns >= self._duration_ns:
             self.ended = True
-            self._restart_clock()
+            self._sync_clock()
             return False
-        self._update_look_ahead()
+        self._set_fast_until()
         return simulation.now_ns >= due_ns and (
             self._computing or due_ns >= simulation.ready_ns - self._ahead_ns)
 
-    def _update_look_ahead(self) -> None:
-        """Set the time until which ticks take the fast path."""
+    def _set_fast_until(self) -> None:
+        """Ticks before this simulated time take the fast path."""
         simulation = self._simulation
         if self._clock.running:
             self._fast_until_ns = min(
@@ -144,7 +146,7 @@ class TickLoop:
                 NEVER_NS if self._computing else simulation.ready_ns - self._ahead_ns)
 
     def _advance(self) -> int:
-        """Send what is due, or as much as one tick has time for; return until when is due [ns]."""
+        """Send what is due, or what one tick has time for; return the simulated time due [ns]."""
         simulation, has_room = self._simulation, self._recording.has_room
         target_ns = min(self._clock.now(), self._duration_ns)
         if not self._clock.running:
@@ -160,20 +162,20 @@ class TickLoop:
         lag_ns = target_ns - simulation.now_ns
         if not arrived and lag_ns > LONGEST_LAG_NS * self._time_scale:
             self.slipped_ns += lag_ns
-            self._restart_clock()
+            self._sync_clock()
         return target_ns
 
     def pause(self) -> None:
         """Send what is due, then hold the motion; does nothing when paused already."""
         self._advance()
         self.paused = True
-        self._restart_clock()
+        self._sync_clock()
 
     def resume(self) -> None:
         """Let simulated time run on from where it was held, without catching up."""
         if self.paused:
             self.paused = False
-            self._restart_clock()
+            self._sync_clock()
 
     def step(self, count: int, dt: float) -> None:
         """Move a paused motion on by count x dt [s], rounded to 1 ns, or raise RuntimeError."""
@@ -192,7 +194,7 @@ class TickLoop:
             self._simulation.advance(target_ns, give_way=give_way)
         except IntegrationError as error:
             self.fail(str(error))
-        self._restart_clock()
+        self._sync_clock()
         if self.failure:
             raise RuntimeError(self.failure)
         if self.now_ns < target_ns:
@@ -219,14 +221,14 @@ class TickLoop:
         simulation.restart(values)
         simulation.epoch_ns = next_epoch(max(simulation.epoch_ns + sent_ns + 1, date_ns))
         self.failure = None
-        self._restart_clock()
+        self._sync_clock()
         self._recording.write_event('reset', sent_ns, epoch_ns=simulation.epoch_ns,
                                     parameters=values)
 
     def fail(self, reason: str) -> None:
         """Hold the motion until `reset`."""
         self.failure = reason
-        self._restart_clock()
+        self._sync_clock()
         self._error(f'{reason}; the motion stands still until ~/reset')
 
     def set_pace(self, values: Mapping[str, Any]) -> None:
