@@ -17,12 +17,12 @@ from spinning_top_sim.streams.topics import Stream
 
 Item = TypeVar('Item')
 
-# Instants of a block.  A command makes what is computed useless, and the next one may come soon:
+# Samples of the fastest stream in a block.  A command makes what is computed useless, and the next one may come soon:
 # after it, blocks begin small and double.
 LARGEST_BLOCK, SMALLEST_BLOCK = 256, 16
 # Nor does a block reach further ahead than this.
 LONGEST_BLOCK_NS = 300_000_000
-# Integration steps between two looks at the time, and in a block.
+# Integration steps between two looks at the time, and how many such pieces make a block.
 STEPS_IN_A_PIECE, MOST_PIECES = 4, 64
 NEVER_NS = 2 ** 63 - 1
 # Offline, a block becomes a chunk of a log.  Twice as many bytes take no less time, and are
@@ -39,9 +39,9 @@ class Delivery:
     Attributes
     ----------
     log_indices : numbers of the recorded streams in the log
-    logged : places of their messages among all, None for every place
-    size : of their messages together [bytes]
-    published : streams with subscribers, and the places of their messages
+    logged : places of their messages among all; None if all are recorded
+    size : of the recorded messages together [bytes]
+    published : (publish, place of the message, stream) of the streams with subscribers
     """
 
     __slots__ = ('log_indices', 'logged', 'published', 'size')
@@ -65,7 +65,8 @@ class Schedule:
     The messages of the streams of one run, in order of time.
 
     Blocks are computed where there is time: `prepare` in pieces after a tick, `compute` at once.
-    What is sent does not depend on it.  It begins with `follow`.
+    What is sent does not depend on it.  `follow` comes first.  Samples are sent up to
+    `Simulation.now_ns`, computed before `computed_ns`, and the solver has steps to `reached_ns`.
 
     Attributes
     ----------
@@ -103,7 +104,7 @@ class Schedule:
         """
         Return the time of the first sample after `now_ns` that is not computed [ns].
 
-        Where nothing is computed up to `now_ns`, the streams that have sinks begin there.
+        If nothing is computed beyond `now_ns`, look first which streams have sinks now.
         """
         if self.computed_ns <= now_ns:
             self._active = [stream for stream in self._streams if stream.has_sinks]
@@ -134,7 +135,7 @@ class Schedule:
         return self._go_on(None if budget_ns is None else time.monotonic_ns() + budget_ns)
 
     def compute(self, now_ns: int, until_ns: int) -> None:
-        """Compute a block up to `until_ns` at the most, or finish the one under way."""
+        """Finish the block under way, or if there is none compute one up to `until_ns` at most."""
         if self._work is None:
             self._work = self._pieces(now_ns, until_ns)
         self._go_on(None)
@@ -153,12 +154,29 @@ class Schedule:
         return True
 
     def _pieces(self, now_ns: int, until_ns: int) -> Iterator[None]:
-        """Compute a block, as far as the steps allow, in pieces of some 0.1 ms."""
+        """Compute a block, as far as the steps allow, in pieces of some 0.1 to 0.3 ms."""
         until_ns = min(until_ns,
                        self.next_due(now_ns) + (LARGEST_BLOCK - 1) * self._shortest_ns)
-        segment = self._segment
-        solver, start_ns = segment.solver, segment.start_ns
-        solver.release(now_ns - start_ns)
+        self._segment.solver.release(now_ns - self._segment.start_ns)
+        yield from self._take_steps(until_ns)
+        until_ns = min(until_ns, self.reached_ns)
+        blocks = [range(first_ns, until_ns + 1, stream.period_ns)
+                  for stream, first_ns in zip(self._active, self._next_ns, strict=True)]
+        instants: dict[int, tuple[list[int], list[bytes]]] = {}
+        yield from self._encode(blocks, instants)
+        # All at once: a block that is dropped before this leaves nothing behind.
+        for t_ns, (places, messages) in sorted(instants.items()):
+            key = tuple(places)
+            if key not in self._deliveries:
+                self._deliveries[key] = Delivery([self._active[k] for k in places])
+            self.ready.append((t_ns, self._deliveries[key], messages))
+        self._next_ns = [first_ns + len(times) * times.step
+                         for first_ns, times in zip(self._next_ns, blocks, strict=True)]
+        self.computed_ns = min(self._next_ns, default=NEVER_NS)
+
+    def _take_steps(self, until_ns: int) -> Iterator[None]:
+        """Let the solver step up to a time, or as far as one block allows."""
+        solver, start_ns = self._segment.solver, self._segment.start_ns
         # Deferred: `Simulation.advance` raises the error when it reaches that time.
         with contextlib.suppress(IntegrationError):
             for _ in range(MOST_PIECES):
@@ -166,13 +184,12 @@ class Schedule:
                     break
                 yield
         self.reached_ns = max(self.reached_ns, start_ns + solver.latest_ns)
-        until_ns = min(until_ns, self.reached_ns)
-        states = cache(segment.states)
-        instants: dict[int, tuple[list[int], list[bytes]]] = {}
-        next_ns = []
-        for place, (stream, first_ns) in enumerate(zip(self._active, self._next_ns, strict=True)):
-            times = range(first_ns, until_ns + 1, stream.period_ns)
-            next_ns.append(first_ns + len(times) * stream.period_ns)
+
+    def _encode(self, blocks: Sequence[range],
+                instants: dict[int, tuple[list[int], list[bytes]]]) -> Iterator[None]:
+        """Add the messages of the active streams at these times, and their places, by time."""
+        states = cache(self._segment.states)        # once for all streams of one rate
+        for place, (stream, times) in enumerate(zip(self._active, blocks, strict=True)):
             if not times:
                 continue
             states(times)
@@ -184,13 +201,6 @@ class Schedule:
                 places.append(place)
                 messages.append(data[number * size:(number + 1) * size])
             yield
-        for t_ns, (places, messages) in sorted(instants.items()):
-            key = tuple(places)
-            if key not in self._deliveries:
-                self._deliveries[key] = Delivery([self._active[k] for k in places])
-            self.ready.append((t_ns, self._deliveries[key], messages))
-        self._next_ns = next_ns
-        self.computed_ns = min(next_ns, default=NEVER_NS)
 
 
 def offline_block_ns(streams: Sequence[Stream]) -> int:
