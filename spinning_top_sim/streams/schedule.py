@@ -17,8 +17,8 @@ from spinning_top_sim.streams.topics import Stream
 
 Item = TypeVar('Item')
 
-# Samples of the fastest stream in a block.  A command makes what is computed useless, and the next one may come soon:
-# after it, blocks begin small and double.
+# Samples of the fastest stream in a block.  A command makes what is computed useless, and the next
+# one may come soon: after it, blocks begin small and double.
 LARGEST_BLOCK, SMALLEST_BLOCK = 256, 16
 # Nor does a block reach further ahead than this.
 LONGEST_BLOCK_NS = 300_000_000
