@@ -26,6 +26,8 @@ from helpers.reference import CASES, start_of, top_of
 from scipy.integrate import solve_ivp
 
 from spinning_top_sim import State, Top, solve
+from spinning_top_sim.physics.attitude import quaternion_of_angles
+from spinning_top_sim.physics.top import ContinuedState
 from spinning_top_sim.solvers.decimal_math import (
     atan2,
     carlson_rf,
@@ -755,3 +757,17 @@ print([name for name in sys.modules if name.split('.')[0] == 'scipy'])
     run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True,
                          timeout=60, cwd=Path(__file__).parent.parent)
     assert run.stdout.strip() == '[]'
+
+
+@pytest.mark.parametrize('turns', [-2, -1, 0, 1, 3])
+@pytest.mark.parametrize('theta', [0.7, -0.7])
+def test_a_start_behind_a_pole_keeps_its_branch_and_the_sign_of_its_quaternion(turns, theta):
+    start = ContinuedState(theta=theta + turns * math.tau, theta_dot=0.3, phi=0.4, psi=-1.1,
+                           l3=1.6, lz=1.3)
+    states = ExactSolution(REGIMES['looping'][0], start).states_at_seconds(np.array([0.0, 0.01]))
+    angles = [states.phi, states.theta, states.psi]
+    assert [column[0] for column in angles] == pytest.approx(
+        [start.phi, start.theta, start.psi], abs=1e-14)
+    expected = np.stack(quaternion_of_angles(*angles), axis=-1)
+    assert np.abs(states.quaternion - expected).max() < 1e-14
+    assert states.theta_dot[0] == pytest.approx(0.3, abs=1e-14)

@@ -2,6 +2,7 @@
 """Constants and states of the top, attitude mathematics, regimes: no ROS."""
 
 import math
+from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.regimes import regime, swing
+from spinning_top_sim.physics.regimes import nutation_cubic, regime, swing
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.pipeline import Simulation
@@ -321,3 +322,15 @@ def test_a_bad_parameter_is_refused_by_name_and_value(name, value):
 def test_an_integer_is_taken_for_a_double():
     value = parameters.checked({'spin.l3': 2})['spin.l3']
     assert value == 2.0 and isinstance(value, float)
+
+
+@pytest.mark.parametrize('theta', [1e-9, 1e-3, math.pi - 1e-3, math.pi - 1e-9])
+def test_the_cubic_keeps_its_digits_next_to_both_poles(theta):
+    """In doubles as in decimals of 60 digits, where L3 and Lz nearly cancel."""
+    numbers = (0.123, 2.94, 1.6, math.copysign(1.6, math.cos(theta)), 0.7,
+               math.sin(0.5 * theta), math.cos(0.5 * theta))
+    with localcontext() as context:
+        context.prec = 60
+        exact = nutation_cubic(*map(Decimal, numbers))
+    for found, expected in zip(nutation_cubic(*numbers), exact, strict=True):
+        assert found == pytest.approx(float(expected), rel=1e-14)

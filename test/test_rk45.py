@@ -490,3 +490,12 @@ def test_phases_are_followed_past_the_poles(l3, lz, rtol, bound):
     assert phases.begins[2] == pytest.approx(0.5 * exact.theta, abs=bound)
     phases.forget(30)
     assert phases.begins.shape == (3, len(t) - 30)
+
+
+def test_an_error_that_is_no_number_is_no_small_error():
+    equations = TransportEquations(top_of(LOOPING), start_of(LOOPING), 1e-9, 1e-10)
+    y = equations.start
+    for place in range(3):
+        difference = [0j, 0j, 0j]
+        difference[place] = complex(math.nan)
+        assert not equations.error(y, y, tuple(difference)) <= 1.0

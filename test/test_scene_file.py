@@ -62,7 +62,7 @@ def test_what_rcl_refuses_is_refused(tmp_path, capfd, text):
 
 def test_a_file_gives_the_parameters_that_the_node_starts_with(tmp_path):
     pytest.importorskip('rclpy')
-    from spinning_top_sim.nodes.ros_parameters import start_values
+    from spinning_top_sim.nodes.ros_parameters import declare
 
     path = scene(tmp_path / 'p.yaml', **{
         'imu.gyroscope_noise_density': '1e-9', 'max_error': '1e5', 'spin.l3': '2',
@@ -70,7 +70,7 @@ def test_a_file_gives_the_parameters_that_the_node_starts_with(tmp_path):
         'start_type_description_service': 'false', 'world_frame': '"1"', 'seed': '0x10'})
     ours = parameters.checked(read_scene(path))
     with ros_node(path) as node:
-        assert ours == start_values(node)
+        assert ours == declare(node)
     assert (ours['imu.gyroscope_noise_density'], ours['max_error']) == (1e-9, 1e5)
     assert (ours['imu.lever_arm'], ours['world_frame'], ours['seed']) == ((0.0, 0.0, 1.0), '1', 16)
 

@@ -20,6 +20,7 @@ from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.propagator import Propagator, propagate
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.all_streams import all_streams
@@ -31,6 +32,9 @@ from spinning_top_sim.streams.topics import Stream
 STEPS_AT_ONCE = 500
 # Steps of a block offline: their interpolants stay in the cache.
 STEPS_IN_A_BLOCK = 2000
+
+# A motion whose exact solution ends before three years is refused when it begins.
+SHORTEST_RUN_NS = 10 ** 17
 
 # Takes the samples of an instant for a log: numbers of their streams there, stamp [ns], messages,
 # size of these together [bytes].
@@ -336,4 +340,7 @@ def _propagate(top: Top, start: State, values: Mapping[str, Any]) -> Propagator:
         raise ValueError(f'the energy would be {energy!r} J with {rates}')
     if not solver.reach(1, STEPS_AT_ONCE):
         raise ValueError(f'{rates} turn the top too fast: over {STEPS_AT_ONCE} steps a nanosecond')
+    if isinstance(solver, ExactSolution) and solver.ns_limit < SHORTEST_RUN_NS:
+        raise ValueError(f'{rates} turn the top too fast: after {solver.time_limit:.3g} s a phase '
+                         'reaches 2^52 turns')
     return solver

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.provenance import provenance
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -147,6 +146,8 @@ def write_log(path: Path, values: Mapping[str, Any], stops: Sequence[Stop],
     epoch_ns : stamp of t = 0 [ns]
     namespace : of the topics
     """
+    from spinning_top_sim.recording.writer import create_file  # noqa: PLC0415 - needs mcap
+
     simulation = Simulation(values, epoch_ns)
     streams = journal.recorded_streams(simulation.streams, values)
     topics = [RecordedTopic(journal.resolve_topic(name, namespace), type_name)
