@@ -529,3 +529,30 @@ def test_the_euler_equations_fail_at_a_pole_with_a_reason_and_can_be_restarted(o
 def test_the_euler_equations_cannot_start_at_a_pole():
     with pytest.raises((ValueError, IntegrationError), match='theta'):
         simulate(solver__equations='euler', initial__theta=0.0, spin__l3=1.0, spin__lz=1.0)
+
+
+# --------------------------------------------------------------- what takes effect at once
+
+def test_a_change_of_rates_reaches_every_stream():
+    simulation = simulate()
+    simulation.advance(SECOND)
+    rates = {f'{one.parameter}.rate': 50.0 for one in simulation.streams}
+    simulation.apply({**rates, 'tick_rate': 100.0})
+    assert {one.period_ns for one in simulation.streams} == {20 * MILLISECOND}
+    taken = record(simulation)
+    simulation.advance(2 * SECOND)
+    for one in simulation.streams:
+        assert times(taken, one.topic) == list(range(SECOND + 20 * MILLISECOND, 2 * SECOND + 1,
+                                                     20 * MILLISECOND)), one.topic
+
+
+def test_samples_that_are_too_late_and_not_recorded_are_not_computed():
+    simulation = simulate()
+    encoded, taken = messages_of(simulation), publish(simulation, 'pose', 'joint_states')
+    record(simulation, 'joint_states')
+    simulation.advance(SECOND, publish_from_ns=SECOND // 2)
+    assert len(taken) == 2 * 51
+    # Recorded samples are all computed; of the others, those from the limit on.
+    assert encoded['joint_states'].count == 101
+    assert encoded['pose'].count == 51
+    assert stream(simulation, 'pose').skipped == stream(simulation, 'joint_states').skipped == 50

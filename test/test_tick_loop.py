@@ -228,6 +228,8 @@ def test_a_clock_too_far_ahead_slips():
     assert run.loop.now_ns == 4 * TICK_NS
     run.tick(200_000_000)
     assert run.loop.slipped_ns == 1_100_000_000
+    run.tick(1_200_000_000)
+    assert run.loop.slipped_ns == 2_300_000_000     # all together
     room[0] = True
     run.ticks(4)
     assert run.loop.now_ns == 8 * TICK_NS
