@@ -326,11 +326,23 @@ def test_an_integer_is_taken_for_a_double():
 
 @pytest.mark.parametrize('theta', [1e-9, 1e-3, math.pi - 1e-3, math.pi - 1e-9])
 def test_the_cubic_keeps_its_digits_next_to_both_poles(theta):
-    """In doubles as in decimals of 60 digits, where L3 and Lz nearly cancel."""
-    numbers = (0.123, 2.94, 1.6, math.copysign(1.6, math.cos(theta)), 0.0,
-               math.sin(0.5 * theta), math.cos(0.5 * theta))
+    """Where L3 and Lz nearly cancel, against 60 digits from the smaller of sin and cos theta/2."""
+    lambda1, torque, l3 = 0.123, 2.94, 1.6
+    sine, cosine = math.sin(0.5 * theta), math.cos(0.5 * theta)
+    upright = theta < 1.0
+    found = nutation_cubic(lambda1, torque, l3, l3 if upright else -l3, 0.0, sine, cosine)
     with localcontext() as context:
         context.prec = 60
-        exact = nutation_cubic(*map(Decimal, numbers))
-    for found, expected in zip(nutation_cubic(*numbers), exact, strict=True):
-        assert found == pytest.approx(float(expected), rel=1e-14)
+        small = Decimal(sine if upright else cosine) ** 2
+        sign, inertia, spin = (1 if upright else -1), Decimal(lambda1), Decimal(l3)
+        u0 = sign * (1 - 2 * small)
+        momentum = 2 * sign * spin * small              # Lz - L3 u0
+        sine2 = 4 * small * (1 - small)
+        kinetic = (momentum / inertia) ** 2 / sine2 * inertia / 2
+        expected = (
+            2 * momentum * spin / inertia ** 2
+            - 2 / inertia * (2 * u0 * kinetic + Decimal(torque) * sine2),
+            2 / inertia * (2 * u0 * Decimal(torque) - kinetic) - (spin / inertia) ** 2)
+    assert found[0] == 0.0
+    for value, exact in zip(found[1:3], expected, strict=True):
+        assert value == pytest.approx(float(exact), rel=1e-14, abs=0.0)
