@@ -86,7 +86,7 @@ class ExactSolution:
         motion = set_up(top, start)
         with precision(motion.digits):
             self._take_constants(motion)
-            self._series = None if motion.alpha.full_circle is None else AttitudeSeries(motion)
+            self._series = AttitudeSeries(motion)
         self._check_start()
 
     def _take_constants(self, motion: ThetaMotion) -> None:
@@ -219,13 +219,7 @@ class _ExactStates(States):
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:
-        if self._solution._series is not None:
-            x, y, z, w = self._solution._series.quaternion(self._times)
-        else:
-            cosine, sine = self._half_angle
-            alpha, beta = self._rotation_angles()
-            x, y = -sine * np.sin(beta), sine * np.cos(beta)
-            z, w = cosine * np.sin(alpha), cosine * np.cos(alpha)
+        x, y, z, w = self._solution._series.quaternion(self._times)
         return (-x, -y, -z, -w) if self._solution._turns % 2 else (x, y, z, w)
 
     @cached_property

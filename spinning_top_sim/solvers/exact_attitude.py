@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The attitude of the exact motion as short theta series of one phase, fast and without cases.
+The attitude of the exact motion as short theta series about even quarter periods.
 
-Away from the separatrix (m1 >= `theta_setup.FULL_CIRCLE_M1`) the series of the even quarter
-periods hold at every phase v = (pi/2) Z:
+Away from the separatrix (m1 >= `theta_setup.FULL_CIRCLE_M1`) they are series in the circular
+functions of v = (pi/2) Z and hold at every phase.  Near the separatrix they are series in
+hyperbolic functions, and reach half a period either way from the nearest even quarter period:
 
-    alpha = (R + i s J)(v)/D(v) exp i(rotation),   D from |alpha|^2 + |beta|^2 = 1.
+    alpha = (R + i s J)(y)/D(y) exp i(rotation),   D from |alpha|^2 + |beta|^2 = 1.
 
 An attitude is i beta = x + iy = (-s J + i R) exp(i rotation) over D, and i conj(alpha) = z + iw =
 (s J + i R) exp(-i rotation) over D, with the R, J, s and rotation of beta and of alpha.
@@ -18,36 +19,50 @@ from decimal import Decimal
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.attitude import Quaternion
-from spinning_top_sim.solvers.decimal_math import ONE, ZERO, pi
-from spinning_top_sim.solvers.rotations import Rotations
+from spinning_top_sim.physics.attitude import Column, Quaternion
+from spinning_top_sim.solvers.decimal_math import ONE, ZERO, pi, sinh_cosh
+from spinning_top_sim.solvers.nutation import QUARTER_PERIOD_ANGLE, NutationPhase
+from spinning_top_sim.solvers.rotations import STEP_ANGLE, Rotations
 from spinning_top_sim.solvers.theta_series import Series
 from spinning_top_sim.solvers.theta_setup import Factor, ThetaMotion
 from spinning_top_sim.solvers.times import Times
 
-NEGLIGIBLE = Decimal('1e-18')           # beside the largest coefficient
-BLOCK = 16384           # times evaluated together: temporaries stay in the cache
+NEGLIGIBLE = Decimal('1e-18')           # beside the largest term
+BLOCK = 8192            # times evaluated together: temporaries stay in the cache
 
 
 class AttitudeSeries:
-    """The attitude of a motion that has full-circle series; see `ThetaMotion.full_circle`."""
+    """The attitude of one motion."""
 
     def __init__(self, motion: ThetaMotion) -> None:
+        self._hyperbolic = motion.alpha.full_circle is None
         v_rate, v_start = motion.quarter_rate / 4, (motion.quarter0 + motion.offset0) / 4
+        largest_xi = ONE
+        if self._hyperbolic:
+            self._phase = NutationPhase(motion)
+            self._stretch = float(motion.stretch)
+            largest_xi = sinh_cosh(motion.stretch * pi() / 2)[0] ** 2
 
         def angle(factor: Factor) -> tuple[Decimal, Decimal]:
+            rate, start = factor.rate / (2 * pi()), factor.phase_turns
+            if self._hyperbolic:
+                return rate, start
             # The drift -s y, with y = v, is part of the rotation.
-            return (factor.rate / (2 * pi()) - factor.sense * v_rate,
-                    factor.phase_turns - factor.sense * v_start)
+            return rate - factor.sense * v_rate, start - factor.sense * v_start
         (alpha_rate, alpha_start), beta_angle = angle(motion.alpha), angle(motion.beta)
-        self._rotations = Rotations(
-            (beta_angle, (-alpha_rate, -alpha_start), (v_rate, v_start)))
+        angles = [beta_angle, (-alpha_rate, -alpha_start)]
+        self._rotations = Rotations(angles if self._hyperbolic else
+                                    [*angles, (v_rate, v_start)])
+        self._drifts = np.array([[float(motion.beta.drift)], [-float(motion.alpha.drift)]])
+        # Signs of the four series that change with every second even quarter period.
+        self._flipped = [k for k, factor in ((0, motion.beta), (2, motion.alpha))
+                         if factor.crosses]
         series = (*_real_and_imaginary(motion.beta, -ONE), *_real_and_imaginary(motion.alpha, ONE))
-        polynomials = [_polynomial(one) for one in series]
+        polynomials = [_polynomial(one, largest_xi) for one in series]
         coefficients = np.zeros((max(2, *map(len, polynomials)), 4))
         for k, polynomial in enumerate(polynomials):
             coefficients[:len(polynomial), k] = polynomial
-        # By power of sin^2 v, then by series.
+        # By power of xi = sin^2 v or -sinh^2 x, then by series.
         self._coefficients = coefficients[:, :, np.newaxis]
         self._prefactors = [one.prefactor for one in series]
 
@@ -61,18 +76,17 @@ class AttitudeSeries:
         return x, y, z, w
 
     def _fill(self, out: NDArray[np.float64], times: Times) -> None:
-        cosines, sines = (self._rotations.cosines_and_sines(times) if times.ns is None
-                          else self._rotations.at_ns(times.ns))
-        cos_v, sin_v = cosines[2], sines[2]
-        square = sin_v * sin_v
-        series = self._coefficients[-1] * square
-        for coefficient in self._coefficients[-2:0:-1]:
-            series += coefficient
-            series *= square
-        series += self._coefficients[0]
-        for k, prefactor in enumerate(self._prefactors):
-            for factor in ((), (cos_v,), (sin_v,), (sin_v, cos_v))[prefactor]:
-                series[k] *= factor
+        if self._hyperbolic:
+            y, sin, cos, flip = self._hyperbolic_phase(times)
+            cosines, sines = self._rotations.cosines_and_sines(
+                times, self._drifts / STEP_ANGLE * y)
+            series = self._series(-sin * sin, sin, cos)
+            for k in self._flipped:
+                series[k:k + 2] *= flip
+        else:
+            cosines, sines = (self._rotations.cosines_and_sines(times) if times.ns is None
+                              else self._rotations.at_ns(times.ns))
+            series = self._series(sines[2] * sines[2], sines[2], cosines[2])
         squares = series * series
         scale = (squares[0] + squares[1]) + (squares[2] + squares[3])
         series *= 1.0 / np.sqrt(scale)
@@ -81,19 +95,40 @@ class AttitudeSeries:
             np.subtract(real * cosines[k], imag * sines[k], out=out[2 * k])
             np.add(real * sines[k], imag * cosines[k], out=out[2 * k + 1])
 
+    def _series(self, xi: Column, sin: Column, cos: Column) -> NDArray[np.float64]:
+        """Return -s J and R of beta, s J and R of alpha, (4, n)."""
+        series: NDArray[np.float64] = self._coefficients[-1] * xi
+        for coefficient in self._coefficients[-2:0:-1]:
+            series += coefficient
+            series *= xi
+        series += self._coefficients[0]
+        for k, prefactor in enumerate(self._prefactors):
+            for factor in ((), (cos,), (sin,), (sin, cos))[prefactor]:
+                series[k] *= factor
+        return series
+
+    def _hyperbolic_phase(self, times: Times) -> tuple[Column, Column, Column, Column]:
+        """Return y in [-pi/2, pi/2], sinh x, cosh x and (-1)^(N/2), N even and nearest."""
+        quarters, y = self._phase.at(times)
+        side = np.copysign(quarters.astype(np.int64) & 1, y)    # 0 at an even quarter period
+        y -= QUARTER_PERIOD_ANGLE * side
+        flip = 1.0 - ((quarters + side).astype(np.int64) & 2)
+        growing = 0.5 * np.exp(self._stretch * y)
+        falling = 0.25 / growing
+        return y, growing - falling, growing + falling, flip
+
 
 def _real_and_imaginary(factor: Factor, sense: Decimal) -> tuple[Series, Series]:
-    """Return `sense` times s J, and R, of a factor over the full circle."""
-    branch = factor.full_circle
-    assert branch is not None
+    """Return `sense` times s J, and R, of a factor about even quarter periods."""
+    branch = factor.full_circle or factor.even
     imag = branch.imag or Series('cos even', (ZERO,))
     return imag.scaled(sense * factor.sense), branch.real.scaled(Decimal(factor.sign))
 
 
-def _polynomial(series: Series) -> list[float]:
-    """Return the coefficients in sin^2 v of a theta series less its prefactor, lowest first."""
+def _polynomial(series: Series, largest_xi: Decimal) -> list[float]:
+    """Return the coefficients in xi of a theta series less its prefactor, lowest first."""
     exact = series.polynomial()
-    largest = max(map(abs, exact))
-    while len(exact) > 1 and abs(exact[-1]) < NEGLIGIBLE * largest:
+    sizes = [abs(x) * largest_xi ** power for power, x in enumerate(exact)]
+    while len(exact) > 1 and sizes[len(exact) - 1] < NEGLIGIBLE * max(sizes):
         exact.pop()
     return [float(x) for x in exact]

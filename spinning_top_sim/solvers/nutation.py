@@ -119,6 +119,33 @@ class _Quarter(NamedTuple):
         return alpha, beta, alpha_argument, beta_argument, theta_dot
 
 
+class NutationPhase:
+    """The phase of the nutation, counted from the nearest quarter period."""
+
+    def __init__(self, motion: ThetaMotion) -> None:
+        self._rate = Rate(motion.quarter_rate)
+        self._quarter0 = motion.quarter0
+        self._offset, self._offset_rest = double_double(motion.offset0)
+
+    def at(self, times: Times) -> tuple[Column, Column]:
+        """
+        Return the nearest whole number N of quarter periods, and the angle y from there.
+
+        y has full relative precision: a top races past a pole that it misses by little.
+        """
+        high, rest = self._rate.product(times)
+        whole = np.rint(high)
+        part = high - whole
+        # Knuth's sum of part and offset: `nearest` with what it leaves out.
+        nearest = part + self._offset
+        taken = nearest - part
+        left_out = (part - (nearest - taken)) + (self._offset - taken)
+        shift = np.rint(nearest + rest)
+        # Exact where the result is small (Sterbenz), as shift is 0 or +-1.
+        y = (nearest - shift) + (left_out + (rest + self._offset_rest))
+        return whole + (self._quarter0 + shift), QUARTER_PERIOD_ANGLE * y
+
+
 class Nutation:
     """
     The nutation of one motion.
@@ -132,9 +159,7 @@ class Nutation:
     def __init__(self, motion: ThetaMotion, start_theta: float) -> None:
         # Even and odd quarter periods.
         self._kinds = _quarter(motion, 0), _quarter(motion, 1)
-        self._quarter_rate = Rate(motion.quarter_rate)
-        self._quarter0 = motion.quarter0
-        self._offset, self._offset_rest = double_double(motion.offset0)
+        self._phase = NutationPhase(motion)
         self._turning = motion.turning
         self._turns0 = 0.0
         if motion.turning:
@@ -151,7 +176,7 @@ class Nutation:
         return NutationColumns(*columns)
 
     def _fill(self, out: NDArray[np.float64], times: Times) -> None:
-        quarters, y = self._phase(times)
+        quarters, y = self._phase.at(times)
         place = quarters.astype(np.int64) & 3
         flip = np.where(place < 2, 1.0, -1.0)
         odd = (place & 1).astype(bool)
@@ -164,24 +189,6 @@ class Nutation:
         if self._turning:
             half_theta += 2.0 * math.pi * np.rint(self._turns(quarters, y, half_theta))
         out[5] = half_theta
-
-    def _phase(self, times: Times) -> tuple[Column, Column]:
-        """
-        Return the nearest whole number of quarter periods, and the angle y from there.
-
-        y has full relative precision: a top races past a pole that it misses by little.
-        """
-        high, rest = self._quarter_rate.product(times)
-        whole = np.rint(high)
-        part = high - whole
-        # Knuth's sum of part and offset: `nearest` with what it leaves out.
-        nearest = part + self._offset
-        taken = nearest - part
-        left_out = (part - (nearest - taken)) + (self._offset - taken)
-        shift = np.rint(nearest + rest)
-        # Exact where the result is small (Sterbenz), as shift is 0 or +-1.
-        y = (nearest - shift) + (left_out + (rest + self._offset_rest))
-        return whole + (self._quarter0 + shift), QUARTER_PERIOD_ANGLE * y
 
     def _turns(self, quarters: Column, y: Column, half_theta: Column) -> Column:
         """

@@ -71,9 +71,9 @@ class Rotations:
         # By step and offset [ns]: `_within_second` of uniform grids.
         self._grids: dict[tuple[int, int], tuple[Rows, Rows]] = {}
 
-    def cosines_and_sines(self, times: Times) -> tuple[Rows, Rows]:
-        """Return cos and sin of the angles, (k, n) each."""
-        return self._of_steps(*self._in_steps(times, self._start_rest), self._whole)
+    def cosines_and_sines(self, times: Times, added: Rows | float = 0.0) -> tuple[Rows, Rows]:
+        """Return cos and sin of the angles, (k, n) each, with `added` (k, n) [steps]."""
+        return self._of_steps(*self._in_steps(times, self._start_rest + added), self._whole)
 
     def at_ns(self, ns: NDArray[np.int64] | range) -> tuple[Rows, Rows]:
         """
@@ -162,7 +162,7 @@ class Rotations:
         rest += start_rest
         far = np.abs(times.high) > self._short_ns
         if far.any():
-            distant = times[far]
+            distant, start_rest = times[far], np.broadcast_to(start_rest, exact.shape)[:, far]
             for k, rate in enumerate(self._rates):
                 turns, turns_rest = rate.fraction(distant)
                 exact[k, far] = STEPS * turns
