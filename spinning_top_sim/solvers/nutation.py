@@ -135,9 +135,9 @@ class Nutation:
         self._quarter_rate = Rate(motion.quarter_rate)
         self._quarter0 = motion.quarter0
         self._offset, self._offset_rest = double_double(motion.offset0)
-        self._turning = motion.turning
+        self._turning = motion.planar_rotation
         self._turns0 = 0.0
-        if motion.turning:
+        if motion.planar_rotation:
             start = np.array([QUARTER_PERIOD_ANGLE * float(motion.offset0)])
             self._turns0 = round(float(self._turns(
                 np.array([float(motion.quarter0)]), start, np.array([0.5 * start_theta]))[0]))
