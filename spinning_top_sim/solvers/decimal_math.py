@@ -30,23 +30,12 @@ def pi() -> Decimal:
 
 @lru_cache
 def _pi(digits: int) -> Decimal:
-    """Machin: pi = 16 arctan(1/5) - 4 arctan(1/239)."""
-    unit: int = 10 ** (digits + 10)
-
-    def arctan_of_inverse(n: int) -> int:
-        total = term = unit // n
-        k = 1
-        while term:
-            term //= -n * n
-            k += 2
-            total += term // k
-            if term == -1:              # floor division never brings a negative term to 0
-                break
-        return total
-
-    with localcontext() as context:
-        context.prec = digits + 5
-        return Decimal(4 * (4 * arctan_of_inverse(5) - arctan_of_inverse(239))) / unit
+    """Gauss and Legendre: pi from the arithmetic-geometric mean."""
+    with precision(digits + 10):
+        a, b, t, power = ONE, 1 / Decimal(2).sqrt(), ONE / 4, 1
+        while abs(a - b) > Decimal(10) ** -digits:
+            a, b, t, power = (a + b) / 2, (a * b).sqrt(), t - power * ((a - b) / 2) ** 2, 2 * power
+        return (a + b) ** 2 / (4 * t)
 
 
 def sign(x: Decimal) -> int:

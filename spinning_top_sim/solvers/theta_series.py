@@ -115,7 +115,7 @@ class ThetaForm:
     """
 
     K: Decimal
-    K_prime: Decimal            # infinite for m = 0
+    K_prime: Decimal
     imaginary: bool
     nome: Decimal
     terms: int = TERMS
@@ -123,8 +123,7 @@ class ThetaForm:
     @classmethod
     def of(cls, m: Decimal, m1: Decimal) -> ThetaForm:
         """Choose the form with the smaller nome, at most exp(-pi)."""
-        K = complete_integral(m1)
-        K_prime = complete_integral(m) if m else Decimal('Infinity')
+        K, K_prime = complete_integral(m1), complete_integral(m)
         imaginary = m > m1
         return cls(K, K_prime, imaginary,
                    (-pi() * (K / K_prime if imaginary else K_prime / K)).exp())
@@ -139,8 +138,6 @@ class ThetaForm:
 
     def with_all_terms(self) -> ThetaForm:
         """Return the same form with every term that reaches the working precision."""
-        if not self.nome:
-            return self
         digits_per_square = -self.nome.adjusted() - 1           # at least 1
         return replace(self, terms=2 + math.isqrt(getcontext().prec // digits_per_square))
 

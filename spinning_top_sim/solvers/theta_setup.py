@@ -49,6 +49,7 @@ MOST_DIGITS = 480
 MOST_NEWTON_STEPS = 5000
 KEPT_DIGITS = 40        # what must be left of the digits after the discriminant has cancelled
 DIGITS_OF_SUMS = 1400   # the sum of any two doubles is exact
+NO_GRAVITY = Decimal('1e-1000')     # so small that u3 is infinite to all digits
 FULL_CIRCLE_M1 = Decimal('2e-4')    # below, the series of the real form cancels too much
 
 
@@ -225,29 +226,24 @@ def _resting(given: _Given) -> ThetaMotion:
 
 
 class _Roots(NamedTuple):
-    """
-    The roots y1 <= 0 <= y2 <= y3 of u'^2 in y = u - u0, and their distances, none by subtraction.
-
-    Without gravity y3 is None, at infinity: gap32 and gap31 are then 1, relative to y3 - y1.
-    """
+    """The roots y1 <= 0 <= y2 <= y3 of u'^2 in y = u - u0, and distances that do not cancel."""
 
     y1: Decimal
     y2: Decimal
-    y3: Decimal | None
+    y3: Decimal
     gap21: Decimal
     gap32: Decimal
 
     @property
     def gap31(self) -> Decimal:
-        return ONE if self.y3 is None else self.y3 - self.y1
+        return self.y3 - self.y1
 
     @property
     def m(self) -> Decimal:
-        return ZERO if self.y3 is None else self.gap21 / self.gap31
+        return self.gap21 / self.gap31
 
     @property
     def m1(self) -> Decimal:
-        """1 - m, without cancellation."""
         return self.gap32 / self.gap31
 
     def start_phase(self, falling: bool, K: Decimal) -> tuple[int, Decimal]:
@@ -259,8 +255,7 @@ class _Roots(NamedTuple):
         sn(K - chi) = cn/dn.
         """
         sense = -1 if falling else 1
-        sn2, cn2 = -self.y1 / self.gap21, self.y2 / self.gap21
-        dn2 = ONE if self.y3 is None else self.y3 / self.gap31
+        sn2, cn2, dn2 = -self.y1 / self.gap21, self.y2 / self.gap21, self.y3 / self.gap31
         if sn2 * (1 + self.m1.sqrt()) < 1:
             return 0, sense * sn2.sqrt() * carlson_rf(cn2, dn2, ONE) / K
         from_quarter = (cn2 / dn2).sqrt() * carlson_rf(self.m1 * sn2 / dn2, self.m1 / dn2, ONE) / K
@@ -298,12 +293,6 @@ def _isolated_root(a2: Decimal, a1: Decimal, a0: Decimal) -> tuple[Decimal, int]
 
 
 def _cubic_roots(f0: Decimal, f1: Decimal, f2: Decimal, f3: Decimal) -> _Roots:
-    if not f3:                                  # free motion: a quadratic
-        if not f0:
-            low, high = min(ZERO, -f1 / f2), max(ZERO, -f1 / f2)
-            return _Roots(low, high, None, high - low, ONE)
-        low, high, gap = _quadratic_roots(-f1 / f2, f0 / f2)
-        return _Roots(low, high, None, gap, ONE)
     a2, a1, a0 = f2 / f3, f1 / f3, f0 / f3
     if not f0:                                  # turning point, cusp or pole: y = 0 is a root
         low, high, gap = _quadratic_roots(-a2, a1)
@@ -321,7 +310,7 @@ def _cubic_roots(f0: Decimal, f1: Decimal, f2: Decimal, f3: Decimal) -> _Roots:
     return _Roots(low, high, y, gap, y - high)
 
 
-# ---------------------------------------------------------------- from the roots to theta functions
+# --------------------------------------------------------------- from the roots to theta functions
 
 
 class _Poles(NamedTuple):
@@ -340,7 +329,7 @@ class _Poles(NamedTuple):
     b: Decimal | None
 
     @classmethod
-    def of(cls, given: _Given, roots: _Roots, strength: Decimal) -> _Poles:
+    def of(cls, given: _Given, roots: _Roots, f3: Decimal) -> _Poles:
         """
         Find the poles without a subtraction that cancels.
 
@@ -349,11 +338,9 @@ class _Poles(NamedTuple):
         """
         s0, c0 = given.sin_half ** 2, given.cos_half ** 2
         one_plus_u2, one_minus_u1 = 2 * c0 + roots.y2, 2 * s0 - roots.y1
-        one_minus_u2 = 2 * s0 - roots.y2
-        one_plus_u3 = u3_minus_one = ONE            # relative to u3 - u1 without gravity
-        if roots.y3 is not None:
-            one_plus_u3, u3_minus_one = roots.y3 + 2 * c0, roots.y3 - 2 * s0
-        scale = given.lambda1 ** 2 * strength
+        one_minus_u2, u3_minus_one = 2 * s0 - roots.y2, roots.y3 - 2 * s0
+        one_plus_u3 = roots.y3 + 2 * c0
+        scale = given.lambda1 ** 2 * f3
         one_plus_u1 = (given.lz + given.l3) ** 2 / (scale * one_plus_u2 * one_plus_u3)
         at_top = (given.lz - given.l3) ** 2 / (scale * one_minus_u1)
         if one_minus_u2 <= u3_minus_one:
@@ -369,10 +356,11 @@ class _Poles(NamedTuple):
 
 
 def _nutating(given: _Given, cubic: tuple[Decimal, Decimal, Decimal, Decimal]) -> ThetaMotion:
-    roots = _cubic_roots(*cubic)
-    strength = cubic[3] or -cubic[2]            # relative to u3 - u1 without gravity
-    w = (strength * roots.gap31 / 4).sqrt()     # of sn(w t)
-    poles = _Poles.of(given, roots, strength)
+    f0, f1, f2, f3 = cubic
+    f3 = f3 or NO_GRAVITY * abs(f2)
+    roots = _cubic_roots(f0, f1, f2, f3)
+    w = (f3 * roots.gap31 / 4).sqrt()           # of sn(w t)
+    poles = _Poles.of(given, roots, f3)
     form = ThetaForm.of(roots.m, roots.m1)
     full_form = form.real() if roots.m1 >= FULL_CIRCLE_M1 else None
     quarter0, offset0 = roots.start_phase(given.theta_dot > 0, form.K)
