@@ -75,12 +75,6 @@ def sinh_cosh(x: Decimal) -> tuple[Decimal, Decimal]:
     return (e - 1 / e) / 2, (e + 1 / e) / 2
 
 
-def one_minus_exp(x: Decimal) -> Decimal:
-    """Return 1 - exp(-x)."""
-    s, c = sinh_cosh(x / 2)
-    return 2 * s / (s + c)
-
-
 def atan2(y: Decimal, x: Decimal) -> Decimal:
     """Turn back by the angle in doubles; a short series of the small angle left is enough."""
     radius = (x * x + y * y).sqrt()
@@ -111,14 +105,6 @@ def carlson_rf(x: Decimal, y: Decimal, z: Decimal) -> Decimal:
     e2, e3 = X * Y - Z * Z, X * Y * Z
     return (1 - e2 / 10 + e3 / 14 + e2 ** 2 / 24 - 3 * e2 * e3 / 44 - 5 * e2 ** 3 / 208
             + 3 * e3 ** 2 / 104 + e2 ** 2 * e3 / 16) / mean.sqrt()
-
-
-def complete_integral(complementary: Decimal) -> Decimal:
-    """Return K(m) from 1 - m > 0, by the arithmetic-geometric mean [DLMF 19.8.5]."""
-    a, b = ONE, complementary.sqrt()
-    while abs(a - b) > a * Decimal(10) ** (-getcontext().prec // 2):    # the last step squares it
-        a, b = (a + b) / 2, (a * b).sqrt()
-    return pi() / (a + b)
 
 
 def reduced_turns(radians: Decimal) -> Decimal:

@@ -168,15 +168,14 @@ class Integrator:
             y_new, derivative_new, difference = self._step(equations.derivative, h, y, derivative)
             self.evaluations += 6
             error = equations.error(y, y_new, difference)
+            # NaN, no number at all, is not <= 1: it shrinks the step until that collapses.
+            factor = max(SHRINK, SAFETY * error ** -0.2) if error else GROW
             if error <= 1.0:
                 break
-            # A NaN compares false everywhere: it lands here and shrinks the step until collapse.
             grow = 1.0
-            shrink = SAFETY * error ** -0.2 if error < math.inf else SHRINK
-            self._next_step = h * max(SHRINK, shrink)
+            self._next_step = h * factor
         y_new = equations.accepted(y, y_new)
-        factor = SAFETY * error ** -0.2 if error > 0.0 else grow
-        self._next_step = h * min(grow, max(SHRINK, factor))
+        self._next_step = h * min(grow, factor)
         self.steps += 1
         # First same as last: the projection moves y by less than the step's own error, so the
         # derivative at the unprojected end serves the next step too.

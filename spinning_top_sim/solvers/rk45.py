@@ -35,16 +35,7 @@ STEPS_TOGETHER = 256
 
 
 class SteppedMotion(ABC):
-    """
-    A motion by the steps of some equations.
-
-    Attributes
-    ----------
-    top : Top
-    start : where it begins, at t = 0
-    steps, evaluations : integration steps taken, evaluations of the right-hand side
-    latest_ns : the last nanosecond that can be read without further steps
-    """
+    """A `propagator.Propagator` by the steps of some equations."""
 
     def __init__(self, top: Top, start: State, equations: Equations) -> None:
         self.top, self.start, self._equations = top, start, equations
@@ -89,19 +80,16 @@ class SteppedMotion(ABC):
         del self._kept[:count]
 
     def states(self, times_ns: NDArray[np.int64] | range) -> States:
-        """
-        Return the states at integer nanoseconds (n,) after the start, in ascending order.
-
-        Raises ValueError if a time lies before the steps that are kept, and IntegrationError if
-        the steps cannot go on to the last time, or it is too many of them away.
-        """
+        """Return the states at ascending integer nanoseconds (n,); see `states_at_seconds`."""
         return self.states_at_seconds(Times.from_ns(times_ns).seconds)
 
     def states_at_seconds(self, t: Column) -> States:
         """
-        Return the states at ascending times t (n,) [s]; see `states`.
+        Return the states at ascending times t (n,) [s].
 
         Steps before the last time may be forgotten on the way.
+        Raises ValueError if a time lies before the steps that are kept, and IntegrationError if
+        the steps cannot go on to the last time, or it is too many of them away.
         """
         if len(t) and t[0] < self._kept[0].t0:
             raise ValueError(f't = {t[0]!r} s: steps go forward, and the oldest one that is kept '
@@ -109,9 +97,8 @@ class SteppedMotion(ABC):
         parts, begin = [], 0
         while begin < len(t):
             while not self._reach(t[begin], STEPS_TOGETHER):
-                newest = self._kept[-1]
-                length = newest.t1 - newest.t0
-                if t[begin] - newest.t1 > MOST_STEPS * length:
+                length = self._kept[-1].t1 - self._kept[-1].t0
+                if t[begin] - self._kept[-1].t1 > MOST_STEPS * length:
                     raise IntegrationError(
                         f't = {t[begin]:.9g} s is more than {MOST_STEPS:.0e} steps of '
                         f"{length:.3g} s away: use method = 'exact'")

@@ -18,8 +18,7 @@ from decimal import Decimal, getcontext
 from spinning_top_sim.solvers.decimal_math import (
     ONE,
     ZERO,
-    complete_integral,
-    one_minus_exp,
+    carlson_rf,
     pi,
     sin_cos,
     sinh_cosh,
@@ -123,7 +122,7 @@ class ThetaForm:
     @classmethod
     def of(cls, m: Decimal, m1: Decimal) -> ThetaForm:
         """Choose the form with the smaller nome, at most exp(-pi)."""
-        K, K_prime = complete_integral(m1), complete_integral(m)
+        K, K_prime = (carlson_rf(ZERO, x, ONE) for x in (m1, m))         # DLMF 19.25.1
         imaginary = m > m1
         return cls(K, K_prime, imaginary,
                    (-pi() * (K / K_prime if imaginary else K_prime / K)).exp())
@@ -155,12 +154,12 @@ class ThetaForm:
         """Return theta1 .. theta4 of y, less constants [DLMF 20.2(i)], or their transforms."""
         if self.imaginary:
             number = {1: 1, 2: 4, 3: 3, 4: 2}[number]
+        kind = {1: 'sin odd', 2: 'cos odd', 3: 'cos even', 4: 'cos even'}[number]
         if number in (1, 2):
-            powers = [self.nome ** (k * (k + 1)) if k else ONE for k in range(self.terms)]
+            powers = tuple(self.nome ** (k * (k + 1)) for k in range(self.terms))
         else:
-            powers = [2 * self.nome ** (k * k) if k else ONE for k in range(self.terms)]
-        return Series({1: 'sin odd', 2: 'cos odd', 3: 'cos even', 4: 'cos even'}[number],
-                      _alternating(powers) if number in (1, 4) else tuple(powers))
+            powers = ONE, *(2 * self.nome ** (k * k) for k in range(1, self.terms))
+        return Series(kind, _alternating(powers) if number in (1, 4) else powers)
 
     @property
     def odd_over_even(self) -> Decimal:
@@ -180,21 +179,16 @@ class ThetaForm:
         even = 2 * theta4 ** 4 * self.K_prime / (pi() * self.theta(1).slope_at_zero)
         return even, -16 * self.nome * even
 
-    def shifted_theta1(self, a: Decimal) -> tuple[Series, Series]:
-        """R and J of i theta1(y - ia), less a positive constant."""
+    def shifted(self, a: Decimal) -> tuple[tuple[Series, Series], tuple[Series, Series]]:
+        """R and J of i theta1(y - ia), and of theta2(y - ia), less positive constants."""
         if self.imaginary:
-            sines, cosines = self._turned_weights(1, a)
-            return Series('cos odd', sines), Series('sin odd', cosines)
+            (sines1, cosines1), (sines2, cosines2) = (
+                self._turned_weights(number, a) for number in (1, 2))
+            return ((Series('cos odd', sines1), Series('sin odd', cosines1)),
+                    (Series('cos even', cosines2), Series('sin even', sines2).scaled(-ONE)))
         minus, plus = self._growing_weights(a)
-        return Series('cos odd', _alternating(minus)), Series('sin odd', _alternating(plus))
-
-    def shifted_theta2(self, a: Decimal) -> tuple[Series, Series]:
-        """R and J of theta2(y - ia), less a positive constant."""
-        if self.imaginary:
-            sines, cosines = self._turned_weights(2, a)
-            return Series('cos even', cosines), Series('sin even', sines).scaled(-ONE)
-        minus, plus = self._growing_weights(a)
-        return Series('cos odd', tuple(plus)), Series('sin odd', tuple(minus))
+        return ((Series('cos odd', _alternating(minus)), Series('sin odd', _alternating(plus))),
+                (Series('cos odd', tuple(plus)), Series('sin odd', tuple(minus))))
 
     def _turned_weights(self, number: int, a: Decimal) -> tuple[tuple[Decimal, ...], ...]:
         """Return the weights of a transformed theta times sin, and cos, of n pi a/(2K')."""
@@ -207,22 +201,23 @@ class ThetaForm:
         """
         Return 2 q^(k(k+1)) exp(-A) times sinh, and cosh, of (2k+1) A, with A = pi a/(2K).
 
-        That is q^(k^2) g^k (1 -+ E^(2k+1)) with E = exp(-2A), g = q/E <= 1: no large numbers.
+        Over exp((2k+1) A) times q^(k^2) g^k with g = q exp(2A) <= 1: no large numbers.
         """
         depth = pi() * a / self.K
         g = (depth - pi() * self.K_prime / self.K).exp()
-        E, one_minus_E = (-depth).exp(), one_minus_exp(depth)
+        sinh, cosh = sinh_cosh(depth / 2)
+        sinh2, cosh2 = 2 * sinh * cosh, 1 + 2 * sinh * sinh
         minus, plus = [], []
         for k in range(self.terms):
-            growth = self.nome ** (k * k) * g ** k if k else ONE
-            one_minus_power = one_minus_E * sum((E ** j for j in range(1, 2 * k + 1)), ONE)
-            minus.append(growth * one_minus_power)
-            plus.append(growth * (2 - one_minus_power))
+            growth = 2 * self.nome ** (k * k) * g ** k / (sinh + cosh)
+            minus.append(growth * sinh)
+            plus.append(growth * cosh)
+            sinh, cosh = sinh * cosh2 + cosh * sinh2, cosh * cosh2 + sinh * sinh2
         return minus, plus
 
     def log_slope(self, a: Decimal) -> Decimal:
         """tau(a) = d/da log theta2(ia), to full precision: it sets the mean rates."""
-        real, imag = self.with_all_terms().shifted_theta2(a)
+        _, (real, imag) = self.with_all_terms().shifted(a)
         slope = imag.slope_at_zero / real.at_zero       # Cauchy-Riemann
         if self.imaginary:
             return pi() / (2 * self.K_prime) * (a / self.K + slope)

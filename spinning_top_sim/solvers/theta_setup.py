@@ -160,9 +160,10 @@ def _set_up(top: Top, start: State) -> ThetaMotion:
     if upside_down:
         torque, theta_dot, l3 = -torque, -theta_dot, -l3
         sin_half, cos_half, arguments = cos_half, sin_half, arguments[::-1]
-    given = _Given(Decimal(top.lambda1), Decimal(top.lambda3), torque, l3, lz, sin_half, cos_half,
-                   theta_dot, *map(reduced_turns, arguments))
-    cubic = nutation_cubic(given.lambda1, torque, l3, lz, theta_dot, sin_half, cos_half)
+    lambda1, lambda3 = Decimal(top.lambda1), Decimal(top.lambda3)
+    given = _Given(lambda1, l3, lz, theta_dot, sin_half, cos_half,
+                   l3 * (1 / lambda3 - 1 / lambda1), *map(reduced_turns, arguments))
+    cubic = nutation_cubic(lambda1, torque, l3, lz, theta_dot, sin_half, cos_half)
     motion = _nutating(given, cubic) if cubic[0] or cubic[1] else _resting(given)
     return _upside_down(motion) if upside_down else motion
 
@@ -186,20 +187,14 @@ class _Given(NamedTuple):
     """
 
     lambda1: Decimal
-    lambda3: Decimal
-    torque: Decimal
     l3: Decimal
     lz: Decimal
+    theta_dot: Decimal
     sin_half: Decimal
     cos_half: Decimal
-    theta_dot: Decimal
+    excess_spin: Decimal        # turns the body and not its axis: L3 (1/lambda3 - 1/lambda1)
     alpha_turns: Decimal        # arguments of alpha and beta [turns]
     beta_turns: Decimal
-
-    @property
-    def excess_spin(self) -> Decimal:
-        """What turns the body and not its axis: L3 (1/lambda3 - 1/lambda1)."""
-        return self.l3 * (1 / self.lambda3 - 1 / self.lambda1)
 
 
 def _resting(given: _Given) -> ThetaMotion:
@@ -410,8 +405,7 @@ def _factor_series(form: ThetaForm, is_beta: bool, s: int, zero: Decimal | None,
     if zero is None:
         theta1, theta2 = FactorSeries(form.theta(4)), FactorSeries(form.theta(3))
     elif s:
-        theta1 = FactorSeries(*form.shifted_theta1(zero))
-        theta2 = FactorSeries(*form.shifted_theta2(zero))
+        theta1, theta2 = (FactorSeries(*x) for x in form.shifted(zero))
     else:
         theta1 = FactorSeries(form.theta(1).scaled(-ONE if is_beta else ONE))
         theta2 = FactorSeries(form.theta(2))
