@@ -39,7 +39,7 @@ from spinning_top_sim.solvers.decimal_math import (
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.rotations import Rotations
 from spinning_top_sim.solvers.theta_setup import set_up
-from spinning_top_sim.solvers.times import LATEST_NS, Rate, Times
+from spinning_top_sim.solvers.times import LARGEST_NS, Rate, Times
 
 BOUND = 5e-15
 G = 9.81
@@ -673,7 +673,7 @@ def test_times_are_exact():
 
 
 def test_a_range_of_times_is_the_same_as_its_array():
-    for times in (range(-5, 5), range(0), range(LATEST_NS - 10, LATEST_NS + 1, 3)):
+    for times in (range(-5, 5), range(0), range(LARGEST_NS - 10, LARGEST_NS + 1, 3)):
         one, other = Times.from_ns(times), Times.from_ns(np.array(times, dtype=np.int64))
         assert one.high.tolist() == other.high.tolist() and one.low.tolist() == other.low.tolist()
 

@@ -35,7 +35,13 @@ STEPS_TOGETHER = 256
 
 
 class SteppedMotion(ABC):
-    """A `propagator.Propagator` by the steps of some equations."""
+    """
+    A motion by the steps of some equations, read in blocks of times.
+
+    top, start : what moves, and from where at t = 0
+    steps, evaluations : integration steps taken, evaluations of the right-hand side
+    latest_ns : the last nanosecond that can be read without further steps
+    """
 
     def __init__(self, top: Top, start: State, equations: Equations) -> None:
         self.top, self.start, self._equations = top, start, equations
@@ -226,11 +232,11 @@ class _TransportStates(States):
                            ) -> tuple[Column, Column, Column, Column]:
         """Return signed moduli and phases of alpha and beta in a frame of this uniform rate."""
         uniform = uniform_rate * self.t
-        alpha = y.alpha_real, y.alpha_imag, uniform
-        beta = y.beta_real, y.beta_imag, -uniform
-        return (self._of_alpha.modulus(*alpha), self._of_beta.modulus(*beta),
-                self._of_alpha.at(*alpha, self._begins[0]),
-                self._of_beta.at(*beta, self._begins[1]))
+        of_alpha = y.alpha_real, y.alpha_imag, uniform
+        of_beta = y.beta_real, y.beta_imag, -uniform
+        return (self._of_alpha.modulus(*of_alpha), self._of_beta.modulus(*of_beta),
+                self._of_alpha.at(*of_alpha, self._begins[0]),
+                self._of_beta.at(*of_beta, self._begins[1]))
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:

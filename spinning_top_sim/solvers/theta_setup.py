@@ -108,7 +108,6 @@ class ThetaMotion:
     alpha: Factor
     beta: Factor
     imaginary: bool             # the form of `even` and `odd` of the factors
-    full_circle: Series | None  # D for the full_circle of the factors
     stretch: Decimal            # x = stretch y in the imaginary form
     quarter_rate: Decimal       # quarter periods per second, w/K
     quarter0: int               # phase at t = 0 in quarter periods: whole part,
@@ -212,9 +211,9 @@ def _resting(given: _Given) -> ThetaMotion:
         digits=getcontext().prec,
         alpha=factor(given.cos_half, given.excess_spin, given.lz + given.l3, given.alpha_turns),
         beta=factor(given.sin_half, -given.excess_spin, given.lz - given.l3, given.beta_turns),
-        imaginary=False, full_circle=Series('cos even', (ONE,)), stretch=ONE, quarter_rate=ZERO,
-        quarter0=0, offset0=ZERO, u_dot=(ZERO, ZERO), u_dot_series=Series('sin odd', (ONE,)),
-        planar_rotation=None, m=ZERO, m1=ONE, theta_bounds=(theta, theta))
+        imaginary=False, stretch=ONE, quarter_rate=ZERO, quarter0=0, offset0=ZERO,
+        u_dot=(ZERO, ZERO), u_dot_series=Series('sin odd', (ONE,)), planar_rotation=None,
+        m=ZERO, m1=ONE, theta_bounds=(theta, theta))
 
 
 # ------------------------------------------------------------------------- the roots of the cubic
@@ -383,8 +382,7 @@ def _nutating(given: _Given, cubic: tuple[Decimal, Decimal, Decimal, Decimal]) -
     slope_even, slope_odd = form.slopes_of_sn2()
     return ThetaMotion(
         digits=getcontext().prec, alpha=alpha, beta=beta, imaginary=form.imaginary,
-        full_circle=full_form.theta(4) if full_form else None, stretch=form.stretch,
-        quarter_rate=w / form.K, quarter0=quarter0, offset0=offset0,
+        stretch=form.stretch, quarter_rate=w / form.K, quarter0=quarter0, offset0=offset0,
         u_dot=(w * roots.gap21 * slope_even, w * roots.gap21 * slope_odd),
         u_dot_series=form.theta(1),
         planar_rotation=(beta.sign, -alpha.sign * beta.sign)
