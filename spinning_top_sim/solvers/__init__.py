@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.propagator import check_settings, propagate
+from spinning_top_sim.solvers.propagator import propagate
 
 
 def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: float = 1e-11,
@@ -46,15 +46,11 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
     if not np.all(np.isfinite(times)):
         at = int(np.argmin(np.isfinite(times)))
         raise ValueError(f't[{at}] = {times[at]} s: must be finite')
-    atol = 0.1 * rtol if atol is None else atol
-    check_settings(method, equations, rtol, atol)
+    motion = propagate(top, start, method=method, equations=equations, rtol=rtol,
+                       atol=0.1 * rtol if atol is None else atol)
     if method == 'rk45':
-        if len(times) and times[0] < 0.0:
-            raise ValueError(f"t[0] = {times[0]} s: must be >= 0 with method = 'rk45'")
-        falls = np.flatnonzero(np.diff(times) < 0.0)
-        if len(falls):
-            at = int(falls[0])
-            raise ValueError(f't[{at + 1}] = {times[at + 1]} s after {times[at]} s: must not '
-                             "decrease with method = 'rk45'")
-    motion = propagate(top, start, method=method, equations=equations, rtol=rtol, atol=atol)
+        before = np.concatenate(([0.0], times[:-1]))
+        for at in np.flatnonzero(times < before)[:1]:
+            raise ValueError(f't[{at}] = {times[at]} s after {before[at]} s: must not decrease '
+                             "with method = 'rk45'")
     return motion.states_at_seconds(times)

@@ -30,23 +30,12 @@ def pi() -> Decimal:
 
 @lru_cache
 def _pi(digits: int) -> Decimal:
-    """Machin: pi = 16 arctan(1/5) - 4 arctan(1/239)."""
-    unit: int = 10 ** (digits + 10)
-
-    def arctan_of_inverse(n: int) -> int:
-        total = term = unit // n
-        k = 1
-        while term:
-            term //= -n * n
-            k += 2
-            total += term // k
-            if term == -1:              # floor division never brings a negative term to 0
-                break
-        return total
-
-    with localcontext() as context:
-        context.prec = digits + 5
-        return Decimal(4 * (4 * arctan_of_inverse(5) - arctan_of_inverse(239))) / unit
+    """Gauss and Legendre: pi from the arithmetic-geometric mean."""
+    with precision(digits + 10):
+        a, b, t, power = ONE, 1 / Decimal(2).sqrt(), ONE / 4, 1
+        while abs(a - b) > Decimal(10) ** -digits:
+            a, b, t, power = (a + b) / 2, (a * b).sqrt(), t - power * ((a - b) / 2) ** 2, 2 * power
+        return (a + b) ** 2 / (4 * t)
 
 
 def sign(x: Decimal) -> int:
@@ -86,12 +75,6 @@ def sinh_cosh(x: Decimal) -> tuple[Decimal, Decimal]:
     return (e - 1 / e) / 2, (e + 1 / e) / 2
 
 
-def one_minus_exp(x: Decimal) -> Decimal:
-    """Return 1 - exp(-x)."""
-    s, c = sinh_cosh(x / 2)
-    return 2 * s / (s + c)
-
-
 def atan2(y: Decimal, x: Decimal) -> Decimal:
     """Turn back by the angle in doubles; a short series of the small angle left is enough."""
     radius = (x * x + y * y).sqrt()
@@ -122,14 +105,6 @@ def carlson_rf(x: Decimal, y: Decimal, z: Decimal) -> Decimal:
     e2, e3 = X * Y - Z * Z, X * Y * Z
     return (1 - e2 / 10 + e3 / 14 + e2 ** 2 / 24 - 3 * e2 * e3 / 44 - 5 * e2 ** 3 / 208
             + 3 * e3 ** 2 / 104 + e2 ** 2 * e3 / 16) / mean.sqrt()
-
-
-def complete_integral(complementary: Decimal) -> Decimal:
-    """Return K(m) from 1 - m > 0, by the arithmetic-geometric mean [DLMF 19.8.5]."""
-    a, b = ONE, complementary.sqrt()
-    while abs(a - b) > a * Decimal(10) ** (-getcontext().prec // 2):    # the last step squares it
-        a, b = (a + b) / 2, (a * b).sqrt()
-    return pi() / (a + b)
 
 
 def reduced_turns(radians: Decimal) -> Decimal:

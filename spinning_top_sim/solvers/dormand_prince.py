@@ -13,15 +13,17 @@ from __future__ import annotations
 
 import functools
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 # The unknowns of one state: complex numbers, of which floats are some.
 Vector = tuple[complex, ...]
+# A row of each component (k, n), a complex one as two rows; a column of each state.
 Rows = NDArray[np.float64]
 
 
@@ -51,42 +53,38 @@ class IntegrationError(RuntimeError):
     """The integration cannot go on; the message says where, why and what to do instead."""
 
 
-class Equations(Protocol):
+class Equations(ABC):
     """
     Equations of motion y' = f(y) in some chart, with what the step control needs to know.
 
     name, is_complex : of the equations; whether the unknowns are complex numbers
     start : the unknowns at t = 0
-    first_step : a careful first step [s]: the control finds the right one within a few
+    tolerance, fastest_rate : error of a step and rate of change [1/s], for the first step
     derivative : takes the unknowns one by one; returns y'
     """
 
-    @property
-    def name(self) -> str: ...
+    name: str
+    is_complex: bool
+    start: Vector
+    tolerance: float
+    fastest_rate: float
+    derivative: Callable[..., Vector]
 
-    @property
-    def is_complex(self) -> bool: ...
-
-    @property
-    def start(self) -> Vector: ...
-
-    @property
-    def first_step(self) -> float: ...
-
-    @property
-    def derivative(self) -> Callable[..., Vector]: ...
-
+    @abstractmethod
     def second_derivative(self, y: Rows, derivative: Rows) -> Rows:
         """Return y'' from y and y': rows of components (k, n), real and imaginary parts apart."""
 
-    def project(self, y: Vector) -> Vector:
-        """Return y moved back onto the motion's invariants, or as it is."""
-
+    @abstractmethod
     def error(self, y: Vector, y_new: Vector, difference: Vector) -> float:
         """Return the largest error estimate over what is tolerated: a step passes at <= 1."""
 
-    def check_step(self, y: Vector, y_new: Vector) -> None:
-        """Raise IntegrationError if a step that passed cannot be trusted all the same."""
+    def accepted(self, y: Vector, y_new: Vector) -> Vector:
+        """
+        Return the end of a step that passed, perhaps moved back onto the motion's invariants.
+
+        Raises IntegrationError if it cannot be trusted.
+        """
+        return y_new
 
 
 StepFunction = Callable[..., tuple[Vector, Vector, Vector]]
@@ -145,11 +143,13 @@ class Integrator:
 
     def __init__(self, equations: Equations) -> None:
         self.equations = equations
-        start = equations.project(equations.start)
+        start = equations.start
         self._step = unrolled_step(len(start), equations.is_complex)
         derivative = equations.derivative(*start)
         self.newest = Step(0.0, start, derivative, 0.0, start, derivative)
-        self._next_step = equations.first_step
+        # A careful first step: the control finds the right one within a few.
+        self._next_step = 0.1 * math.pow(equations.tolerance, 0.2) / (
+            equations.fastest_rate or 1.0)
         self.steps = 0
         self.evaluations = 1
 
@@ -168,19 +168,18 @@ class Integrator:
             y_new, derivative_new, difference = self._step(equations.derivative, h, y, derivative)
             self.evaluations += 6
             error = equations.error(y, y_new, difference)
+            # NaN, no number at all, is not <= 1: it shrinks the step until that collapses.
+            factor = max(SHRINK, SAFETY * error ** -0.2) if error else GROW
             if error <= 1.0:
                 break
-            # A NaN compares false everywhere: it lands here and shrinks the step until collapse.
             grow = 1.0
-            shrink = SAFETY * error ** -0.2 if error < math.inf else SHRINK
-            self._next_step = h * max(SHRINK, shrink)
-        equations.check_step(y, y_new)
-        factor = SAFETY * error ** -0.2 if error > 0.0 else grow
-        self._next_step = h * min(grow, max(SHRINK, factor))
+            self._next_step = h * factor
+        y_new = equations.accepted(y, y_new)
+        self._next_step = h * min(grow, factor)
         self.steps += 1
         # First same as last: the projection moves y by less than the step's own error, so the
         # derivative at the unprojected end serves the next step too.
-        self.newest = Step(t, y, derivative, end, equations.project(y_new), derivative_new)
+        self.newest = Step(t, y, derivative, end, y_new, derivative_new)
         return self.newest
 
 
@@ -201,9 +200,9 @@ class Interpolants(NamedTuple):
         """Return the interpolants of steps of these equations."""
         begin = np.array([step.t0 for step in steps])
         h = np.array([step.t1 - step.t0 for step in steps])
-        y0, y1 = _rows([step.y0 for step in steps]), _rows([step.y1 for step in steps])
-        first0 = _rows([step.derivative0 for step in steps])
-        first1 = _rows([step.derivative1 for step in steps])
+        y0, y1 = _components([step.y0 for step in steps]), _components([step.y1 for step in steps])
+        first0 = _components([step.derivative0 for step in steps])
+        first1 = _components([step.derivative1 for step in steps])
         rise, p, q = y1 - y0, h * first0, h * first1
         u = 0.5 * h * h * equations.second_derivative(y0, first0)
         v = 0.5 * h * h * equations.second_derivative(y1, first1)
@@ -221,7 +220,7 @@ class Interpolants(NamedTuple):
         return unknowns
 
 
-def _rows(vectors: Sequence[Vector]) -> Rows:
+def _components(vectors: Sequence[Vector]) -> Rows:
     """Return rows (k, n) of n vectors; a complex component makes two rows."""
     columns: NDArray[np.generic] = np.array(vectors)
     return np.ascontiguousarray(columns.view(np.float64).T)

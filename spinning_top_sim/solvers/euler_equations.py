@@ -19,15 +19,15 @@ import math
 import numpy as np
 
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.dormand_prince import IntegrationError, Rows, Vector
+from spinning_top_sim.solvers.dormand_prince import Equations, IntegrationError, Rows, Vector
 
 # |sin(theta)| at which the rounding of cos(theta), 1.1e-16, costs phi' a millionth of L3/lambda1.
 SMALLEST_SINE = math.sqrt(2.0 ** -53 / 1e-6)
 ADVICE = "use the regular equations (equations = 'transport') or method = 'exact'"
 
 
-class EulerEquations:
-    """The equations above for one top and one motion; see `dormand_prince.Equations`."""
+class EulerEquations(Equations):
+    """The equations above for one top and one motion."""
 
     name = 'euler'
     is_complex = False
@@ -36,13 +36,10 @@ class EulerEquations:
         self.top, self.l3, self.lz = top, start.l3, start.lz
         self._rtol, self._atol = rtol, atol
         self.start = (start.theta, start.theta_dot, start.phi, start.psi)
-
-    @property
-    def first_step(self) -> float:
-        top = self.top
-        rate = (abs(self.start[1]) + (abs(self.l3) + abs(self.lz)) / top.lambda1
-                + abs(self.l3) / top.lambda3 + math.sqrt(abs(top.gravity_torque) / top.lambda1))
-        return 0.1 * math.pow(self._rtol + self._atol, 0.2) / (rate or 1.0)
+        self.tolerance = rtol + atol
+        self.fastest_rate = (
+            abs(start.theta_dot) + (abs(start.l3) + abs(start.lz)) / top.lambda1
+            + abs(start.l3) / top.lambda3 + math.sqrt(abs(top.gravity_torque) / top.lambda1))
 
     def derivative(self, theta: float, theta_dot: float, phi: float, psi: float) -> Vector:
         """Return (theta', theta'', phi', psi').  Raises IntegrationError near a pole."""
@@ -80,14 +77,11 @@ class EulerEquations:
         return max([abs(e) / (self._atol + self._rtol * max(abs(a), abs(b)) or math.ulp(0.0))
                     for e, a, b in zip(difference, y, y_new, strict=True)])
 
-    def check_step(self, y: Vector, y_new: Vector) -> None:
+    def accepted(self, y: Vector, y_new: Vector) -> Vector:
         """Raise IntegrationError if the step leapt over a pole: phi and psi would be lost."""
         before, after = y[0].real, y_new[0].real
         if math.floor(before / math.pi) != math.floor(after / math.pi):
             raise IntegrationError(
                 f'euler equations: a step leapt over a pole, from theta = {before!r} to '
                 f'{after!r} rad, and lost phi and psi; {ADVICE}')
-
-    def project(self, y: Vector) -> Vector:
-        """Return y as it is: L3 and Lz are exact here, and the rest is to the letter."""
-        return y
+        return y_new

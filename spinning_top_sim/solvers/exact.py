@@ -30,7 +30,7 @@ from spinning_top_sim.solvers.decimal_math import pi, precision
 from spinning_top_sim.solvers.exact_attitude import AttitudeSeries
 from spinning_top_sim.solvers.nutation import MOST, Nutation, NutationColumns, in_range
 from spinning_top_sim.solvers.theta_setup import ThetaMotion, set_up
-from spinning_top_sim.solvers.times import LATEST_NS, Rate, Times
+from spinning_top_sim.solvers.times import LARGEST_NS, Rate, Times
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
 MOST_TURNS = 2.0 ** 52
@@ -70,7 +70,7 @@ class ExactSolution:
     """
 
     steps = evaluations = 0
-    latest_ns = LATEST_NS
+    latest_ns = LARGEST_NS
 
     def __init__(self, top: Top, start: State) -> None:
         self.top = top
@@ -123,7 +123,7 @@ class ExactSolution:
         fastest = max(abs(motion.quarter_rate), abs(alpha.rate / two_pi), abs(beta.rate / two_pi),
                       Decimal('1e-300'))
         limit = min(Decimal(MOST_TURNS) / fastest, MOST)
-        self.time_limit, self.ns_limit = float(limit), min(int(limit * 10 ** 9), LATEST_NS)
+        self.time_limit, self.ns_limit = float(limit), min(int(limit * 10 ** 9), LARGEST_NS)
 
     def _check_start(self) -> None:
         """Refuse constants so far apart that doubles lose the start among them."""

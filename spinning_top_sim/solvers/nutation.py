@@ -160,9 +160,9 @@ class Nutation:
         # Even and odd quarter periods.
         self._kinds = _quarter(motion, 0), _quarter(motion, 1)
         self._phase = NutationPhase(motion)
-        self._turning = motion.turning
+        self._turning = motion.planar_rotation
         self._turns0 = 0.0
-        if motion.turning:
+        if motion.planar_rotation:
             start = np.array([QUARTER_PERIOD_ANGLE * float(motion.offset0)])
             self._turns0 = round(float(self._turns(
                 np.array([float(motion.quarter0)]), start, np.array([0.5 * start_theta]))[0]))

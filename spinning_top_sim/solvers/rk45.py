@@ -21,28 +21,24 @@ from spinning_top_sim.solvers.dormand_prince import (
     IntegrationError,
     Integrator,
     Interpolants,
+    Rows,
 )
 from spinning_top_sim.solvers.euler_equations import EulerEquations
 from spinning_top_sim.solvers.times import NANOSECONDS, Times
 from spinning_top_sim.solvers.transport import TransportEquations, Unknowns
-from spinning_top_sim.solvers.unwrap import PhaseUnwrapper, spin_excess
+from spinning_top_sim.solvers.unwrap import PhaseUnwrapper
 
 # A time that so many steps of the present size do not reach is refused at once: 3 hours of work.
 MOST_STEPS = 1e9
-# Steps that are taken and read together; more would only take memory.
-STEPS_AT_ONCE = 256
-
-Rows = NDArray[np.float64]
+# Steps that are kept to be read together; more would only take memory.
+STEPS_TOGETHER = 256
 
 
 class SteppedMotion(ABC):
     """
-    A motion by the steps of some equations.
+    A motion by the steps of some equations, read in blocks of times.
 
-    Attributes
-    ----------
-    top : Top
-    start : where it begins, at t = 0
+    top, start : what moves, and from where at t = 0
     steps, evaluations : integration steps taken, evaluations of the right-hand side
     latest_ns : the last nanosecond that can be read without further steps
     """
@@ -90,62 +86,53 @@ class SteppedMotion(ABC):
         del self._kept[:count]
 
     def states(self, times_ns: NDArray[np.int64] | range) -> States:
-        """
-        Return the states at integer nanoseconds (n,) after the start, in ascending order.
-
-        Raises ValueError if a time lies before the steps that are kept, and IntegrationError if
-        the steps cannot go on to the last time, or it is too many of them away.
-        """
+        """Return the states at ascending integer nanoseconds (n,); see `states_at_seconds`."""
         return self.states_at_seconds(Times.from_ns(times_ns).seconds)
 
     def states_at_seconds(self, t: Column) -> States:
         """
-        Return the states at ascending times t (n,) [s]; see `states`.
+        Return the states at ascending times t (n,) [s].
 
         Steps before the last time may be forgotten on the way.
+        Raises ValueError if a time lies before the steps that are kept, and IntegrationError if
+        the steps cannot go on to the last time, or it is too many of them away.
         """
         if len(t) and t[0] < self._kept[0].t0:
             raise ValueError(f't = {t[0]!r} s: steps go forward, and the oldest one that is kept '
                              f'begins at {self._kept[0].t0!r} s')
         parts, begin = [], 0
         while begin < len(t):
-            while not self._reach(t[begin], STEPS_AT_ONCE):
-                newest = self._kept[-1]
-                length = newest.t1 - newest.t0
-                if t[begin] - newest.t1 > MOST_STEPS * length:
+            while not self._reach(t[begin], STEPS_TOGETHER):
+                length = self._kept[-1].t1 - self._kept[-1].t0
+                if t[begin] - self._kept[-1].t1 > MOST_STEPS * length:
                     raise IntegrationError(
                         f't = {t[begin]:.9g} s is more than {MOST_STEPS:.0e} steps of '
                         f"{length:.3g} s away: use method = 'exact'")
                 self._forget(len(self._kept) - 1)
-            while self._kept[-1].t1 < t[-1] and len(self._kept) < STEPS_AT_ONCE:
+            while self._kept[-1].t1 < t[-1] and len(self._kept) < STEPS_TOGETHER:
                 self._kept.append(self._integrator.step())
             end = int(np.searchsorted(t, self._kept[-1].t1, 'right'))
-            parts.append(self._rows(t[begin:end]))
+            parts.append(self._unknowns(t[begin:end]))
             begin = end
             if begin < len(t):
                 self._forget(len(self._kept) - 1)
-        rows = np.concatenate(parts, axis=1) if parts else self._rows(t[:0])
-        return self._states_of(t.copy(), rows)
+        unknowns = np.concatenate(parts, axis=1) if parts else self._unknowns(t[:0])
+        return self._states_of(t.copy(), unknowns)
 
-    def _rows(self, t: Column) -> Rows:
-        """Return what `_states_of` needs at times [s] within the steps that are kept."""
-        numbers = np.array([step.t1 for step in self._kept]).searchsorted(t)
-        first = int(numbers[0]) if len(t) else 0
-        steps = self._kept[first:int(numbers[-1]) + 1] if len(t) else self._kept[:1]
-        return self._read(Interpolants.of(steps, self._equations), numbers - first, t, first)
+    def _unknowns(self, t: Column) -> Rows:
+        """Return the rows that `_states_of` needs at times [s] within the steps that are kept."""
+        steps = np.array([step.t1 for step in self._kept]).searchsorted(t)
+        first, last = (int(steps[0]), int(steps[-1])) if len(t) else (0, 0)
+        interpolants = Interpolants.of(self._kept[first:last + 1], self._equations)
+        return np.concatenate((interpolants.at(steps - first, t), self._phases_at(steps)))
 
-    def _read(self, interpolants: Interpolants, numbers: NDArray[np.int64], t: Column,
-              first: int) -> Rows:
-        """
-        Return rows of numbers (k, n) at times [s] from the steps of these numbers.
-
-        first : place of the first of these steps among those that are kept
-        """
-        return interpolants.at(numbers, t)
+    def _phases_at(self, steps: NDArray[np.int64]) -> Rows:
+        """Return what else is known at the begins of these of the steps that are kept: nothing."""
+        return np.empty((0, len(steps)))
 
     @abstractmethod
-    def _states_of(self, t: Column, rows: Rows) -> States:
-        """Return the states at times [s] from all their rows."""
+    def _states_of(self, t: Column, unknowns: Rows) -> States:
+        """Return the states at times [s]."""
 
 
 class EulerMotion(SteppedMotion):
@@ -154,16 +141,16 @@ class EulerMotion(SteppedMotion):
     def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
         super().__init__(top, start, EulerEquations(top, start, rtol, atol))
 
-    def _states_of(self, t: Column, rows: Rows) -> States:
-        return _StatesOfAngles(self.top, self.start, t, rows)
+    def _states_of(self, t: Column, unknowns: Rows) -> States:
+        return _EulerStates(self.top, self.start, t, unknowns)
 
 
-class _StatesOfAngles(States):
+class _EulerStates(States):
     """States known by their Euler angles."""
 
-    def __init__(self, top: Top, start: State, t: Column, rows: Rows) -> None:
+    def __init__(self, top: Top, start: State, t: Column, unknowns: Rows) -> None:
         super().__init__(top, start, len(t))
-        theta, theta_dot, phi, psi = rows
+        theta, theta_dot, phi, psi = unknowns
         self.t, self.theta_dot, self.angles = t, theta_dot, (phi, theta, psi)
 
     @cached_property
@@ -187,11 +174,9 @@ class TransportMotion(SteppedMotion):
     """A motion by the regular equations, its angles unwrapped from step to step."""
 
     def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
-        equations = TransportEquations(top, start, rtol, atol)
-        super().__init__(top, start, equations)
-        self._transport = equations
-        # The stepped frame lacks `TransportEquations.spin_rate`; what is left of the spin:
-        self._phases = PhaseUnwrapper(start, -0.5 * equations.spin_carried / top.lambda1)
+        self._transport = TransportEquations(top, start, rtol, atol)
+        super().__init__(top, start, self._transport)
+        self._phases = PhaseUnwrapper(start, self._transport.uniform_rates[0])
 
     def _forget(self, count: int) -> None:
         self._unwrap()
@@ -205,39 +190,36 @@ class TransportMotion(SteppedMotion):
             begins = np.array([step.y0 for step in new])
             self._phases.extend(np.array([step.t0 for step in new]), begins[:, 0], begins[:, 1])
 
-    def _read(self, interpolants: Interpolants, numbers: NDArray[np.int64], t: Column,
-              first: int) -> Rows:
+    def _phases_at(self, steps: NDArray[np.int64]) -> Rows:
         self._unwrap()
-        return np.concatenate((super()._read(interpolants, numbers, t, first),
-                               self._phases.begins[:, first:].take(numbers, axis=1)))
+        return self._phases.begins.take(steps, axis=1)
 
-    def _states_of(self, t: Column, rows: Rows) -> States:
-        return _TransportStates(self._transport, self._phases, self.start, t, rows)
+    def _states_of(self, t: Column, unknowns: Rows) -> States:
+        return _TransportStates(self._transport, self._phases, self.start, t, unknowns)
 
 
 class _TransportStates(States):
     """
     States known by alpha, beta and the momentum.
 
-    rows : the six unknowns in the stepped frame, and the phases of alpha and beta and theta/2 at
-        the begin of the step that a sample lies in
+    rows : the six unknowns in the frame that is stepped, and `PhaseUnwrapper.begins` of the step
+        that a sample lies in
     """
 
     def __init__(self, equations: TransportEquations, phases: PhaseUnwrapper, start: State,
                  t: Column, rows: Rows) -> None:
         super().__init__(equations.top, start, len(t))
         self.t, self._equations = t, equations
-        self._alpha, self._beta = phases.alpha, phases.beta
+        self._of_alpha, self._of_beta = phases.of_alpha, phases.of_beta
         self._stepped, self._begins = Unknowns(*rows[:6]), rows[6:]
 
     @cached_property
     def _projected(self) -> Unknowns:
-        """The unknowns on the invariants, in the frame that has all of the spin."""
+        """The unknowns on the invariants, in the body's own frame."""
         equations = self._equations
-        if self._alpha.crosses or self._beta.crosses:
-            carried = -0.5 * equations.spin_carried / self.top.lambda1 * self.t
-            projected = equations.project_through_poles(
-                self._stepped, *self._moduli_and_phases(self._stepped, carried))
+        if self._of_alpha.crosses or self._of_beta.crosses:
+            projected = equations.project_through_poles(self._stepped, *self._moduli_and_phases(
+                self._stepped, equations.uniform_rates[0]))
         else:
             projected = equations.project_columns(self._stepped)
         a, b, c, d, m_real, m_imag = projected
@@ -246,13 +228,15 @@ class _TransportStates(States):
         return Unknowns(a * cosine - b * sine, b * cosine + a * sine,
                         c * cosine + d * sine, d * cosine - c * sine, m_real, m_imag)
 
-    def _moduli_and_phases(self, y: Unknowns, spin_phase: Column,
+    def _moduli_and_phases(self, y: Unknowns, uniform_rate: float,
                            ) -> tuple[Column, Column, Column, Column]:
-        """Return signed moduli and phases of alpha and beta."""
-        return (self._alpha.modulus(y.alpha_real, y.alpha_imag, spin_phase),
-                self._beta.modulus(y.beta_real, y.beta_imag, -spin_phase),
-                self._alpha.phase(y.alpha_real, y.alpha_imag, self._begins[0], spin_phase),
-                self._beta.phase(y.beta_real, y.beta_imag, self._begins[1], -spin_phase))
+        """Return signed moduli and phases of alpha and beta in a frame of this uniform rate."""
+        uniform = uniform_rate * self.t
+        of_alpha = y.alpha_real, y.alpha_imag, uniform
+        of_beta = y.beta_real, y.beta_imag, -uniform
+        return (self._of_alpha.modulus(*of_alpha), self._of_beta.modulus(*of_beta),
+                self._of_alpha.at(*of_alpha, self._begins[0]),
+                self._of_beta.at(*of_beta, self._begins[1]))
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:
@@ -267,7 +251,7 @@ class _TransportStates(States):
     @cached_property
     def angles(self) -> tuple[Column, Column, Column]:
         cosine, sine, half_sum, half_difference = self._moduli_and_phases(
-            self._projected, 0.5 * spin_excess(self.top, self._l3) * self.t)
+            self._projected, self._equations.uniform_rates[1])
         half = np.arctan2(sine, cosine)
         # theta/2 turns by less than half a turn within a step.
         half = half + math.tau * np.rint((self._begins[2] - half) / math.tau)

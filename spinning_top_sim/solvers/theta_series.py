@@ -11,17 +11,17 @@ and, beside it, a polynomial in sin^2 y, which is what is evaluated in doubles.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from decimal import Decimal, getcontext
 
 from spinning_top_sim.solvers.decimal_math import (
     ONE,
     ZERO,
-    complete_integral,
-    one_minus_exp,
+    carlson_rf,
     pi,
     sin_cos,
+    sinh_cosh,
 )
 
 TERMS = 4               # the nome is <= exp(-pi): the fifth term is below 1e-21
@@ -60,6 +60,16 @@ class Series:
         """The value of a cosine series at y = 0."""
         return sum(self.weights, ZERO)
 
+    @property
+    def multiples(self) -> range:
+        """The numbers n."""
+        return range(self.kind.endswith('odd'), 2 * len(self.weights), 2)
+
+    @property
+    def slope_at_zero(self) -> Decimal:
+        """The derivative of a sine series at y = 0."""
+        return sum((n * x for n, x in zip(self.multiples, self.weights, strict=True)), ZERO)
+
     def __call__(self, sin: Decimal, cos: Decimal, xi: Decimal) -> Decimal:
         """Return the sum at the y of these sine and cosine."""
         value = ZERO
@@ -90,15 +100,21 @@ def _multiple_angles(kind: str) -> Iterator[list[int]]:
         before, now = now, after
 
 
+def _alternating(weights: Iterable[Decimal]) -> tuple[Decimal, ...]:
+    return tuple(-x if k % 2 else x for k, x in enumerate(weights))
+
+
 @dataclass(frozen=True)
 class ThetaForm:
     """
     The theta series in the real form (nome q, circular functions of y) or in the imaginary form
     (Jacobi's transformation [DLMF 20.7(viii)]: nome q', hyperbolic functions of x = y K/K').
+
+    Positive constants that all series of a Cayley-Klein parameter share are left out.
     """
 
     K: Decimal
-    K_prime: Decimal            # infinite for m = 0
+    K_prime: Decimal
     imaginary: bool
     nome: Decimal
     terms: int = TERMS
@@ -106,8 +122,7 @@ class ThetaForm:
     @classmethod
     def of(cls, m: Decimal, m1: Decimal) -> ThetaForm:
         """Choose the form with the smaller nome, at most exp(-pi)."""
-        K = complete_integral(m1)
-        K_prime = complete_integral(m) if m else Decimal('Infinity')
+        K, K_prime = (carlson_rf(ZERO, x, ONE) for x in (m1, m))         # DLMF 19.25.1
         imaginary = m > m1
         return cls(K, K_prime, imaginary,
                    (-pi() * (K / K_prime if imaginary else K_prime / K)).exp())
@@ -120,34 +135,31 @@ class ThetaForm:
             terms += 1
         return ThetaForm(self.K, self.K_prime, False, nome, terms + 1)
 
-    def _weights(self, weight: Callable[[int], Decimal], alternating: bool = False
-                 ) -> tuple[Decimal, ...]:
-        return tuple((-1) ** (k * alternating) * weight(k) for k in range(self.terms))
+    def with_all_terms(self) -> ThetaForm:
+        """Return the same form with every term that reaches the working precision."""
+        digits_per_square = -self.nome.adjusted() - 1           # at least 1
+        return replace(self, terms=2 + math.isqrt(getcontext().prec // digits_per_square))
 
-    def _power(self, exponent: int) -> Decimal:
-        return self.nome ** exponent if exponent else ONE
+    @property
+    def stretch(self) -> Decimal:
+        """What y is multiplied with: x = stretch y in the imaginary form."""
+        return self.K / self.K_prime if self.imaginary else ONE
 
-    def _square(self, k: int) -> Decimal:
-        """Weights of theta3, and alternating of theta4 [DLMF 20.2.3, 20.2.4]."""
-        return (2 if k else 1) * self._power(k * k)
+    def point(self, y: Decimal) -> tuple[Decimal, Decimal, Decimal]:
+        """Return the arguments of a `Series` at y: sine, cosine and xi."""
+        sin, cos = sinh_cosh(self.stretch * y) if self.imaginary else sin_cos(y)
+        return sin, cos, -sin * sin if self.imaginary else sin * sin
 
-    def _pronic(self, k: int) -> Decimal:
-        """Weights of theta2, and alternating of theta1, less 2 nome^(1/4) [DLMF 20.2.1, 2]."""
-        return self._power(k * (k + 1))
-
-    def denominator_even(self) -> Series:
-        """Return theta4, D over even quarter periods."""
+    def theta(self, number: int) -> Series:
+        """Return theta1 .. theta4 of y, less constants [DLMF 20.2(i)], or their transforms."""
         if self.imaginary:
-            return Series('cos odd', self._weights(self._pronic))
-        return Series('cos even', self._weights(self._square, alternating=True))
-
-    def denominator_odd(self) -> Series:
-        """Return theta3, D over odd quarter periods."""
-        return Series('cos even', self._weights(self._square))
-
-    def theta1(self) -> Series:
-        """Return theta1, less 2 nome^(1/4)."""
-        return Series('sin odd', self._weights(self._pronic, alternating=True))
+            number = {1: 1, 2: 4, 3: 3, 4: 2}[number]
+        kind = {1: 'sin odd', 2: 'cos odd', 3: 'cos even', 4: 'cos even'}[number]
+        if number in (1, 2):
+            powers = tuple(self.nome ** (k * (k + 1)) for k in range(self.terms))
+        else:
+            powers = ONE, *(2 * self.nome ** (k * k) for k in range(1, self.terms))
+        return Series(kind, _alternating(powers) if number in (1, 4) else powers)
 
     @property
     def odd_over_even(self) -> Decimal:
@@ -160,72 +172,53 @@ class ThetaForm:
 
         By duplication [DLMF 20.7.10] and the quotients of DLMF 22.2.
         """
-        theta3, theta4 = self.denominator_odd().at_zero, self.denominator_even().at_zero
+        theta2, theta3, theta4 = (self.theta(number).at_zero for number in (2, 3, 4))
         if not self.imaginary:
-            theta2 = sum(self._pronic(k) for k in range(self.terms))
             even = theta3 * theta4 ** 3 / theta2
             return even, -even
-        theta1_slope = sum((-1) ** k * (2 * k + 1) * self._pronic(k) for k in range(self.terms))
-        even = 2 * theta4 ** 4 * self.K_prime / (pi() * theta1_slope)
+        even = 2 * theta4 ** 4 * self.K_prime / (pi() * self.theta(1).slope_at_zero)
         return even, -16 * self.nome * even
 
-    def shifted_theta1(self, a: Decimal) -> tuple[Series, Series]:
-        """R and J of i theta1(y - ia), less positive constants."""
+    def shifted(self, a: Decimal) -> tuple[tuple[Series, Series], tuple[Series, Series]]:
+        """R and J of i theta1(y - ia), and of theta2(y - ia), less positive constants."""
         if self.imaginary:
-            angle = pi() * a / (2 * self.K_prime)
-            sines, cosines = zip(*(sin_cos((2 * k + 1) * angle) for k in range(self.terms)),
-                                 strict=True)
-            return (Series('cos odd', self._weights(lambda k: self._pronic(k) * sines[k], True)),
-                    Series('sin odd', self._weights(lambda k: self._pronic(k) * cosines[k], True)))
+            (sines1, cosines1), (sines2, cosines2) = (
+                self._turned_weights(number, a) for number in (1, 2))
+            return ((Series('cos odd', sines1), Series('sin odd', cosines1)),
+                    (Series('cos even', cosines2), Series('sin even', sines2).scaled(-ONE)))
         minus, plus = self._growing_weights(a)
-        return (Series('cos odd', self._weights(lambda k: minus[k], True)),
-                Series('sin odd', self._weights(lambda k: plus[k], True)))
+        return ((Series('cos odd', _alternating(minus)), Series('sin odd', _alternating(plus))),
+                (Series('cos odd', tuple(plus)), Series('sin odd', tuple(minus))))
 
-    def shifted_theta2(self, a: Decimal) -> tuple[Series, Series]:
-        """R and J of theta2(y - ia), less positive constants."""
-        if self.imaginary:
-            angle = pi() * a / (2 * self.K_prime)
-            sines, cosines = zip(*(sin_cos(2 * k * angle) for k in range(self.terms)), strict=True)
-            return (
-                Series('cos even', self._weights(lambda k: self._square(k) * cosines[k], True)),
-                Series('sin even', self._weights(lambda k: -self._square(k) * sines[k], True)))
-        minus, plus = self._growing_weights(a)
-        return Series('cos odd', tuple(plus)), Series('sin odd', tuple(minus))
+    def _turned_weights(self, number: int, a: Decimal) -> tuple[tuple[Decimal, ...], ...]:
+        """Return the weights of a transformed theta times sin, and cos, of n pi a/(2K')."""
+        series = self.theta(number)
+        waves = [sin_cos(n * pi() * a / (2 * self.K_prime)) for n in series.multiples]
+        return tuple(tuple(x * wave[k] for x, wave in zip(series.weights, waves, strict=True))
+                     for k in (0, 1))
 
     def _growing_weights(self, a: Decimal) -> tuple[list[Decimal], list[Decimal]]:
         """
         Return 2 q^(k(k+1)) exp(-A) times sinh, and cosh, of (2k+1) A, with A = pi a/(2K).
 
-        That is q^(k^2) g^k (1 -+ E^(2k+1)) with E = exp(-2A), g = q/E <= 1: no large numbers.
+        Over exp((2k+1) A) times q^(k^2) g^k with g = q exp(2A) <= 1: no large numbers.
         """
         depth = pi() * a / self.K
         g = (depth - pi() * self.K_prime / self.K).exp()
-        E, one_minus_E = (-depth).exp(), one_minus_exp(depth)
+        sinh, cosh = sinh_cosh(depth / 2)
+        sinh2, cosh2 = 2 * sinh * cosh, 1 + 2 * sinh * sinh
         minus, plus = [], []
         for k in range(self.terms):
-            growth = self._power(k * k) * (g ** k if k else 1)
-            one_minus_power = one_minus_E * sum((E ** j for j in range(1, 2 * k + 1)), ONE)
-            minus.append(growth * one_minus_power)
-            plus.append(growth * (2 - one_minus_power))
+            growth = 2 * self.nome ** (k * k) * g ** k / (sinh + cosh)
+            minus.append(growth * sinh)
+            plus.append(growth * cosh)
+            sinh, cosh = sinh * cosh2 + cosh * sinh2, cosh * cosh2 + sinh * sinh2
         return minus, plus
 
     def log_slope(self, a: Decimal) -> Decimal:
         """tau(a) = d/da log theta2(ia), to full precision: it sets the mean rates."""
+        _, (real, imag) = self.with_all_terms().shifted(a)
+        slope = imag.slope_at_zero / real.at_zero       # Cauchy-Riemann
         if self.imaginary:
-            angle = pi() * a / (2 * self.K_prime)
-            waves = [sin_cos(2 * k * angle) for k in range(self.with_all_terms().terms)]
-            slope = sum(((-1) ** k * 2 * k * self._square(k) * s
-                         for k, (s, _) in enumerate(waves)), ZERO)
-            value = sum(((-1) ** k * self._square(k) * c
-                         for k, (_, c) in enumerate(waves)), ZERO)
-            return pi() / (2 * self.K_prime) * (a / self.K - slope / value)
-        minus, plus = self.with_all_terms()._growing_weights(a)
-        slope = sum(((2 * k + 1) * x for k, x in enumerate(minus)), ZERO)
-        return pi() / (2 * self.K) * slope / sum(plus, ZERO)
-
-    def with_all_terms(self) -> ThetaForm:
-        """Return the same form with every term that reaches the working precision."""
-        if not self.nome:
-            return self
-        digits_per_square = -self.nome.adjusted() - 1           # at least 1
-        return replace(self, terms=2 + math.isqrt(getcontext().prec // digits_per_square))
+            return pi() / (2 * self.K_prime) * (a / self.K + slope)
+        return pi() / (2 * self.K) * slope

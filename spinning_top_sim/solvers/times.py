@@ -14,7 +14,7 @@ from spinning_top_sim.solvers.decimal_math import double_double
 
 NANOSECONDS = 1_000_000_000
 # The largest time [ns] that is taken as an integer: the end of int64 lies a second behind it.
-LATEST_NS = 2 ** 63 - NANOSECONDS
+LARGEST_NS = 2 ** 63 - NANOSECONDS
 # 2^27 + 1: the factor that splits a double into two halves (Dekker, Numer. Math. 18, 1971, 224).
 SPLITTER = 134217729.0
 

@@ -30,7 +30,7 @@ import numpy as np
 
 from spinning_top_sim.physics.attitude import Column, precession_rate
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.dormand_prince import Rows, Vector
+from spinning_top_sim.solvers.dormand_prince import Equations, Rows, Vector
 
 # The energy error is taken out of the nutation rate where its square is this share of the
 # largest |m|^2 or more: at a turning point the energy does not tell the rate.
@@ -56,36 +56,46 @@ COLUMNS = np.sqrt, np.copysign, np.where
 ONE_STATE = math.sqrt, math.copysign, lambda condition, x, y: x if condition else y
 
 
-class TransportEquations:
+class TransportEquations(Equations):
     """
-    The equations above for one top and one motion; see `dormand_prince.Equations`.
+    The equations above for one top and one motion.
 
     rtol, atol : tolerated error of a step; the unknowns are scaled to 1, so the two add up
-    spin_carried_share : c/L3
+    carried_share : c/L3
+
+    Attributes
+    ----------
+    spin_rate : chi [rad/s]
+    uniform_rates : of the phase of alpha in the frame that is stepped, and in the body [rad/s];
+        they differ by chi/2, and those of beta are the opposite (see `unwrap`)
     """
 
     name = 'transport'
     is_complex = True
 
     def __init__(self, top: Top, start: State, rtol: float, atol: float,
-                 spin_carried_share: float = 0.5) -> None:
+                 carried_share: float = 0.5) -> None:
         lambda1, l3, lz, torque = top.lambda1, start.l3, start.lz, top.gravity_torque
         self.top, self.l3, self.lz = top, l3, lz
-        self.spin_carried = spin_carried_share * l3                     # c
-        self._turn_a = 0.5j * (lz - self.spin_carried) / lambda1
-        self._turn_b = 0.5j * (lz + self.spin_carried) / lambda1
+        carried = carried_share * l3                                    # c
+        self.spin_rate = l3 / top.lambda3 - (l3 - carried) / lambda1
+        self.uniform_rates = (-0.5 * carried / lambda1,
+                              0.5 * (l3 * (1.0 / top.lambda3 - 1.0 / lambda1)))
+        self._turn_alpha = 0.5j * (lz - carried) / lambda1
+        self._turn_beta = 0.5j * (lz + carried) / lambda1
         self._fall = complex(-torque / lambda1)
-        self.spin_rate = l3 / top.lambda3 - (l3 - self.spin_carried) / lambda1   # chi
-        self.start = self._vector(start)
         # What 2 lambda1 |m|^2 + P cos(theta) must stay; the rest of the energy is constant.
-        alpha, beta, m = self.start
+        alpha, beta, m = self._vector(start)
         self._energy = 2.0 * lambda1 * abs(m) ** 2 + torque * (abs(alpha) ** 2 - abs(beta) ** 2)
         # |m| never exceeds this: the scale of its error, as 1 is that of alpha and beta.  Close to
         # hanging the sum is what its rounding leaves.
         above_lowest = max(self._energy + abs(torque), 4.0 * math.ulp(1.0) * abs(torque))
         self._scale = math.sqrt(0.5 * above_lowest / lambda1) or 1.0
-        self._tolerance = rtol + atol
+        self.tolerance = rtol + atol
+        self.fastest_rate = (self._scale + (abs(l3) + abs(lz)) / lambda1
+                             + math.sqrt(abs(torque) / lambda1))
         self._large_enough = NUTATION_SHARE * self._scale ** 2
+        self.start = self.project((alpha, beta, m))
 
     def _vector(self, start: State) -> Vector:
         """Return alpha, beta and m of a state; L_x + i L_y by eq. (6), turned by exp(i phi)."""
@@ -100,24 +110,17 @@ class TransportEquations:
                 sine * cmath.rect(1.0, 0.5 * (start.phi - start.psi)),
                 0.5j * momentum / lambda1)
 
-    @property
-    def first_step(self) -> float:
-        top = self.top
-        rate = (self._scale + (abs(self.l3) + abs(self.lz)) / top.lambda1
-                + math.sqrt(abs(top.gravity_torque) / top.lambda1))
-        return 0.1 * math.pow(self._tolerance, 0.2) / rate
-
     def derivative(self, alpha: complex, beta: complex, m: complex) -> Vector:
         """Return (alpha', beta', m')."""
-        return (self._turn_a * alpha + m * beta.conjugate(),
-                self._turn_b * beta - m * alpha.conjugate(),
+        return (self._turn_alpha * alpha + m * beta.conjugate(),
+                self._turn_beta * beta - m * alpha.conjugate(),
                 self._fall * (alpha * beta))
 
     def second_derivative(self, y: Rows, derivative: Rows) -> Rows:
         """Return alpha'', beta'' and m'', the equations differentiated once, as six rows."""
         a, a_imag, b, b_imag, m, m_imag = y
         da, da_imag, db, db_imag, dm, dm_imag = derivative
-        turn_a, turn_b, fall = self._turn_a.imag, self._turn_b.imag, self._fall.real
+        turn_a, turn_b, fall = self._turn_alpha.imag, self._turn_beta.imag, self._fall.real
         return np.array((
             dm * b + dm_imag * b_imag + m * db + m_imag * db_imag - turn_a * da_imag,
             dm_imag * b - dm * b_imag + m_imag * db - m * db_imag + turn_a * da,
@@ -131,10 +134,11 @@ class TransportEquations:
         da, db, dm = difference
         errors = abs(da), abs(db), abs(dm) / self._scale
         # A NaN may be any of them, and `max` finds only the first.
-        return (max(errors) if sum(errors) < math.inf else math.inf) / self._tolerance
+        return (max(errors) if sum(errors) < math.inf else math.inf) / self.tolerance
 
-    def check_step(self, y: Vector, y_new: Vector) -> None:
-        """Nothing can go wrong silently in these equations."""
+    def accepted(self, y: Vector, y_new: Vector) -> Vector:
+        """Return the projected end of a step."""
+        return self.project(y_new)
 
     def project(self, y: Vector) -> Vector:
         """Return y moved back onto the invariants; see `project_columns`."""
@@ -151,7 +155,7 @@ class TransportEquations:
                  ) -> tuple[Any, ...]:
         # m conj(alpha beta) = u + i v, where v carries L.e3 and u the nutation rate: v follows
         # from L3 and Lz, and u^2 from |u + i v|^2, which the energy tells.
-        sqrt, copysign, where = functions
+        sqrt, _, where = functions
         alpha_real, alpha_imag, beta_real, beta_imag, m_real, m_imag = y
         cos2 = alpha_real * alpha_real + alpha_imag * alpha_imag
         sin2 = beta_real * beta_real + beta_imag * beta_imag
@@ -169,15 +173,20 @@ class TransportEquations:
         u = m_real * axis_real + m_imag * axis_imag
         modulus_squared = sine_squared * (
             self._energy - self.top.gravity_torque * cos_theta) / (2.0 * lambda1)
-        u_squared = modulus_squared - v * v
-        from_energy = (u * u > self._large_enough * sine_squared) & (u_squared > 0.0)
-        u = where(from_energy, copysign(sqrt(where(u_squared > 0.0, u_squared, 0.0)), u), u)
+        u = self._with_energy(u, modulus_squared - v * v, sine_squared, functions)
         at_pole = sine_squared <= POLE_SHARE
         divisor = where(at_pole, 1.0, sine_squared)
         return (
             alpha_real, alpha_imag, beta_real, beta_imag,
             where(at_pole, m_real, (u * axis_real - v * axis_imag) / divisor),
             where(at_pole, m_imag, (u * axis_imag + v * axis_real) / divisor))
+
+    def _with_energy(self, u: Any, u_squared: Any, size: Any,
+                     functions: tuple[Callable[..., Any], ...]) -> Any:
+        """Return u from its square, where that is not what rounding leaves of the energy."""
+        sqrt, copysign, where = functions
+        is_known = (u * u > self._large_enough * size) & (u_squared > 0.0)
+        return where(is_known, copysign(sqrt(where(u_squared > 0.0, u_squared, 0.0)), u), u)
 
     def project_through_poles(self, y: Unknowns, cosine: Column, sine: Column,
                               alpha_phase: Column, beta_phase: Column) -> Unknowns:
@@ -206,11 +215,9 @@ class TransportEquations:
         u = np.where(away, (y.m_real * axis_real + y.m_imag * axis_imag)
                      / np.where(away, half_axis, 1.0),
                      y.m_real * meridian_cos + y.m_imag * meridian_sin)
-        u_squared = (self._energy - self.top.gravity_torque * (cosine - sine) * (cosine + sine)
-                ) / (2.0 * lambda1) - v * v
-        from_energy = (u * u > self._large_enough) & (u_squared > 0.0)
-        u = np.where(from_energy, np.copysign(
-            np.sqrt(np.where(u_squared > 0.0, u_squared, 0.0)), u), u)
+        modulus_squared = (self._energy - self.top.gravity_torque
+                           * (cosine - sine) * (cosine + sine)) / (2.0 * lambda1)
+        u = self._with_energy(u, modulus_squared - v * v, 1.0, COLUMNS)
         return Unknowns(
             cosine * np.cos(alpha_phase), cosine * np.sin(alpha_phase),
             sine * np.cos(beta_phase), sine * np.sin(beta_phase),

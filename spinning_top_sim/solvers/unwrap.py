@@ -2,12 +2,14 @@
 """
 Unwrapped angles of a stepped motion, from the phases of the Cayley-Klein parameters.
 
-With Omega = L3/lambda3 - L3/lambda1, arg(alpha) - (Omega/2) t turns one way only, at the rate
-(Lz + L3)/(4 lambda1 cos^2(theta/2)), and arg(beta) + (Omega/2) t at (Lz - L3)/(4 lambda1
-sin^2(theta/2)).  So a phase follows from its value modulo 2 pi and from the phase at the beginning
-of its step.  Where Lz + L3 or Lz - L3 vanishes, the axis may cross that pole exactly: then the
-parameter moves on a straight line through zero, whose phase is known, and its modulus changes
-sign.
+phi + psi and phi - psi are twice the phases of alpha and beta.  Each phase is the sum of a uniform
+part, +-Omega t/2 with Omega = L3/lambda3 - L3/lambda1, and of a part that turns one way only: that
+of alpha at the rate (Lz + L3)/(4 lambda1 cos^2(theta/2)), that of beta at the rate
+(Lz - L3)/(4 lambda1 sin^2(theta/2)).  A step turns it by half a turn at most, however close by a
+pole it passes.  So the phase of a sample is the first one ahead of that at the begin of its step,
+among the values that arctan2 leaves open.  If Lz + L3 or Lz - L3 is 0, alpha or beta only has the
+uniform part: it moves on a line through zero, and where the axis goes through that pole its
+modulus changes sign.
 """
 
 from __future__ import annotations
@@ -19,12 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column
-from spinning_top_sim.physics.top import State, Top
-
-
-def spin_excess(top: Top, l3: float) -> float:
-    """Return Omega = L3/lambda3 - L3/lambda1 [rad/s]: what turns the body and not its axis."""
-    return l3 * (1.0 / top.lambda3 - 1.0 / top.lambda1)
+from spinning_top_sim.physics.top import State
 
 
 def turns_to_follow(phase: Column, before: Column, momentum: float) -> Column:
@@ -32,8 +29,7 @@ def turns_to_follow(phase: Column, before: Column, momentum: float) -> Column:
     Return the whole turns to add to `phase` so that it follows `before` [rad].
 
     In the sense of `momentum` it then lies within (-pi/2, 3 pi/2) from there: backwards by
-    rounding at most, and forwards by half a turn where one step passes close by a pole.  Without
-    a sense (momentum 0) it is the nearest.
+    rounding at most.  Without a sense (momentum 0) it is the nearest.
     """
     turned = phase - before
     if momentum > 0.0:
@@ -50,9 +46,12 @@ def unwrap(phases: Column, before: float, momentum: float) -> Column:
 
 
 @dataclass(frozen=True)
-class CayleyKleinPhase:
+class Phase:
     """
-    How one Cayley-Klein parameter turns.
+    The phase and the signed modulus of alpha or beta.
+
+    The methods take the real and the imaginary part in some frame, and `uniform`, the uniform part
+    of the phase in that frame [rad].
 
     momentum : Lz + L3 of alpha, Lz - L3 of beta; its sign is the sense of turning
     sign : of the modulus, where theta is continued out of [0, pi]
@@ -68,68 +67,62 @@ class CayleyKleinPhase:
         """Whether the parameter can vanish: it then moves on a line through zero."""
         return self.momentum == 0.0
 
-    def modulus(self, real: Column, imag: Column, spin_phase: Column) -> Column:
-        """Return the signed modulus; `spin_phase` is what the uniform spin adds to the phase."""
+    def modulus(self, real: Column, imag: Column, uniform: Column) -> Column:
         if self.crosses:
-            phase = self.start + spin_phase
+            phase = self.start + uniform
             return real * np.cos(phase) + imag * np.sin(phase)
         return self.sign * np.hypot(real, imag)
 
-    def argument(self, real: Column, imag: Column) -> Column:
-        """Return the phase [rad], less whole turns, of a parameter with this sign."""
-        return np.arctan2(self.sign * imag, self.sign * real)
-
-    def phase(self, real: Column, imag: Column, before: Column, spin_phase: Column) -> Column:
-        """
-        Return the unwrapped phase [rad].
-
-        before : the phase at the begin of the step, less that of the spin there [rad]
-        spin_phase : what the uniform spin adds to the phase [rad]
-        """
+    def at(self, real: Column, imag: Column, uniform: Column, begin: Column) -> Column:
+        """Return the phase [rad]; begin: that at the begin of the step, less its uniform part."""
         if self.crosses:
-            return self.start + spin_phase
-        argument = self.argument(real, imag)
-        return argument + math.tau * turns_to_follow(argument, before + spin_phase, self.momentum)
+            return self.start + uniform
+        argument = self._argument(real, imag)
+        return argument + math.tau * turns_to_follow(argument, begin + uniform, self.momentum)
+
+    def at_begins(self, real: Column, imag: Column, uniform: Column, before: float) -> Column:
+        """Return the phases at the begins of steps after `before`, less their uniform parts."""
+        if self.crosses:
+            return np.full(len(real), self.start)
+        return unwrap(self._argument(real, imag) - uniform, before, self.momentum)
+
+    def _argument(self, real: Column, imag: Column) -> Column:
+        return np.arctan2(self.sign * imag, self.sign * real)
 
 
 class PhaseUnwrapper:
     """
     The phases of alpha and beta of a motion at the begins of its steps.
 
-    frame_rate : what the uniform spin of the stepped frame adds to the phase of alpha [rad/s], and
-        takes from that of beta
+    uniform_rate : of the phase of alpha in the frame that is stepped, less in that of beta [rad/s]
 
     Attributes
     ----------
-    alpha, beta : CayleyKleinPhase
-    begins : (3, n) phases of alpha and beta, less that of the spin, and theta/2 [rad]
+    of_alpha, of_beta : Phase
+    begins : (3, n) phases of alpha and beta, less their uniform parts, and theta/2 [rad]
     """
 
-    def __init__(self, start: State, frame_rate: float) -> None:
+    def __init__(self, start: State, uniform_rate: float) -> None:
         half = 0.5 * start.theta
-        self.alpha = CayleyKleinPhase(start.lz + start.l3, math.copysign(1.0, math.cos(half)),
-                                      0.5 * (start.phi + start.psi))
-        self.beta = CayleyKleinPhase(start.lz - start.l3, math.copysign(1.0, math.sin(half)),
-                                     0.5 * (start.phi - start.psi))
-        self._frame_rate = frame_rate
-        self.begins = np.array([[self.alpha.start], [self.beta.start], [half]])
+        self.of_alpha = Phase(start.lz + start.l3, math.copysign(1.0, math.cos(half)),
+                              0.5 * (start.phi + start.psi))
+        self.of_beta = Phase(start.lz - start.l3, math.copysign(1.0, math.sin(half)),
+                             0.5 * (start.phi - start.psi))
+        self._uniform_rate = uniform_rate
+        self.begins = np.array([[self.of_alpha.start], [self.of_beta.start], [half]])
 
     def extend(self, t: Column, alpha: NDArray[np.complex128],
                beta: NDArray[np.complex128]) -> None:
         """Follow the phases over the begins of further steps at t [s]."""
-        more = np.empty((3, len(t)))
-        moduli = []
-        turned = self._frame_rate * t
-        for k, (parameter, z, spin_phase) in enumerate((
-                (self.alpha, alpha, turned), (self.beta, beta, -turned))):
-            real, imag = z.real.copy(), z.imag.copy()
-            more[k] = parameter.start if parameter.crosses else unwrap(
-                parameter.argument(real, imag) - spin_phase, self.begins[k, -1],
-                parameter.momentum)
-            moduli.append(parameter.modulus(real, imag, spin_phase))
-        cosine, sine = moduli
-        more[2] = unwrap(np.arctan2(sine, cosine), self.begins[2, -1], 0.0)
-        self.begins = np.concatenate((self.begins, more), axis=1)
+        uniform = self._uniform_rate * t
+        of_alpha = alpha.real.copy(), alpha.imag.copy(), uniform
+        of_beta = beta.real.copy(), beta.imag.copy(), -uniform
+        before = self.begins[:, -1]
+        half_theta = np.arctan2(self.of_beta.modulus(*of_beta), self.of_alpha.modulus(*of_alpha))
+        self.begins = np.concatenate((self.begins, (
+            self.of_alpha.at_begins(*of_alpha, before[0]),
+            self.of_beta.at_begins(*of_beta, before[1]),
+            unwrap(half_theta, before[2], 0.0))), axis=1)
 
     def forget(self, count: int) -> None:
         """Forget the oldest steps."""
