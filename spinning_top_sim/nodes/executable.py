@@ -12,12 +12,13 @@ from os import _exit
 from typing import TYPE_CHECKING, Protocol, cast
 
 if TYPE_CHECKING:
-    from rclpy.executors import Executor
     from rclpy.node import Node
     from rclpy.task import Future
 
 # Longest wait of the executor [s]: Python answers signals between two waits.
 SPIN_S = 0.2
+# What says in its text why a node cannot start; of anything else the name says it, too.
+EXPECTED = ValueError, RuntimeError, OSError
 
 
 class RunnableNode(Protocol):
@@ -36,15 +37,35 @@ def run(name: str, argv: list[str],
     Run a node; return 0 after an ordinary end, 2 if it cannot be started.
 
     `prepare` takes the arguments.  It returns a function that makes the node, or None if there is
-    nothing to run.  Both may raise ValueError, RuntimeError or OSError, whose text is shown.
+    nothing to run.  The text of what either raises is shown.
     """
     # Nothing is open yet, and a KeyboardInterrupt in the midst of imports is easily lost.
     _handle(signal.SIGINT, lambda *_: _exit(130))
     try:
         make_node = prepare(argv)
-    except (ValueError, RuntimeError, OSError) as error:
+        if make_node is None:
+            return 0
+        interrupts = _init(argv)
+    except Exception as error:
         return _cannot_start(name, error)
-    return 0 if make_node is None else _run(name, argv, make_node)
+    import rclpy  # noqa: PLC0415
+
+    node = None
+    try:
+        node = make_node()
+        return _spin(node, interrupts)
+    except Exception as error:
+        # A call that the end of the context interrupts may raise anything.
+        if rclpy.ok() and node is not None:
+            raise
+        return _cannot_start(name, error) if rclpy.ok() else 0
+    finally:
+        _ignore_signals()
+        if node is not None:
+            node.stop()
+            node.destroy_node()
+        rclpy.try_shutdown()
+        _ignore_signals()       # rclpy has put back the handler that it had found
 
 
 def _handle(number: signal.Signals, handler: Callable[[int, object], object]) -> None:
@@ -53,26 +74,22 @@ def _handle(number: signal.Signals, handler: Callable[[int, object], object]) ->
         signal.signal(number, handler)
 
 
+def _ignore_signals() -> None:
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
+        signal.signal(number, signal.SIG_IGN)
+
+
 def _cannot_start(name: str, error: Exception) -> int:
     """Say why in one line, without the places in the sources of rcl; return the exit code."""
-    text = re.sub(r',\s*at \S+:\d+', '', str(error))
-    print(f'{name}: cannot start: {" ".join(text.split())}', file=sys.stderr)
+    text = ' '.join(re.sub(r',\s*at \S+:\d+', '', str(error)).split())
+    kind = '' if isinstance(error, EXPECTED) else f'{type(error).__name__}: '
+    print(f'{name}: cannot start: {kind}{text}', file=sys.stderr)
     return 2
 
 
-def _executor() -> Executor:
-    """Return the executor that takes least processor time of those that rclpy has here."""
-    try:
-        from rclpy.experimental import EventsExecutor  # noqa: PLC0415
-    except ImportError:
-        from rclpy.executors import SingleThreadedExecutor  # noqa: PLC0415
-        return SingleThreadedExecutor()
-    return EventsExecutor()
-
-
-def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode]) -> int:
+def _init(argv: list[str]) -> list[int]:
+    """Initialise rclpy; return the SIGINTs that come from now on."""
     import rclpy  # noqa: PLC0415
-    from rclpy.exceptions import ParameterException  # noqa: PLC0415
 
     # rclpy shuts the context down at SIGINT and SIGTERM, from `init` on; a launched node gets
     # SIGINT twice, from the terminal and from launch.
@@ -80,44 +97,28 @@ def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode]) -> i
     _handle(signal.SIGINT, lambda number, _: interrupts.append(number))
     for number in (signal.SIGHUP, signal.SIGQUIT):
         _handle(number, lambda *_: signal.raise_signal(signal.SIGTERM))
-    try:
-        rclpy.init(args=argv)
-    except Exception as error:          # a params file that is missing or no YAML, a bad remapping
-        return _cannot_start(name, error)
-    node = None
-    try:
-        node = make_node()
-        executor = _executor()
-        executor.add_node(cast('Node', node))
-        node.finished.add_done_callback(lambda _: executor.wake())
-        gc.collect()
-        gc.freeze()             # no full collection goes through what is there from the start
-        # A full collection waits until there is a quarter more than the one before has found.
-        # This one finds nothing, so the cyclic garbage of service calls does not pile up.
-        gc.collect()
-        node.start()
-        # Without a timeout, the EventsExecutor of Jazzy hangs.
-        while rclpy.ok() and not interrupts and not node.finished.done():
-            executor.spin_once(SPIN_S)
-        if node.finished.done():
-            return node.finished.result() or 0
-    except Exception as error:
-        # A call that the end of the context interrupts may raise anything.
-        if rclpy.ok():
-            if node is None and isinstance(
-                    error, ValueError | RuntimeError | OSError | ParameterException):
-                return _cannot_start(name, error)
-            raise
-    finally:
-        _ignore_signals()
-        if node is not None:
-            node.stop()
-            node.destroy_node()
-        rclpy.try_shutdown()
-        _ignore_signals()       # rclpy has put back the handler that it had found
-    return 0
+    rclpy.init(args=argv)
+    return interrupts
 
 
-def _ignore_signals() -> None:
-    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
-        signal.signal(number, signal.SIG_IGN)
+def _spin(node: RunnableNode, interrupts: list[int]) -> int:
+    """Spin a node until it has finished, or a signal ends it; return the exit code."""
+    import rclpy  # noqa: PLC0415
+    try:
+        # It takes least processor time.
+        from rclpy.experimental import EventsExecutor as Executor  # noqa: PLC0415
+    except ImportError:
+        from rclpy.executors import SingleThreadedExecutor as Executor  # noqa: PLC0415
+    executor = Executor()
+    executor.add_node(cast('Node', node))
+    node.finished.add_done_callback(lambda _: executor.wake())
+    gc.collect()
+    gc.freeze()             # no full collection goes through what is there from the start
+    # A full collection waits until there is a quarter more than the one before has found.
+    # This one finds nothing, so the cyclic garbage of service calls does not pile up.
+    gc.collect()
+    node.start()
+    # Without a timeout, the EventsExecutor of Jazzy hangs.
+    while rclpy.ok() and not interrupts and not node.finished.done():
+        executor.spin_once(SPIN_S)
+    return (node.finished.result() or 0) if node.finished.done() else 0

@@ -71,11 +71,11 @@ class Simulator(Node):
         self._outputs = StreamPublishers(self)
         self._session = RecordingSession(simulation, self._lock, self._outputs.topics_to_record)
         self._loop = TickLoop(
-            simulation, values, self._session, align=self._align_ticks,
+            simulation, values, self._session, error=logger.error,
             update_subscribers=lambda: self._outputs.update_subscribers(simulation.streams),
-            error=logger.error, source=followed if self._follows else time.monotonic_ns)
-        self._pacer = DeadlineThread(self._guarded(self._tick), values['tick_rate'],
-                                     self._guarded(self._idle))
+            source=followed if self._follows else time.monotonic_ns)
+        self._pacer = DeadlineThread(self._guarded(self._tick), self._guarded(self._idle),
+                                     lambda: self._loop.grid)
         self._report = reports.MotionReport(simulation, self._loop, self._session)
         self._terminal = reports.Terminal()
         self._outputs.open(simulation.streams, values)
@@ -138,11 +138,6 @@ class Simulator(Node):
             except RecordingError as error:
                 self._session.error = str(error)
                 self.get_logger().error(f'not recording: {error}')
-
-    def _align_ticks(self, origin_ns: int | None) -> None:
-        """Have ticks just after samples are due."""
-        if origin_ns is not None and not self._follows:
-            self._pacer.align(origin_ns / NANOSECONDS)
 
     def stop(self) -> None:
         """End the motion and close the recording; safe whatever state the context is in."""
@@ -236,8 +231,6 @@ class Simulator(Node):
             self._outputs.open(self._simulation.streams, values)
         if 'status_period' in changed:
             self._set_status_period(values['status_period'])
-        if 'tick_rate' in changed:
-            self._pacer.set_rate(values['tick_rate'])
         self._loop.set_pace(values)
 
     # ---------------------------------------------------------------------------- services
