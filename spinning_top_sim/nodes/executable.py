@@ -7,18 +7,18 @@ import gc
 import re
 import signal
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterable
 from os import _exit
 from typing import TYPE_CHECKING, Protocol, cast
 
 if TYPE_CHECKING:
     from rclpy.node import Node
+    from rclpy.publisher import Publisher
     from rclpy.task import Future
 
 # Longest wait of the executor [s]: Python answers signals between two waits.
 SPIN_S = 0.2
-# What says in its text why a node cannot start; of anything else the name says it, too.
-EXPECTED = ValueError, RuntimeError, OSError
 
 
 class RunnableNode(Protocol):
@@ -37,7 +37,7 @@ def run(name: str, argv: list[str],
     Run a node; return 0 after an ordinary end, 2 if it cannot be started.
 
     `prepare` takes the arguments.  It returns a function that makes the node, or None if there is
-    nothing to run.  The text of what either raises is shown.
+    nothing to run.  What either raises is shown in one line.
     """
     # Nothing is open yet, and a KeyboardInterrupt in the midst of imports is easily lost.
     _handle(signal.SIGINT, lambda *_: _exit(130))
@@ -45,11 +45,17 @@ def run(name: str, argv: list[str],
         make_node = prepare(argv)
         if make_node is None:
             return 0
-        interrupts = _init(argv)
+        import rclpy  # noqa: PLC0415
+
+        # rclpy shuts the context down at SIGINT and SIGTERM, from `init` on; a launched node gets
+        # SIGINT twice, from the terminal and from launch.
+        interrupts: list[int] = []
+        _handle(signal.SIGINT, lambda number, _: interrupts.append(number))
+        for number in (signal.SIGHUP, signal.SIGQUIT):
+            _handle(number, lambda *_: signal.raise_signal(signal.SIGTERM))
+        rclpy.init(args=argv)
     except Exception as error:
         return _cannot_start(name, error)
-    import rclpy  # noqa: PLC0415
-
     node = None
     try:
         node = make_node()
@@ -82,23 +88,10 @@ def _ignore_signals() -> None:
 def _cannot_start(name: str, error: Exception) -> int:
     """Say why in one line, without the places in the sources of rcl; return the exit code."""
     text = ' '.join(re.sub(r',\s*at \S+:\d+', '', str(error)).split())
-    kind = '' if isinstance(error, EXPECTED) else f'{type(error).__name__}: '
-    print(f'{name}: cannot start: {kind}{text}', file=sys.stderr)
+    kind = type(error).__name__
+    expected = isinstance(error, ValueError | RuntimeError | OSError) or kind.startswith('Invalid')
+    print(f'{name}: cannot start: {text if expected else f"{kind}: {text}"}', file=sys.stderr)
     return 2
-
-
-def _init(argv: list[str]) -> list[int]:
-    """Initialise rclpy; return the SIGINTs that come from now on."""
-    import rclpy  # noqa: PLC0415
-
-    # rclpy shuts the context down at SIGINT and SIGTERM, from `init` on; a launched node gets
-    # SIGINT twice, from the terminal and from launch.
-    interrupts: list[int] = []
-    _handle(signal.SIGINT, lambda number, _: interrupts.append(number))
-    for number in (signal.SIGHUP, signal.SIGQUIT):
-        _handle(number, lambda *_: signal.raise_signal(signal.SIGTERM))
-    rclpy.init(args=argv)
-    return interrupts
 
 
 def _spin(node: RunnableNode, interrupts: list[int]) -> int:
@@ -122,3 +115,15 @@ def _spin(node: RunnableNode, interrupts: list[int]) -> int:
     while rclpy.ok() and not interrupts and not node.finished.done():
         executor.spin_once(SPIN_S)
     return (node.finished.result() or 0) if node.finished.done() else 0
+
+
+def wait_for_all_acked(publishers: Iterable[Publisher], seconds: float,
+                       stopped: Callable[[], bool] = lambda: False) -> None:
+    """Wait until all subscribers have the last messages, until stopped, and at most so long."""
+    from rclpy.duration import Duration  # noqa: PLC0415
+
+    end = time.monotonic() + seconds
+    waiting = [publisher for publisher in publishers if publisher.get_subscription_count()]
+    while waiting and time.monotonic() < end and not stopped():
+        waiting = [publisher for publisher in waiting
+                   if not publisher.wait_for_all_acked(Duration(seconds=0.02))]

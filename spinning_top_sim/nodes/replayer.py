@@ -30,6 +30,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes import reports
+from spinning_top_sim.nodes.executable import wait_for_all_acked
 from spinning_top_sim.nodes.playback import ROUND_GAP_NS, Message, Playback, ReadAhead, rounds
 from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import DefinitionNotFoundError, LogError
@@ -45,7 +46,7 @@ SLOWEST, FASTEST = 1e-6, 1e9
 LAST_WORD_S = 5.0
 # Wait for subscribers that acknowledge nothing: shared memory goes with its sender.
 UNACKNOWLEDGED_S = 0.3
-# How often subscribers are counted, and stops looked for, while waiting.
+# How often subscribers are counted while waiting.
 LOOK_S = 0.02
 # The thread that sends gets Python's lock this soon from the one that reads ahead.
 SWITCH_INTERVAL_S = 0.0005
@@ -70,7 +71,7 @@ class Replayer(Node):
         self._length_s = (self._end_ns - self._log_begin_ns) / NANOSECONDS
         if self._span_ns < 0:
             raise ValueError(f'--start {options.start:g}: the log lasts {self._length_s:.3f} s')
-        self._outputs = self._open_publishers()
+        self._outputs = self._open_publishers()     # by channel
         self._senders = set(self._outputs.values())
         self._playback = Playback(
             self._begin_ns, lambda channel_id, data: self._outputs[channel_id].publish(data),
@@ -167,15 +168,17 @@ class Replayer(Node):
         try:
             self._wait_to_begin()
             self._playback.run(self._ahead)
-            self._wait_for_delivery()
+            self._stopping.wait(UNACKNOWLEDGED_S)
+            wait_for_all_acked(self._senders, LAST_WORD_S, self._stopping.is_set)
             code = 2 if self._tell_damage() else 0
         except Exception as error:
             if self.context.ok():           # publishing fails once the context is down
                 self.get_logger().error(f'cannot be played any further: {error}')
             code = 2
         if self.context.ok():
+            late = f', {self._playback.late} of them late' if self._playback.late else ''
             self._terminal.tell(f'played {self._playback.sent} messages on '
-                                f'{len(self._senders)} topics{self._late(", ", " of them")}')
+                                f'{len(self._senders)} topics{late}')
             self.finished.set_result(code)
 
     def _messages(self) -> Iterator[Message]:
@@ -203,28 +206,15 @@ class Replayer(Node):
     def _wait_to_begin(self) -> None:
         """Wait for subscribers and the delay."""
         begin = time.monotonic() + self._options.delay
-        publishers = [*self._senders]
-        if self._options.clock:
-            publishers.append(self._clock_publisher)
+        publishers = [*self._senders, *([self._clock_publisher] if self._options.clock else [])]
         while not self._stopping.wait(LOOK_S) and (time.monotonic() < begin or sum(
                 publisher.get_subscription_count() for publisher in publishers
                 ) < self._options.wait_for_subscribers):
             pass
 
-    def _wait_for_delivery(self) -> None:
-        """Wait until all subscribers have the last messages, or for too long."""
-        waiting = [publisher for publisher in self._senders
-                   if publisher.get_subscription_count()]
-        if waiting:
-            self._stopping.wait(UNACKNOWLEDGED_S)
-        end = time.monotonic() + LAST_WORD_S
-        while waiting and time.monotonic() < end and not self._stopping.is_set():
-            waiting = [publisher for publisher in waiting
-                       if not publisher.wait_for_all_acked(Duration(seconds=LOOK_S))]
-
     def _publish_clock(self) -> None:
-        self._clock_publisher.publish(
-            ClockMessage(clock=Time(nanoseconds=self._playback.now()).to_msg()))
+        now = Time(nanoseconds=self._playback.now())
+        self._clock_publisher.publish(ClockMessage(clock=now.to_msg()))
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._playback.pause(request.data)
@@ -240,15 +230,11 @@ class Replayer(Node):
         which = f' of round {number + 1}' if self._options.loop else ''
         return f'{at:.2f} of {self._length_s:.2f} s, {percent:.0f} %{which}'
 
-    def _late(self, before: str, behind: str = '') -> str:
-        late = self._playback.late
-        return f'{before}{late}{behind} late' if late else ''
-
     def _show_status(self) -> None:
         self._tell_damage()
         paused = ' | paused' if self._playback.paused else ''
         self._terminal.show(f'{self._position()} | x{self.get_parameter("rate").value:g}{paused} '
-                            f'| {self._playback.sent} messages{self._late(" | ")}')
+                            f'| {self._playback.sent} messages | {self._playback.late} late')
 
 
 def open_log(path: Path, partial: bool) -> LogReader:

@@ -21,6 +21,7 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes import reports, ros_parameters
+from spinning_top_sim.nodes.executable import wait_for_all_acked
 from spinning_top_sim.nodes.pacing import DeadlineThread, FairLock, MonotonicClock
 from spinning_top_sim.nodes.recording_session import RecordingSession
 from spinning_top_sim.nodes.ros_parameters import SPIN
@@ -43,9 +44,8 @@ class Simulator(Node):
     """
     The node; docs/interface.md has its topics, services and parameters.
 
-    One thread ticks, and the executor's thread does everything else.  Both hold the lock while
-    they use the simulation.  `finished` completes when `duration` has passed.  Raises ValueError
-    for a bad parameter.
+    One thread ticks, the executor's does everything else; both hold the lock while they use the
+    simulation.  `finished` completes after `duration`.  Raises ValueError for a bad parameter.
     """
 
     def __init__(self) -> None:
@@ -79,14 +79,6 @@ class Simulator(Node):
         self._report = reports.MotionReport(simulation, self._loop, self._session)
         self._terminal = reports.Terminal()
         self._outputs.open(simulation.streams, values)
-        self._make_interface()
-        if not simulation.top.is_realizable:
-            logger.warning(
-                f'top.lambda3 = {simulation.top.lambda3!r} kg m^2: no rigid body has more than '
-                f'2 (lambda1 - M R^2) = {2.0 * simulation.top.lambda1_at_com:g}; simulated all '
-                'the same')
-
-    def _make_interface(self) -> None:
         self._diagnostics = self._outputs.create(DiagnosticArray, '/diagnostics')
         self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
         for name, kind, act in (('set_pause', SetBool, self._set_pause),
@@ -95,7 +87,12 @@ class Simulator(Node):
             self.create_service(kind, f'~/{name}', functools.partial(self._serve, act))
         self._steady_timer(1.0, self._publish_diagnostics)
         self._status_timer: Timer | None = None
-        self._set_status_period(self._values['status_period'])
+        self._set_status_period(values['status_period'])
+        if not simulation.top.is_realizable:
+            logger.warning(
+                f'top.lambda3 = {simulation.top.lambda3!r} kg m^2: no rigid body has more than '
+                f'2 (lambda1 - M R^2) = {2.0 * simulation.top.lambda1_at_com:g}; simulated all '
+                'the same')
 
     def _steady_timer(self, period: float, callback: Callable[[], object]) -> Timer:
         """Create a timer that neither a step of the date nor /clock can hold up."""
@@ -153,7 +150,7 @@ class Simulator(Node):
         with self._lock:
             wants_idle = self._loop.tick()
         if self._loop.ended and not self.finished.done():
-            self._outputs.wait_for_all_acked(ACKNOWLEDGED_S)
+            wait_for_all_acked(self._outputs.by_topic.values(), ACKNOWLEDGED_S)
             self.finished.set_result(None)
         return wants_idle
 
@@ -222,16 +219,13 @@ class Simulator(Node):
                 self._loop.command(values['spin.l3'], values['spin.lz'])
             if rest:
                 self._session.write_event('parameters', **{name: values[name] for name in rest})
-                self._put_into_effect(values, rest)
+                self._simulation.apply(values)
+                if any(name.endswith('.enabled') for name in rest):
+                    self._outputs.open(self._simulation.streams, values)
+                if 'status_period' in rest:
+                    self._set_status_period(values['status_period'])
+                self._loop.set_pace(values)
         self._values = values
-
-    def _put_into_effect(self, values: dict[str, Any], changed: list[str]) -> None:
-        self._simulation.apply(values)
-        if any(name.endswith('.enabled') for name in changed):
-            self._outputs.open(self._simulation.streams, values)
-        if 'status_period' in changed:
-            self._set_status_period(values['status_period'])
-        self._loop.set_pace(values)
 
     # ---------------------------------------------------------------------------- services
 

@@ -41,8 +41,8 @@ class TickLoop:
     """
     Moves a simulation along with a clock, one tick at a time.
 
-    A tick sends every sample that is due, however late it comes, so no sample depends on how
-    ticks fall.  Not thread-safe: calls from several threads need a lock around them.
+    A tick sends all samples that are due, so none depends on how ticks fall.  Calls from several
+    threads need a lock around them.
 
     recording : where it has no room, nothing is sent
     update_subscribers : sets `publish` of each stream that has subscribers
@@ -115,17 +115,6 @@ class TickLoop:
             self.late_ticks += 1
             since_last_ns = steady_ns - (late_from_ns - self._late_after_ns)
             self.skipped_ticks += round(since_last_ns / self._tick_period_ns) - 1
-        return self._slow_tick(steady_ns)
-
-    def idle(self) -> None:
-        """Compute some of the samples that are due next, until about the next tick."""
-        simulation = self._simulation
-        self._computing = not simulation.prepare(
-            simulation.now_ns + self._ahead_ns, int(BUSY_SHARE * self._tick_period_ns))
-        self._set_fast_until()
-
-    def _slow_tick(self, steady_ns: int) -> bool:
-        """Send what is due, and do all that the fast path leaves out; return as `tick` does."""
         if steady_ns >= self._subscribers_due_ns:
             self._update_subscribers()
             self._subscribers_due_ns = steady_ns + SUBSCRIBERS_PERIOD_NS
@@ -138,6 +127,13 @@ class TickLoop:
         self._set_fast_until()
         return simulation.now_ns >= due_ns and (
             self._computing or due_ns >= simulation.ready_ns - self._ahead_ns)
+
+    def idle(self) -> None:
+        """Compute some of the samples that are due next, until about the next tick."""
+        simulation = self._simulation
+        self._computing = not simulation.prepare(
+            simulation.now_ns + self._ahead_ns, int(BUSY_SHARE * self._tick_period_ns))
+        self._set_fast_until()
 
     def _set_fast_until(self) -> None:
         """Ticks before this simulated time take the fast path."""
