@@ -64,8 +64,7 @@ class FairLock:
     """
     A lock that threads get in turn.
 
-    An ordinary lock stays with a thread that takes it again and again, as ticks do on a machine
-    that is overloaded: those who wait for it do not wake up in time.
+    An ordinary one stays with a thread that takes it again and again, as an overloaded tick does.
     """
 
     def __init__(self) -> None:
@@ -89,8 +88,7 @@ class DeadlineThread(threading.Thread):
     grid : returns a deadline on the monotonic clock and the time between two [s]
     """
 
-    # Longest sleep [s], so that `stop` is quick.
-    LONGEST_SLEEP = 0.05
+    LONGEST_SLEEP = 0.05    # [s], so that `stop` is quick
     # `idle` is called after this share of the period: a thread woken by the tick is often put on
     # the same core, because its waker will sleep soon.  At high rates there is no time for that.
     NAP = 0.15

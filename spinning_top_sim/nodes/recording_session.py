@@ -50,7 +50,7 @@ class RecordingSession:
         """
         Keep in memory what is to be recorded from now on; return what opens the log for it.
 
-        That returns what to tell the user, or raises RecordingError; then nothing is recorded.
+        That says to where, or raises RecordingError; then nothing is recorded.
         """
         if self._recorder is not None:
             path = self._recorder.path
@@ -137,10 +137,10 @@ class RecordingSession:
             self._recorder.wait_for_room(0.1)
 
     @property
-    def size(self) -> str | None:
-        """Size of the log, for the user; None without one."""
+    def size(self) -> str:
+        """Size of the log, for the user; empty without one."""
         recorder = self._recorder
-        return None if recorder is None else f'{recorder.counters.bytes / 1e6:.1f} MB'
+        return '' if recorder is None else f'{recorder.counters.bytes / 1e6:.1f} MB'
 
     def numbers(self) -> dict[str, object]:
         """Return what /diagnostics says about the recording."""

@@ -107,8 +107,6 @@ class Simulator(Node):
     def _date_ns(self) -> int:
         return self._date.now().nanoseconds
 
-    # ---------------------------------------------------------------------- start and stop
-
     def start(self) -> None:
         """Let time run: simulated t = 0 is the next point of the stamps' grid."""
         sys.setswitchinterval(SWITCH_INTERVAL_S)
@@ -123,9 +121,9 @@ class Simulator(Node):
         if self._values['max_error'] > 0.0:
             self._simulation.segment.reference.prepare()    # its modules take a while to import
         now_ns = self._date_ns()
-        epoch_ns = self._simulation.epoch_ns = next_epoch(now_ns)
+        self._simulation.epoch_ns = next_epoch(now_ns)
         if not self._follows:
-            time.sleep((epoch_ns - now_ns) / NANOSECONDS)
+            time.sleep((self._simulation.epoch_ns - now_ns) / NANOSECONDS)
         self._loop.start()
         open_log = self._session.start(self._values) if self._values['record.enabled'] else None
         self._pacer.start()
@@ -143,8 +141,6 @@ class Simulator(Node):
         summary = self._session.stop()
         if summary:
             self._terminal.tell(summary)
-
-    # ------------------------------------------------------------------------------- ticks
 
     def _tick(self) -> bool:
         with self._lock:
@@ -177,8 +173,6 @@ class Simulator(Node):
         with self._lock:
             self._loop.fail(reason)
         self._session.stop(reason)
-
-    # ---------------------------------------------------------------- commands, parameters
 
     def _outcome(self, act: Callable[[Any], str | None], asked: object) -> tuple[bool, str]:
         """Return whether `act` does it, and what it says; unexpected errors stop the motion."""
@@ -227,8 +221,6 @@ class Simulator(Node):
                 self._loop.set_pace(values)
         self._values = values
 
-    # ---------------------------------------------------------------------------- services
-
     def _serve(self, act: Callable[[Any], str], request: object, response: Any) -> object:
         response.success, response.message = self._outcome(act, request)
         return response
@@ -269,8 +261,6 @@ class Simulator(Node):
             return self._session.stop() or 'not recording'
         self._check_started()
         return self._session.start(self._values)()
-
-    # ----------------------------------------------------------------------------- reports
 
     def _publish_diagnostics(self) -> None:
         """Look at the recording, and publish /diagnostics."""
