@@ -50,14 +50,13 @@ def _nodes(context: LaunchContext) -> list:
     given = {name: context.launch_configurations[name] for name in (
         'file', 'rate', 'start', 'loop', 'clock', 'partial', 'tf', 'rviz')}
     on = {name: given[name] == 'true' for name in ('loop', 'partial', 'tf', 'rviz')}
-    options = ['--rate', str(launch_helpers.number('rate', given['rate'])),
-               '--start', str(launch_helpers.number('start', given['start'], zero=True))]
+    # replay_node refuses what is no number.
+    options = [f'--{name}={given[name]}' for name in ('rate', 'start')]
     options += [f'--{name}' for name in ('loop', 'partial') if on[name]]
     clocked = given['clock'].lower() != 'false'
     if clocked:
-        options.append('--clock')
-        if given['clock'].lower() != 'true':
-            options.append(str(launch_helpers.number('clock', given['clock'])))
+        options.append('--clock' if given['clock'].lower() == 'true'
+                       else f'--clock={given["clock"]}')
     node = Node(package='spinning_top_sim', executable='replay_node', output='screen',
                 emulate_tty=True, arguments=[given['file'], *options],
                 on_exit=Shutdown(reason='it has ended'))

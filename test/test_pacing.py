@@ -38,7 +38,9 @@ class Run:
         self.time, self.seen, self.idled = Time(), [], []
         self._count, self._costs, self._wants, self._at = count, costs or {}, wants, at or {}
         monkeypatch.setattr(pacing, 'time', self.time)
-        self.thread = pacing.DeadlineThread(self._tick, 1.0 / PERIOD, self._idle)
+        self.origin, self.period = BEGIN, PERIOD
+        self.thread = pacing.DeadlineThread(self._tick, self._idle,
+                                            lambda: (self.origin, self.period))
         self.thread.run()
 
     def _tick(self):
@@ -72,14 +74,17 @@ def test_ticks_that_take_longer_than_a_period_follow_each_other(monkeypatch):
 def test_the_grid_is_aligned_with_a_time_before_or_after(monkeypatch):
     for origin in (-7.5, 0.5, 12.5):
         def align(run, origin=origin):
-            run.thread.align(BEGIN + origin * PERIOD)
+            run.origin = BEGIN + origin * PERIOD
         assert Run(monkeypatch, 5, at={1: align}).seen == [1.0, 2.0, 2.5, 3.5, 4.5]
 
 
 def test_a_new_rate_holds_from_the_next_deadline_on(monkeypatch):
-    seen = Run(monkeypatch, 6, at={1: lambda run: run.thread.set_rate(0.5 / PERIOD)}).seen
+    def set_period(period):
+        return lambda run: setattr(run, 'period', period)
+
+    seen = Run(monkeypatch, 6, at={1: set_period(2.0 * PERIOD)}).seen
     assert seen == [1.0, 2.0, 4.0, 6.0, 8.0, 10.0]
-    seen = Run(monkeypatch, 4, at={1: lambda run: run.thread.set_rate(2.0 / PERIOD)}).seen
+    seen = Run(monkeypatch, 4, at={1: set_period(0.5 * PERIOD)}).seen
     assert seen == [1.0, 2.0, 2.5, 3.0]
 
 
@@ -90,7 +95,7 @@ def test_idle_work_begins_a_moment_after_the_tick_that_asks_for_it(monkeypatch):
 
 
 def test_a_far_deadline_is_waited_for_in_pieces(monkeypatch):
-    run = Run(monkeypatch, 2, at={0: lambda run: run.thread.set_rate(1.0)})
+    run = Run(monkeypatch, 2, at={0: lambda run: setattr(run, 'period', 1.0)})
     assert max(run.time.naps) <= run.thread.LONGEST_SLEEP
     assert run.seen[1] * PERIOD == pytest.approx(1.0)
 
@@ -123,13 +128,13 @@ def test_simulated_time_knows_when_it_will_be_what():
     now = [5_000]
     clock = pacing.SimulatedClock(lambda: now[0], 2.0)
     assert (clock.now(), clock.when(0), clock.running) == (0, None, False)
-    clock.start(100)
+    clock.set(100, running=True)
     now[0] += 50
     assert (clock.now(), clock.when(0), clock.when(200)) == (200, 4_950, 5_050)
     clock.set_scale(0.5)
     now[0] += 100
     assert (clock.now(), clock.when(250)) == (250, 5_150)
-    clock.stop()
+    clock.set(clock.now(), running=False)
     now[0] += 100
     assert (clock.now(), clock.when(250)) == (250, None)
 

@@ -32,8 +32,7 @@ def reported():
     session = SimpleNamespace(error=None, size=None, numbers=lambda: {'recorder': 'off'},
                               has_room=lambda: True,
                               write_command=print, write_event=lambda *_, **__: None)
-    loop = TickLoop(simulation, values, session, update_subscribers=lambda: None, align=print,
-                    error=print)
+    loop = TickLoop(simulation, values, session, update_subscribers=lambda: None, error=print)
     loop.start()
     loop.step(1, 1.25)
     return SimpleNamespace(report=MotionReport(simulation, loop, session), loop=loop,

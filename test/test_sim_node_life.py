@@ -365,7 +365,7 @@ def test_the_euler_form_at_a_pole_stands_still_and_says_why(peer, diagnostics, t
 BREAKABLE = (
     'tick_loop.TickLoop.tick', 'tick_loop.TickLoop.idle', 'reports.MotionReport.diagnostics',
     'reports.MotionReport.status_line', 'tick_loop.TickLoop.pause', 'tick_loop.TickLoop.command',
-    'simulator.Simulator._put_into_effect')
+    'tick_loop.TickLoop.set_pace')
 # Each of these methods raises as long as there is a file of its name.
 BREAKING = f"""
 import importlib, os, sys
@@ -411,7 +411,7 @@ def test_an_error_that_nobody_expects_stops_the_motion_loudly_until_a_reset(
         assert not answer.success and 'nobody expected this' in answer.message
     elif method.endswith('command'):
         peer.send_command(node, 1.0, 1.0)
-    elif method.endswith('effect'):
+    elif method.endswith('pace'):
         answer = peer.set_together(node, pose__rate=50.0)
         assert not answer.successful and 'nobody expected this' in answer.reason
     wait_for('an error', lambda: node.err.count('until ~/reset') > said)

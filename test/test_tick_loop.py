@@ -46,7 +46,6 @@ class Run:
                 has_room=room, write_command=lambda *_: self.told.append('command'),
                 write_event=lambda event, sent_ns, **_: self.told.append((event, sent_ns))),
             update_subscribers=lambda: self.told.append('subscribers'),
-            align=lambda at: self.told.append(('began', at)) if at else None,
             error=self.told.append, source=self.clock, steady=self.clock)
 
     @property
@@ -99,8 +98,8 @@ def test_idle_work_makes_most_ticks_take_the_fast_path(monkeypatch):
     monkeypatch.setattr(tick_loop, 'BUSY_SHARE', 1e6)       # as fast as this machine may be
     run = started()
     slow = []
-    ordinary = run.loop._slow_tick
-    monkeypatch.setattr(run.loop, '_slow_tick', lambda now: slow.append(now) or ordinary(now))
+    ordinary = run.loop._advance
+    monkeypatch.setattr(run.loop, '_advance', lambda: slow.append(None) or ordinary())
     run.ticks(1000)
     assert len(slow) < 300
     assert run.stamps == grid(1000 * TICK_NS)
@@ -251,12 +250,12 @@ def test_a_tick_gives_way_when_its_time_is_up(monkeypatch):
 
 def test_a_time_scale_holds_from_its_moment_on():
     run = started().ticks(4)
+    assert run.loop.grid == (BEGIN_NS / 1e9, 0.005)
     run.loop.set_pace({**run.values, 'time_scale': 10.0})
+    # Where t = 0 would have been at the new pace, so that ticks are aligned with samples.
+    assert run.loop.grid == pytest.approx(((BEGIN_NS + 4 * TICK_NS - 2e6) / 1e9, 0.005), abs=0.0)
     run.tick()
     assert run.loop.now_ns == 4 * TICK_NS + 10 * TICK_NS
-    began = [told for told in run.told if told[0] == 'began']
-    # Where t = 0 would have been at the new pace, so that ticks can be aligned with samples.
-    assert began == [('began', BEGIN_NS), ('began', BEGIN_NS + 4 * TICK_NS - 2_000_000)]
 
 
 def test_a_reset_begins_again_at_a_later_stamp_and_a_pause_remains():

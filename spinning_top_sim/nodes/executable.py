@@ -7,13 +7,14 @@ import gc
 import re
 import signal
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterable
 from os import _exit
 from typing import TYPE_CHECKING, Protocol, cast
 
 if TYPE_CHECKING:
-    from rclpy.executors import Executor
     from rclpy.node import Node
+    from rclpy.publisher import Publisher
     from rclpy.task import Future
 
 # Longest wait of the executor [s]: Python answers signals between two waits.
@@ -36,15 +37,41 @@ def run(name: str, argv: list[str],
     Run a node; return 0 after an ordinary end, 2 if it cannot be started.
 
     `prepare` takes the arguments.  It returns a function that makes the node, or None if there is
-    nothing to run.  Both may raise ValueError, RuntimeError or OSError, whose text is shown.
+    nothing to run.  What either raises is shown in one line.
     """
     # Nothing is open yet, and a KeyboardInterrupt in the midst of imports is easily lost.
     _handle(signal.SIGINT, lambda *_: _exit(130))
     try:
         make_node = prepare(argv)
-    except (ValueError, RuntimeError, OSError) as error:
+        if make_node is None:
+            return 0
+        import rclpy  # noqa: PLC0415
+
+        # rclpy shuts the context down at SIGINT and SIGTERM, from `init` on; a launched node gets
+        # SIGINT twice, from the terminal and from launch.
+        interrupts: list[int] = []
+        _handle(signal.SIGINT, lambda number, _: interrupts.append(number))
+        for number in (signal.SIGHUP, signal.SIGQUIT):
+            _handle(number, lambda *_: signal.raise_signal(signal.SIGTERM))
+        rclpy.init(args=argv)
+    except Exception as error:
         return _cannot_start(name, error)
-    return 0 if make_node is None else _run(name, argv, make_node)
+    node = None
+    try:
+        node = make_node()
+        return _spin(node, interrupts)
+    except Exception as error:
+        # A call that the end of the context interrupts may raise anything.
+        if rclpy.ok() and node is not None:
+            raise
+        return _cannot_start(name, error) if rclpy.ok() else 0
+    finally:
+        _ignore_signals()
+        if node is not None:
+            node.stop()
+            node.destroy_node()
+        rclpy.try_shutdown()
+        _ignore_signals()       # rclpy has put back the handler that it had found
 
 
 def _handle(number: signal.Signals, handler: Callable[[int, object], object]) -> None:
@@ -53,71 +80,50 @@ def _handle(number: signal.Signals, handler: Callable[[int, object], object]) ->
         signal.signal(number, handler)
 
 
-def _cannot_start(name: str, error: Exception) -> int:
-    """Say why in one line, without the places in the sources of rcl; return the exit code."""
-    text = re.sub(r',\s*at \S+:\d+', '', str(error))
-    print(f'{name}: cannot start: {" ".join(text.split())}', file=sys.stderr)
-    return 2
-
-
-def _executor() -> Executor:
-    """Return the executor that takes least processor time of those that rclpy has here."""
-    try:
-        from rclpy.experimental import EventsExecutor  # noqa: PLC0415
-    except ImportError:
-        from rclpy.executors import SingleThreadedExecutor  # noqa: PLC0415
-        return SingleThreadedExecutor()
-    return EventsExecutor()
-
-
-def _run(name: str, argv: list[str], make_node: Callable[[], RunnableNode]) -> int:
-    import rclpy  # noqa: PLC0415
-    from rclpy.exceptions import ParameterException  # noqa: PLC0415
-
-    # rclpy shuts the context down at SIGINT and SIGTERM, from `init` on; a launched node gets
-    # SIGINT twice, from the terminal and from launch.
-    interrupts: list[int] = []
-    _handle(signal.SIGINT, lambda number, _: interrupts.append(number))
-    for number in (signal.SIGHUP, signal.SIGQUIT):
-        _handle(number, lambda *_: signal.raise_signal(signal.SIGTERM))
-    try:
-        rclpy.init(args=argv)
-    except Exception as error:          # a params file that is missing or no YAML, a bad remapping
-        return _cannot_start(name, error)
-    node = None
-    try:
-        node = make_node()
-        executor = _executor()
-        executor.add_node(cast('Node', node))
-        node.finished.add_done_callback(lambda _: executor.wake())
-        gc.collect()
-        gc.freeze()             # no full collection goes through what is there from the start
-        # A full collection waits until there is a quarter more than the one before has found.
-        # This one finds nothing, so the cyclic garbage of service calls does not pile up.
-        gc.collect()
-        node.start()
-        # Without a timeout, the EventsExecutor of Jazzy hangs.
-        while rclpy.ok() and not interrupts and not node.finished.done():
-            executor.spin_once(SPIN_S)
-        if node.finished.done():
-            return node.finished.result() or 0
-    except Exception as error:
-        # A call that the end of the context interrupts may raise anything.
-        if rclpy.ok():
-            if node is None and isinstance(
-                    error, ValueError | RuntimeError | OSError | ParameterException):
-                return _cannot_start(name, error)
-            raise
-    finally:
-        _ignore_signals()
-        if node is not None:
-            node.stop()
-            node.destroy_node()
-        rclpy.try_shutdown()
-        _ignore_signals()       # rclpy has put back the handler that it had found
-    return 0
-
-
 def _ignore_signals() -> None:
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
         signal.signal(number, signal.SIG_IGN)
+
+
+def _cannot_start(name: str, error: Exception) -> int:
+    """Say why in one line, without the places in the sources of rcl; return the exit code."""
+    text = ' '.join(re.sub(r',\s*at \S+:\d+', '', str(error)).split())
+    kind = type(error).__name__
+    expected = isinstance(error, ValueError | RuntimeError | OSError) or kind.startswith('Invalid')
+    print(f'{name}: cannot start: {text if expected else f"{kind}: {text}"}', file=sys.stderr)
+    return 2
+
+
+def _spin(node: RunnableNode, interrupts: list[int]) -> int:
+    """Spin a node until it has finished, or a signal ends it; return the exit code."""
+    import rclpy  # noqa: PLC0415
+    try:
+        # It takes least processor time.
+        from rclpy.experimental import EventsExecutor as Executor  # noqa: PLC0415
+    except ImportError:
+        from rclpy.executors import SingleThreadedExecutor as Executor  # noqa: PLC0415
+    executor = Executor()
+    executor.add_node(cast('Node', node))
+    node.finished.add_done_callback(lambda _: executor.wake())
+    gc.collect()
+    gc.freeze()             # no full collection goes through what is there from the start
+    # A full collection waits until there is a quarter more than the one before has found.
+    # This one finds nothing, so the cyclic garbage of service calls does not pile up.
+    gc.collect()
+    node.start()
+    # Without a timeout, the EventsExecutor of Jazzy hangs.
+    while rclpy.ok() and not interrupts and not node.finished.done():
+        executor.spin_once(SPIN_S)
+    return (node.finished.result() or 0) if node.finished.done() else 0
+
+
+def wait_for_all_acked(publishers: Iterable[Publisher], seconds: float,
+                       stopped: Callable[[], bool] = lambda: False) -> None:
+    """Wait until all subscribers have the last messages, until stopped, and at most so long."""
+    from rclpy.duration import Duration  # noqa: PLC0415
+
+    end = time.monotonic() + seconds
+    waiting = [publisher for publisher in publishers if publisher.get_subscription_count()]
+    while waiting and time.monotonic() < end and not stopped():
+        waiting = [publisher for publisher in waiting
+                   if not publisher.wait_for_all_acked(Duration(seconds=0.02))]

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the launch files share: numbers as arguments, robot_state_publisher and RViz."""
+"""What the launch files share: robot_state_publisher and RViz."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,17 +19,6 @@ from spinning_top_sim.tools.urdf import inertia_warning, robot_description
 STATE_PUBLISHER = 'robot_state_publisher'
 # The highest rate that it accepts [Hz].
 HIGHEST_PUBLISH_FREQUENCY = 1000.0
-
-
-def number(name: str, text: str, *, zero: bool = False) -> float:
-    """Return a number > 0 (or >= 0).  Raises ValueError for anything else."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and (value > 0.0 or (zero and value == 0.0))):
-        raise ValueError(f'{name} = {text!r}: must be a number {">=" if zero else ">"} 0')
-    return value
 
 
 def state_publisher(share: Path, values: Mapping[str, Any], namespace: str, joint_states: str,

@@ -16,25 +16,20 @@ class SimulatedClock:
         self._from_source: int | None = None        # None: the clock stands
         self._from_simulated = 0
 
+    def set(self, simulated_ns: int, running: bool) -> None:
+        """Run from this simulated time on, or stand there."""
+        self._from_source = self._source() if running else None
+        self._from_simulated = simulated_ns
+
+    def set_scale(self, scale: float) -> None:
+        """Go on from the present time at another speed."""
+        self.set(self.now(), self.running)
+        self._scale = scale
+
     @property
     def running(self) -> bool:
         """Whether time passes."""
         return self._from_source is not None
-
-    def set_scale(self, scale: float) -> None:
-        """Go on from the present time at another speed."""
-        if self.running:
-            self.start(self.now())
-        self._scale = scale
-
-    def start(self, simulated_ns: int) -> None:
-        """Run from this simulated time on."""
-        self._from_source, self._from_simulated = self._source(), simulated_ns
-
-    def stop(self, at_ns: int | None = None) -> None:
-        """Stand at this simulated time, or at the present one."""
-        self._from_simulated = self.now() if at_ns is None else at_ns
-        self._from_source = None
 
     def now(self) -> int:
         """Return the simulated time [ns]."""
@@ -69,8 +64,7 @@ class FairLock:
     """
     A lock that threads get in turn.
 
-    An ordinary lock stays with a thread that takes it again and again, as ticks do on a machine
-    that is overloaded: those who wait for it do not wake up in time.
+    An ordinary one stays with a thread that takes it again and again, as an overloaded tick does.
     """
 
     def __init__(self) -> None:
@@ -88,42 +82,32 @@ class DeadlineThread(threading.Thread):
     """
     Calls `tick` at absolute deadlines until it is stopped, and `idle` behind it where it asks so.
 
-    A tick that comes late comes at once.  Deadlines that have passed meanwhile are skipped, and
-    the grid of deadlines stays.  A sleeping thread wakes up at less processor time than an rclpy
-    timer (`python benchmark/wake_up.py`).
+    A late tick comes at once, deadlines that have passed are skipped, and their grid stays.  A
+    sleeping thread costs less processor time than an rclpy timer (`benchmark/wake_up.py`).
+
+    grid : returns a deadline on the monotonic clock and the time between two [s]
     """
 
-    # Longest sleep [s], so that `stop` is quick.
-    LONGEST_SLEEP = 0.05
+    LONGEST_SLEEP = 0.05    # [s], so that `stop` is quick
     # `idle` is called after this share of the period: a thread woken by the tick is often put on
     # the same core, because its waker will sleep soon.  At high rates there is no time for that.
     NAP = 0.15
     SHORTEST_NAP = 1e-4
 
-    def __init__(self, tick: Callable[[], object], rate: float,
-                 idle: Callable[[], object]) -> None:
+    def __init__(self, tick: Callable[[], object], idle: Callable[[], object],
+                 grid: Callable[[], tuple[float, float]]) -> None:
         super().__init__(name='simulation', daemon=True)
-        self._tick, self._idle = tick, idle
+        self._tick, self._idle, self._grid = tick, idle, grid
         self._stopped = False
-        # Origin and period [s].  Another thread may replace it at any time.
-        self._grid = time.monotonic(), 1.0 / rate
-
-    def set_rate(self, rate: float) -> None:
-        """Change the rate [Hz] from the next deadline on."""
-        self._grid = self._grid[0], 1.0 / rate
-
-    def align(self, origin: float) -> None:
-        """Put deadlines at whole periods from this time of the monotonic clock [s]."""
-        self._grid = origin, self._grid[1]
 
     def run(self) -> None:
         grid: tuple[float, float] | None = None
         newest = 0              # number of the deadline of the newest tick
         while not self._stopped:
-            before, grid = grid, self._grid
+            before, grid = grid, self._grid()
             origin, period = grid
             passed = int((time.monotonic() - origin) // period)
-            newest = passed + 1 if grid is not before else max(passed, newest + 1)
+            newest = max(passed, newest + 1) if grid == before else passed + 1
             deadline = origin + newest * period
             while (left := deadline - time.monotonic()) > 0.0 and not self._stopped:
                 time.sleep(min(left, self.LONGEST_SLEEP))

@@ -25,12 +25,7 @@ BATCHES = 16
 
 
 def rounds(read: Callable[[], Iterable[Message]], span_ns: int, loop: bool) -> Iterator[Message]:
-    """
-    Yield the messages once, or again and again with times that go on.
-
-    read : returns the messages of one round
-    span_ns : length of a round [ns]; the next one begins ROUND_GAP_NS later
-    """
+    """Yield the messages of a round, `span_ns` long, or those of round after round."""
     shift = 0
     while True:
         at_ns = None
@@ -49,19 +44,19 @@ class ReadAhead:
     reading is raised after the messages before it.
     """
 
-    def __init__(self, messages: Iterator[Message]) -> None:
-        self._messages = messages
-        self._batches: queue.Queue[list[Message]] = queue.Queue(BATCHES)    # an empty one: the end
-        self._error: Exception | None = None
+    def __init__(self, messages: Iterable[Message]) -> None:
+        # Behind the batches comes the error, or None.
+        self._batches: queue.Queue[list[Message] | Exception | None] = queue.Queue(BATCHES)
         self._stopped = False
-        self._thread = threading.Thread(target=self._read, name='read ahead', daemon=True)
+        self._thread = threading.Thread(target=self._read, args=(messages,), name='read ahead',
+                                        daemon=True)
         self._thread.start()
 
     def __iter__(self) -> Iterator[Message]:
-        while batch := self._batches.get():
+        while isinstance(batch := self._batches.get(), list):
             yield from batch
-        if self._error is not None:
-            raise self._error
+        if batch is not None:
+            raise batch
 
     def stop(self) -> None:
         """End both the reading and the iterating."""
@@ -70,29 +65,25 @@ class ReadAhead:
         with contextlib.suppress(queue.Empty):
             while True:
                 self._batches.get_nowait()
-        self._batches.put([])
+        self._batches.put(None)
         self._thread.join(1.0)
 
-    def _read(self) -> None:
-        batch = None
-        while batch != [] and not self._stopped:
-            batch = self._next_batch()
-            self._batches.put(batch)
-
-    def _next_batch(self) -> list[Message]:
-        """Return the next messages: none at the end, which is also where an error leads to."""
+    def _read(self, messages: Iterable[Message]) -> None:
         batch: list[Message] = []
-        size = 0
+        end, size = None, 0
         try:
-            for message in self._messages:
+            for message in messages:
+                if self._stopped:
+                    return
                 batch.append(message)
                 size += len(message[2])
-                if size >= BATCH_BYTES or len(batch) >= BATCH_MESSAGES or self._stopped:
-                    break
+                if size >= BATCH_BYTES or len(batch) >= BATCH_MESSAGES:
+                    self._batches.put(batch)
+                    batch, size = [], 0
         except Exception as error:
-            self._error = error
-            self._messages = iter(())
-        return batch
+            end = error
+        self._batches.put(batch)
+        self._batches.put(end)
 
 
 class Playback:
@@ -110,9 +101,9 @@ class Playback:
     def __init__(self, begin_ns: int, send: Callable[[int, bytes], None], *, paused: bool = False,
                  source: Callable[[], int] = time.monotonic_ns,
                  sleep: Callable[[float | None], object] | None = None) -> None:
-        self._begin_ns, self._send, self._source = begin_ns, send, source
+        self._send, self._source = send, source
         self._clock = SimulatedClock(source, 1.0)
-        self._clock.stop(begin_ns)
+        self._clock.set(begin_ns, running=False)
         self._sent_until = begin_ns         # all messages before this time are sent
         self._stopped = False
         self._wake = threading.Event()
@@ -126,7 +117,7 @@ class Playback:
         for at_ns, index, data in messages:
             if not self.sent:           # reading the first message may have taken a while
                 with self._lock:
-                    self._set_clock(self._begin_ns, self.paused)
+                    self._clock.set(self._sent_until, not self.paused)
             self._sent_until = at_ns
             if not self._send_when_due(at_ns, index, data):
                 return
@@ -139,7 +130,8 @@ class Playback:
     def pause(self, paused: bool) -> None:
         """Pause, or go on without catching up; once paused, no message is sent any more."""
         with self._lock:
-            self._set_clock(self._clock.now(), paused)
+            self.paused = paused
+            self._clock.set(self._clock.now(), not paused)
         self._wake.set()
 
     def set_rate(self, rate: float) -> None:
@@ -153,12 +145,6 @@ class Playback:
         with self._lock:
             self._stopped = True
         self._wake.set()
-
-    def _set_clock(self, at_ns: int, paused: bool) -> None:
-        self.paused = paused
-        self._clock.stop(at_ns)
-        if not paused:
-            self._clock.start(at_ns)
 
     def _send_when_due(self, at_ns: int, index: int, data: bytes) -> bool:
         """Send a message when its time has come; return False when stopped before."""

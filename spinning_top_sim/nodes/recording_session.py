@@ -3,11 +3,9 @@
 
 from __future__ import annotations
 
-import functools
-import itertools
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,10 +33,7 @@ class RecordingSession:
     Records a simulation into one log at a time.
 
     Nothing waits for the disk while it holds the simulation's lock: while a log is being opened,
-    its messages are kept in memory.
-
-    lock : to hold while the simulation is used
-    topics : returns the topics of streams, and behind them those of the journal
+    its messages are kept in memory.  `topics` returns those of streams, and then the journal's.
     """
 
     def __init__(self, simulation: Simulation, lock: FairLock,
@@ -48,14 +43,14 @@ class RecordingSession:
         self._recorder: McapRecorder | None = None
         self._pending: list[Messages] = []      # while a log is being opened
         self._write: Log | None = None          # into the recorder, or `_pending`
-        self._journal_topics: dict[str, int] = {}
+        self._journal_index = 0                 # number of the journal's first topic in the log
         self._file_lock = threading.Lock()      # one opens or closes at a time
 
     def start(self, values: Mapping[str, Any]) -> Callable[[], str]:
         """
         Keep in memory what is to be recorded from now on; return what opens the log for it.
 
-        That returns what to tell the user, or raises RecordingError; then nothing is recorded.
+        That says to where, or raises RecordingError; then nothing is recorded.
         """
         if self._recorder is not None:
             path = self._recorder.path
@@ -66,11 +61,10 @@ class RecordingSession:
             topics = self._topics(streams)
             run = (simulation.values, simulation.epoch_ns, simulation.now_ns,
                    tuple(simulation.history), values)
-            self._journal_topics = {name: len(streams) + i
-                                    for i, (name, _) in enumerate(journal.TOPICS)}
+            self._journal_index = len(streams)
             self._feed(lambda *messages: self._pending.append(messages), streams)
             self.write_event('start')
-        return functools.partial(self._open, streams, topics, run)
+        return lambda: self._open(streams, topics, run)
 
     def _open(self, streams: Sequence[Stream], topics: Sequence[Topic], run: Run) -> str:
         with self._file_lock:
@@ -127,8 +121,9 @@ class RecordingSession:
 
     def _write_now(self, topic: str, data: bytes) -> None:
         if self._write is not None:
+            index = self._journal_index + [name for name, _ in journal.TOPICS].index(topic)
             stamp_ns = self._simulation.epoch_ns + max(self._simulation.now_ns, 0)
-            self._write((self._journal_topics[topic],), stamp_ns, (data,), len(data))
+            self._write((index,), stamp_ns, (data,), len(data))
 
     def has_room(self) -> bool:
         """Return whether more messages can be taken without losing any."""
@@ -142,10 +137,10 @@ class RecordingSession:
             self._recorder.wait_for_room(0.1)
 
     @property
-    def size(self) -> str | None:
-        """Size of the log, for the user; None without one."""
+    def size(self) -> str:
+        """Size of the log, for the user; empty without one."""
         recorder = self._recorder
-        return None if recorder is None else f'{recorder.counters.bytes / 1e6:.1f} MB'
+        return '' if recorder is None else f'{recorder.counters.bytes / 1e6:.1f} MB'
 
     def numbers(self) -> dict[str, object]:
         """Return what /diagnostics says about the recording."""
@@ -167,24 +162,19 @@ def _open_log(topics: Sequence[Topic], run: Run) -> McapRecorder:
 
     values, metadata = run[-1], provenance(*run)
     recorded = [RecordedTopic(*topic) for topic in topics]
-    path = Path(values['record.uri']).expanduser().absolute()
+    folder = path = Path(values['record.uri']).expanduser().absolute()
     named = values['record.uri'] and not path.is_dir()
-    paths = itertools.repeat(path) if named else _dated(path)
+    stem, number = time.strftime('spinning_top_%Y-%m-%d_%H-%M-%S'), 1
     while True:
+        if not named:
+            path = folder / f'{stem}{f"_{number}" if number > 1 else ""}.mcap'
         try:
             return McapRecorder.open(
-                next(paths), recorded, metadata, max_loss=values['record.max_loss'],
+                path, recorded, metadata, max_loss=values['record.max_loss'],
                 compression=values['record.compression'],
                 min_free_bytes=values['record.min_free_bytes'])
         except RecordingError as error:
             # Another node may take a name at any time: only opening shows whether it is free.
             if named or not isinstance(error.__cause__, FileExistsError):
                 raise
-
-
-def _dated(folder: Path) -> Iterator[Path]:
-    """Yield names with the date, without end."""
-    stem = time.strftime('spinning_top_%Y-%m-%d_%H-%M-%S')
-    yield folder / f'{stem}.mcap'
-    for number in itertools.count(2):
-        yield folder / f'{stem}_{number}.mcap'
+        number += 1

@@ -25,12 +25,10 @@ Publish the messages of a ROS 2 log (.mcap) with their recorded spacing, then en
 
 EPILOG = """\
 Topics keep their recorded names, whatever the namespace of this node (`replay`); remapping with
-`--ros-args -r FROM:=TO` works on them. They are published with the recorded QoS, and
-`qos_overrides.<topic>.publisher.{history,depth,reliability}` override it. A topic that cannot be
-published, such as one of a type that is not installed, is named and left out. Messages go out in
-the order of their log times and with their recorded bytes: stamps inside them stay as they are, in
-every round of --loop. What is late is sent at once; at high rates a greater depth keeps more of it
-for subscribers that cannot follow.
+`--ros-args -r FROM:=TO` works on them. They have the recorded QoS, which the parameters
+`qos_overrides.<topic>.publisher.{history,depth,reliability}` override. A topic that cannot be
+published is named and left out. Messages go out in the order of their log times and with their
+recorded bytes, old stamps included; what is late is sent at once.
 
 while playing:
   ros2 service call /replay/set_pause std_srvs/srv/SetBool '{data: true}'
@@ -62,26 +60,24 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='replay_node', description=DESCRIPTION, epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('file', type=Path, metavar='FILE', help='the log')
-    parser.add_argument('-r', '--rate', type=float, metavar='R',
-                        help='recorded over real time (default: the parameter `rate`, 1)')
-    parser.add_argument('-l', '--loop', action='store_true',
-                        help='begin again at the end; --clock goes on')
-    parser.add_argument('--start', type=_not_negative, default=0.0, metavar='S',
-                        help='begin S seconds after the begin of the log')
-    parser.add_argument('--topics', nargs='+', default=[], metavar='T',
-                        help='play these only, by their recorded names')
-    parser.add_argument('--clock', type=_not_negative, nargs='?', const=CLOCK_RATE, default=0.0,
-                        metavar='HZ', help="publish the log's time on /clock, HZ times a second "
-                        f'(default {CLOCK_RATE:g}), instead of a recorded /clock')
-    parser.add_argument('--partial', action='store_true',
-                        help='play what is whole of a torn log')
-    parser.add_argument('-p', '--start-paused', action='store_true',
-                        help='wait for ~/set_pause false')
-    parser.add_argument('-d', '--delay', type=_not_negative, default=0.0, metavar='S',
-                        help='wait S seconds before the first message')
-    parser.add_argument('--wait-for-subscribers', type=int, default=0, metavar='COUNT',
-                        help='wait until there are so many, over all topics')
+    add = parser.add_argument
+    add('file', type=Path, metavar='FILE', help='the log')
+    add('-r', '--rate', type=float, metavar='R',
+        help='recorded over real time (default: the parameter `rate`, 1)')
+    add('-l', '--loop', action='store_true', help='begin again at the end; --clock goes on')
+    add('--start', type=_not_negative, default=0.0, metavar='S',
+        help='begin S seconds after the begin of the log')
+    add('--topics', nargs='+', default=[], metavar='T',
+        help='play these only, by their recorded names')
+    add('--clock', type=_not_negative, nargs='?', const=CLOCK_RATE, default=0.0, metavar='HZ',
+        help="publish the log's time on /clock, HZ times a second "
+        f'(default {CLOCK_RATE:g}), instead of a recorded /clock')
+    add('--partial', action='store_true', help='play what is whole of a torn log')
+    add('-p', '--start-paused', action='store_true', help='wait for ~/set_pause false')
+    add('-d', '--delay', type=_not_negative, default=0.0, metavar='S',
+        help='wait S seconds before the first message')
+    add('--wait-for-subscribers', type=int, default=0, metavar='COUNT',
+        help='wait until there are so many, over all topics')
     return parser
 
 

@@ -30,6 +30,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes import reports
+from spinning_top_sim.nodes.executable import wait_for_all_acked
 from spinning_top_sim.nodes.playback import ROUND_GAP_NS, Message, Playback, ReadAhead, rounds
 from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import DefinitionNotFoundError, LogError
@@ -45,7 +46,7 @@ SLOWEST, FASTEST = 1e-6, 1e9
 LAST_WORD_S = 5.0
 # Wait for subscribers that acknowledge nothing: shared memory goes with its sender.
 UNACKNOWLEDGED_S = 0.3
-# How often subscribers are counted, and stops looked for, while waiting.
+# How often subscribers are counted while waiting.
 LOOK_S = 0.02
 # The thread that sends gets Python's lock this soon from the one that reads ahead.
 SWITCH_INTERVAL_S = 0.0005
@@ -56,22 +57,22 @@ class Replayer(Node):
     The node: plays a log once it is started.  Raises ValueError if nothing of it can be played.
 
     options : those of `replay_node`
-    finished : completes with the exit code when all is played
     """
 
     def __init__(self, log: LogReader, options: argparse.Namespace) -> None:
         given = [] if options.rate is None else [Parameter('rate', value=options.rate)]
         super().__init__('replay', parameter_overrides=given)
-        self.finished: Future = Future()
+        self.finished: Future = Future()    # completes with the exit code when all is played
         self._log, self._options = log, options
         self._terminal = reports.Terminal()
         self._log_begin_ns, self._end_ns = log.span
         self._begin_ns = self._log_begin_ns + round(options.start * NANOSECONDS)
         self._span_ns = self._end_ns - self._begin_ns
+        self._length_s = (self._end_ns - self._log_begin_ns) / NANOSECONDS
         if self._span_ns < 0:
-            raise ValueError(f'--start {options.start:g}: the log lasts '
-                             f'{(self._end_ns - self._log_begin_ns) / NANOSECONDS:.3f} s')
-        self._outputs = self._open_publishers()
+            raise ValueError(f'--start {options.start:g}: the log lasts {self._length_s:.3f} s')
+        self._outputs = self._open_publishers()     # by channel
+        self._senders = set(self._outputs.values())
         self._playback = Playback(
             self._begin_ns, lambda channel_id, data: self._outputs[channel_id].publish(data),
             paused=options.start_paused)
@@ -80,9 +81,8 @@ class Replayer(Node):
             description='recorded over real time; a change takes effect at once',
             additional_constraints=f'a number in [{SLOWEST:g}, {FASTEST:g}]', dynamic_typing=True))
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._clock_publishers = []
         if options.clock:
-            self._clock_publishers.append(self.create_publisher(ClockMessage, '/clock', 10))
+            self._clock_publisher = self.create_publisher(ClockMessage, '/clock', 10)
             self.create_timer(1.0 / max(options.clock, SLOWEST), self._publish_clock, clock=steady)
         self.create_timer(1.0, self._show_status, clock=steady)
         self.create_service(SetBool, '~/set_pause', self._on_pause)
@@ -165,13 +165,12 @@ class Replayer(Node):
 
     def _play(self) -> None:
         """Play all; the body of a thread beside the executor's."""
-        code = 0
         try:
             self._wait_to_begin()
             self._playback.run(self._ahead)
-            self._wait_for_delivery()
-            if self._tell_damage():
-                code = 2
+            self._stopping.wait(UNACKNOWLEDGED_S)
+            wait_for_all_acked(self._senders, LAST_WORD_S, self._stopping.is_set)
+            code = 2 if self._tell_damage() else 0
         except Exception as error:
             if self.context.ok():           # publishing fails once the context is down
                 self.get_logger().error(f'cannot be played any further: {error}')
@@ -179,7 +178,7 @@ class Replayer(Node):
         if self.context.ok():
             late = f', {self._playback.late} of them late' if self._playback.late else ''
             self._terminal.tell(f'played {self._playback.sent} messages on '
-                                f'{len(set(self._outputs.values()))} topics{late}')
+                                f'{len(self._senders)} topics{late}')
             self.finished.set_result(code)
 
     def _messages(self) -> Iterator[Message]:
@@ -207,26 +206,15 @@ class Replayer(Node):
     def _wait_to_begin(self) -> None:
         """Wait for subscribers and the delay."""
         begin = time.monotonic() + self._options.delay
-        publishers = {*self._outputs.values(), *self._clock_publishers}
+        publishers = [*self._senders, *([self._clock_publisher] if self._options.clock else [])]
         while not self._stopping.wait(LOOK_S) and (time.monotonic() < begin or sum(
                 publisher.get_subscription_count() for publisher in publishers
                 ) < self._options.wait_for_subscribers):
             pass
 
-    def _wait_for_delivery(self) -> None:
-        """Wait until all subscribers have the last messages, or for too long."""
-        waiting = [publisher for publisher in set(self._outputs.values())
-                   if publisher.get_subscription_count()]
-        if waiting:
-            self._stopping.wait(UNACKNOWLEDGED_S)
-        end = time.monotonic() + LAST_WORD_S
-        while waiting and time.monotonic() < end and not self._stopping.is_set():
-            waiting = [publisher for publisher in waiting
-                       if not publisher.wait_for_all_acked(Duration(seconds=LOOK_S))]
-
     def _publish_clock(self) -> None:
-        message = ClockMessage(clock=Time(nanoseconds=self._playback.now()).to_msg())
-        self._clock_publishers[0].publish(message)
+        now = Time(nanoseconds=self._playback.now())
+        self._clock_publisher.publish(ClockMessage(clock=now.to_msg()))
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._playback.pause(request.data)
@@ -235,20 +223,18 @@ class Replayer(Node):
         return response
 
     def _position(self) -> str:
-        passed = self._playback.now() - self._begin_ns
-        number, within = divmod(passed, self._span_ns + ROUND_GAP_NS)
-        length = self._end_ns - self._log_begin_ns
-        at = self._begin_ns - self._log_begin_ns + min(within, self._span_ns)
-        percent = 100.0 * at / length if length else 100.0
+        number, within = divmod(self._playback.now() - self._begin_ns,
+                                self._span_ns + ROUND_GAP_NS)
+        at = self._options.start + min(within, self._span_ns) / NANOSECONDS
+        percent = 100.0 * at / self._length_s if self._length_s else 100.0
         which = f' of round {number + 1}' if self._options.loop else ''
-        return f'{at / NANOSECONDS:.2f} of {length / NANOSECONDS:.2f} s, {percent:.0f} %{which}'
+        return f'{at:.2f} of {self._length_s:.2f} s, {percent:.0f} %{which}'
 
     def _show_status(self) -> None:
         self._tell_damage()
         paused = ' | paused' if self._playback.paused else ''
-        late = f' | {self._playback.late} late' if self._playback.late else ''
         self._terminal.show(f'{self._position()} | x{self.get_parameter("rate").value:g}{paused} '
-                            f'| {self._playback.sent} messages{late}')
+                            f'| {self._playback.sent} messages | {self._playback.late} late')
 
 
 def open_log(path: Path, partial: bool) -> LogReader:
@@ -269,10 +255,9 @@ def open_log(path: Path, partial: bool) -> LogReader:
 
 def message_class(type_name: str) -> type:
     """
-    Return the class of a message type, such as 'geometry_msgs/msg/Pose', that a log names.
+    Return the class of a message type that a log names.
 
-    Raises LookupError if it is no message type of an installed ROS package.  No other module is
-    ever imported.
+    Raises LookupError unless it is one of an installed ROS package; nothing else is imported.
     """
     match = TYPE_NAME.fullmatch(type_name)
     if match is None:

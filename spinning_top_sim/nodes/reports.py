@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from std_msgs.msg import Header
 
 from spinning_top_sim.streams.cdr import NANOSECONDS
 
@@ -36,7 +37,7 @@ class MotionReport:
 
         max_error : largest orientation error that is no problem; 0: it is not computed [rad]
         """
-        simulation, loop = self._simulation, self._loop
+        simulation, loop, session = self._simulation, self._loop, self._session
         error = simulation.orientation_error if max_error else math.nan
         problems = [(DiagnosticStatus.OK, 'paused' if loop.paused else 'running')]
         if self.overloaded:
@@ -44,29 +45,13 @@ class MotionReport:
         if error > max_error > 0.0:
             problems.append((DiagnosticStatus.WARN, f'orientation error {error:.3g} rad: more '
                                                     f'than max_error = {max_error:g} rad'))
-        if self._session.error:
-            problems.append((DiagnosticStatus.ERROR, f'recording: {self._session.error}'))
+        if session.error:
+            problems.append((DiagnosticStatus.ERROR, f'recording: {session.error}'))
         if loop.failure:
             problems.append((DiagnosticStatus.ERROR, loop.failure))
         level, message = max(problems, key=lambda problem: problem[0])
-        array = DiagnosticArray(status=[DiagnosticStatus(
-            level=level, name=name, hardware_id='none', message=message,
-            values=[KeyValue(key=key, value=str(value))
-                    for key, value in self._numbers(error).items()])])
-        array.header.stamp = stamp
-        return array
-
-    @property
-    def overloaded(self) -> bool:
-        """Whether samples have come too late to be published, or the clock has slipped."""
-        return self._loop.slipped_ns > 0 or self._total('skipped') > 0
-
-    def _total(self, count: str) -> int:
-        return sum(getattr(stream, count) for stream in self._simulation.streams)
-
-    def _numbers(self, error: float) -> dict[str, object]:
-        simulation, loop, now_ns = self._simulation, self._loop, self._loop.now_ns
-        return {
+        now_ns = loop.now_ns
+        numbers = {
             'simulated time [s]': f'{now_ns / NANOSECONDS:.6f}',
             'real-time factor': f'{self._measure_speed(now_ns):.3f}',
             'late ticks': loop.late_ticks,
@@ -79,8 +64,18 @@ class MotionReport:
             'rejected commands': loop.rejected_commands,
             'integration steps': simulation.steps,
             'evaluations': simulation.evaluations,
-            **self._session.numbers(),
-        }
+            **session.numbers()}
+        return DiagnosticArray(header=Header(stamp=stamp), status=[DiagnosticStatus(
+            level=level, name=name, hardware_id='none', message=message,
+            values=[KeyValue(key=key, value=str(value)) for key, value in numbers.items()])])
+
+    @property
+    def overloaded(self) -> bool:
+        """Whether samples have come too late to be published, or the clock has slipped."""
+        return self._loop.slipped_ns > 0 or self._total('skipped') > 0
+
+    def _total(self, count: str) -> int:
+        return sum(getattr(stream, count) for stream in self._simulation.streams)
 
     def _measure_speed(self, now_ns: int) -> float:
         """Return simulated over real time since the reading before, or since a reset."""

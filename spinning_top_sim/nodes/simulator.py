@@ -21,6 +21,7 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes import reports, ros_parameters
+from spinning_top_sim.nodes.executable import wait_for_all_acked
 from spinning_top_sim.nodes.pacing import DeadlineThread, FairLock, MonotonicClock
 from spinning_top_sim.nodes.recording_session import RecordingSession
 from spinning_top_sim.nodes.ros_parameters import SPIN
@@ -43,9 +44,8 @@ class Simulator(Node):
     """
     The node; docs/interface.md has its topics, services and parameters.
 
-    One thread ticks, and the executor's thread does everything else.  Both hold the lock while
-    they use the simulation.  `finished` completes when `duration` has passed.  Raises ValueError
-    for a bad parameter.
+    One thread ticks, the executor's does everything else; both hold the lock while they use the
+    simulation.  `finished` completes after `duration`.  Raises ValueError for a bad parameter.
     """
 
     def __init__(self) -> None:
@@ -71,22 +71,14 @@ class Simulator(Node):
         self._outputs = StreamPublishers(self)
         self._session = RecordingSession(simulation, self._lock, self._outputs.topics_to_record)
         self._loop = TickLoop(
-            simulation, values, self._session, align=self._align_ticks,
+            simulation, values, self._session, error=logger.error,
             update_subscribers=lambda: self._outputs.update_subscribers(simulation.streams),
-            error=logger.error, source=followed if self._follows else time.monotonic_ns)
-        self._pacer = DeadlineThread(self._guarded(self._tick), values['tick_rate'],
-                                     self._guarded(self._idle))
+            source=followed if self._follows else time.monotonic_ns)
+        self._pacer = DeadlineThread(self._guarded(self._tick), self._guarded(self._idle),
+                                     lambda: self._loop.grid)
         self._report = reports.MotionReport(simulation, self._loop, self._session)
         self._terminal = reports.Terminal()
         self._outputs.open(simulation.streams, values)
-        self._make_interface()
-        if not simulation.top.is_realizable:
-            logger.warning(
-                f'top.lambda3 = {simulation.top.lambda3!r} kg m^2: no rigid body has more than '
-                f'2 (lambda1 - M R^2) = {2.0 * simulation.top.lambda1_at_com:g}; simulated all '
-                'the same')
-
-    def _make_interface(self) -> None:
         self._diagnostics = self._outputs.create(DiagnosticArray, '/diagnostics')
         self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
         for name, kind, act in (('set_pause', SetBool, self._set_pause),
@@ -95,7 +87,12 @@ class Simulator(Node):
             self.create_service(kind, f'~/{name}', functools.partial(self._serve, act))
         self._steady_timer(1.0, self._publish_diagnostics)
         self._status_timer: Timer | None = None
-        self._set_status_period(self._values['status_period'])
+        self._set_status_period(values['status_period'])
+        if not simulation.top.is_realizable:
+            logger.warning(
+                f'top.lambda3 = {simulation.top.lambda3!r} kg m^2: no rigid body has more than '
+                f'2 (lambda1 - M R^2) = {2.0 * simulation.top.lambda1_at_com:g}; simulated all '
+                'the same')
 
     def _steady_timer(self, period: float, callback: Callable[[], object]) -> Timer:
         """Create a timer that neither a step of the date nor /clock can hold up."""
@@ -109,8 +106,6 @@ class Simulator(Node):
 
     def _date_ns(self) -> int:
         return self._date.now().nanoseconds
-
-    # ---------------------------------------------------------------------- start and stop
 
     def start(self) -> None:
         """Let time run: simulated t = 0 is the next point of the stamps' grid."""
@@ -126,9 +121,9 @@ class Simulator(Node):
         if self._values['max_error'] > 0.0:
             self._simulation.segment.reference.prepare()    # its modules take a while to import
         now_ns = self._date_ns()
-        epoch_ns = self._simulation.epoch_ns = next_epoch(now_ns)
+        self._simulation.epoch_ns = next_epoch(now_ns)
         if not self._follows:
-            time.sleep((epoch_ns - now_ns) / NANOSECONDS)
+            time.sleep((self._simulation.epoch_ns - now_ns) / NANOSECONDS)
         self._loop.start()
         open_log = self._session.start(self._values) if self._values['record.enabled'] else None
         self._pacer.start()
@@ -139,11 +134,6 @@ class Simulator(Node):
                 self._session.error = str(error)
                 self.get_logger().error(f'not recording: {error}')
 
-    def _align_ticks(self, origin_ns: int | None) -> None:
-        """Have ticks just after samples are due."""
-        if origin_ns is not None and not self._follows:
-            self._pacer.align(origin_ns / NANOSECONDS)
-
     def stop(self) -> None:
         """End the motion and close the recording; safe whatever state the context is in."""
         self._pacer.stop()
@@ -152,13 +142,11 @@ class Simulator(Node):
         if summary:
             self._terminal.tell(summary)
 
-    # ------------------------------------------------------------------------------- ticks
-
     def _tick(self) -> bool:
         with self._lock:
             wants_idle = self._loop.tick()
         if self._loop.ended and not self.finished.done():
-            self._outputs.wait_for_all_acked(ACKNOWLEDGED_S)
+            wait_for_all_acked(self._outputs.by_topic.values(), ACKNOWLEDGED_S)
             self.finished.set_result(None)
         return wants_idle
 
@@ -185,8 +173,6 @@ class Simulator(Node):
         with self._lock:
             self._loop.fail(reason)
         self._session.stop(reason)
-
-    # ---------------------------------------------------------------- commands, parameters
 
     def _outcome(self, act: Callable[[Any], str | None], asked: object) -> tuple[bool, str]:
         """Return whether `act` does it, and what it says; unexpected errors stop the motion."""
@@ -227,20 +213,13 @@ class Simulator(Node):
                 self._loop.command(values['spin.l3'], values['spin.lz'])
             if rest:
                 self._session.write_event('parameters', **{name: values[name] for name in rest})
-                self._put_into_effect(values, rest)
+                self._simulation.apply(values)
+                if any(name.endswith('.enabled') for name in rest):
+                    self._outputs.open(self._simulation.streams, values)
+                if 'status_period' in rest:
+                    self._set_status_period(values['status_period'])
+                self._loop.set_pace(values)
         self._values = values
-
-    def _put_into_effect(self, values: dict[str, Any], changed: list[str]) -> None:
-        self._simulation.apply(values)
-        if any(name.endswith('.enabled') for name in changed):
-            self._outputs.open(self._simulation.streams, values)
-        if 'status_period' in changed:
-            self._set_status_period(values['status_period'])
-        if 'tick_rate' in changed:
-            self._pacer.set_rate(values['tick_rate'])
-        self._loop.set_pace(values)
-
-    # ---------------------------------------------------------------------------- services
 
     def _serve(self, act: Callable[[Any], str], request: object, response: Any) -> object:
         response.success, response.message = self._outcome(act, request)
@@ -282,8 +261,6 @@ class Simulator(Node):
             return self._session.stop() or 'not recording'
         self._check_started()
         return self._session.start(self._values)()
-
-    # ----------------------------------------------------------------------------- reports
 
     def _publish_diagnostics(self) -> None:
         """Look at the recording, and publish /diagnostics."""

@@ -4,11 +4,9 @@
 from __future__ import annotations
 
 import importlib
-import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -26,7 +24,7 @@ class StreamPublishers:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._by_topic: dict[str, Publisher] = {}
+        self.by_topic: dict[str, Publisher] = {}
 
     def create(self, message_class: type, topic: str) -> Publisher:
         """Create a reliable publisher whose QoS can be overridden by parameters."""
@@ -38,19 +36,19 @@ class StreamPublishers:
         """Create the publishers of enabled streams; destroy those of others."""
         for stream in streams:
             enabled = journal.is_enabled(stream.parameter, values)
-            there = stream.topic in self._by_topic
+            there = stream.topic in self.by_topic
             if enabled and not there:
                 package, _, name = stream.type_name.split('/')
                 message_class = getattr(importlib.import_module(f'{package}.msg'), name)
-                self._by_topic[stream.topic] = self.create(message_class, stream.topic)
+                self.by_topic[stream.topic] = self.create(message_class, stream.topic)
             elif there and not enabled:
                 stream.publish = None
-                self._node.destroy_publisher(self._by_topic.pop(stream.topic))
+                self._node.destroy_publisher(self.by_topic.pop(stream.topic))
 
     def update_subscribers(self, streams: Sequence[Stream]) -> None:
         """Let a stream publish if anybody subscribes to it; without that, it computes nothing."""
         for stream in streams:
-            publisher = self._by_topic.get(stream.topic)
+            publisher = self.by_topic.get(stream.topic)
             if publisher is not None:
                 heard = publisher.get_subscription_count() > 0
                 stream.publish = publisher.publish if heard else None
@@ -59,16 +57,8 @@ class StreamPublishers:
         """Return the topics of these streams, and behind them those of the journal."""
         topics: list[Topic] = []
         for stream in streams:
-            publisher = self._by_topic[stream.topic]
+            publisher = self.by_topic[stream.topic]
             topics.append((publisher.topic_name, stream.type_name, {
                 name: int(getattr(publisher.qos_profile, name)) for name in RECORDED_POLICIES}))
         return [*topics, *((self._node.resolve_topic_name(name), type_name, {})
                            for name, type_name in journal.TOPICS)]
-
-    def wait_for_all_acked(self, seconds: float) -> None:
-        """Wait until subscribers have all messages, together at most this long."""
-        give_up = time.monotonic() + seconds
-        for publisher in self._by_topic.values():
-            if publisher.get_subscription_count():
-                left = max(0.0, give_up - time.monotonic())
-                publisher.wait_for_all_acked(Duration(seconds=left))

@@ -41,13 +41,11 @@ class TickLoop:
     """
     Moves a simulation along with a clock, one tick at a time.
 
-    A tick sends every sample that is due, however late it comes, so no sample depends on how
-    ticks fall.  Not thread-safe: calls from several threads need a lock around them.
+    A tick sends all samples that are due, so none depends on how ticks fall.  Calls from several
+    threads need a lock around them.
 
     recording : where it has no room, nothing is sent
     update_subscribers : sets `publish` of each stream that has subscribers
-    align : takes the time at which the source read, or will read, simulated time 0 [ns]; None
-        while the clock stands
     error : takes a text for the log
     source : returns the time that simulated time follows [ns]
     steady : returns steady time [ns]; decides which ticks are late and how long one may work
@@ -55,17 +53,17 @@ class TickLoop:
 
     def __init__(self, simulation: Simulation, values: Mapping[str, Any],
                  recording: RecordingSession, *, update_subscribers: Callable[[], object],
-                 align: Callable[[int | None], object], error: Callable[[str], object],
-                 source: Callable[[], int] = time.monotonic_ns,
+                 error: Callable[[str], object], source: Callable[[], int] = time.monotonic_ns,
                  steady: Callable[[], int] = time.monotonic_ns) -> None:
         self.late_ticks = self.skipped_ticks = self.slipped_ns = 0      # since the start
         self.commands = self.rejected_commands = 0
         self.started = self.ended = False       # `ended`: all samples of `duration` are sent
         self.paused: bool = values['start_paused']
         self.failure: str | None = None         # why the motion stands still until `reset`
+        self.grid = 0.0, 0.0                    # a time for a tick on the steady clock, period [s]
         self._simulation, self._recording = simulation, recording
-        self._update_subscribers, self._align = update_subscribers, align
-        self._error, self._steady = error, steady
+        self._update_subscribers, self._error = update_subscribers, error
+        self._steady, self._is_steady = steady, source is steady
         self._clock = SimulatedClock(source, values['time_scale'])
         self._subscribers_due_ns = 0            # on the steady clock
         self._late_from_ns = NEVER_NS           # on the steady clock
@@ -92,10 +90,15 @@ class TickLoop:
     def _sync_clock(self) -> None:
         """Let time go on from where samples are sent up to, or stand there if it is held."""
         self._fast_until_ns, self._late_from_ns = -1, NEVER_NS
-        self._clock.stop(self.now_ns)
-        if self.started and not (self.ended or self.paused or self.failure):
-            self._clock.start(self.now_ns)
-        self._align(self._clock.when(0))
+        self._clock.set(self.now_ns, running=self.started and not (
+            self.ended or self.paused or self.failure))
+        self._align()
+
+    def _align(self) -> None:
+        """Have ticks just after samples are due."""
+        origin_ns = self._clock.when(0) if self._is_steady else None
+        self.grid = (self.grid[0] if origin_ns is None else origin_ns / NANOSECONDS,
+                     self._tick_period_ns / NANOSECONDS)
 
     def tick(self) -> bool:
         """Send what is due; return whether `idle` has something to do before the next tick."""
@@ -112,17 +115,6 @@ class TickLoop:
             self.late_ticks += 1
             since_last_ns = steady_ns - (late_from_ns - self._late_after_ns)
             self.skipped_ticks += round(since_last_ns / self._tick_period_ns) - 1
-        return self._slow_tick(steady_ns)
-
-    def idle(self) -> None:
-        """Compute some of the samples that are due next, until about the next tick."""
-        simulation = self._simulation
-        self._computing = not simulation.prepare(
-            simulation.now_ns + self._ahead_ns, int(BUSY_SHARE * self._tick_period_ns))
-        self._set_fast_until()
-
-    def _slow_tick(self, steady_ns: int) -> bool:
-        """Send what is due, and do all that the fast path leaves out; return as `tick` does."""
         if steady_ns >= self._subscribers_due_ns:
             self._update_subscribers()
             self._subscribers_due_ns = steady_ns + SUBSCRIBERS_PERIOD_NS
@@ -135,6 +127,13 @@ class TickLoop:
         self._set_fast_until()
         return simulation.now_ns >= due_ns and (
             self._computing or due_ns >= simulation.ready_ns - self._ahead_ns)
+
+    def idle(self) -> None:
+        """Compute some of the samples that are due next, until about the next tick."""
+        simulation = self._simulation
+        self._computing = not simulation.prepare(
+            simulation.now_ns + self._ahead_ns, int(BUSY_SHARE * self._tick_period_ns))
+        self._set_fast_until()
 
     def _set_fast_until(self) -> None:
         """Ticks before this simulated time take the fast path."""
@@ -241,4 +240,4 @@ class TickLoop:
             1.5 * self._tick_period_ns, min(TICKS_AHEAD * self._tick_period_ns, AHEAD_NS)))
         self._late_from_ns, self._fast_until_ns = NEVER_NS, -1
         self._clock.set_scale(self._time_scale)
-        self._align(self._clock.when(0))
+        self._align()
