@@ -13,7 +13,6 @@ from pathlib import Path
 from spinning_top_sim.recording.damage import count, seconds
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools.cli import Table
-from spinning_top_sim.tools.recorded_run import RunDescription
 from spinning_top_sim.tools.survey import Motion, Survey
 from spinning_top_sim.tools.verify import Verdict
 
@@ -25,8 +24,10 @@ ROWS = (('nutation period [s]', 'nutation_period', 1.0),
         ('mean spin [rad/s]', 'mean_spin_rate', 1.0),
         ('least tilt [deg]', 'theta_min', DEGREES),
         ('greatest tilt [deg]', 'theta_max', DEGREES),
-        ('slowest precession seen [rad/s]', 'precession_min', 1.0),
-        ('fastest precession seen [rad/s]', 'precession_max', 1.0))
+        ('least precession [rad/s]', 'precession_min', 1.0),
+        ('greatest precession [rad/s]', 'precession_max', 1.0),
+        ('1 - m', 'separatrix_distance', 1.0),
+        ('L3^2/(4 lambda1 |P|)', 'gyroscopic_ratio', 1.0))
 
 
 def as_json(path: Path, found: Survey, verdict: Verdict | None) -> object:
@@ -81,7 +82,14 @@ def as_text(path: Path, found: Survey, verdict: Verdict | None) -> Iterator[str 
         solver += f" ({values['solver.equations']}, rtol {values['solver.rtol']:g})"
     yield f'spinning_top_sim {run.surroundings["version"]}, {solver}, seed {values["seed"]}'
     yield from _topics(found)
-    yield from _journal(run)
+    counts = Counter(event.name for event in run.events)
+    if run.events_topic is None:
+        yield 'no journal: commands and resets are unknown'
+    else:
+        yield (f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
+               f'{counts["parameters"]} changes of parameters')
+    for stamp_ns, reason in run.broken:
+        yield f'journal, entry at {seconds(stamp_ns)}: {reason}'
     yield from found.notes
     for number, motion in enumerate(found.motions[:MOST_MOTIONS], start=1):
         yield from _motion(number, motion, damage.start_ns)
@@ -105,17 +113,6 @@ def _topics(found: Survey) -> Iterator[str | Table]:
             yield f'{name}: {topic.odd_size} messages do not have the size of this stream'
 
 
-def _journal(run: RunDescription) -> Iterator[str]:
-    if run.events_topic is None:
-        yield 'no journal: commands and resets are unknown'
-        return
-    counts = Counter(event.name for event in run.events)
-    yield (f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
-           f'{counts["parameters"]} changes of parameters')
-    for stamp_ns, reason in run.broken:
-        yield f'journal, entry at {seconds(stamp_ns)}: {reason}'
-
-
 def _motion(number: int, motion: Motion, begin_ns: int) -> Iterator[str | Table]:
     exact, measured = motion.exact, motion.measured
     begin, end = (max(at_ns - begin_ns, 0) / NANOSECONDS
@@ -129,19 +126,14 @@ def _motion(number: int, motion: Motion, begin_ns: int) -> Iterator[str | Table]
         expected, seen = (None if value is None else value * factor for value in (
             getattr(exact, key, None), getattr(measured, key, None)))
         rows.append((text, _number(expected, 12), _number(seen, 12), _difference(expected, seen)))
-    if exact is not None:
-        rows += [('1 - m', _number(exact.separatrix_distance), '', ''),
-                 ('L3^2/(4 lambda1 |P|)', _number(exact.gyroscopic_ratio), '', '')]
-    yield Table(title, ('', 'exact', f'from {motion.source}' if motion.source else 'measured',
-                        'relative difference'), rows)
-    if measured is None:
-        yield ('not measured: too few samples' if motion.source else
-               'not measured: no topic with an attitude (joint_states, pose, ground_truth/...)')
-        return
-    if measured.nutations:
-        yield count(measured.nutations, 'whole nutation')
-    for reason in measured.missing:
-        yield f'not measured: {reason}'
+    yield Table(title, ('', 'exact', 'measured', 'relative difference'), rows)
+    if measured is not None:
+        yield f'measured from {motion.source}: {count(measured.nutations, "whole nutation")}'
+        yield from (f'not measured: {reason}' for reason in measured.missing)
+    elif motion.source is not None:
+        yield 'not measured: too few samples'
+    else:
+        yield 'not measured: no topic with an attitude (joint_states, pose, ground_truth/...)'
 
 
 def _accuracy(found: Survey) -> Iterator[str | Table]:

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-One pass through a log: what is in it, and how accurate that is.
-
-Samples are analysed in blocks.  Kept are all stamps, and of each motion the samples of one topic.
-"""
+"""What is in a log, and how accurate that is, from one pass through its messages in blocks."""
 
 from __future__ import annotations
 
@@ -12,8 +8,9 @@ import itertools
 import math
 from bisect import bisect_left
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +21,7 @@ from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.reader import LogMessage, LogReader
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.imu import Imu
+from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.streams.segment import Segment
 from spinning_top_sim.streams.topics import Stream
 from spinning_top_sim.tools import analysis
@@ -31,9 +29,9 @@ from spinning_top_sim.tools.analysis import Attitudes, Measured, Reals
 from spinning_top_sim.tools.recorded_run import (
     DepartureError,
     ForeignLogError,
-    Rerun,
     RunDescription,
     read_run_description,
+    rerun,
 )
 
 BLOCK = 16384               # messages of all topics analysed together
@@ -156,27 +154,26 @@ def survey(reader: LogReader) -> Survey:
     sections: list[Section] = []
     try:
         found.run = read_run_description(reader)
-    except ForeignLogError as error:
-        found.foreign_reason = str(error)
-    else:
         for name, topic in found.run.topics.items():
             found.topics[topic].stream = name
         sections = _find_sections(found, found.run)
+    except ForeignLogError as error:
+        found.foreign_reason = str(error)
     ends_ns = [section.end_ns for section in sections]
-    stamps_ns: dict[str, list[NDArray[np.int64]]] = {topic: [] for topic in found.topics}
+    stamps_ns: defaultdict[str, list[NDArray[np.int64]]] = defaultdict(
+        lambda: [np.empty(0, np.int64)])
     messages = reader.messages()
     while block := list(itertools.islice(messages, BLOCK)):
-        by_topic: defaultdict[str, list[LogMessage]] = defaultdict(list)
-        for message in block:
-            by_topic[message.topic].append(message)
-        for topic, samples in by_topic.items():
+        block.sort(key=attrgetter('topic'))         # and, as before, by time
+        for topic, group in itertools.groupby(block, attrgetter('topic')):
+            samples = list(group)
             stamps_ns[topic].append(np.array([sample.log_time for sample in samples]))
             if sections and found.topics[topic].stream is not None:
                 for number, part in itertools.groupby(
                         samples, lambda sample: bisect_left(ends_ns, sample.log_time)):
                     _analyse(found, sections[number], topic, list(part))
     for topic, report in found.topics.items():
-        _count(report, np.concatenate([np.empty(0, np.int64), *stamps_ns[topic]]),
+        _count(report, np.concatenate(stamps_ns[topic]),
                [(section, section.streams[topic].period_ns) for section in sections
                 if topic in section.streams])
     for motion in found.motions:
@@ -188,14 +185,19 @@ def _find_sections(found: Survey, run: RunDescription) -> list[Section]:
     """Return the sections of a run, and note its motions and why it cannot be followed on."""
     sections: list[Section] = []
     try:
-        rerun = Rerun(run)
-        sections.append(_section(found, rerun, 'start', rerun.stamp_ns))
-        for event in rerun.advance(found.damage.end_ns):
-            if event is not None:
-                begin_ns = sections[-1].end_ns = found.motions[-1].end_ns = rerun.stamp_ns
-                if event.name == 'reset':
-                    begin_ns = rerun.simulation.epoch_ns - 1
-                sections.append(_section(found, rerun, event.name, begin_ns))
+        for simulation, event in rerun(run, found.damage.end_ns):
+            if event is None:
+                continue
+            if sections:
+                last = sections[-1]
+                last.end_ns = last.motion.end_ns = last.epoch_ns + event.sent_ns
+            begin_ns = simulation.epoch_ns + simulation.now_ns
+            streams = {run.topics[stream.topic]: copy.copy(stream)
+                       for stream in simulation.streams if stream.topic in run.topics}
+            if event.name != 'parameters':
+                found.motions.append(_motion(run, simulation, streams, event.name, begin_ns))
+            sections.append(Section(found.motions[-1], begin_ns, begin_ns, simulation.epoch_ns,
+                                    streams, Imu(simulation.values)))
     except DepartureError as error:
         found.notes.append(f'the run cannot be followed beyond here: {error}')
     if sections:
@@ -204,21 +206,15 @@ def _find_sections(found: Survey, run: RunDescription) -> list[Section]:
     return sections
 
 
-def _section(found: Survey, rerun: Rerun, cause: str, begin_ns: int) -> Section:
-    """Return the section that begins now, perhaps with a motion of its own."""
-    simulation, run = rerun.simulation, rerun.run
-    by_name = {stream.topic: copy.copy(stream) for stream in simulation.streams}
-    if cause != 'parameters':
-        segment, exact = simulation.segment, simulation.describe()
-        period_ns = ((exact and exact.nutation_period) or math.inf) * NANOSECONDS
-        source = max((name for name in SOURCES if name in run.topics), default='',
-                     key=lambda name: min(period_ns / by_name[name].period_ns, ENOUGH_SAMPLES))
-        found.motions.append(Motion(
-            cause, begin_ns, begin_ns, simulation.epoch_ns + segment.start_ns, segment, exact,
-            run.topics.get(source)))
-    return Section(found.motions[-1], begin_ns, begin_ns, simulation.epoch_ns,
-                   {topic: by_name[name] for name, topic in run.topics.items()},
-                   Imu(simulation.values))
+def _motion(run: RunDescription, simulation: Simulation, streams: Mapping[str, Stream],
+            cause: str, begin_ns: int) -> Motion:
+    """Return the motion that begins now."""
+    exact = simulation.describe()
+    period_ns = ((exact and exact.nutation_period) or math.inf) * NANOSECONDS
+    source = max((run.topics[name] for name in SOURCES if name in run.topics), default=None,
+                 key=lambda name: min(period_ns / streams[name].period_ns, ENOUGH_SAMPLES))
+    return Motion(cause, begin_ns, begin_ns, simulation.epoch_ns + simulation.segment.start_ns,
+                  simulation.segment, exact, source)
 
 
 def _analyse(found: Survey, section: Section, topic: str, samples: list[LogMessage]) -> None:

@@ -17,7 +17,7 @@ from spinning_top_sim.recording.provenance import surroundings
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.topics import Stream
-from spinning_top_sim.tools.recorded_run import DepartureError, Rerun, RunDescription
+from spinning_top_sim.tools.recorded_run import DepartureError, RunDescription, rerun
 
 # Names in the message definition of the arrays of numbers in a template, in their order.
 FIELDS = {
@@ -114,14 +114,14 @@ def verify(reader: LogReader, run: RunDescription, show: Callable[[int], None]) 
             message = next(messages, None)
 
     try:
-        rerun = Rerun(run, take)
-        for event in rerun.advance(damage.end_ns):
-            show(rerun.stamp_ns)
+        for simulation, event in rerun(run, damage.end_ns, take):
+            stamp_ns = simulation.epoch_ns + simulation.now_ns
+            show(stamp_ns)
             if event is not None and event.name == 'command' and run.commands_topic is not None:
                 computed[run.commands_topic, event.stamp_ns].append(
                     (None, journal.command(event.details['l3'], event.details['lz'])))
             # Another command at this very time may follow.
-            compare(rerun.stamp_ns)
+            compare(stamp_ns)
     except DepartureError as error:
         verdict.stopped = str(error)
     compare(math.inf)
