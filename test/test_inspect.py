@@ -477,7 +477,7 @@ def test_a_torn_file_is_told_and_what_is_left_verifies(columns, tmp_path, capsys
     torn.write_bytes(columns.read_bytes()[:last.chunk_start_offset + last.chunk_length // 2])
     code, out, _ = told(capsys, torn, '--verify')
     assert code == 1
-    assert 'torn.mcap: torn' in out and 'lost: ' in out
+    assert 'torn.mcap: truncated' in out and 'lost: ' in out
     assert re.search(r'verify: identical, all \d+ messages', out)
     code, content = as_json(capsys, torn)
     assert code == 1 and not content['whole'] and content['damage']['torn']

@@ -28,7 +28,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='inspect', formatter_class=argparse.RawDescriptionHelpFormatter,
         description='Show what is in a log: topics, gaps, the motions measured from the data\n'
-                    'beside the exact ones, drifts, errors.  Reads torn and damaged logs too.',
+                    'beside the exact ones, drifts, errors.  Reads truncated and damaged logs too.',
         epilog='exit codes:\n'
                '  0    no fault was found\n'
                '  1    the file cannot be read or is damaged, --verify found a difference or\n'
@@ -58,10 +58,10 @@ def _run(arguments: argparse.Namespace) -> int:
     with LogReader(arguments.log) as reader:
         found = survey(reader)
         if arguments.verify and found.run is not None:
-            begin_ns, end_ns = found.damage.start_ns, found.damage.end_ns
+            begin_ns, end_ns = found.damage.start_ns, found.end_ns
             with progress('verified', (end_ns - begin_ns) / NANOSECONDS, 's',
                           quiet=arguments.json) as show:
-                verdict = verify(reader, found.run,
+                verdict = verify(reader, found.run, end_ns,
                                  lambda stamp_ns: show((stamp_ns - begin_ns) / NANOSECONDS))
     if arguments.json:
         print(json.dumps(as_json(arguments.log, found, verdict), indent=2, allow_nan=False))

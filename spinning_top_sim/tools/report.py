@@ -59,7 +59,9 @@ def as_json(path: Path, found: Survey, verdict: Verdict | None) -> object:
                    for topic, drifts in found.drifts.items()},
         'orientation_error': {topic: {'max': series.largest, 'rms': series.rms}
                               for topic, series in found.errors.items()},
-        'verify': verdict and {'identical': verdict.identical, **asdict(verdict)},
+        'verify': verdict and {
+            'identical': verdict.identical, 'whole': found.whole, **asdict(verdict),
+            'first': verdict.first and verdict.first._asdict()},
     }
     # Numbers that JSON does not have become null.
     return json.loads(json.dumps(content), parse_constant=lambda name: None)
@@ -69,7 +71,7 @@ def as_text(path: Path, found: Survey, verdict: Verdict | None) -> Iterator[str 
     """Yield the findings as lines and tables."""
     damage, run = found.damage, found.run
     state = ('whole' if found.whole and not damage.defects else
-             'torn' if damage.truncated else 'damaged')
+             'truncated' if damage.truncated else 'damaged')
     yield f'{path}: {state}, {(damage.end_ns - damage.start_ns) / NANOSECONDS:.6g} s'
     yield from damage.lines()
     if run is None:
@@ -126,7 +128,7 @@ def _motion(number: int, motion: Motion, begin_ns: int) -> Iterator[str | Table]
         expected, seen = (None if value is None else value * factor for value in (
             getattr(exact, key, None), getattr(measured, key, None)))
         rows.append((text, _number(expected, 12), _number(seen, 12), _difference(expected, seen)))
-    yield Table(title, ('', 'exact', 'measured', 'relative difference'), rows)
+    yield Table(title, ('', 'exact', 'measured', 'difference'), rows)
     if measured is not None:
         yield f'measured from {motion.source}: {count(measured.nutations, "whole nutation")}'
         yield from (f'not measured: {reason}' for reason in measured.missing)
@@ -161,11 +163,13 @@ def _verdict(verdict: Verdict) -> Iterator[str]:
     if verdict.stopped:
         yield f'verify: the run cannot be computed again: {verdict.stopped}'
     if verdict.identical:
-        missing = f' ({verdict.missing} more are not in the file)' if verdict.missing else ''
-        yield f'verify: identical, all {compared} messages byte for byte{missing}'
-        return
-    yield (f'verify: DIFFERENT: {verdict.different} of {compared} messages differ, '
-           f'{verdict.missing} are missing, {verdict.unexpected} should not be there')
+        yield f'verify: identical, all {compared} messages byte for byte'
+    elif verdict.consistent:
+        yield (f'verify: incomplete, {count(verdict.missing, "message")} missing; '
+               f'the other {compared} are identical byte for byte')
+    else:
+        yield (f'verify: DIFFERENT: {verdict.different} of {compared} messages differ, '
+               f'{verdict.missing} are missing, {verdict.unexpected} should not be there')
     first = verdict.first
     if first is not None:
         place = '' if first.byte is None else f', byte {first.byte}'
@@ -183,4 +187,4 @@ def _difference(expected: float | None, seen: float | None) -> str:
     difference = seen - expected
     if abs(difference) > abs(expected):         # also where that is 0
         return f'{difference:.1e} absolute'
-    return f'{difference / abs(expected):.1e}' if expected else '0'
+    return f'{difference / abs(expected):.1e}' if difference else '0'

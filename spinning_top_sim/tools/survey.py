@@ -123,6 +123,7 @@ class Survey:
 
     damage: Damage
     whole: bool                           # the log was closed, and nothing is lost
+    end_ns: int                           # log time up to which samples were recorded [ns]
     topics: dict[str, TopicReport]
     run: RunDescription | None = None     # None for a log that this package did not record
     foreign_reason: str = ''              # why not
@@ -150,7 +151,7 @@ def survey(reader: LogReader) -> Survey:
     """Return the findings about a log.  Raises LogError."""
     damage = reader.damage
     found = Survey(damage, reader.whole and not damage.truncated and damage.lossless,
-                   {topic.name: TopicReport(topic.type_name) for topic in reader.topics})
+                   damage.end_ns, {topic.name: TopicReport(topic.type_name) for topic in reader.topics})
     sections: list[Section] = []
     try:
         found.run = read_run_description(reader)
@@ -159,7 +160,7 @@ def survey(reader: LogReader) -> Survey:
         sections = _find_sections(found, found.run)
     except ForeignLogError as error:
         found.foreign_reason = str(error)
-    ends_ns = [section.end_ns for section in sections]
+    ends_ns = [section.end_ns for section in sections[:-1]]
     stamps_ns: defaultdict[str, list[NDArray[np.int64]]] = defaultdict(
         lambda: [np.empty(0, np.int64)])
     messages = reader.messages()
@@ -172,6 +173,11 @@ def survey(reader: LogReader) -> Survey:
                 for number, part in itertools.groupby(
                         samples, lambda sample: bisect_left(ends_ns, sample.log_time)):
                     _analyse(found, sections[number], topic, list(part))
+    if sections:        # the last entry of the journal may be later than the last sample
+        last = sections[-1]
+        found.end_ns = last.end_ns = last.motion.end_ns = max(
+            last.begin_ns, *(int(block[-1]) for topic in last.streams
+                             for block in stamps_ns[topic][-1:] if len(block)), last.begin_ns)
     for topic, report in found.topics.items():
         _count(report, np.concatenate(stamps_ns[topic]),
                [(section, section.streams[topic].period_ns) for section in sections
@@ -200,9 +206,6 @@ def _find_sections(found: Survey, run: RunDescription) -> list[Section]:
                                     streams, Imu(simulation.values)))
     except DepartureError as error:
         found.notes.append(f'the run cannot be followed beyond here: {error}')
-    if sections:
-        last = sections[-1]
-        last.end_ns = last.motion.end_ns = max(found.damage.end_ns, last.begin_ns)
     return sections
 
 
