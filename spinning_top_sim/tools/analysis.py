@@ -40,15 +40,18 @@ class Attitudes:
     Samples of the body's attitude, in order of time, and what follows from each.
 
     stamps_ns : (n,) log times [ns]
-    rows : (4, n) q(world <- body) as x, y, z, w; below it, if the log has them, angular velocity in
-        the body frame [rad/s] (3, n), and phi and psi, which count turns, and phi' (3, n)
-    cos2, sin2, sin2_rate : (n,) squares, of theta/2: the smaller keeps the digits near a pole; and
-        the rate of the second [1/s], None where the log has no rates, like phi_dot
+    rows : (4, n) q(world <- body) as x, y, z, w; below it, if the log has them, (3, n) angular
+        velocity in the body frame [rad/s], and (3, n) phi and psi, which count turns, and phi'
+    time, period : (n,) since the first sample, and the mean time between two samples [s]
+    cos2, sin2 : (n,) squares, of theta/2: the smaller keeps the digits near a pole
     tip, body_tip : (n,) sin(theta) exp(i phi) and sin(theta) exp(i psi)
+    phi_dot, sin2_rate : (n,) rates of phi and sin2 [1/s], None where the log has none
     """
 
     def __init__(self, stamps_ns: NDArray[np.int64], rows: Reals) -> None:
         self.stamps_ns, self.rows = stamps_ns, rows
+        self.time = (stamps_ns - stamps_ns[:1]) * 1e-9
+        self.period = float(np.max(self.time, initial=0.0)) / max(len(stamps_ns) - 1, 1)
         x, y, z, w = self.quaternion = tuple(rows[:4])
         self.cos2, self.sin2 = w * w + z * z, x * x + y * y
         tip_x, tip_y, self.height = attitude.axis_in_world(self.quaternion)
@@ -66,16 +69,6 @@ class Attitudes:
             self.phi, self.psi, self.phi_dot = rows[7:]
         else:
             self.phi, self.psi = (np.unwrap(np.angle(tip)) for tip in (self.tip, self.body_tip))
-
-    @property
-    def time(self) -> Reals:
-        """Since the first sample [s]."""
-        return (self.stamps_ns - self.stamps_ns[0]) * 1e-9
-
-    @property
-    def period(self) -> float:
-        """Mean time between two samples [s]."""
-        return float(self.time[-1]) / (len(self.time) - 1)
 
     def first(self, seconds: float) -> Attitudes:
         """Return the samples of the first seconds, two at least."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import os
 import shutil
@@ -21,11 +22,13 @@ TEXT_WIDTH = 118            # without a terminal
 GAP = '  '                  # before each column of a table
 
 
-def exit_code(name: str, command: Callable[[], int],
+def exit_code(parser: argparse.ArgumentParser, argv: Sequence[str] | None,
+              command: Callable[[argparse.Namespace], int],
               errors: tuple[type[Exception], ...]) -> int:
     """Run a command; return its code, FAILED after one of `errors`, INTERRUPTED after Ctrl-C."""
+    arguments = parser.parse_args(argv)
     try:
-        code = command()
+        code = command(arguments)
         sys.stdout.flush()
         return code
     except BrokenPipeError:
@@ -36,10 +39,10 @@ def exit_code(name: str, command: Callable[[], int],
         what = str(error)
         if isinstance(error, OSError) and error.filename is not None:
             what = f'{error.filename}: {error.strerror}'
-        print_line(f'{name}: {what}', sys.stderr)
+        print_line(f'{parser.prog}: {what}', sys.stderr)
         return FAILED
     except KeyboardInterrupt:
-        print_line(f'{name}: interrupted', sys.stderr)
+        print_line(f'{parser.prog}: interrupted', sys.stderr)
         return INTERRUPTED
 
 

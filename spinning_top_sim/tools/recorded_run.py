@@ -153,18 +153,18 @@ def rerun(run: RunDescription, end_ns: int,
         simulation.record_blocks(
             [stream for stream in simulation.streams if stream.topic in run.topics])
     yield simulation, Event('start', run.epoch_ns, 0, simulation.now_ns, {})
-    for event in (*(event for event in run.events if event.name != 'start'), None):
-        stop_ns = end_ns - simulation.epoch_ns if event is None else event.sent_ns
+    for item in (*(event for event in run.events if event.name != 'start'), None):
+        stop_ns = end_ns - simulation.epoch_ns if item is None else item.sent_ns
         recorded = [stream for stream in simulation.streams if stream.has_sinks]
-        for target_ns, item in offline_targets(
-                max(simulation.now_ns, 0), [(stop_ns, event)], offline_block_ns(recorded)):
+        for target_ns, reached in offline_targets(
+                max(simulation.now_ns, 0), [(stop_ns, item)], offline_block_ns(recorded)):
             # Without samples states are only needed where a command finds them.
-            if send is not None or (item is not None and item.name == 'command'):
+            if send is not None or (reached is not None and reached.name == 'command'):
                 reach(target_ns)
             simulation.now_ns = target_ns
-            if item is not None:
-                _apply(simulation, item)
-            yield simulation, item
+            if reached is not None:
+                _apply(simulation, reached)
+            yield simulation, reached
 
 
 def _apply(simulation: Simulation, event: Event) -> None:

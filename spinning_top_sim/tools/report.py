@@ -35,24 +35,23 @@ def as_json(path: Path, found: Survey, verdict: Verdict | None) -> object:
     damage, run = found.damage, found.run
     content: dict[str, object] = {
         'file': str(path), 'whole': found.whole,
-        'damage': {'torn': damage.truncated, 'lost_bytes': damage.lost_bytes,
-                   'lost_chunks': damage.lost_chunks, 'missing_messages': damage.missing_messages,
-                   'missing_exactly': damage.missing_exactly, 'report': damage.lines()},
-        'begin_ns': damage.start_ns, 'end_ns': damage.end_ns,
-        'duration': (damage.end_ns - damage.start_ns) / NANOSECONDS,
+        'damage': {'torn': damage.truncated, 'report': damage.lines(), **{
+            key: getattr(damage, key) for key in (
+                'lost_bytes', 'lost_chunks', 'missing_messages', 'missing_exactly')}},
+        'begin_ns': damage.start_ns, 'end_ns': damage.end_ns, 'duration': _duration(found),
         'topics': {name: asdict(topic) for name, topic in found.topics.items()},
         'ours': run is not None, 'why_not_ours': found.foreign_reason or None,
         'notes': found.notes,
-        'run': None if run is None else {
+        'run': run and {
             'parameters': run.values, 'seed': run.values['seed'], 'epoch_ns': run.epoch_ns,
             'begun_ns': run.begun_ns, **run.surroundings},
-        'events': [] if run is None else [
+        'events': [
             {'event': event.name, 'stamp_ns': event.stamp_ns, 't_ns': event.t_ns, **event.details}
-            for event in run.events],
+            for event in (run.events if run else ())],
         'motions': [{
-            'cause': motion.cause, 'begin_ns': motion.begin_ns, 'end_ns': motion.end_ns,
-            'l3': motion.segment.l3, 'lz': motion.segment.lz, 'energy': motion.segment.energy,
-            'source': motion.source, 'regime': motion.regime,
+            **{key: getattr(motion, key) for key in (
+                'cause', 'begin_ns', 'end_ns', 'source', 'regime')},
+            **{key: getattr(motion.segment, key) for key in ('l3', 'lz', 'energy')},
             'exact': motion.exact and asdict(motion.exact),
             'measured': motion.measured and asdict(motion.measured)} for motion in found.motions],
         'drifts': {topic: {name: series.largest for name, series in drifts.items()}
@@ -67,29 +66,30 @@ def as_json(path: Path, found: Survey, verdict: Verdict | None) -> object:
     return json.loads(json.dumps(content), parse_constant=lambda name: None)
 
 
+def _duration(found: Survey) -> float:
+    return (found.damage.end_ns - found.damage.start_ns) / NANOSECONDS
+
+
 def as_text(path: Path, found: Survey, verdict: Verdict | None) -> Iterator[str | Table]:
     """Yield the findings as lines and tables."""
     damage, run = found.damage, found.run
     state = ('whole' if found.whole and not damage.defects else
              'truncated' if damage.truncated else 'damaged')
-    yield f'{path}: {state}, {(damage.end_ns - damage.start_ns) / NANOSECONDS:.6g} s'
+    yield f'{path}: {state}, {_duration(found):.6g} s'
     yield from damage.lines()
     if run is None:
         yield f'not recorded by spinning_top_sim: {found.foreign_reason}'
         yield from _topics(found)
         return
-    values = run.values
-    solver = values['solver.method']
+    solver = run.values['solver.method']
     if solver != 'exact':
-        solver += f" ({values['solver.equations']}, rtol {values['solver.rtol']:g})"
-    yield f'spinning_top_sim {run.surroundings["version"]}, {solver}, seed {values["seed"]}'
+        solver += f" ({run.values['solver.equations']}, rtol {run.values['solver.rtol']:g})"
+    yield f'spinning_top_sim {run.surroundings["version"]}, {solver}, seed {run.values["seed"]}'
     yield from _topics(found)
     counts = Counter(event.name for event in run.events)
-    if run.events_topic is None:
-        yield 'no journal: commands and resets are unknown'
-    else:
-        yield (f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
-               f'{counts["parameters"]} changes of parameters')
+    yield ('no journal: commands and resets are unknown' if run.events_topic is None else
+           f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
+           f'{counts["parameters"]} changes of parameters')
     for stamp_ns, reason in run.broken:
         yield f'journal, entry at {seconds(stamp_ns)}: {reason}'
     yield from found.notes
@@ -97,7 +97,15 @@ def as_text(path: Path, found: Survey, verdict: Verdict | None) -> Iterator[str 
         yield from _motion(number, motion, damage.start_ns)
     if len(found.motions) > MOST_MOTIONS:
         yield f'and {len(found.motions) - MOST_MOTIONS} more motions (all are in --json)'
-    yield from _accuracy(found)
+    yield 'drifts of E, L3, Lz: no topic with rates (joint_states, ground_truth/...)' if not (
+        found.drifts) else Table(
+        'largest drifts since the start of each motion, relative', ('from', 'E', 'L3', 'Lz'),
+        [(topic, *(f'{series.largest:.2g}' for series in drifts.values()))
+         for topic, drifts in found.drifts.items()])
+    yield 'orientation error: no topic with an attitude' if not found.errors else Table(
+        'orientation error against the exact solution [rad]', ('from', 'max', 'rms'),
+        [(topic, f'{series.largest:.3g}', f'{series.rms:.3g}')
+         for topic, series in found.errors.items()])
     if verdict is not None:
         yield from _verdict(verdict)
 
@@ -138,24 +146,6 @@ def _motion(number: int, motion: Motion, begin_ns: int) -> Iterator[str | Table]
         yield 'not measured: no topic with an attitude (joint_states, pose, ground_truth/...)'
 
 
-def _accuracy(found: Survey) -> Iterator[str | Table]:
-    if found.drifts:
-        yield Table('largest drifts since the start of each motion, relative',
-                    ('from', 'E', 'L3', 'Lz'),
-                    [(topic, *(f'{series.largest:.2g}' for series in drifts.values()))
-                     for topic, drifts in found.drifts.items()])
-    else:
-        yield ('drifts of E, L3, Lz: no topic with rates (joint_states, ground_truth/odom, '
-               'ground_truth/imu)')
-    if found.errors:
-        yield Table('orientation error against the exact solution [rad]',
-                    ('from', 'max', 'rms'),
-                    [(topic, f'{series.largest:.3g}', f'{series.rms:.3g}')
-                     for topic, series in found.errors.items()])
-    else:
-        yield 'orientation error: no topic with an attitude'
-
-
 def _verdict(verdict: Verdict) -> Iterator[str]:
     for warning in verdict.warnings:
         yield f'verify: {warning}: the last bits may differ for that'
@@ -164,7 +154,7 @@ def _verdict(verdict: Verdict) -> Iterator[str]:
         yield f'verify: the run cannot be computed again: {verdict.stopped}'
     if verdict.identical:
         yield f'verify: identical, all {compared} messages byte for byte'
-    elif verdict.consistent:
+    elif not (verdict.different or verdict.unexpected or verdict.stopped):
         yield (f'verify: incomplete, {count(verdict.missing, "message")} missing; '
                f'the other {compared} are identical byte for byte')
     else:

@@ -37,8 +37,7 @@ FORMATS = ('mcap', 'csv', 'parquet')
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    arguments = _parser().parse_args(argv)
-    return exit_code('simulate', lambda: _run(arguments),
+    return exit_code(_parser(), argv, _run,
                      (ValueError, RecordingError, IntegrationError, OSError))
 
 

@@ -24,15 +24,9 @@ from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.streams.segment import Segment
 from spinning_top_sim.streams.topics import Stream
-from spinning_top_sim.tools import analysis
+from spinning_top_sim.tools import analysis, recorded_run
 from spinning_top_sim.tools.analysis import Attitudes, Measured, Reals
-from spinning_top_sim.tools.recorded_run import (
-    DepartureError,
-    ForeignLogError,
-    RunDescription,
-    read_run_description,
-    rerun,
-)
+from spinning_top_sim.tools.recorded_run import RunDescription
 
 BLOCK = 16384               # messages of all topics analysed together
 MOST_POINTS = 20_000        # of a series that is kept for a picture
@@ -42,6 +36,7 @@ IMU_TOPICS = ('imu/data_raw', 'ground_truth/imu', 'ground_truth/imu_bias')
 # Streams that measure a motion, the best first: with angles, with exact rates, with neither.
 SOURCES = ('joint_states', 'ground_truth/imu', 'ground_truth/odom', 'imu/data', 'pose')
 ENOUGH_SAMPLES = 12.0       # in a nutation: a faster stream shows nothing new
+Stamps = NDArray[np.int64]
 
 
 @dataclass
@@ -69,7 +64,7 @@ class Series:
         self.largest = self._square_sum = 0.0
         self._count = 0
 
-    def add(self, times_ns: NDArray[np.int64], values: Reals) -> None:
+    def add(self, times_ns: Stamps, values: Reals) -> None:
         """Append values, without those that are not finite."""
         points = np.stack((times_ns, values))[:, np.isfinite(values)]
         sizes = np.abs(points[1])
@@ -100,7 +95,7 @@ class Motion:
     exact: Description | None             # None where the closed form cannot hold it
     source: str | None                    # topic that measures it best
     # Of this topic: log times (n,) [ns], and `Attitudes.rows`
-    samples: list[tuple[NDArray[np.int64], Reals]] = field(default_factory=list)
+    samples: list[tuple[Stamps, Reals]] = field(default_factory=list)
     measured: Measured | None = None      # the numbers of `exact` from these samples
     regime: str | None = None             # name of the motion by them
 
@@ -151,37 +146,33 @@ def survey(reader: LogReader) -> Survey:
     """Return the findings about a log.  Raises LogError."""
     damage = reader.damage
     found = Survey(damage, reader.whole and not damage.truncated and damage.lossless,
-                   damage.end_ns, {topic.name: TopicReport(topic.type_name) for topic in reader.topics})
+                   damage.end_ns, {topic.name: TopicReport(topic.type_name)
+                                   for topic in reader.topics})
     sections: list[Section] = []
     try:
-        found.run = read_run_description(reader)
-        for name, topic in found.run.topics.items():
-            found.topics[topic].stream = name
+        found.run = recorded_run.read_run_description(reader)
         sections = _find_sections(found, found.run)
-    except ForeignLogError as error:
+    except recorded_run.ForeignLogError as error:
         found.foreign_reason = str(error)
     ends_ns = [section.end_ns for section in sections[:-1]]
-    stamps_ns: defaultdict[str, list[NDArray[np.int64]]] = defaultdict(
-        lambda: [np.empty(0, np.int64)])
+    blocks_ns: defaultdict[str, list[Stamps]] = defaultdict(lambda: [np.empty(0, np.int64)])
     messages = reader.messages()
-    while block := list(itertools.islice(messages, BLOCK)):
-        block.sort(key=attrgetter('topic'))         # and, as before, by time
+    while block := sorted(itertools.islice(messages, BLOCK), key=attrgetter('topic')):
         for topic, group in itertools.groupby(block, attrgetter('topic')):
             samples = list(group)
-            stamps_ns[topic].append(np.array([sample.log_time for sample in samples]))
-            if sections and found.topics[topic].stream is not None:
+            blocks_ns[topic].append(np.array([sample.log_time for sample in samples]))
+            if sections and topic in sections[0].streams:
                 for number, part in itertools.groupby(
                         samples, lambda sample: bisect_left(ends_ns, sample.log_time)):
                     _analyse(found, sections[number], topic, list(part))
+    stamps_ns = {topic: np.concatenate(blocks_ns[topic]) for topic in found.topics}
     if sections:        # the last entry of the journal may be later than the last sample
         last = sections[-1]
         found.end_ns = last.end_ns = last.motion.end_ns = max(
-            last.begin_ns, *(int(block[-1]) for topic in last.streams
-                             for block in stamps_ns[topic][-1:] if len(block)), last.begin_ns)
+            last.begin_ns, *(int(stamps_ns[topic].max(initial=0)) for topic in last.streams), 0)
     for topic, report in found.topics.items():
-        _count(report, np.concatenate(stamps_ns[topic]),
-               [(section, section.streams[topic].period_ns) for section in sections
-                if topic in section.streams])
+        _count(report, stamps_ns[topic], [(section, section.streams[topic].period_ns)
+                                          for section in sections if topic in section.streams])
     for motion in found.motions:
         _measure(found, motion)
     return found
@@ -190,8 +181,10 @@ def survey(reader: LogReader) -> Survey:
 def _find_sections(found: Survey, run: RunDescription) -> list[Section]:
     """Return the sections of a run, and note its motions and why it cannot be followed on."""
     sections: list[Section] = []
+    for name, topic in run.topics.items():
+        found.topics[topic].stream = name
     try:
-        for simulation, event in rerun(run, found.damage.end_ns):
+        for simulation, event in recorded_run.rerun(run, found.damage.end_ns):
             if event is None:
                 continue
             if sections:
@@ -204,7 +197,7 @@ def _find_sections(found: Survey, run: RunDescription) -> list[Section]:
                 found.motions.append(_motion(run, simulation, streams, event.name, begin_ns))
             sections.append(Section(found.motions[-1], begin_ns, begin_ns, simulation.epoch_ns,
                                     streams, Imu(simulation.values)))
-    except DepartureError as error:
+    except recorded_run.DepartureError as error:
         found.notes.append(f'the run cannot be followed beyond here: {error}')
     return sections
 
@@ -225,18 +218,14 @@ def _analyse(found: Survey, section: Section, topic: str, samples: list[LogMessa
     stream, motion, segment = section.streams[topic], section.motion, section.motion.segment
     fitting = [sample for sample in samples if len(sample.data) == len(stream.template)]
     found.topics[topic].odd_size += len(samples) - len(fitting)
-    if not fitting:
-        return
-    stamps_ns = np.array([sample.log_time for sample in fitting])
+    stamps_ns = np.array([sample.log_time for sample in fitting], np.int64)
     fields = stream.template.decode(b''.join(sample.data for sample in fitting))
     if stream.topic in IMU_TOPICS:
         time = (stamps_ns - found.motions[0].begin_ns) / NANOSECONDS
-        shown = time <= found.shown_s
-        if shown.any():
-            found.readings.setdefault(topic, []).append(
-                np.column_stack((time, *fields[1:]))[shown])
+        readings = np.column_stack((time, *fields[1:]))[time <= found.shown_s]
+        found.readings.setdefault(topic, []).append(readings)
     data = analysis.attitudes_of(stream.topic, section.imu, stamps_ns, fields)
-    if data is None or not len(data.stamps_ns):
+    if data is None:
         return
     if topic == motion.source:
         motion.samples.append((data.stamps_ns, data.rows))
@@ -254,8 +243,8 @@ def _analyse(found: Survey, section: Section, topic: str, samples: list[LogMessa
             data.stamps_ns, angle_between(data.quaternion, truth))
 
 
-def _count(report: TopicReport, stamps_ns: NDArray[np.int64],
-           sections: Sequence[tuple[Section, int]]) -> None:
+def _count(report: TopicReport, stamps_ns: Stamps, sections: Sequence[tuple[Section, int]],
+           ) -> None:
     """Count a topic's messages, and compare those of a stream with the grid of each section."""
     report.count = len(stamps_ns)
     if report.count > 1:

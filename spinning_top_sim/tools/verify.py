@@ -9,6 +9,7 @@ import struct
 from collections import defaultdict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,20 +59,14 @@ class Verdict:
     warnings: list[str] = field(default_factory=list)
 
     @property
-    def consistent(self) -> bool:
-        """Whether every message that is in the log is as computed."""
-        return not (self.different or self.unexpected or self.stopped)
-
-    @property
     def identical(self) -> bool:
         """Whether the messages in the log are those computed."""
-        return self.consistent and not self.missing
+        return not (self.different or self.missing or self.unexpected or self.stopped)
 
     def note(self, *difference: Any) -> None:
         """Keep a difference if it is the earliest so far."""
         this = Difference(*difference)
-        if self.first is None or this.stamp_ns < self.first.stamp_ns:
-            self.first = this
+        self.first = min(self.first or this, this, key=attrgetter('stamp_ns'))
 
 
 def verify(reader: LogReader, run: RunDescription, end_ns: int,
@@ -157,10 +152,11 @@ def _difference(stream: Stream | None, logged: bytes,
 
 def _warnings(run: RunDescription) -> list[str]:
     """Return the differences of this machine from that of the recording."""
-    then, now = (
-        {'the version of spinning_top_sim': recorded['version'],
-         'the platform': recorded['platform'],
-         # Of the libraries only numpy computes.
-         'numpy': ''.join(re.findall('"numpy": "([^"]*)"', recorded['libraries'])) or 'unknown'}
-        for recorded in (run.surroundings, surroundings()))
-    return [f'{what} was {then[what]}, is {now[what]}' for what in now if then[what] != now[what]]
+    now, found = surroundings(), []
+    for what, key, pattern in (('the version of spinning_top_sim', 'version', '.*'),
+                               ('the platform', 'platform', '.*'),
+                               ('numpy', 'libraries', '"numpy": "[^"]*"')):     # only it computes
+        then, here = (''.join(re.findall(pattern, one[key])) for one in (run.surroundings, now))
+        if then != here:
+            found.append(f'{what} was {then}, is {here}')
+    return found
