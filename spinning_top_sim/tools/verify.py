@@ -10,7 +10,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,9 +63,8 @@ class Verdict:
         """Whether the messages in the log are those computed."""
         return not (self.different or self.missing or self.unexpected or self.stopped)
 
-    def note(self, *difference: Any) -> None:
+    def note(self, this: Difference) -> None:
         """Keep a difference if it is the earliest so far."""
-        this = Difference(*difference)
         self.first = min(self.first or this, this, key=attrgetter('stamp_ns'))
 
 
@@ -81,7 +80,7 @@ def verify(reader: LogReader, run: RunDescription, end_ns: int,
                        if topic is not None}, warnings=_warnings(run))
     for stamp_ns, reason in run.broken:
         verdict.different += 1
-        verdict.note(stamp_ns, run.events_topic, 'entry', reason, 'an entry of the journal')
+        verdict.note(Difference(stamp_ns, run.events_topic or '', 'entry', reason, 'an entry'))
     # What has not been met in the log, by stamp and topic: several commands may have the same.
     computed: defaultdict[tuple[int, str], deque[tuple[Stream | None, bytes]]] = defaultdict(deque)
 
@@ -104,10 +103,10 @@ def verify(reader: LogReader, run: RunDescription, end_ns: int,
                 verdict.compared[message.topic] += 1
                 if message.data != expected:
                     verdict.different += 1
-                    verdict.note(*key, *_difference(stream, message.data, expected))
+                    verdict.note(Difference(*key, *_difference(stream, message.data, expected)))
             else:
                 verdict.unexpected += 1
-                verdict.note(*key, 'message', 'there', 'no such message')
+                verdict.note(Difference(*key, 'message', 'there', 'no such message'))
             message = next(messages, None)
 
     try:
@@ -124,7 +123,7 @@ def verify(reader: LogReader, run: RunDescription, end_ns: int,
     compare(math.inf)
     for key, left in computed.items():
         verdict.missing += len(left)
-        verdict.note(*key, 'message', 'no such message', 'there')
+        verdict.note(Difference(*key, 'message', 'no such message', 'there'))
     return verdict
 
 
