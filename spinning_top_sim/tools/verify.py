@@ -103,7 +103,7 @@ def verify(reader: LogReader, run: RunDescription, end_ns: int,
                 verdict.compared[message.topic] += 1
                 if message.data != expected:
                     verdict.different += 1
-                    verdict.note(Difference(*key, *_difference(stream, message.data, expected)))
+                    verdict.note(_difference(key, stream, message.data, expected))
             else:
                 verdict.unexpected += 1
                 verdict.note(Difference(*key, 'message', 'there', 'no such message'))
@@ -127,16 +127,16 @@ def verify(reader: LogReader, run: RunDescription, end_ns: int,
     return verdict
 
 
-def _difference(stream: Stream | None, logged: bytes,
-                computed: bytes) -> tuple[str, str, str, int]:
-    """Return the name of the first field that differs, its values, and the byte."""
+def _difference(key: tuple[int, str], stream: Stream | None, logged: bytes,
+                computed: bytes) -> Difference:
+    """Return the first difference of two messages."""
     sizes = len(logged), len(computed)
     if sizes[0] != sizes[1]:
-        return 'size', f'{sizes[0]} bytes', f'{sizes[1]} bytes', min(sizes)
+        return Difference(*key, 'size', f'{sizes[0]} bytes', f'{sizes[1]} bytes', min(sizes))
     at = next(at for at in range(sizes[0]) if logged[at] != computed[at])
     place = None if stream is None else stream.template.field_at(at)
     if stream is None or place is None:
-        return f'byte {at}', f'0x{logged[at]:02x}', f'0x{computed[at]:02x}', at
+        return Difference(*key, f'byte {at}', f'0x{logged[at]:02x}', f'0x{computed[at]:02x}', at)
     number, element, offset = place
     if number < 0:
         what, code, text = 'header.stamp', '<iI', '{}.{:09d}'
@@ -146,7 +146,7 @@ def _difference(stream: Stream | None, logged: bytes,
         code, text = '<d', '{!r}'
     one, two = (text.format(*struct.unpack_from(code, data, offset))
                 for data in (logged, computed))
-    return what, one, two, at
+    return Difference(*key, what, one, two, at)
 
 
 def _warnings(run: RunDescription) -> list[str]:
