@@ -10,7 +10,6 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize_scalar
-from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.regimes import regime
@@ -42,49 +41,34 @@ class Attitudes:
 
     stamps_ns : (n,) log times [ns]
     rows : (4, n) q(world <- body) as x, y, z, w; below it, if the log has them, (3, n) angular
-        velocity in the body frame [rad/s], or (6, n) phi, theta, psi and their rates
+        velocity in the body frame [rad/s], and (3, n) phi and psi, which count turns, and phi'
+    time, period : (n,) since the first sample, and the mean time between two samples [s]
     cos2, sin2 : (n,) squares, of theta/2: the smaller keeps the digits near a pole
-    height : (n,) cos(theta)
     tip, body_tip : (n,) sin(theta) exp(i phi) and sin(theta) exp(i psi)
-    phi, psi : (n,) [rad], unwrapped if the log does not count turns
-    up, omega : vertical and angular velocity [rad/s] in a frame whose z is the axis
-    phi_dot, sin2_rate : (n,) rates of phi and sin2 [1/s]; like omega None where the log has none
+    phi_dot, sin2_rate : (n,) rates of phi and sin2 [1/s], None where the log has none
     """
 
     def __init__(self, stamps_ns: NDArray[np.int64], rows: Reals) -> None:
         self.stamps_ns, self.rows = stamps_ns, rows
+        self.time = (stamps_ns - stamps_ns[:1]) * 1e-9
+        self.period = float(np.max(self.time, initial=0.0)) / max(len(stamps_ns) - 1, 1)
         x, y, z, w = self.quaternion = tuple(rows[:4])
         self.cos2, self.sin2 = w * w + z * z, x * x + y * y
-        tip_x, tip_y, self.height = attitude.axis_in_world((x, y, z, w))
-        self.up = attitude.vertical_in_body((x, y, z, w))
-        self.tip, self.body_tip = tip_x + 1j * tip_y, -self.up[0] + 1j * self.up[1]
-        self.omega = tuple(rows[4:]) or None
+        tip_x, tip_y, self.height = attitude.axis_in_world(self.quaternion)
+        up_1, up_2, _ = self.up = attitude.vertical_in_body(self.quaternion)
+        self.tip, self.body_tip = tip_x + 1j * tip_y, -up_1 + 1j * up_2
+        self.omega = tuple(rows[4:7]) or None
         self.phi_dot = self.sin2_rate = None
+        if self.omega is not None:
+            one, two, _ = self.omega
+            self.sin2_rate = 0.5 * (up_2 * one - up_1 * two)
+            with np.errstate(invalid='ignore'):     # NaN at a pole
+                self.phi_dot = (one * up_1 + two * up_2) / (up_1 ** 2 + up_2 ** 2)
         self.counts_turns = len(rows) == 10
         if self.counts_turns:
-            self.phi, theta, self.psi, self.phi_dot, theta_dot, psi_dot = rows[4:]
-            sine, cosine = np.sin(theta), np.cos(theta)
-            # In the frame that does not spin.
-            self.up = -sine, 0.0 * sine, cosine
-            self.omega = -self.phi_dot * sine, theta_dot, psi_dot + self.phi_dot * cosine
+            self.phi, self.psi, self.phi_dot = rows[7:]
         else:
             self.phi, self.psi = (np.unwrap(np.angle(tip)) for tip in (self.tip, self.body_tip))
-        if self.omega is not None:
-            (one, two, _), (up_1, up_2, _) = self.omega, self.up
-            self.sin2_rate = 0.5 * (up_2 * one - up_1 * two)
-            if self.phi_dot is None:
-                with np.errstate(invalid='ignore'):     # NaN at a pole
-                    self.phi_dot = (one * up_1 + two * up_2) / (up_1 ** 2 + up_2 ** 2)
-
-    @property
-    def time(self) -> Reals:
-        """Since the first sample [s]."""
-        return (self.stamps_ns - self.stamps_ns[0]) * 1e-9
-
-    @property
-    def period(self) -> float:
-        """Mean time between two samples [s]."""
-        return float(self.time[-1]) / (len(self.time) - 1)
 
     def first(self, seconds: float) -> Attitudes:
         """Return the samples of the first seconds, two at least."""
@@ -108,14 +92,19 @@ def attitudes_of(name: str, imu: Imu, stamps_ns: NDArray[np.int64],
     Return the attitudes in messages of a stream, None for a stream without.
 
     name : topic of the stream, such as ground_truth/imu
-    imu : how the IMU is mounted
     fields : numbers in the messages, as `Template.decode` returns them
     """
     rows = [field.T for field in fields]
     if name in ('ground_truth/imu', 'imu/data'):
         rows = list(map(np.vstack, imu.in_body(tuple(rows[0]), tuple(rows[1]))))
     elif name == 'joint_states':
-        rows.insert(0, Rotation.from_euler('ZYZ', fields[0]).as_quat().T)
+        (phi, theta, psi), (phi_dot, theta_dot, psi_dot) = rows
+        across = phi_dot * np.sin(theta)
+        rows = [np.stack((
+            *attitude.quaternion_of_angles(phi, theta, psi),
+            theta_dot * np.sin(psi) - across * np.cos(psi),
+            theta_dot * np.cos(psi) + across * np.sin(psi), psi_dot + phi_dot * np.cos(theta),
+            phi, psi, phi_dot))]
     elif name not in ('pose', 'ground_truth/odom'):
         return None
     columns = np.vstack(rows)
@@ -138,9 +127,7 @@ def longest_run(blocks: list[tuple[NDArray[np.int64], Reals]]) -> Attitudes:
 
 def interpolate(values: NDArray[Number], at: Reals) -> NDArray[Number]:
     """
-    Return the values between samples (n,), on the polynomial through the POINTS samples around.
-
-    at : (m,) fractional indices, in [0, n - 1]
+    Return values at fractional indices, on the polynomial through the POINTS samples around.
 
     Berrut & Trefethen, "Barycentric Lagrange interpolation", SIAM Review 46 (2004), eq. 4.2.
     SciPy's BarycentricInterpolator is for one set of nodes, and orders them at random, so that
@@ -191,9 +178,9 @@ def measure(data: Attitudes) -> Measured:
                         for angle, phasor in ((data.phi, data.tip), (data.psi, data.body_tip)))
     if not reason and None in (precession, spin):
         reason = 'phi or psi cannot be unwrapped: a pole, or too few samples in a turn'
-    phi_dot = data.phi_dot
-    extremes = [] if phi_dot is None else [float(np.min(phi_dot)), float(np.max(phi_dot))]
-    slowest, fastest = extremes if np.isfinite(extremes).all() and extremes else (None, None)
+    rates = data.phi_dot
+    slowest, fastest = ((None, None) if rates is None or not np.isfinite(rates).all()
+                        else (float(np.min(rates)), float(np.max(rates))))
     return Measured(count, nutations, None if reason else period, low, high, precession, spin,
                     slowest, fastest, (reason,) if reason else ())
 
@@ -265,11 +252,7 @@ def _mean_rate(data: Attitudes, angle: Reals, phasor: Complexes, begin: float,
 
 
 def measured_regime(top: Top, data: Attitudes) -> str | None:
-    """
-    Return the name of a motion from its samples, None where they have no rates.
-
-    A motion that differs from a special one by less than SNAP is taken for it.
-    """
+    """Return the name of a motion from its samples, None where they have no rates."""
     values, rate = data.constants(top), data.sin2_rate
     if values is None or rate is None:
         return None

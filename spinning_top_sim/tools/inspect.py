@@ -20,15 +20,14 @@ if TYPE_CHECKING:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    arguments = _parser().parse_args(argv)
-    return exit_code('inspect', lambda: _run(arguments), (LogError,))
+    return exit_code(_parser(), argv, _run, (LogError,))
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='inspect', formatter_class=argparse.RawDescriptionHelpFormatter,
         description='Show what is in a log: topics, gaps, the motions measured from the data\n'
-                    'beside the exact ones, drifts, errors.  Reads torn and damaged logs too.',
+                    'beside the exact ones, drifts, errors.  Reads damaged logs too.',
         epilog='exit codes:\n'
                '  0    no fault was found\n'
                '  1    the file cannot be read or is damaged, --verify found a difference or\n'
@@ -36,14 +35,14 @@ def _parser() -> argparse.ArgumentParser:
                '  2    wrong arguments\n'
                '  130  interrupted\n'
                'The keys of --json are in docs/inspect.md.\n')
-    parser.add_argument('log', type=Path, help='an MCAP file, of this package or any other')
-    parser.add_argument('--plot', type=Path, metavar='FILE',
-                        help='draw a page of figures (.png, .pdf, .svg); needs matplotlib')
-    parser.add_argument('--animate', type=Path, metavar='GIF',
-                        help='draw the turning top; needs matplotlib')
-    parser.add_argument('--verify', action='store_true',
-                        help='compute the run again and compare every message byte for byte')
-    parser.add_argument('--json', action='store_true', help='print everything as JSON')
+    add = parser.add_argument
+    add('log', type=Path, help='an MCAP file, of this package or any other')
+    add('--plot', type=Path, metavar='FILE',
+        help='draw a page of figures (.png, .pdf, .svg); needs matplotlib')
+    add('--animate', type=Path, metavar='GIF', help='draw the turning top; needs matplotlib')
+    add('--verify', action='store_true',
+        help='compute the run again and compare every message byte for byte')
+    add('--json', action='store_true', help='print everything as JSON')
     return parser
 
 
@@ -58,10 +57,10 @@ def _run(arguments: argparse.Namespace) -> int:
     with LogReader(arguments.log) as reader:
         found = survey(reader)
         if arguments.verify and found.run is not None:
-            begin_ns, end_ns = found.damage.start_ns, found.damage.end_ns
+            begin_ns, end_ns = found.damage.start_ns, found.end_ns
             with progress('verified', (end_ns - begin_ns) / NANOSECONDS, 's',
                           quiet=arguments.json) as show:
-                verdict = verify(reader, found.run,
+                verdict = verify(reader, found.run, end_ns,
                                  lambda stamp_ns: show((stamp_ns - begin_ns) / NANOSECONDS))
     if arguments.json:
         print(json.dumps(as_json(arguments.log, found, verdict), indent=2, allow_nan=False))

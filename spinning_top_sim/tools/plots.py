@@ -63,8 +63,7 @@ def draw_sphere(axes: Axes, tilts: tuple[float, ...], lowest: float = -0.9) -> N
     for theta in tilts:
         draw(axes, on_sphere(np.sin(theta) * circle, np.cos(theta)), FAINT, 0.8)
     axes.set_aspect('equal')
-    axes.set_xlim(-1.1, 1.1)
-    axes.set_ylim(lowest, 1.25)
+    axes.set(xlim=(-1.1, 1.1), ylim=(lowest, 1.25))
     axes.axis('off')
 
 
@@ -97,8 +96,7 @@ def draw_page(found: Survey, path: Path, name: str) -> None:
     motion, data = found.shown
     assert motion.measured is not None
     period, mean = motion.measured.nutation_period, motion.measured.mean_precession_rate
-    shown_s = PAGE_NUTATIONS * period if period else PAGE_S
-    data = data.first(shown_s)
+    data = data.first(PAGE_NUTATIONS * period if period else PAGE_S)
     rows = 4 if found.readings else 3
     with rc_context(STYLE):
         figure = Figure(figsize=(11.0, 2.4 * rows + 0.6), layout='constrained')
@@ -112,14 +110,31 @@ def draw_page(found: Survey, path: Path, name: str) -> None:
         tilt.set(title=f'nutation, period {period:.9g} s' if period else '',
                  xlabel='time [s]', ylabel='tilt θ [deg]')
         _precession_panel(figure.add_subplot(grid[1, 1], sharex=tilt), data, mean)
-        _drift_panel(figure.add_subplot(grid[2, 0]), found)
-        _error_panel(figure.add_subplot(grid[2, 1]), found)
+        drifts, errors = (figure.add_subplot(grid[2, column]) for column in (0, 1))
+        if found.drifts:
+            topic = min(found.drifts, key=lambda name: found.drifts[name]['energy'].largest)
+            for series, style, label in zip(found.drifts[topic].values(), ('-', '--', ':'),
+                                            ('E', '$L_3$', '$L_z$'), strict=True):
+                _plot_series(drifts, found, series, linestyle=style, label=label)
+            drifts.legend(loc='upper left', ncols=3)
+            drifts.margins(y=0.25)
+            drifts.set_title(f'drift of the constants, from {topic}')
+        if found.errors:
+            topic = min(found.errors, key=lambda name: found.errors[name].largest)
+            _plot_series(errors, found, found.errors[topic], color=COLOURS[2])
+            errors.set_title(f'error against the exact solution, from {topic}')
+            errors.set_ylim(bottom=0.0)
+        for axes, quantity in ((drifts, 'relative drift'), (errors, 'orientation error [rad]')):
+            axes.set(xlabel='time in the log [s]', ylabel=quantity)
+            for later in found.motions[1:] if len(found.motions) <= MOST_MARKS else ():
+                axes.axvline((later.begin_ns - found.damage.start_ns) * 1e-9, color=FAINT,
+                             linewidth=0.8, zorder=0)
         if found.readings:
             # The noisy readings, else the noise-free ones, else the bias.
             topic = min(found.readings, key=lambda name: (not name.endswith('data_raw'),
                                                           not name.endswith('ground_truth/imu')))
             time, *vectors = np.concatenate(found.readings[topic]).T
-            shown = time <= time[0] + shown_s
+            shown = time <= time[0] + float(data.time[-1])
             for column, quantity in enumerate(('angular velocity [rad/s]',
                                                'specific force [m/s²]')):
                 axes = figure.add_subplot(grid[3, column])
@@ -159,38 +174,9 @@ def _precession_panel(axes: Axes, data: Attitudes, mean: float | None) -> None:
         axes.set_title(f'precession, mean {mean:.9g} rad/s (dashed)')
 
 
-def _drift_panel(axes: Axes, found: Survey) -> None:
-    topic = min(found.drifts, default='', key=lambda name: found.drifts[name]['energy'].largest)
-    if topic:
-        for series, style, label in zip(found.drifts[topic].values(), ('-', '--', ':'),
-                                        ('E', '$L_3$', '$L_z$'), strict=True):
-            axes.plot(*_points(found, series), style, label=label)
-        axes.legend(loc='upper left', ncols=3)
-        axes.margins(y=0.25)
-        axes.set_title(f'drift of the constants, from {topic}')
-    _mark_motions(axes, found, 'relative drift')
-
-
-def _error_panel(axes: Axes, found: Survey) -> None:
-    if found.errors:
-        topic = min(found.errors, key=lambda name: found.errors[name].largest)
-        axes.plot(*_points(found, found.errors[topic]), color=COLOURS[2])
-        axes.set_title(f'error against the exact solution, from {topic}')
-        axes.set_ylim(bottom=0.0)
-    _mark_motions(axes, found, 'orientation error [rad]')
-
-
-def _points(found: Survey, series: Series) -> tuple[Reals, Reals]:
+def _plot_series(axes: Axes, found: Survey, series: Series, **style: Any) -> None:
     stamps_ns, values = series.points
-    return (stamps_ns - found.damage.start_ns) * 1e-9, values
-
-
-def _mark_motions(axes: Axes, found: Survey, quantity: str) -> None:
-    """Mark commands and resets, where there are not too many, and label the axes."""
-    for motion in found.motions[1:] if len(found.motions) <= MOST_MARKS else ():
-        axes.axvline((motion.begin_ns - found.damage.start_ns) * 1e-9, color=FAINT,
-                     linewidth=0.8, zorder=0)
-    axes.set(xlabel='time in the log [s]', ylabel=quantity)
+    axes.plot((stamps_ns - found.damage.start_ns) * 1e-9, values, **style)
 
 
 def animate(found: Survey, path: Path) -> None:
@@ -209,27 +195,23 @@ def animate(found: Survey, path: Path) -> None:
     lowest = -0.9 if np.min(height) > -0.2 else -1.25
     figure = Figure(figsize=(FRAME_SIZE, FRAME_SIZE), dpi=FRAME_DPI)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    # The disc across the axis, and a mark that turns with the body.
+    rim, mark = (on_sphere(DISC * np.exp(1j * np.linspace(begin, end, count)), DISC_HEIGHT)
+                 for begin, end, count in ((0.0, 2.0 * np.pi, 60), (-0.25, 0.25, 9)))
+    mark = np.vstack(((0.0, 0.0, DISC_HEIGHT), mark))
 
     def frame(number: int) -> list[Artist]:
         axes.clear()
         draw_sphere(axes, (np.pi / 2,), lowest)
         now = number * FINER
-        _draw_body(axes, tip[now], float(height[now]), float(spin[number]))
+        body = Rotation.from_euler('ZYZ', (
+            np.angle(tip[now]), np.arctan2(abs(tip[now]), height[now]), spin[number]))
+        axes.fill(*project(body.apply(rim))[:2], facecolor='#f2e3c9', edgecolor=INK,
+                  linewidth=1.0, alpha=0.9)
+        axes.fill(*project(body.apply(mark))[:2], color=COLOURS[1])
         draw_tip(axes, tip[:now + 1], height[:now + 1])
         axes.text(-1.05, 1.15, f't = {number / FRAMES_PER_S:.2f} s', color=INK, fontsize=9)
         return []
 
     FuncAnimation(figure, frame, frames=frames, blit=False).save(
         path, writer=PillowWriter(fps=FRAMES_PER_S))
-
-
-def _draw_body(axes: Axes, tip: complex, height: float, psi: float) -> None:
-    """Draw the disc across the axis, with a mark that turns with the body."""
-    theta = np.arctan2(abs(tip), height)
-    attitude = Rotation.from_euler('ZYZ', (float(np.angle(tip)), theta, psi))
-    rim, mark = (on_sphere(DISC * np.exp(1j * np.linspace(begin, end, count)), DISC_HEIGHT)
-                 for begin, end, count in ((0.0, 2.0 * np.pi, 60), (-0.25, 0.25, 9)))
-    across, up, _ = project(attitude.apply(rim))
-    axes.fill(across, up, facecolor='#f2e3c9', edgecolor=INK, linewidth=1.0, alpha=0.9)
-    across, up, _ = project(attitude.apply(np.vstack(((0.0, 0.0, DISC_HEIGHT), mark))))
-    axes.fill(across, up, color=COLOURS[1])

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -121,84 +122,66 @@ def _event(stamp_ns: int, data: bytes) -> Event:
     return Event(name, stamp_ns, t_ns, sent_ns, details)
 
 
-class Rerun:
+def rerun(run: RunDescription, end_ns: int,
+          send: TakeRows | None = None) -> Iterator[tuple[Simulation, Event | None]]:
     """
-    The run of a log, computed again.
+    Compute the run of a log again; yield it after the start, each event, and each block (None).
 
+    end_ns : log time of the end [ns]
     send : takes the samples of the log's streams in blocks; without it only motions are computed
-    simulation : at the time that `advance` has reached, in the beginning that of the recording
-    stamp_ns : log time up to which all samples have been sent [ns]
 
     Raises DepartureError where there is no motion with these parameters and commands.
     """
+    try:
+        simulation = Simulation(run.values, run.epoch_ns)
+    except (ValueError, IntegrationError) as error:
+        raise DepartureError(str(error)) from error
 
-    def __init__(self, run: RunDescription, send: TakeRows | None = None) -> None:
-        self.run, self._send = run, send
-        self._stopped = False       # the equations could not go on
-        try:
-            self.simulation = simulation = Simulation(run.values, run.epoch_ns)
-        except (ValueError, IntegrationError) as error:
-            raise DepartureError(str(error)) from error
-        for event in run.history:
-            self._reach(event.t_ns)
-            self._apply(event)
-        if send is not None:
-            self._reach(run.begun_ns)
-        # -1: commands before the first sample.
-        simulation.now_ns = -1 if run.begun_ns < 0 else max(run.begun_ns, simulation.now_ns)
-        simulation.apply(run.now)
-        if send is not None:
-            simulation.record_blocks(
-                [stream for stream in simulation.streams if stream.topic in run.topics])
-        self.stamp_ns = run.epoch_ns + simulation.now_ns
+    def reach(target_ns: int) -> None:
+        with contextlib.suppress(IntegrationError):     # as far as the equations go
+            simulation.advance_in_blocks(target_ns, send or (lambda *_: None))
 
-    def advance(self, end_ns: int) -> Iterator[Event | None]:
-        """
-        Go on to a log time; yield each event when it has been applied, and None after a block.
+    for event in run.history:
+        reach(event.t_ns)
+        _apply(simulation, event)
+    if send is not None:
+        reach(run.begun_ns)
+    # -1: commands before the first sample.
+    simulation.now_ns = -1 if run.begun_ns < 0 else max(run.begun_ns, simulation.now_ns)
+    simulation.apply(run.now)
+    if send is not None:
+        simulation.record_blocks(
+            [stream for stream in simulation.streams if stream.topic in run.topics])
+    yield simulation, Event('start', run.epoch_ns, 0, simulation.now_ns, {})
+    for item in (*(event for event in run.events if event.name != 'start'), None):
+        stop_ns = end_ns - simulation.epoch_ns if item is None else item.sent_ns
+        recorded = [stream for stream in simulation.streams if stream.has_sinks]
+        for target_ns, reached in offline_targets(
+                max(simulation.now_ns, 0), [(stop_ns, item)], offline_block_ns(recorded)):
+            # Without samples states are only needed where a command finds them.
+            if send is not None or (reached is not None and reached.name == 'command'):
+                reach(target_ns)
+            simulation.now_ns = target_ns
+            if reached is not None:
+                _apply(simulation, reached)
+            yield simulation, reached
 
-        Raises DepartureError where an event cannot be applied.
-        """
-        simulation = self.simulation
-        for event in (*self.run.events, None):
-            if event is not None and event.name == 'start':
-                continue
-            stop_ns = end_ns - simulation.epoch_ns if event is None else event.sent_ns
-            block_ns = offline_block_ns([stream for stream in simulation.streams
-                                         if stream.has_sinks])
-            for target_ns, item in offline_targets(
-                    max(simulation.now_ns, 0), [(stop_ns, event)], block_ns):
-                # Without samples states are only needed where a command finds them.
-                if self._send is not None or (item is not None and item.name == 'command'):
-                    self._reach(target_ns)
-                self.stamp_ns = simulation.epoch_ns + target_ns
-                if item is not None:
-                    simulation.now_ns = target_ns
-                    self._apply(item)
-                yield item
 
-    def _reach(self, target_ns: int) -> None:
-        """Compute, and send, the samples up to a time, as far as the equations go."""
-        if not self._stopped:
-            try:
-                self.simulation.advance_in_blocks(target_ns, self._send or (lambda *_: None))
-            except IntegrationError:
-                self._stopped = True
-
-    def _apply(self, event: Event) -> None:
-        details = event.details
-        try:
-            if event.name == 'command':
-                self.simulation.command(details['l3'], details['lz'])
-                applied_ns = self.simulation.history[-1][0]
-                if applied_ns != event.t_ns:
-                    raise ValueError(f'applied at {applied_ns} ns')
-            elif event.name == 'parameters':
-                self.simulation.apply({name: parameters.BY_NAME[name].check(value)
-                                       for name, value in details.items()})
-            else:
-                self.simulation.restart(parameters.checked(details['parameters']))
-                self.simulation.epoch_ns = int(details['epoch_ns'])
-                self._stopped = False
-        except (KeyError, TypeError, ValueError, IntegrationError) as error:
-            raise DepartureError(f'{event.name} at t = {event.t_ns} ns: '
-                                 f'{type(error).__name__}: {error}') from error
+def _apply(simulation: Simulation, event: Event) -> None:
+    """Apply an event.  Raises DepartureError where that cannot be."""
+    details = event.details
+    try:
+        if event.name == 'command':
+            simulation.command(details['l3'], details['lz'])
+            applied_ns = simulation.history[-1][0]
+            if applied_ns != event.t_ns:
+                raise ValueError(f'applied at {applied_ns} ns')
+        elif event.name == 'parameters':
+            simulation.apply({name: parameters.BY_NAME[name].check(value)
+                              for name, value in details.items()})
+        else:
+            simulation.restart(parameters.checked(details['parameters']))
+            simulation.epoch_ns = int(details['epoch_ns'])
+    except (KeyError, TypeError, ValueError, IntegrationError) as error:
+        raise DepartureError(f'{event.name} at t = {event.t_ns} ns: '
+                             f'{type(error).__name__}: {error}') from error

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The executable `recover`: make a whole log of what is whole in a torn or damaged one."""
+"""The executable `recover`: write what is whole in a truncated or damaged log anew."""
 
 from __future__ import annotations
 
@@ -22,11 +22,10 @@ PROGRESS_BYTES = 50_000_000
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    arguments = _parser().parse_args(argv)
     # An exception, so that the unfinished output is removed.
     previous = signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     try:
-        return exit_code('recover', lambda: _run(arguments), (LogError,))
+        return exit_code(_parser(), argv, _run, (LogError,))
     finally:
         signal.signal(signal.SIGTERM, previous)
 
@@ -34,9 +33,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='recover', formatter_class=argparse.RawDescriptionHelpFormatter,
-        description='Write everything that is whole in a torn or damaged MCAP log into a new log\n'
-                    'that every reader takes: chunks as they are, index and summary made anew.\n'
-                    'The old file is only read.',
+        description='Write everything that is whole in a truncated or damaged MCAP log into a\n'
+                    'new log that every reader takes: chunks as they are, index and summary\n'
+                    'made anew.  The old file is only read.',
         epilog='exit codes:\n'
                '  0    everything was kept (index and summary do not count)\n'
                '  1    nothing was written: no whole message in it, no MCAP file, not readable,\n'

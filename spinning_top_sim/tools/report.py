@@ -13,7 +13,6 @@ from pathlib import Path
 from spinning_top_sim.recording.damage import count, seconds
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools.cli import Table
-from spinning_top_sim.tools.recorded_run import RunDescription
 from spinning_top_sim.tools.survey import Motion, Survey
 from spinning_top_sim.tools.verify import Verdict
 
@@ -25,8 +24,10 @@ ROWS = (('nutation period [s]', 'nutation_period', 1.0),
         ('mean spin [rad/s]', 'mean_spin_rate', 1.0),
         ('least tilt [deg]', 'theta_min', DEGREES),
         ('greatest tilt [deg]', 'theta_max', DEGREES),
-        ('slowest precession seen [rad/s]', 'precession_min', 1.0),
-        ('fastest precession seen [rad/s]', 'precession_max', 1.0))
+        ('least precession [rad/s]', 'precession_min', 1.0),
+        ('greatest precession [rad/s]', 'precession_max', 1.0),
+        ('1 - m', 'separatrix_distance', 1.0),
+        ('L3^2/(4 lambda1 |P|)', 'gyroscopic_ratio', 1.0))
 
 
 def as_json(path: Path, found: Survey, verdict: Verdict | None) -> object:
@@ -34,60 +35,77 @@ def as_json(path: Path, found: Survey, verdict: Verdict | None) -> object:
     damage, run = found.damage, found.run
     content: dict[str, object] = {
         'file': str(path), 'whole': found.whole,
-        'damage': {'torn': damage.truncated, 'lost_bytes': damage.lost_bytes,
-                   'lost_chunks': damage.lost_chunks, 'missing_messages': damage.missing_messages,
-                   'missing_exactly': damage.missing_exactly, 'report': damage.lines()},
-        'begin_ns': damage.start_ns, 'end_ns': damage.end_ns,
-        'duration': (damage.end_ns - damage.start_ns) / NANOSECONDS,
+        'damage': {'torn': damage.truncated, 'report': damage.lines(), **{
+            key: getattr(damage, key) for key in (
+                'lost_bytes', 'lost_chunks', 'missing_messages', 'missing_exactly')}},
+        'begin_ns': damage.start_ns, 'end_ns': damage.end_ns, 'duration': _duration(found),
         'topics': {name: asdict(topic) for name, topic in found.topics.items()},
         'ours': run is not None, 'why_not_ours': found.foreign_reason or None,
         'notes': found.notes,
-        'run': None if run is None else {
+        'run': run and {
             'parameters': run.values, 'seed': run.values['seed'], 'epoch_ns': run.epoch_ns,
             'begun_ns': run.begun_ns, **run.surroundings},
-        'events': [] if run is None else [
+        'events': [
             {'event': event.name, 'stamp_ns': event.stamp_ns, 't_ns': event.t_ns, **event.details}
-            for event in run.events],
+            for event in (run.events if run else ())],
         'motions': [{
-            'cause': motion.cause, 'begin_ns': motion.begin_ns, 'end_ns': motion.end_ns,
-            'l3': motion.segment.l3, 'lz': motion.segment.lz, 'energy': motion.segment.energy,
-            'source': motion.source, 'regime': motion.regime,
+            **{key: getattr(motion, key) for key in (
+                'cause', 'begin_ns', 'end_ns', 'source', 'regime')},
+            **{key: getattr(motion.segment, key) for key in ('l3', 'lz', 'energy')},
             'exact': motion.exact and asdict(motion.exact),
             'measured': motion.measured and asdict(motion.measured)} for motion in found.motions],
         'drifts': {topic: {name: series.largest for name, series in drifts.items()}
                    for topic, drifts in found.drifts.items()},
         'orientation_error': {topic: {'max': series.largest, 'rms': series.rms}
                               for topic, series in found.errors.items()},
-        'verify': verdict and {'identical': verdict.identical, **asdict(verdict)},
+        'verify': verdict and {
+            'identical': verdict.identical, 'whole': found.whole, **asdict(verdict),
+            'first': verdict.first and verdict.first._asdict()},
     }
     # Numbers that JSON does not have become null.
     return json.loads(json.dumps(content), parse_constant=lambda name: None)
+
+
+def _duration(found: Survey) -> float:
+    return (found.damage.end_ns - found.damage.start_ns) / NANOSECONDS
 
 
 def as_text(path: Path, found: Survey, verdict: Verdict | None) -> Iterator[str | Table]:
     """Yield the findings as lines and tables."""
     damage, run = found.damage, found.run
     state = ('whole' if found.whole and not damage.defects else
-             'torn' if damage.truncated else 'damaged')
-    yield f'{path}: {state}, {(damage.end_ns - damage.start_ns) / NANOSECONDS:.6g} s'
+             'truncated' if damage.truncated else 'damaged')
+    yield f'{path}: {state}, {_duration(found):.6g} s'
     yield from damage.lines()
     if run is None:
         yield f'not recorded by spinning_top_sim: {found.foreign_reason}'
         yield from _topics(found)
         return
-    values = run.values
-    solver = values['solver.method']
+    solver = run.values['solver.method']
     if solver != 'exact':
-        solver += f" ({values['solver.equations']}, rtol {values['solver.rtol']:g})"
-    yield f'spinning_top_sim {run.surroundings["version"]}, {solver}, seed {values["seed"]}'
+        solver += f" ({run.values['solver.equations']}, rtol {run.values['solver.rtol']:g})"
+    yield f'spinning_top_sim {run.surroundings["version"]}, {solver}, seed {run.values["seed"]}'
     yield from _topics(found)
-    yield from _journal(run)
+    counts = Counter(event.name for event in run.events)
+    yield ('no journal: commands and resets are unknown' if run.events_topic is None else
+           f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
+           f'{counts["parameters"]} changes of parameters')
+    for stamp_ns, reason in run.broken:
+        yield f'journal, entry at {seconds(stamp_ns)}: {reason}'
     yield from found.notes
     for number, motion in enumerate(found.motions[:MOST_MOTIONS], start=1):
         yield from _motion(number, motion, damage.start_ns)
     if len(found.motions) > MOST_MOTIONS:
         yield f'and {len(found.motions) - MOST_MOTIONS} more motions (all are in --json)'
-    yield from _accuracy(found)
+    yield 'drifts of E, L3, Lz: no topic with rates (joint_states, ground_truth/...)' if not (
+        found.drifts) else Table(
+        'largest drifts since the start of each motion, relative', ('from', 'E', 'L3', 'Lz'),
+        [(topic, *(f'{series.largest:.2g}' for series in drifts.values()))
+         for topic, drifts in found.drifts.items()])
+    yield 'orientation error: no topic with an attitude' if not found.errors else Table(
+        'orientation error against the exact solution [rad]', ('from', 'max', 'rms'),
+        [(topic, f'{series.largest:.3g}', f'{series.rms:.3g}')
+         for topic, series in found.errors.items()])
     if verdict is not None:
         yield from _verdict(verdict)
 
@@ -105,17 +123,6 @@ def _topics(found: Survey) -> Iterator[str | Table]:
             yield f'{name}: {topic.odd_size} messages do not have the size of this stream'
 
 
-def _journal(run: RunDescription) -> Iterator[str]:
-    if run.events_topic is None:
-        yield 'no journal: commands and resets are unknown'
-        return
-    counts = Counter(event.name for event in run.events)
-    yield (f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
-           f'{counts["parameters"]} changes of parameters')
-    for stamp_ns, reason in run.broken:
-        yield f'journal, entry at {seconds(stamp_ns)}: {reason}'
-
-
 def _motion(number: int, motion: Motion, begin_ns: int) -> Iterator[str | Table]:
     exact, measured = motion.exact, motion.measured
     begin, end = (max(at_ns - begin_ns, 0) / NANOSECONDS
@@ -129,37 +136,14 @@ def _motion(number: int, motion: Motion, begin_ns: int) -> Iterator[str | Table]
         expected, seen = (None if value is None else value * factor for value in (
             getattr(exact, key, None), getattr(measured, key, None)))
         rows.append((text, _number(expected, 12), _number(seen, 12), _difference(expected, seen)))
-    if exact is not None:
-        rows += [('1 - m', _number(exact.separatrix_distance), '', ''),
-                 ('L3^2/(4 lambda1 |P|)', _number(exact.gyroscopic_ratio), '', '')]
-    yield Table(title, ('', 'exact', f'from {motion.source}' if motion.source else 'measured',
-                        'relative difference'), rows)
-    if measured is None:
-        yield ('not measured: too few samples' if motion.source else
-               'not measured: no topic with an attitude (joint_states, pose, ground_truth/...)')
-        return
-    if measured.nutations:
-        yield count(measured.nutations, 'whole nutation')
-    for reason in measured.missing:
-        yield f'not measured: {reason}'
-
-
-def _accuracy(found: Survey) -> Iterator[str | Table]:
-    if found.drifts:
-        yield Table('largest drifts since the start of each motion, relative',
-                    ('from', 'E', 'L3', 'Lz'),
-                    [(topic, *(f'{series.largest:.2g}' for series in drifts.values()))
-                     for topic, drifts in found.drifts.items()])
+    yield Table(title, ('', 'exact', 'measured', 'difference'), rows)
+    if measured is not None:
+        yield f'measured from {motion.source}: {count(measured.nutations, "whole nutation")}'
+        yield from (f'not measured: {reason}' for reason in measured.missing)
+    elif motion.source is not None:
+        yield 'not measured: too few samples'
     else:
-        yield ('drifts of E, L3, Lz: no topic with rates (joint_states, ground_truth/odom, '
-               'ground_truth/imu)')
-    if found.errors:
-        yield Table('orientation error against the exact solution [rad]',
-                    ('from', 'max', 'rms'),
-                    [(topic, f'{series.largest:.3g}', f'{series.rms:.3g}')
-                     for topic, series in found.errors.items()])
-    else:
-        yield 'orientation error: no topic with an attitude'
+        yield 'not measured: no topic with an attitude (joint_states, pose, ground_truth/...)'
 
 
 def _verdict(verdict: Verdict) -> Iterator[str]:
@@ -169,11 +153,13 @@ def _verdict(verdict: Verdict) -> Iterator[str]:
     if verdict.stopped:
         yield f'verify: the run cannot be computed again: {verdict.stopped}'
     if verdict.identical:
-        missing = f' ({verdict.missing} more are not in the file)' if verdict.missing else ''
-        yield f'verify: identical, all {compared} messages byte for byte{missing}'
-        return
-    yield (f'verify: DIFFERENT: {verdict.different} of {compared} messages differ, '
-           f'{verdict.missing} are missing, {verdict.unexpected} should not be there')
+        yield f'verify: identical, all {compared} messages byte for byte'
+    elif not (verdict.different or verdict.unexpected or verdict.stopped):
+        yield (f'verify: incomplete, {count(verdict.missing, "message")} missing; '
+               f'the other {compared} are identical byte for byte')
+    else:
+        yield (f'verify: DIFFERENT: {verdict.different} of {compared} messages differ, '
+               f'{verdict.missing} are missing, {verdict.unexpected} should not be there')
     first = verdict.first
     if first is not None:
         place = '' if first.byte is None else f', byte {first.byte}'
@@ -191,4 +177,4 @@ def _difference(expected: float | None, seen: float | None) -> str:
     difference = seen - expected
     if abs(difference) > abs(expected):         # also where that is 0
         return f'{difference:.1e} absolute'
-    return f'{difference / abs(expected):.1e}' if expected else '0'
+    return f'{difference / abs(expected):.1e}' if difference else '0'

@@ -75,13 +75,11 @@ def _parse_yaml(text: str | bytes, source: str) -> object:
 def _flatten(section: Mapping[str, object], prefix: str = '') -> Iterator[tuple[str, object]]:
     """Yield dotted names and values of the parameters in a section, those of ROS left out."""
     for name, value in section.items():
-        full = f'{prefix}{name}'
-        if full.split('.', maxsplit=1)[0] in ROS_PARAMETERS:
-            continue
-        if isinstance(value, Mapping):
-            yield from _flatten(value, f'{full}.')
-        else:
-            yield full, value
+        if prefix or name.split('.')[0] not in ROS_PARAMETERS:
+            if isinstance(value, Mapping):
+                yield from _flatten(value, f'{prefix}{name}.')
+            else:
+                yield f'{prefix}{name}', value
 
 
 def _check(name: str, value: object, source: str) -> None:

@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-The executable `simulate`: the node's pipeline offline, as fast as the machine goes.
-
-The same parameters, seed and commands give the same messages as a live run, apart from the
-offset of the stamps.
-"""
+"""The executable `simulate`: the node's pipeline offline, as fast as the machine goes."""
 
 from __future__ import annotations
 
@@ -42,8 +37,7 @@ FORMATS = ('mcap', 'csv', 'parquet')
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    arguments = _parser().parse_args(argv)
-    return exit_code('simulate', lambda: _run(arguments),
+    return exit_code(_parser(), argv, _run,
                      (ValueError, RecordingError, IntegrationError, OSError))
 
 
@@ -57,31 +51,32 @@ def _parser() -> argparse.ArgumentParser:
                '  1    the run cannot be simulated or written; the reason is printed\n'
                '  2    wrong arguments\n'
                '  130  interrupted; the log holds what was computed before\n')
-    parser.add_argument('--params', metavar='FILE', action='append', default=[],
-                        help='parameter file as for the node; may be repeated')
-    parser.add_argument('-p', '--param', metavar='NAME:=VALUE', action='append', default=[],
-                        help='one parameter; may be repeated')
-    parser.add_argument('--duration', type=float, metavar='S',
-                        help='simulated time [s]; default: the parameter duration')
-    parser.add_argument('-o', '--output', metavar='FILE', required=True,
-                        help='file to write; an existing one is never overwritten')
-    parser.add_argument('--seed', type=int, help='seed of the noise: the parameter seed')
-    parser.add_argument('--command', metavar='T:L3:LZ', action='append', default=[],
-                        help='at T [s] set L3 and Lz [kg m^2/s]; may be repeated; commands at '
-                             'the same time are applied in the order given')
-    parser.add_argument('--epoch', type=float, default=DEFAULT_EPOCH, metavar='S',
-                        help='stamp of t = 0 [s], default %(default)g')
-    parser.add_argument('--namespace', default='/', help='of the topics in the log')
-    parser.add_argument('--format', choices=FORMATS,
-                        help='format of the output; default: by the extension of its name')
-    parser.add_argument('--quiet', action='store_true', help='no progress, no summary')
+    add = parser.add_argument
+    add('--params', metavar='FILE', action='append', default=[],
+        help='parameter file as for the node; may be repeated')
+    add('-p', '--param', metavar='NAME:=VALUE', action='append', default=[],
+        help='one parameter; may be repeated')
+    add('--duration', type=float, metavar='S',
+        help='simulated time [s]; default: the parameter duration')
+    add('-o', '--output', metavar='FILE', required=True, type=Path,
+        help='file to write; an existing one is never overwritten')
+    add('--seed', type=int, help='seed of the noise; default: the parameter seed')
+    add('--command', metavar='T:L3:LZ', action='append', default=[],
+        help='at T [s] set L3 and Lz [kg m^2/s]; may be repeated; commands at the same time are '
+        'applied in the order given')
+    add('--epoch', type=float, default=DEFAULT_EPOCH, metavar='S',
+        help='stamp of t = 0 [s], default %(default)g')
+    add('--namespace', default='/', help='of the topics in the log')
+    add('--format', choices=FORMATS,
+        help='format of the output; default: by the extension of its name')
+    add('--quiet', action='store_true', help='no progress, no summary')
     return parser
 
 
 def _run(arguments: argparse.Namespace) -> int:
     values = _parameters(arguments)
     stops = parse_stops(arguments.command, round(values['duration'] * NANOSECONDS))
-    output = Path(arguments.output)
+    output: Path = arguments.output
     file_format = arguments.format or output.suffix[1:]
     if file_format not in FORMATS:
         raise ValueError(f'{output}: the name must end in .{", .".join(FORMATS)}, or --format be '
@@ -112,12 +107,7 @@ def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def parse_stops(commands: Sequence[str], duration_ns: int) -> list[Stop]:
-    """
-    Return the commands in the order in which they are applied, and the end of the run.
-
-    commands : each T:L3:LZ, in s and kg m^2/s
-    duration_ns : end of the run [ns], the latest time of a command
-    """
+    """Return the commands (T:L3:LZ) in the order of their application, and the end of the run."""
     stops: list[Stop] = []
     for text in commands:
         try:
@@ -140,7 +130,6 @@ def write_log(path: Path, values: Mapping[str, Any], stops: Sequence[Stop],
 
     After an error the log is closed and readable, and holds what was computed before.
 
-    values : checked parameters
     stops : in ascending order of time, the last one is the end of the run
     show : takes the simulated time reached [s]
     epoch_ns : stamp of t = 0 [ns]
@@ -157,8 +146,8 @@ def write_log(path: Path, values: Mapping[str, Any], stops: Sequence[Stop],
     metadata = provenance(values, epoch_ns, -1, (), values)
     file = create_file(path, topics, metadata, compression=values['record.compression'])
     simulation.record_blocks(streams)
-    with contextlib.closing(_LogWriter(file, streams, epoch_ns)) as writer:
-        writer.write(events_topic, 0, journal.event('start', 0, -1))
+    with contextlib.closing(_LogWriter(file, streams)) as writer:
+        writer.write(events_topic, epoch_ns, journal.event('start', 0, -1))
         for target_ns, momenta in offline_targets(0, stops, offline_block_ns(streams)):
             try:
                 simulation.advance_in_blocks(target_ns, writer.take)
@@ -167,30 +156,31 @@ def write_log(path: Path, values: Mapping[str, Any], stops: Sequence[Stop],
             if momenta is not None:
                 simulation.command(*momenta)
                 t_ns, l3, lz = simulation.history[-1]
-                writer.write(events_topic, t_ns, journal.event(
+                writer.write(events_topic, epoch_ns + t_ns, journal.event(
                     'command', t_ns, simulation.now_ns, l3=l3, lz=lz))
-                writer.write(commands_topic, t_ns, journal.command(l3, lz))
+                writer.write(commands_topic, epoch_ns + t_ns, journal.command(l3, lz))
             show(target_ns / NANOSECONDS)
     return f'{sum(file.counts)} messages, {file.size / 1e6:.1f} MB'
 
 
 class _LogWriter:
-    """
-    Writes a log.  A thread compresses and writes a chunk while the next one is computed.
+    """Writes a log in a thread: compression and the file system leave Python to others."""
 
-    Compression and the file system leave Python to other threads while they work.
-    """
-
-    def __init__(self, file: McapWriter, streams: Sequence[Stream], epoch_ns: int) -> None:
-        self._file, self._streams, self._epoch_ns = file, streams, epoch_ns
+    def __init__(self, file: McapWriter, streams: Sequence[Stream]) -> None:
+        self._file, self._streams = file, streams
         self._blocks: list[tuple[int, NDArray[np.int64], NDArray[np.uint8]]] = []
         self._executor = ThreadPoolExecutor(1)
-        self._pending: Future[None] | None = None
+        self._chunk: Future[None] | None = None         # that is being written
 
-    def write(self, topic_index: int, t_ns: int, data: bytes) -> None:
+    def _wait(self) -> None:
+        chunk, self._chunk = self._chunk, None
+        if chunk is not None:
+            chunk.result()
+
+    def write(self, topic_index: int, stamp_ns: int, data: bytes) -> None:
         """Write an entry of the journal with the next chunk."""
         self._wait()
-        if self._file.append(topic_index, self._epoch_ns + t_ns, data):
+        if self._file.append(topic_index, stamp_ns, data):
             self._file.write_chunk()
 
     def take(self, stream: Stream, stamps_ns: NDArray[np.int64],
@@ -205,12 +195,7 @@ class _LogWriter:
             chunk = self._file.chunk_of_rows(blocks)
             self._wait()
             self._file.write_chunk()
-            self._pending = self._executor.submit(self._file.put_plain_chunk, chunk)
-
-    def _wait(self) -> None:
-        pending, self._pending = self._pending, None
-        if pending is not None:
-            pending.result()
+            self._chunk = self._executor.submit(self._file.put_plain_chunk, chunk)
 
     def close(self) -> None:
         """Finish the file."""

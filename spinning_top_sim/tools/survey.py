@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-One pass through a log: what is in it, and how accurate that is.
-
-Samples are analysed in blocks.  Kept are all stamps, and of each motion the samples of one topic.
-"""
+"""What is in a log, and how accurate that is, from one pass through its messages in blocks."""
 
 from __future__ import annotations
 
@@ -12,8 +8,9 @@ import itertools
 import math
 from bisect import bisect_left
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,17 +21,12 @@ from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.reader import LogMessage, LogReader
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.imu import Imu
+from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.streams.segment import Segment
 from spinning_top_sim.streams.topics import Stream
-from spinning_top_sim.tools import analysis
+from spinning_top_sim.tools import analysis, recorded_run
 from spinning_top_sim.tools.analysis import Attitudes, Measured, Reals
-from spinning_top_sim.tools.recorded_run import (
-    DepartureError,
-    ForeignLogError,
-    Rerun,
-    RunDescription,
-    read_run_description,
-)
+from spinning_top_sim.tools.recorded_run import RunDescription
 
 BLOCK = 16384               # messages of all topics analysed together
 MOST_POINTS = 20_000        # of a series that is kept for a picture
@@ -44,6 +36,7 @@ IMU_TOPICS = ('imu/data_raw', 'ground_truth/imu', 'ground_truth/imu_bias')
 # Streams that measure a motion, the best first: with angles, with exact rates, with neither.
 SOURCES = ('joint_states', 'ground_truth/imu', 'ground_truth/odom', 'imu/data', 'pose')
 ENOUGH_SAMPLES = 12.0       # in a nutation: a faster stream shows nothing new
+Stamps = NDArray[np.int64]
 
 
 @dataclass
@@ -71,7 +64,7 @@ class Series:
         self.largest = self._square_sum = 0.0
         self._count = 0
 
-    def add(self, times_ns: NDArray[np.int64], values: Reals) -> None:
+    def add(self, times_ns: Stamps, values: Reals) -> None:
         """Append values, without those that are not finite."""
         points = np.stack((times_ns, values))[:, np.isfinite(values)]
         sizes = np.abs(points[1])
@@ -102,7 +95,7 @@ class Motion:
     exact: Description | None             # None where the closed form cannot hold it
     source: str | None                    # topic that measures it best
     # Of this topic: log times (n,) [ns], and `Attitudes.rows`
-    samples: list[tuple[NDArray[np.int64], Reals]] = field(default_factory=list)
+    samples: list[tuple[Stamps, Reals]] = field(default_factory=list)
     measured: Measured | None = None      # the numbers of `exact` from these samples
     regime: str | None = None             # name of the motion by them
 
@@ -125,6 +118,7 @@ class Survey:
 
     damage: Damage
     whole: bool                           # the log was closed, and nothing is lost
+    end_ns: int                           # log time up to which samples were recorded [ns]
     topics: dict[str, TopicReport]
     run: RunDescription | None = None     # None for a log that this package did not record
     foreign_reason: str = ''              # why not
@@ -152,33 +146,33 @@ def survey(reader: LogReader) -> Survey:
     """Return the findings about a log.  Raises LogError."""
     damage = reader.damage
     found = Survey(damage, reader.whole and not damage.truncated and damage.lossless,
-                   {topic.name: TopicReport(topic.type_name) for topic in reader.topics})
+                   damage.end_ns, {topic.name: TopicReport(topic.type_name)
+                                   for topic in reader.topics})
     sections: list[Section] = []
     try:
-        found.run = read_run_description(reader)
-    except ForeignLogError as error:
-        found.foreign_reason = str(error)
-    else:
-        for name, topic in found.run.topics.items():
-            found.topics[topic].stream = name
+        found.run = recorded_run.read_run_description(reader)
         sections = _find_sections(found, found.run)
-    ends_ns = [section.end_ns for section in sections]
-    stamps_ns: dict[str, list[NDArray[np.int64]]] = {topic: [] for topic in found.topics}
+    except recorded_run.ForeignLogError as error:
+        found.foreign_reason = str(error)
+    ends_ns = [section.end_ns for section in sections[:-1]]
+    blocks_ns: defaultdict[str, list[Stamps]] = defaultdict(lambda: [np.empty(0, np.int64)])
     messages = reader.messages()
-    while block := list(itertools.islice(messages, BLOCK)):
-        by_topic: defaultdict[str, list[LogMessage]] = defaultdict(list)
-        for message in block:
-            by_topic[message.topic].append(message)
-        for topic, samples in by_topic.items():
-            stamps_ns[topic].append(np.array([sample.log_time for sample in samples]))
-            if sections and found.topics[topic].stream is not None:
+    while block := sorted(itertools.islice(messages, BLOCK), key=attrgetter('topic')):
+        for topic, group in itertools.groupby(block, attrgetter('topic')):
+            samples = list(group)
+            blocks_ns[topic].append(np.array([sample.log_time for sample in samples]))
+            if sections and topic in sections[0].streams:
                 for number, part in itertools.groupby(
                         samples, lambda sample: bisect_left(ends_ns, sample.log_time)):
                     _analyse(found, sections[number], topic, list(part))
+    stamps_ns = {topic: np.concatenate(blocks_ns[topic]) for topic in found.topics}
+    if sections:        # the last entry of the journal may be later than the last sample
+        last = sections[-1]
+        found.end_ns = last.end_ns = last.motion.end_ns = max(
+            last.begin_ns, *(int(stamps_ns[topic].max(initial=0)) for topic in last.streams), 0)
     for topic, report in found.topics.items():
-        _count(report, np.concatenate([np.empty(0, np.int64), *stamps_ns[topic]]),
-               [(section, section.streams[topic].period_ns) for section in sections
-                if topic in section.streams])
+        _count(report, stamps_ns[topic], [(section, section.streams[topic].period_ns)
+                                          for section in sections if topic in section.streams])
     for motion in found.motions:
         _measure(found, motion)
     return found
@@ -187,38 +181,36 @@ def survey(reader: LogReader) -> Survey:
 def _find_sections(found: Survey, run: RunDescription) -> list[Section]:
     """Return the sections of a run, and note its motions and why it cannot be followed on."""
     sections: list[Section] = []
+    for name, topic in run.topics.items():
+        found.topics[topic].stream = name
     try:
-        rerun = Rerun(run)
-        sections.append(_section(found, rerun, 'start', rerun.stamp_ns))
-        for event in rerun.advance(found.damage.end_ns):
-            if event is not None:
-                begin_ns = sections[-1].end_ns = found.motions[-1].end_ns = rerun.stamp_ns
-                if event.name == 'reset':
-                    begin_ns = rerun.simulation.epoch_ns - 1
-                sections.append(_section(found, rerun, event.name, begin_ns))
-    except DepartureError as error:
+        for simulation, event in recorded_run.rerun(run, found.damage.end_ns):
+            if event is None:
+                continue
+            if sections:
+                last = sections[-1]
+                last.end_ns = last.motion.end_ns = last.epoch_ns + event.sent_ns
+            begin_ns = simulation.epoch_ns + simulation.now_ns
+            streams = {run.topics[stream.topic]: copy.copy(stream)
+                       for stream in simulation.streams if stream.topic in run.topics}
+            if event.name != 'parameters':
+                found.motions.append(_motion(run, simulation, streams, event.name, begin_ns))
+            sections.append(Section(found.motions[-1], begin_ns, begin_ns, simulation.epoch_ns,
+                                    streams, Imu(simulation.values)))
+    except recorded_run.DepartureError as error:
         found.notes.append(f'the run cannot be followed beyond here: {error}')
-    if sections:
-        last = sections[-1]
-        last.end_ns = last.motion.end_ns = max(found.damage.end_ns, last.begin_ns)
     return sections
 
 
-def _section(found: Survey, rerun: Rerun, cause: str, begin_ns: int) -> Section:
-    """Return the section that begins now, perhaps with a motion of its own."""
-    simulation, run = rerun.simulation, rerun.run
-    by_name = {stream.topic: copy.copy(stream) for stream in simulation.streams}
-    if cause != 'parameters':
-        segment, exact = simulation.segment, simulation.describe()
-        period_ns = ((exact and exact.nutation_period) or math.inf) * NANOSECONDS
-        source = max((name for name in SOURCES if name in run.topics), default='',
-                     key=lambda name: min(period_ns / by_name[name].period_ns, ENOUGH_SAMPLES))
-        found.motions.append(Motion(
-            cause, begin_ns, begin_ns, simulation.epoch_ns + segment.start_ns, segment, exact,
-            run.topics.get(source)))
-    return Section(found.motions[-1], begin_ns, begin_ns, simulation.epoch_ns,
-                   {topic: by_name[name] for name, topic in run.topics.items()},
-                   Imu(simulation.values))
+def _motion(run: RunDescription, simulation: Simulation, streams: Mapping[str, Stream],
+            cause: str, begin_ns: int) -> Motion:
+    """Return the motion that begins now."""
+    exact = simulation.describe()
+    period_ns = ((exact and exact.nutation_period) or math.inf) * NANOSECONDS
+    source = max((run.topics[name] for name in SOURCES if name in run.topics), default=None,
+                 key=lambda name: min(period_ns / streams[name].period_ns, ENOUGH_SAMPLES))
+    return Motion(cause, begin_ns, begin_ns, simulation.epoch_ns + simulation.segment.start_ns,
+                  simulation.segment, exact, source)
 
 
 def _analyse(found: Survey, section: Section, topic: str, samples: list[LogMessage]) -> None:
@@ -226,18 +218,14 @@ def _analyse(found: Survey, section: Section, topic: str, samples: list[LogMessa
     stream, motion, segment = section.streams[topic], section.motion, section.motion.segment
     fitting = [sample for sample in samples if len(sample.data) == len(stream.template)]
     found.topics[topic].odd_size += len(samples) - len(fitting)
-    if not fitting:
-        return
-    stamps_ns = np.array([sample.log_time for sample in fitting])
+    stamps_ns = np.array([sample.log_time for sample in fitting], np.int64)
     fields = stream.template.decode(b''.join(sample.data for sample in fitting))
     if stream.topic in IMU_TOPICS:
         time = (stamps_ns - found.motions[0].begin_ns) / NANOSECONDS
-        shown = time <= found.shown_s
-        if shown.any():
-            found.readings.setdefault(topic, []).append(
-                np.column_stack((time, *fields[1:]))[shown])
+        readings = np.column_stack((time, *fields[1:]))[time <= found.shown_s]
+        found.readings.setdefault(topic, []).append(readings)
     data = analysis.attitudes_of(stream.topic, section.imu, stamps_ns, fields)
-    if data is None or not len(data.stamps_ns):
+    if data is None:
         return
     if topic == motion.source:
         motion.samples.append((data.stamps_ns, data.rows))
@@ -255,8 +243,8 @@ def _analyse(found: Survey, section: Section, topic: str, samples: list[LogMessa
             data.stamps_ns, angle_between(data.quaternion, truth))
 
 
-def _count(report: TopicReport, stamps_ns: NDArray[np.int64],
-           sections: Sequence[tuple[Section, int]]) -> None:
+def _count(report: TopicReport, stamps_ns: Stamps, sections: Sequence[tuple[Section, int]],
+           ) -> None:
     """Count a topic's messages, and compare those of a stream with the grid of each section."""
     report.count = len(stamps_ns)
     if report.count > 1:

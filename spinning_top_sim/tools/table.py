@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.schedule import offline_targets
 
 # Names and units of the columns.
 UNITS = {
@@ -33,7 +34,6 @@ def write_table(path: Path, file_format: str, values: Mapping[str, Any], stops: 
     Simulate a run into a new table of states, on the grid of `pose.rate`; return what it holds.
 
     file_format : 'csv' or 'parquet'
-    values : checked parameters
     stops : in ascending order of time, the last one is the end of the run
     show : takes the simulated time reached [s]
     """
@@ -49,20 +49,19 @@ def _rows(simulation: Simulation, period_ns: int, stops: Sequence[Stop],
           show: Callable[[float], object]) -> Iterator[Rows]:
     """Yield consecutive rows of the table.  A command changes the rows after its time."""
     next_ns = 0
-    for end_ns, momenta in stops:
-        while next_ns <= end_ns:
-            count = min((end_ns - next_ns) // period_ns + 1, ROWS_AT_ONCE)
-            times = range(next_ns, next_ns + count * period_ns, period_ns)
+    for target_ns, momenta in offline_targets(0, stops, ROWS_AT_ONCE * period_ns):
+        times = range(next_ns, target_ns + 1, period_ns)
+        if times:
             states = simulation.segment.states(times)
             yield np.stack(np.broadcast_arrays(
                 np.array(times) / NANOSECONDS, states.theta, states.theta_dot, states.phi,
                 states.phi_dot, states.psi, states.psi_dot, *states.quaternion.T,
                 *states.angular_velocity.T, states.energy, states.l3, states.lz))
-            show(times[-1] / NANOSECONDS)
-            next_ns = times.stop
-        simulation.advance(end_ns)
+            next_ns = times[-1] + period_ns
+        simulation.advance(target_ns)
         if momenta is not None:
             simulation.command(*momenta)
+        show(target_ns / NANOSECONDS)
 
 
 def _write_csv(path: Path, blocks: Iterable[Rows]) -> None:

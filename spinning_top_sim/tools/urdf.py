@@ -51,9 +51,7 @@ def arguments(values: Mapping[str, Any]) -> dict[str, str]:
 
 def robot_description(values: Mapping[str, Any], folder: str | Path) -> str:
     """
-    Return the URDF of checked parameters.
-
-    folder : folder of the xacro file
+    Return the URDF of checked parameters; `folder` has the xacro file.
 
     Raises ValueError as `arguments` does, and ImportError where xacro is not installed.
     """

@@ -6,9 +6,11 @@ from __future__ import annotations
 import math
 import re
 import struct
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +19,7 @@ from spinning_top_sim.recording.provenance import surroundings
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.topics import Stream
-from spinning_top_sim.tools.recorded_run import DepartureError, Rerun, RunDescription
+from spinning_top_sim.tools.recorded_run import DepartureError, RunDescription, rerun
 
 # Names in the message definition of the arrays of numbers in a template, in their order.
 FIELDS = {
@@ -32,23 +34,21 @@ FIELDS = {
 }
 
 
-@dataclass(frozen=True)
-class Difference:
+class Difference(NamedTuple):
     """A place where a log and the computation differ."""
 
-    topic: str
     stamp_ns: int                         # log time of the message [ns]
-    byte: int | None                      # None where one of them has no such message
-    field: str                            # name of the field there
-    logged: str                           # its two values, or what is different instead
+    topic: str
+    field: str                            # name of the field, or what else is different
+    logged: str                           # its two values
     computed: str
+    byte: int | None = None               # None where one of them has no such message
 
 
 @dataclass
 class Verdict:
     """The result of a comparison."""
 
-    whole: bool                           # the log is whole
     compared: dict[str, int]              # messages that both have, by topic
     different: int = 0                    # how many of these differ
     missing: int = 0                      # messages that were computed and are not in the log
@@ -60,37 +60,34 @@ class Verdict:
 
     @property
     def identical(self) -> bool:
-        """Whether every message is as computed; of a torn log, every message that is left."""
-        return not (self.different or self.unexpected or self.stopped
-                    or (self.missing and self.whole))
+        """Whether the messages in the log are those computed."""
+        return not (self.different or self.missing or self.unexpected or self.stopped)
 
-    def note(self, topic: str, stamp_ns: int, what: str, logged: str, computed: str,
-             byte: int | None = None) -> None:
+    def note(self, this: Difference) -> None:
         """Keep a difference if it is the earliest so far."""
-        if self.first is None or stamp_ns < self.first.stamp_ns:
-            self.first = Difference(topic, stamp_ns, byte, what, logged, computed)
+        self.first = min(self.first or this, this, key=attrgetter('stamp_ns'))
 
 
-def verify(reader: LogReader, run: RunDescription, show: Callable[[int], None]) -> Verdict:
+def verify(reader: LogReader, run: RunDescription, end_ns: int,
+           show: Callable[[int], None]) -> Verdict:
     """
     Compute the run of a log again and compare all messages.
 
+    end_ns : log time up to which samples were recorded [ns]
     show : takes the log time reached [ns]
     """
-    damage = reader.damage
-    topics = [*run.topics.values(), run.commands_topic]
-    verdict = Verdict(not damage.truncated and damage.lossless,
-                      {topic: 0 for topic in topics if topic is not None}, warnings=_warnings(run))
+    verdict = Verdict({topic: 0 for topic in (*run.topics.values(), run.commands_topic)
+                       if topic is not None}, warnings=_warnings(run))
     for stamp_ns, reason in run.broken:
         verdict.different += 1
-        verdict.note(run.events_topic or '', stamp_ns, 'entry', reason, 'an entry of the journal')
-    # What has not been met in the log, by topic and stamp: several commands may have the same.
-    computed: defaultdict[tuple[str, int], list[tuple[Stream | None, bytes]]] = defaultdict(list)
+        verdict.note(Difference(stamp_ns, run.events_topic or '', 'entry', reason, 'an entry'))
+    # What has not been met in the log, by stamp and topic: several commands may have the same.
+    computed: defaultdict[tuple[int, str], deque[tuple[Stream | None, bytes]]] = defaultdict(deque)
 
     def take(stream: Stream, stamps_ns: NDArray[np.int64], rows: NDArray[np.uint8]) -> None:
         topic, size, data = run.topics[stream.topic], rows.shape[1], rows.tobytes()
-        for number, stamp_ns in enumerate(stamps_ns[stamps_ns <= damage.end_ns].tolist()):
-            computed[topic, stamp_ns].append((stream, data[number * size:(number + 1) * size]))
+        for number, stamp_ns in enumerate(stamps_ns.tolist()):
+            computed[stamp_ns, topic].append((stream, data[number * size:(number + 1) * size]))
 
     messages = reader.messages(topics=verdict.compared)
     message = next(messages, None)
@@ -98,67 +95,67 @@ def verify(reader: LogReader, run: RunDescription, show: Callable[[int], None]) 
     def compare(before_ns: float) -> None:
         nonlocal message
         while message is not None and message.log_time < before_ns:
-            key = message.topic, message.log_time
+            key = message.log_time, message.topic
             if key in computed:
-                stream, expected = computed[key].pop(0)
+                stream, expected = computed[key].popleft()
                 if not computed[key]:
                     del computed[key]
                 verdict.compared[message.topic] += 1
                 if message.data != expected:
                     verdict.different += 1
-                    what, logged, value, byte = _difference(stream, message.data, expected)
-                    verdict.note(*key, what, logged, value, byte)
+                    verdict.note(_difference(key, stream, message.data, expected))
             else:
                 verdict.unexpected += 1
-                verdict.note(*key, 'message', 'there', 'no such message')
+                verdict.note(Difference(*key, 'message', 'there', 'no such message'))
             message = next(messages, None)
 
     try:
-        rerun = Rerun(run, take)
-        for event in rerun.advance(damage.end_ns):
-            show(rerun.stamp_ns)
+        for simulation, event in rerun(run, end_ns, take):
             if event is not None and event.name == 'command' and run.commands_topic is not None:
-                computed[run.commands_topic, event.stamp_ns].append(
+                computed[event.stamp_ns, run.commands_topic].append(
                     (None, journal.command(event.details['l3'], event.details['lz'])))
+            reached_ns = simulation.epoch_ns + simulation.now_ns
+            show(reached_ns)
             # Another command at this very time may follow.
-            compare(rerun.stamp_ns)
+            compare(reached_ns)
     except DepartureError as error:
         verdict.stopped = str(error)
     compare(math.inf)
-    for (topic, stamp_ns), left in computed.items():
+    for key, left in computed.items():
         verdict.missing += len(left)
-        if verdict.whole:
-            verdict.note(topic, stamp_ns, 'message', 'no such message', 'there')
+        verdict.note(Difference(*key, 'message', 'no such message', 'there'))
     return verdict
 
 
-def _difference(stream: Stream | None, logged: bytes,
-                computed: bytes) -> tuple[str, str, str, int]:
-    """Return the name of the first field that differs, its values, and the byte."""
-    if len(logged) != len(computed):
-        return ('size', f'{len(logged)} bytes', f'{len(computed)} bytes',
-                min(len(logged), len(computed)))
-    at = next(at for at, pair in enumerate(zip(logged, computed, strict=True))
-              if pair[0] != pair[1])
+def _difference(key: tuple[int, str], stream: Stream | None, logged: bytes,
+                computed: bytes) -> Difference:
+    """Return the first difference of two messages."""
+    sizes = len(logged), len(computed)
+    if sizes[0] != sizes[1]:
+        return Difference(*key, 'size', f'{sizes[0]} bytes', f'{sizes[1]} bytes', min(sizes))
+    at = next(at for at in range(sizes[0]) if logged[at] != computed[at])
     place = None if stream is None else stream.template.field_at(at)
     if stream is None or place is None:
-        return f'byte {at}', f'0x{logged[at]:02x}', f'0x{computed[at]:02x}', at
+        return Difference(*key, f'byte {at}', f'0x{logged[at]:02x}', f'0x{computed[at]:02x}', at)
     number, element, offset = place
     if number < 0:
         what, code, text = 'header.stamp', '<iI', '{}.{:09d}'
     else:
-        what, code, text = f'{FIELDS[stream.type_name][number]}[{element}]', '<d', '{!r}'
+        names = FIELDS.get(stream.type_name)
+        what = f'{names[number] if names else f"array {number}"}[{element}]'
+        code, text = '<d', '{!r}'
     one, two = (text.format(*struct.unpack_from(code, data, offset))
                 for data in (logged, computed))
-    return what, one, two, at
+    return Difference(*key, what, one, two, at)
 
 
 def _warnings(run: RunDescription) -> list[str]:
     """Return the differences of this machine from that of the recording."""
-    then, now = (
-        {'the version of spinning_top_sim': recorded['version'],
-         'the platform': recorded['platform'],
-         # Of the libraries only numpy computes.
-         'numpy': ''.join(re.findall('"numpy": "([^"]*)"', recorded['libraries'])) or 'unknown'}
-        for recorded in (run.surroundings, surroundings()))
-    return [f'{what} was {then[what]}, is {now[what]}' for what in now if then[what] != now[what]]
+    now, found = surroundings(), []
+    for what, key, pattern in (('the version of spinning_top_sim', 'version', '.*'),
+                               ('the platform', 'platform', '.*'),
+                               ('numpy', 'libraries', '"numpy": "[^"]*"')):     # only it computes
+        then, here = (''.join(re.findall(pattern, one[key])) for one in (run.surroundings, now))
+        if then != here:
+            found.append(f'{what} was {then}, is {here}')
+    return found
