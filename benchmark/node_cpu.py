@@ -36,7 +36,7 @@ from report import number, preamble, table, write_section
 
 STREAMS = ('pose', 'joint_states', 'imu')
 OTHERS = ('ground_truth_imu', 'ground_truth_odom', 'invariants')
-RATES = (100, 200, 500, 1000, 2000)
+RATES = (200, 500, 1000, 2000)
 SUBSCRIBERS = (0, 1, 3)
 KINDS = {
     'sim_node, 200 ticks, recording': (False, True), 'sim_node, 200 ticks': (False, False),

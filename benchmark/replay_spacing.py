@@ -25,6 +25,8 @@ import time
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
+
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.writer import McapRecorder
 from spinning_top_sim.streams import messages
@@ -45,7 +47,7 @@ def record(path: Path, seconds: float) -> dict[str, list[int]]:
     times = {topic.name: [EPOCH_NS + shift + n * SECOND // rate
                           for n in range(int(seconds * rate))]
              for topic, rate, shift in zip(topics, RATES_HZ, SHIFTS_NS, strict=True)}
-    data = messages.float64_multi_array(('a', 'b')).encode(0, (1.0, 2.0))
+    data = messages.float64_multi_array(('a', 'b')).encode_one(0, np.array([1.0, 2.0]))
     with McapRecorder.open(path, topics, {}, min_free_bytes=0) as recorder:
         for at_ns, index in sorted((at_ns, index) for index, stamps in enumerate(times.values())
                                    for at_ns in stamps):
