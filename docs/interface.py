@@ -5,8 +5,7 @@
 from pathlib import Path
 
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.all_streams import all_streams
-from spinning_top_sim.streams.topics import INVARIANTS, JOINTS
+from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, all_streams
 
 HEAD = """<!-- Written by docs/interface.py from the code. -->
 # Interface of sim_node

@@ -93,7 +93,8 @@ def test_samples_of_one_instant_are_together_with_their_sinks():
 
 def test_without_sinks_nothing_is_ever_due():
     schedule, simulation = schedule_of()
-    assert schedule.next_due(-1) == NEVER_NS
+    schedule.update(-1)
+    assert schedule.computed_ns == NEVER_NS
     states = states_of(simulation)
     assert schedule.prepare(-1, 60 * SECOND)
     assert not schedule.ready and states.count == 0

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from spinning_top_sim.streams import messages
-from spinning_top_sim.streams.topics import Stream
+from spinning_top_sim.streams.stream import Stream
 
 NODE_NAME = 'spinning_top'
 COMMANDS, EVENTS = '~/commands', '~/events'

@@ -16,7 +16,7 @@ from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams import messages, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS, Field
 from spinning_top_sim.streams.segment import Axis, Reference, Segment
-from spinning_top_sim.streams.topics import Stream
+from spinning_top_sim.streams.stream import Stream
 
 
 class PastAxis:

@@ -59,22 +59,39 @@ class Reference:
 
 class Segment:
     """
-    A motion from its start, or from a command, until the next command.
+    A motion from its start, or from a command, until the next command, in simulated time.
 
     Attributes
     ----------
-    solver : its t = 0 is `start_ns`
+    solver : its t = 0 is `start_ns`; only the segment lets it step
     start_ns : simulated time at which it begins [ns]
+    reached_ns : simulated time up to which no further steps are needed [ns]
     energy, l3, lz : constants of the motion, as it began
     reference : the exact solution of the same motion
     """
 
     def __init__(self, solver: Propagator, start: State, start_ns: int) -> None:
         self.solver, self.start_ns = solver, start_ns
+        self.reached_ns = start_ns + solver.latest_ns
         first = solver.states(range(1))
         self.energy, self.l3, self.lz = float(first.energy[0]), start.l3, start.lz
         self.reference = Reference(solver.top, start, start_ns,
                                    solver if isinstance(solver, ExactSolution) else None)
+
+    def reach(self, t_ns: int, max_steps: int) -> bool:
+        """
+        Let the solver step up to a simulated time [ns]; return False if that takes more steps.
+
+        Raises IntegrationError if the equations cannot go on; `reached_ns` has where they stop.
+        """
+        try:
+            return self.solver.reach(t_ns - self.start_ns, max_steps)
+        finally:
+            self.reached_ns = self.start_ns + self.solver.latest_ns
+
+    def release(self, before_ns: int) -> None:
+        """Forget the steps that only states before this simulated time [ns] need."""
+        self.solver.release(before_ns - self.start_ns)
 
     def states(self, times: range) -> States:
         """Return the states at ascending simulated times [ns]."""

@@ -2,132 +2,27 @@
 """
 The streams: for each a topic, a message type, a rate, and how states become bytes.
 
-A new stream is a subclass of `Stream` here, a template in messages.py, its place in all_streams.py
+A new stream is a subclass of `Stream` here, its place in `all_streams`, a template in messages.py
 and a line in parameters.STREAM_DEFAULTS.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams import messages
-from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
+from spinning_top_sim.streams.cdr import Field
 from spinning_top_sim.streams.imu import Imu
+from spinning_top_sim.streams.markers import Markers
 from spinning_top_sim.streams.segment import Segment
+from spinning_top_sim.streams.stream import Stream
 
 JOINTS = ('precession_joint', 'nutation_joint', 'spin_joint')
 INVARIANTS = ('energy', 'l3', 'lz', 'energy_drift', 'l3_drift', 'lz_drift',
               'quaternion_norm_error', 'orientation_error')
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
-
-
-class Stream:
-    """
-    One topic: samples at t = k * period, k = 0, 1, 2.., whoever listens and however ticks fall.
-
-    Attributes
-    ----------
-    parameter : prefix of its parameters
-    topic, type_name : of its messages
-    template : Template
-    period_ns : of its samples [ns]
-    log_index : its number in the log that records it, None for no log; see `Simulation.log_to`
-    sent, skipped : counts of samples published, and of those that came too late for that
-    on_change : called when its sinks, its rate or the numbers in its samples change
-    """
-
-    parameter: str
-    topic: str
-    type_name: str
-    template: Template
-
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        self._publish: Callable[[bytes], object] | None = None
-        self.log_index: int | None = None
-        self.on_change: Callable[[], None] = lambda: None
-        self.sent = self.skipped = 0
-        self._skipped_until_ns = 0
-        self.period_ns = 1
-        self.set_rate(values[f'{self.parameter}.rate'])
-
-    @property
-    def publish(self) -> Callable[[bytes], object] | None:
-        """What a sample is handed to in time; None while there are no subscribers."""
-        return self._publish
-
-    @publish.setter
-    def publish(self, sink: Callable[[bytes], object] | None) -> None:
-        if sink != self._publish:
-            self._publish = sink
-            self.on_change()
-
-    def follow(self, segment: Segment) -> None:
-        """Begin with the samples of a motion, or of the one after a command."""
-
-    def apply(self, values: Mapping[str, Any]) -> None:
-        """
-        Take over parameters that take effect at once: the rate, where it is among `values`.
-
-        A stream with others of its own takes them here too, and calls `on_change`.
-        """
-        rate = values.get(f'{self.parameter}.rate')
-        if rate is not None and _period_ns(rate) != self.period_ns:
-            self.set_rate(rate)
-
-    def set_rate(self, rate: float) -> None:
-        """Put the samples on the grid of another rate [Hz]."""
-        self.period_ns = _period_ns(rate)
-        self.on_change()
-
-    @property
-    def has_sinks(self) -> bool:
-        """Whether it has subscribers or is recorded: else nothing is computed."""
-        return self._publish is not None or self.log_index is not None
-
-    def first_after(self, t_ns: int) -> int:
-        """Return the time of the first sample later than `t_ns` that is not skipped [ns]."""
-        return (max(t_ns, self._skipped_until_ns - 1) // self.period_ns + 1) * self.period_ns
-
-    def times(self, after_ns: int, until_ns: int) -> range:
-        """Return the times of the samples after `after_ns` and up to `until_ns` [ns]."""
-        return range(self.first_after(after_ns), until_ns + 1, self.period_ns)
-
-    def skip(self, after_ns: int, before_ns: int) -> None:
-        """Leave out and count the samples after `after_ns` and before `before_ns` [ns]."""
-        count = len(self.times(after_ns, before_ns - 1))
-        if count:
-            self.skipped += count
-            self._skipped_until_ns = before_ns
-            self.on_change()
-
-    def encode(self, states: States, epoch_ns: int, times: range) -> NDArray[np.uint8]:
-        """
-        Return the messages at sample times as rows of bytes (n, size), valid until the next call.
-
-        states : the states at `times`
-        epoch_ns : stamp of t = 0 [ns]
-        times : of n samples [ns]; see `times`
-        """
-        stamps_ns = np.arange(epoch_ns + times.start, epoch_ns + times.stop, times.step)
-        return self.template.encode(stamps_ns, *self.fields(states, times))
-
-    def fields(self, states: States, times: range) -> Sequence[Field]:
-        """Return the numbers that go into the fields of `template`."""
-        raise NotImplementedError
-
-    def indices(self, times: range) -> range:
-        """Return the numbers k of the samples at these times."""
-        first = times.start // self.period_ns
-        return range(first, first + len(times))
-
-
-def _period_ns(rate: float) -> int:
-    return max(1, round(NANOSECONDS / rate))
 
 
 class Pose(Stream):
@@ -262,3 +157,11 @@ class Clock(Stream):
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         return ()
+
+
+def all_streams(values: Mapping[str, Any]) -> list[Stream]:
+    """Return every stream, in the order in which samples of one instant are sent."""
+    imu = Imu(values)
+    return [Clock(values), Pose(values), JointStates(values), ImuRaw(values, imu),
+            ImuData(values, imu), ImuBias(values, imu), GroundTruthImu(values, imu),
+            GroundTruthOdometry(values), Invariants(values), Markers(values)]

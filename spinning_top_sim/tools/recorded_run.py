@@ -12,10 +12,10 @@ from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.writer import METADATA_NAME
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.streams.all_streams import all_streams
 from spinning_top_sim.streams.cdr import ENCAPSULATION
 from spinning_top_sim.streams.pipeline import Simulation, TakeRows
-from spinning_top_sim.streams.schedule import offline_block_ns, offline_targets
+from spinning_top_sim.streams.schedule import offline_targets
+from spinning_top_sim.streams.topics import all_streams
 
 EVENT_NAMES = ('start', 'command', 'parameters', 'reset')
 
@@ -148,8 +148,8 @@ class Rerun:
         simulation.now_ns = -1 if run.begun_ns < 0 else max(run.begun_ns, simulation.now_ns)
         simulation.apply(run.now)
         if send is not None:
-            simulation.record_blocks(
-                [stream for stream in simulation.streams if stream.topic in run.topics])
+            simulation.log_to(None, [stream for stream in simulation.streams
+                                     if stream.topic in run.topics])
         self.stamp_ns = run.epoch_ns + simulation.now_ns
 
     def advance(self, end_ns: int) -> Iterator[Event | None]:
@@ -163,10 +163,9 @@ class Rerun:
             if event is not None and event.name == 'start':
                 continue
             stop_ns = end_ns - simulation.epoch_ns if event is None else event.sent_ns
-            block_ns = offline_block_ns([stream for stream in simulation.streams
-                                         if stream.has_sinks])
             for target_ns, item in offline_targets(
-                    max(simulation.now_ns, 0), [(stop_ns, event)], block_ns):
+                    max(simulation.now_ns, 0), [(stop_ns, event)],
+                    [stream for stream in simulation.streams if stream.has_sinks]):
                 # Without samples states are only needed where a command finds them.
                 if self._send is not None or (item is not None and item.name == 'command'):
                     self._reach(target_ns)

@@ -25,7 +25,7 @@ from spinning_top_sim.recording.reader import LogMessage, LogReader
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.segment import Segment
-from spinning_top_sim.streams.topics import Stream
+from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools import analysis
 from spinning_top_sim.tools.analysis import Attitudes, Measured, Reals
 from spinning_top_sim.tools.recorded_run import (
