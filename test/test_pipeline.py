@@ -369,7 +369,7 @@ def test_a_change_of_rate_goes_on_on_the_new_grid(before, after):
     taken = record(simulation, 'pose')
     changed_at = 123_456_789
     simulation.advance(changed_at)
-    stream(simulation, 'pose').set_rate(after)
+    simulation.apply({'pose.rate': after})
     simulation.advance(SECOND)
     old, new = round(SECOND / before), round(SECOND / after)
     expected = [*range(0, changed_at + 1, old),

@@ -190,7 +190,7 @@ def test_what_was_computed_ahead_is_dropped_when_it_no_longer_holds(change):
         if change == 'command':
             simulation.command(2.0, 1.5)
         elif change == 'rate':
-            pose.set_rate(300.0)
+            simulation.apply({'pose.rate': 300.0})
         elif change == 'subscriber':
             raw.publish = taken.append
         elif change == 'no subscriber':

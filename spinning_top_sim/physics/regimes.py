@@ -161,14 +161,14 @@ def regime(top: Top, state: State, coincide: float = COINCIDE) -> str:
         return 'steady precession'
     if l3 == 0.0:
         return 'spherical pendulum'
-    turning = lz / l3
+    reversal = lz / l3          # cos(theta) at which phi' changes sign
     if lz == l3 and high >= 1.0 - coincide:
         return 'through the top'
     if lz == -l3 and low <= -1.0 + coincide:
         return 'through the bottom'
-    if min(abs(turning - low), abs(turning - high)) <= coincide * max(1.0, abs(turning)):
+    if min(abs(reversal - low), abs(reversal - high)) <= coincide * max(1.0, abs(reversal)):
         return 'cusps'
-    return 'loops' if low < turning < high else 'waves'
+    return 'loops' if low < reversal < high else 'waves'
 
 
 def precession_extremes(top: Top, state: State, theta_min: float,

@@ -40,8 +40,7 @@ class Stream:
         self.on_change: Callable[[], None] = lambda: None
         self.sent = self.skipped = 0
         self._skipped_until_ns = 0
-        self.period_ns = 1
-        self.set_rate(values[f'{self.parameter}.rate'])
+        self.period_ns = period_ns(values[f'{self.parameter}.rate'])
 
     @property
     def publish(self) -> Callable[[bytes], object] | None:
@@ -64,13 +63,9 @@ class Stream:
         A stream with others of its own takes them here too, and calls `on_change`.
         """
         rate = values.get(f'{self.parameter}.rate')
-        if rate is not None and _period_ns(rate) != self.period_ns:
-            self.set_rate(rate)
-
-    def set_rate(self, rate: float) -> None:
-        """Put the samples on the grid of another rate [Hz]."""
-        self.period_ns = _period_ns(rate)
-        self.on_change()
+        if rate is not None and period_ns(rate) != self.period_ns:
+            self.period_ns = period_ns(rate)
+            self.on_change()
 
     @property
     def has_sinks(self) -> bool:
@@ -108,11 +103,7 @@ class Stream:
         """Return the numbers that go into the fields of `template`."""
         raise NotImplementedError
 
-    def indices(self, times: range) -> range:
-        """Return the numbers k of the samples at these times."""
-        first = times.start // self.period_ns
-        return range(first, first + len(times))
 
-
-def _period_ns(rate: float) -> int:
+def period_ns(rate: float) -> int:
+    """Return the time from one sample to the next at a rate [Hz], in whole nanoseconds."""
     return max(1, round(NANOSECONDS / rate))

@@ -17,7 +17,7 @@ from spinning_top_sim.streams.cdr import Field
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.markers import Markers
 from spinning_top_sim.streams.segment import Segment
-from spinning_top_sim.streams.stream import Stream
+from spinning_top_sim.streams.stream import Stream, period_ns
 
 JOINTS = ('precession_joint', 'nutation_joint', 'spin_joint')
 INVARIANTS = ('energy', 'l3', 'lz', 'energy_drift', 'l3_drift', 'lz_drift',
@@ -67,20 +67,26 @@ class GroundTruthOdometry(Stream):
 
 
 class ImuStream(Stream):
-    """What all IMU topics share: the mounting, and the sensor at the stream's rate."""
+    """What all IMU topics share: the IMU, which takes its samples at `imu.rate`."""
 
     type_name = 'sensor_msgs/msg/Imu'
     has_orientation, is_noisy = True, False
 
     def __init__(self, values: Mapping[str, Any], imu: Imu) -> None:
+        super().__init__(values)
         self._frame_id: str = values['imu.frame_id']
         self._imu = imu
-        super().__init__(values)
+        self._use_sensor(values['imu.rate'])
 
-    def set_rate(self, rate: float) -> None:
-        super().set_rate(rate)
+    def apply(self, values: Mapping[str, Any]) -> None:
+        super().apply(values)
+        if 'imu.rate' in values:
+            self._use_sensor(values['imu.rate'])
+            self.on_change()
+
+    def _use_sensor(self, rate: float) -> None:
         # A density says how much noise a sample has at a rate.
-        self._sensor = self._imu.sensor(self.period_ns)
+        self._sensor = self._imu.sensor(period_ns(rate))
         kinds = self._sensor.gyroscope, self._sensor.accelerometer
         self.template = messages.imu(
             self._frame_id,
@@ -95,7 +101,7 @@ class ImuRaw(ImuStream):
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         orientation = self._imu.orientation(states) if self.has_orientation else IDENTITY
-        return (orientation, *self._sensor.read(self._imu.true(states), self.indices(times)))
+        return (orientation, *self._sensor.read(self._imu.true(states), times))
 
 
 class ImuData(ImuRaw):
@@ -105,12 +111,12 @@ class ImuData(ImuRaw):
 
 
 class ImuBias(ImuStream):
-    """The bias that `ImuRaw` carries."""
+    """The bias that the readings contain."""
 
     parameter, topic, has_orientation = 'imu', 'ground_truth/imu_bias', False
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
-        return (IDENTITY, *self._sensor.bias(self.indices(times)))
+        return (IDENTITY, *self._sensor.bias(times))
 
 
 class GroundTruthImu(ImuStream):
