@@ -444,12 +444,12 @@ def test_at_a_pole_only_lz_of_the_pole_is_taken(theta, sign):
 def test_a_reference_stays_that_of_its_own_motion():
     """It may be set up in another thread, while a command begins the next motion."""
     simulation = simulate()
-    first = simulation.segment.reference
+    first = simulation.segment
     simulation.command(2.0, 1.5)
-    assert first.solution.start.l3 == 1.6
-    assert simulation.segment.reference.solution.start.l3 == 2.0
-    assert simulation.segment.reference.solution is simulation.segment.reference.solution
-    assert simulate(solver__method='exact').segment.reference.solution.start.l3 == 1.6
+    assert first.exact.start.l3 == 1.6
+    assert simulation.segment.exact.start.l3 == 2.0
+    assert simulation.segment.exact is simulation.segment.exact
+    assert simulate(solver__method='exact').segment.exact.start.l3 == 1.6
 
 
 # ----------------------------------------------------------------------------- restart, failure

@@ -15,7 +15,7 @@ from spinning_top_sim.physics.shape import shape_of
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams import messages, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS, Field
-from spinning_top_sim.streams.segment import Axis, Reference, Segment
+from spinning_top_sim.streams.segment import Axis, Segment
 from spinning_top_sim.streams.stream import Stream
 
 
@@ -28,22 +28,22 @@ class PastAxis:
 
     def __init__(self, length_ns: int) -> None:
         self._length_ns = length_ns
-        self._references: deque[Reference] = deque()
+        self._segments: deque[Segment] = deque()
 
-    def begin(self, reference: Reference) -> None:
+    def begin(self, segment: Segment) -> None:
         """Begin a new segment; forget those that the trace does not reach any more."""
-        self._references.append(reference)
-        oldest_ns = reference.start_ns - self._length_ns
-        while len(self._references) > 1 and self._references[1].start_ns < oldest_ns:
-            self._references.popleft()
+        self._segments.append(segment)
+        oldest_ns = segment.start_ns - self._length_ns
+        while len(self._segments) > 1 and self._segments[1].start_ns < oldest_ns:
+            self._segments.popleft()
 
     def axis(self, times_ns: NDArray[np.int64]) -> Axis:
         """Return the axis in the world at ascending simulated times (n,) [ns]."""
-        begins = [reference.start_ns for reference in self._references]
+        begins = [segment.start_ns for segment in self._segments]
         # A segment ends with the command that begins the next one.
         ends = np.searchsorted(times_ns, begins[1:], 'right')
-        parts = [reference.axis(times) for reference, times in zip(
-            self._references, np.split(times_ns, ends), strict=True) if len(times)]
+        parts = [segment.exact_axis(times) for segment, times in zip(
+            self._segments, np.split(times_ns, ends), strict=True) if len(times)]
         x, y, z = (np.concatenate(rows) for rows in zip(*parts, strict=True))
         return x, y, z
 
@@ -83,7 +83,7 @@ class Markers(Stream):
             0.02 * abs(shape.tip), self._count + 1 if self._count else 0)
 
     def follow(self, segment: Segment) -> None:
-        self.past.begin(segment.reference)
+        self.past.begin(segment)
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         axis = states.rows_axis

@@ -150,7 +150,7 @@ class Simulation:
 
     def describe(self) -> Description | None:
         """Return the present motion in numbers; None where the closed form cannot hold it."""
-        exact = self.segment.reference.solution
+        exact = self.segment.exact
         return None if exact is None else exact.describe()
 
     # ------------------------------------------------------------------------------ sending

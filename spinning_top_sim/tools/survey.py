@@ -248,7 +248,7 @@ def _analyse(found: Survey, section: Section, topic: str, samples: list[LogMessa
         for series, value, start in zip(
                 drifts.values(), values, (segment.energy, segment.l3, segment.lz), strict=True):
             series.add(data.stamps_ns, (value - start) / (abs(start) or 1.0))
-    exact = segment.reference.solution
+    exact = segment.exact
     if exact is not None:
         truth = exact.states(data.stamps_ns - motion.origin_ns).rows_quaternion
         found.errors.setdefault(topic, Series()).add(
