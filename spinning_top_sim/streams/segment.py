@@ -25,13 +25,13 @@ class Segment:
     Attributes
     ----------
     solver : its t = 0 is `start_ns`; only the segment lets it step
-    start_ns : simulated time at which it begins [ns]
+    start, start_ns : where it begins, and at which simulated time [ns]
     reached_ns : simulated time up to which no further steps are needed [ns]
     energy, l3, lz : constants of the motion, as it began
     """
 
     def __init__(self, solver: Propagator, start: State, start_ns: int) -> None:
-        self.solver, self.start_ns = solver, start_ns
+        self.solver, self.start, self.start_ns = solver, start, start_ns
         self.reached_ns = start_ns + solver.latest_ns
         first = solver.states(range(1))
         self.energy, self.l3, self.lz = float(first.energy[0]), start.l3, start.lz
@@ -47,7 +47,7 @@ class Segment:
         if isinstance(self.solver, ExactSolution):
             return self.solver
         try:
-            return ExactSolution(self.solver.top, self.solver.start)
+            return ExactSolution(self.solver.top, self.start)
         except ValueError:
             return None
 
@@ -94,7 +94,7 @@ class Segment:
         """
         if self.exact is not None:
             return self.exact.states(times_ns - self.start_ns).rows_axis
-        start, ones = self.solver.start, np.ones(len(times_ns))
+        start, ones = self.start, np.ones(len(times_ns))
         across = math.sin(start.theta)
         return (across * math.cos(start.phi) * ones, across * math.sin(start.phi) * ones,
                 math.cos(start.theta) * ones)
