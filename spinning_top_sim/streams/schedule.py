@@ -174,21 +174,7 @@ class Schedule:
         blocks = [range(first_ns, until_ns + 1, stream.period_ns)
                   for stream, first_ns in zip(self._active, self._next_ns, strict=True)]
         instants: dict[int, tuple[list[int], list[bytes]]] = {}
-        yield from self._encode(blocks, instants)
-        # All at once: a block that is dropped before this leaves nothing behind.
-        for t_ns, (places, messages) in sorted(instants.items()):
-            key = tuple(places)
-            if key not in self._deliveries:
-                self._deliveries[key] = Delivery([self._active[k] for k in places])
-            self.ready.append((t_ns, self._deliveries[key], messages))
-        self._next_ns = [first_ns + len(times) * times.step
-                         for first_ns, times in zip(self._next_ns, blocks, strict=True)]
-        self.computed_ns = min(self._next_ns, default=NEVER_NS)
-
-    def _encode(self, blocks: Sequence[range],
-                instants: dict[int, tuple[list[int], list[bytes]]]) -> Iterator[None]:
-        """Add the messages of the active streams at these times, and their places, by time."""
-        states = cache(self._segment.states)        # once for all streams of one rate
+        states = cache(segment.states)              # once for all streams of one rate
         for place, (stream, times) in enumerate(zip(self._active, blocks, strict=True)):
             if not times:
                 continue
@@ -201,6 +187,15 @@ class Schedule:
                 places.append(place)
                 messages.append(data[number * size:(number + 1) * size])
             yield
+        # All at once: a block that is dropped before this leaves nothing behind.
+        for t_ns, (places, messages) in sorted(instants.items()):
+            key = tuple(places)
+            if key not in self._deliveries:
+                self._deliveries[key] = Delivery([self._active[k] for k in places])
+            self.ready.append((t_ns, self._deliveries[key], messages))
+        self._next_ns = [first_ns + len(times) * times.step
+                         for first_ns, times in zip(self._next_ns, blocks, strict=True)]
+        self.computed_ns = min(self._next_ns, default=NEVER_NS)
 
 
 def offline_targets(now_ns: int, stops: Iterable[tuple[int, Item]], streams: Iterable[Stream],
