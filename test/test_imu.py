@@ -125,7 +125,7 @@ def readings(values, count, period_ns=PERIOD_NS):
 def test_noise_has_the_covariance_that_is_published():
     rows, biases, sensor = readings(NOISY, 40_000)
     white = rows - biases
-    published = np.repeat([sensor.gyroscope.variance, sensor.accelerometer.variance], 3)
+    published = np.repeat([sensor.rate_variance, sensor.force_variance], 3)
     # A sample variance of n normal numbers has a relative deviation of sqrt(2/n): 5 of them.
     assert np.var(white, axis=0) == pytest.approx(published, rel=5.0 * math.sqrt(2.0 / 40_000))
     assert np.abs(np.mean(white, axis=0) / np.sqrt(published)).max() < 5.0 / math.sqrt(40_000)
@@ -326,7 +326,7 @@ def test_readings_saturate_and_are_rounded():
     assert found.tolist() == [[1.0, -4.0, 4.0, 1.1, -20.0, 20.0],
                               [0.0, 0.25, 4.0, 2.0, 2.0, -2.0]]
     assert not np.signbit(found[1, 0]), 'no reading is -0'
-    assert sensor.gyroscope.variance == pytest.approx(0.25 ** 2 / 12.0)
+    assert sensor.rate_variance == pytest.approx(0.25 ** 2 / 12.0)
 
 
 def test_equal_seeds_give_equal_bytes_in_any_company():

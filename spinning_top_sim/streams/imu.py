@@ -9,6 +9,7 @@ kalibr's model, with its names and units.  Conventions: REP-145
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
@@ -23,7 +24,6 @@ from spinning_top_sim.physics.states import States
 
 # Six columns or rows: three axes of the gyroscope, three of the accelerometer.
 Rows = NDArray[np.float64]
-GYROSCOPE, ACCELEROMETER = slice(0, 3), slice(3, 6)
 NO_ERRORS = np.zeros((6, 1))
 # At rates that are changed often, old ones are forgotten.
 SENSORS_KEPT = 4
@@ -71,39 +71,6 @@ class Imu:
         return attitude.in_body(self._mounting, rates), attitude.in_body(self._mounting, force)
 
 
-class Axes:
-    """
-    The errors of three axes of one kind, `imu.<kind>_...`, in samples `period` [s] apart.
-
-    white : standard deviation of one sample's noise, density/sqrt(period)
-    walk : of the bias' change in a step of the walk, random walk x sqrt(WALK_STEP_NS)
-    turn_on : of the bias at the start
-    variance : of what is added to a sample besides the bias: white noise and rounding
-
-    (kalibr, "IMU Noise Model"; N. Trawny, S. Roumeliotis, "Indirect Kalman filter for 3D attitude
-    estimation", 2005, eqs. 133, 140)
-    """
-
-    def __init__(self, values: Mapping[str, Any], kind: str, period: float) -> None:
-        self.white: float = values[f'imu.{kind}_noise_density'] / math.sqrt(period)
-        self.walk: float = values[f'imu.{kind}_random_walk'] * math.sqrt(WALK_STEP_NS * 1e-9)
-        self.turn_on: float = values[f'imu.{kind}_turn_on_bias']
-        self._limit: float = values[f'imu.{kind}_range'] or math.inf
-        self._resolution: float = values[f'imu.{kind}_resolution']
-        self.is_perfect = not (self.white or self.walk or self.turn_on or self._resolution
-                               or self._limit < math.inf)
-        self.variance = self.white ** 2 + self._resolution ** 2 / 12.0
-
-    def read(self, exact: Vector, white: Rows, bias: Rows) -> Vector:
-        """Return the readings: noise and bias added, cut at the range, rounded."""
-        x, y, z = (np.clip(value + noise + offset, -self._limit, self._limit)
-                   for value, noise, offset in zip(exact, white, bias, strict=True))
-        step = self._resolution
-        if step:        # + 0.0: no reading is -0
-            return tuple((np.rint(one / step) + 0.0) * step for one in (x, y, z))
-        return x, y, z
-
-
 class Sensor:
     """
     The readings of an IMU that takes a sample every `period_ns`.
@@ -112,18 +79,30 @@ class Sensor:
     bias is a path in time, which depends on the seed alone: a change of the rate does not move it.
     A reading between two samples has the noise of the one before, as of a driver that sends the
     newest sample, so that all streams agree where they have a time in common.
+
+    rate_variance, force_variance : of what is added to a sample besides the bias: white noise and
+        rounding
+
+    (kalibr, "IMU Noise Model"; N. Trawny, S. Roumeliotis, "Indirect Kalman filter for 3D attitude
+    estimation", 2005, eqs. 133, 140)
     """
 
     def __init__(self, values: Mapping[str, Any], period_ns: int) -> None:
-        self.gyroscope, self.accelerometer = kinds = [
-            Axes(values, kind, period_ns * 1e-9) for kind in ('gyroscope', 'accelerometer')]
-        self._is_perfect = all(kind.is_perfect for kind in kinds)
-        self._seed: int = values['seed']
-        self._period_ns = period_ns
-        self._white, self._walk, turn_on = (
-            np.repeat([getattr(kind, name) for kind in kinds], 3)[:, np.newaxis]
-            for name in ('white', 'walk', 'turn_on'))
-        self._turn_on = turn_on * _normal(self._seed, TURN_ON, 0, 1).T + 0.0    # no bias is -0
+        def six(name: str) -> Rows:
+            rate, force = values[f'imu.gyroscope_{name}'], values[f'imu.accelerometer_{name}']
+            return np.repeat((rate, force), 3)[:, np.newaxis]
+
+        self._seed, self._period_ns = values['seed'], period_ns
+        # Deviations of a sample's noise, and of the change of the bias in a step of its walk.
+        self._white = six('noise_density') / math.sqrt(period_ns * 1e-9)
+        self._walk = six('random_walk') * math.sqrt(WALK_STEP_NS * 1e-9)
+        # + 0.0: no bias is -0, and below no reading.
+        self._turn_on = six('turn_on_bias') * _normal(self._seed, TURN_ON, 0, 1).T + 0.0
+        self._range, self._resolution = six('range'), six('resolution')
+        self._is_perfect = not any(map(np.any, (
+            self._white, self._walk, self._turn_on, self._range, self._resolution)))
+        variances = self._white ** 2 + self._resolution ** 2 / 12.0
+        self.rate_variance, self.force_variance = variances[[0, 3], 0].tolist()
         self._newest: tuple[range, Rows, Rows] = range(0), NO_ERRORS, NO_ERRORS
 
     def read(self, exact: tuple[Vector, Vector], times: range) -> tuple[Vector, Vector]:
@@ -134,14 +113,20 @@ class Sensor:
         """
         if self._is_perfect:
             return exact
-        white, bias = self._errors(times)
-        return (self.gyroscope.read(exact[0], white[GYROSCOPE], bias[GYROSCOPE]),
-                self.accelerometer.read(exact[1], white[ACCELEROMETER], bias[ACCELEROMETER]))
+        rows = []
+        for value, white, bias, (limit,), (step,) in zip(
+                itertools.chain(*exact), *self._errors(times), self._range, self._resolution,
+                strict=True):
+            reading = value + white + bias
+            if limit:
+                reading = np.clip(reading, -limit, limit)
+            rows.append((np.rint(reading / step) + 0.0) * step if step else reading)
+        return tuple(rows[:3]), tuple(rows[3:])
 
     def bias(self, times: range) -> tuple[Vector, Vector]:
         """Return the bias at these times [ns]: [rad/s], [m/s^2]."""
         _, bias = self._errors(times)
-        return tuple(bias[GYROSCOPE]), tuple(bias[ACCELEROMETER])
+        return tuple(bias[:3]), tuple(bias[3:])
 
     def _errors(self, times: range) -> tuple[Rows, Rows]:
         """Return white noise and bias at these times, (6, n) or (6, 1) each."""

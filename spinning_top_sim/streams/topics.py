@@ -87,11 +87,11 @@ class ImuStream(Stream):
     def _use_sensor(self, rate: float) -> None:
         # A density says how much noise a sample has at a rate.
         self._sensor = self._imu.sensor(period_ns(rate))
-        kinds = self._sensor.gyroscope, self._sensor.accelerometer
+        variances = self._sensor.rate_variance, self._sensor.force_variance
         self.template = messages.imu(
             self._frame_id,
             messages.EXACT if self.has_orientation else messages.UNKNOWN_ORIENTATION,
-            *(messages.diagonal(kind.variance if self.is_noisy else 0.0) for kind in kinds))
+            *(messages.diagonal(variance if self.is_noisy else 0.0) for variance in variances))
 
 
 class ImuRaw(ImuStream):
