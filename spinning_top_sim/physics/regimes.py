@@ -143,7 +143,7 @@ def regime(top: Top, state: State, coincide: float = COINCIDE) -> str:
     l3, lz = state.l3, state.lz
     scale = abs(l3) + abs(lz)
     low, high = swing(top, state)
-    resting = axis_rests(top, state, coincide)
+    resting = high - low <= coincide
     if top.gravity_torque == 0.0:
         return 'free top' if scale or state.theta_dot else 'at rest'
     if resting and 1.0 - abs(low) <= coincide:
@@ -173,11 +173,8 @@ def regime(top: Top, state: State, coincide: float = COINCIDE) -> str:
 
 def precession_extremes(top: Top, state: State, theta_min: float,
                         theta_max: float) -> tuple[float, float]:
-    """
-    Return the least and the greatest phi' [rad/s] while theta swings between two tilts.
-
-    They lie at the ends, or where d phi'/du = 0: L3 u^2 - 2 Lz u + L3 = 0.
-    """
+    """Return the least and the greatest phi' [rad/s] while theta swings between two tilts."""
+    # They lie at the ends, or where d phi'/du = 0: L3 u^2 - 2 Lz u + L3 = 0.
     tilts = [theta_min, theta_max]
     l3, lz = state.l3, state.lz
     if abs(lz) > abs(l3) > 0.0:

@@ -68,16 +68,13 @@ class CdrWriter:
         self.stamp()
         self.string(frame_id)
 
-    def end(self) -> None:
-        """Pad to four bytes, as RTPS does: what arrives is then what was sent."""
-        self.buffer += bytes(-len(self.buffer) % 4)
-
 
 class Template:
     """A serialized message whose stamps and fields are replaced, many messages at a time."""
 
     def __init__(self, writer: CdrWriter) -> None:
-        self._buffer = writer.buffer
+        # Padded to four bytes, as RTPS does: what arrives is then what was sent.
+        self._buffer = writer.buffer + bytes(-len(writer.buffer) % 4)
         self._stamps_at, self._fields = tuple(writer.stamps_at), tuple(writer.fields)
         # A message as a numpy type: the fields, and the stamps if there are any.
         columns = [(f'field{i}', f'({count},)f8', at)

@@ -56,7 +56,6 @@ def event(name: str, t_ns: int, sent_ns: int, **details: object) -> bytes:
     """
     Return an event as it is logged: std_msgs/String of JSON.
 
-    name : what happened
     t_ns : simulated time [ns]
     sent_ns : up to there all samples had been sent (-1: not even that of t = 0), of the motion
         that a reset ended [ns]

@@ -35,7 +35,6 @@ class Markers(Stream):
     parameter, topic, type_name = 'markers', 'markers', 'visualization_msgs/msg/MarkerArray'
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values)
         shape = self._shape = shape_of(parameters.top_of(values))
         length_ns = round(values['markers.trace_length'] * NANOSECONDS)
         self._count = min(values['markers.trace_points'], length_ns)
@@ -50,9 +49,9 @@ class Markers(Stream):
                  0.0, 0.0, far, rim, 0.0, far,
                  rim, 0.0, far, rim, 0.0, near,
                  rim, 0.0, near, 0.0, 0.0, near)
-        self.template = messages.markers(
+        super().__init__(values, messages.markers(
             values['world_frame'], (2.0 * shape.radius, 2.0 * shape.radius, shape.height), lines,
-            0.02 * abs(shape.tip), self._count + 1 if self._count else 0)
+            0.02 * abs(shape.tip), self._count + 1 if self._count else 0))
 
     def follow(self, segment: Segment) -> None:
         """Begin a new segment; forget those that the trace does not reach any more."""

@@ -110,7 +110,6 @@ def markers(frame_id: str, size: Sequence[float], lines: Sequence[float], line_w
     if trace_points:
         _marker(writer, frame_id, 'trace', LINE_STRIP, (0.5 * line_width, 0.0, 0.0), TRACE_COLOR,
                 'points', points=3 * trace_points * (0.0,))
-    writer.end()
     return Template(writer)
 
 

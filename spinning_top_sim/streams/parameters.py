@@ -86,7 +86,7 @@ class Parameter:
                 if isinstance(self.default, tuple):
                     return tuple(type(self.default[0])(item) for item in value)
                 return float(value) if self.is_double else value
-        raise ValueError(f'{self.name} = {value!r:.200}: {self.allowed}')
+        raise ValueError(f'{self.name} = {value!r}: {self.allowed}')
 
     def _is_allowed(self, value: Value) -> bool:
         default = self.default

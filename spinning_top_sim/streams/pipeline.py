@@ -23,13 +23,13 @@ from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.propagator import propagate
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.schedule import Instant, Schedule
 from spinning_top_sim.streams.segment import Segment
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import all_streams
 
-# Integration steps that the first nanosecond may take, and those of a block offline, whose
-# interpolants stay in the cache.
+# Steps that the first nanosecond may take; of a block offline: interpolants stay in the cache.
 FIRST_STEPS, OFFLINE_STEPS = 500, 2000
 # A motion whose exact solution ends before three years is refused when it begins.
 SHORTEST_RUN_NS = 10 ** 17
@@ -46,21 +46,15 @@ class Simulation:
     """
     One top in motion.
 
-    Parameters
-    ----------
-    values : checked parameters, see `parameters.checked`
     epoch_ns : stamp of t = 0 [ns]
-
-    Attributes
-    ----------
-    values, top : parameters of the run, and the top that they describe
+    values, top : checked parameters of the run, and the top that they describe
     streams : every stream; the caller sets `publish` of each, and records them with `log_to`
     now_ns : simulated time up to which every sample has been sent (-1: not even that of t = 0)
     l3, lz : as last commanded [kg m^2/s]
     history : applied commands since the start as (t_ns, l3, lz)
     segment : the motion since the last command
 
-    Raises ValueError or IntegrationError where there is no motion from the start state.
+    Raises ValueError where there is no motion from the start state.
     """
 
     def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
@@ -73,8 +67,7 @@ class Simulation:
         """
         Go back to the start state of these parameters; sinks, counts and stamps remain.
 
-        Raises ValueError or IntegrationError where there is no motion from there; then the present
-        one goes on.
+        Raises ValueError where there is no motion from there; then the present one goes on.
         """
         counts = self.steps, self.evaluations
         self._load(values, self.epoch_ns)
@@ -172,7 +165,6 @@ class Simulation:
         """
         Send every sample due up to `target_ns`; return whether that was reached.
 
-        target_ns : simulated time [ns]
         publish_from_ns : earlier samples are recorded, not published: they are too late
         give_way : asked between samples and between blocks of steps; True ends the call early.
             Nothing is lost: the next call goes on there.
@@ -295,11 +287,7 @@ class Simulation:
                 f'{theta!r} rad), where lz must equal {pole!r}; command both together')
         start = ContinuedState(theta=theta, theta_dot=float(now.theta_dot[0]),
                                phi=float(now.phi[0]), psi=float(now.psi[0]), l3=l3, lz=lz)
-        try:
-            segment = _segment(self.top, start, at_ns, self.values)
-        except (ArithmeticError, ValueError, RuntimeError) as error:
-            raise ValueError(f'l3 = {l3!r}, lz = {lz!r} kg m^2/s: no motion from theta = '
-                             f'{theta!r} rad: {error}') from error
+        segment = _segment(self.top, start, at_ns, self.values)
         self._steps_before, self._evaluations_before = self.steps, self.evaluations
         self._begin(segment)
         self.history.append((at_ns, l3, lz))
@@ -311,17 +299,20 @@ def _segment(top: Top, start: State, start_ns: int, values: Mapping[str, Any]) -
 
     Raises ValueError where the first nanosecond shows that there is none.
     """
-    solver = propagate(top, start, method=values['solver.method'],
-                       equations=values['solver.equations'], rtol=values['solver.rtol'],
-                       atol=values['solver.atol'])
-    rates = (f'theta_dot = {start.theta_dot!r} rad/s, l3 = {start.l3!r}, lz = {start.lz!r} '
-             'kg m^2/s')
-    segment = Segment(solver, start, start_ns)
-    if not math.isfinite(segment.energy):
-        raise ValueError(f'the energy would be {segment.energy!r} J with {rates}')
-    if not segment.reach(start_ns + 1, FIRST_STEPS):
-        raise ValueError(f'{rates} turn the top too fast: over {FIRST_STEPS} steps a nanosecond')
-    if isinstance(solver, ExactSolution) and solver.ns_limit < SHORTEST_RUN_NS:
-        raise ValueError(f'{rates} turn the top too fast: after {solver.time_limit:.3g} s a phase '
-                         'reaches 2^52 turns')
+    try:
+        solver = propagate(top, start, method=values['solver.method'],
+                           equations=values['solver.equations'], rtol=values['solver.rtol'],
+                           atol=values['solver.atol'])
+        segment = Segment(solver, start, start_ns)
+        if not math.isfinite(segment.energy):
+            raise ValueError(f'the energy would be {segment.energy!r} J')
+        if not segment.reach(start_ns + 1, FIRST_STEPS):
+            raise ValueError(f'it turns too fast: over {FIRST_STEPS} steps a nanosecond')
+        if isinstance(solver, ExactSolution) and solver.ns_limit < SHORTEST_RUN_NS:
+            raise ValueError(f'it turns too fast: after {solver.time_limit:.3g} s, not '
+                             f'{SHORTEST_RUN_NS / NANOSECONDS:g} s, a phase reaches 2^52 turns')
+    except (ArithmeticError, RuntimeError, ValueError) as error:
+        raise ValueError(f'no motion from theta = {start.theta!r} rad, theta_dot = '
+                         f'{start.theta_dot!r} rad/s with l3 = {start.l3!r}, lz = {start.lz!r} '
+                         f'kg m^2/s: {error}') from error
     return segment

@@ -36,8 +36,6 @@ class Delivery:
     """
     The sinks for one set of streams that are due together.
 
-    Attributes
-    ----------
     log_indices : numbers of the recorded streams in the log
     logged : places of their messages among all; None if all are recorded
     size : of the recorded messages together [bytes]
@@ -67,8 +65,6 @@ class Schedule:
     Blocks are computed where there is time: `prepare` in pieces after a tick, `compute` at once.
     What is sent does not depend on it.  `follow` comes first.
 
-    Attributes
-    ----------
     epoch_ns : stamp of t = 0 [ns]; after a change, call `invalidate`
     ready : instants that are computed and not yet sent
     computed_ns : every sample before this simulated time is sent or in `ready` [ns]
@@ -77,11 +73,6 @@ class Schedule:
     def __init__(self, streams: Sequence[Stream], epoch_ns: int) -> None:
         self._streams, self.epoch_ns = streams, epoch_ns
         self.ready: deque[Instant] = deque()
-        # Streams with sinks, and the first sample of each that is not computed.
-        self._active: list[Stream] = []
-        self._next_ns: list[int] = []
-        self._deliveries: dict[tuple[int, ...], Delivery] = {}      # by places in `_active`
-        self._shortest_ns = NEVER_NS
         for stream in streams:
             stream.on_change = self.invalidate
 
@@ -105,10 +96,11 @@ class Schedule:
         """
         if self.computed_ns <= now_ns:
             self._active = [stream for stream in self._streams if stream.has_sinks]
+            # The first sample of each that is not computed.
             self._next_ns = [stream.first_after(now_ns) for stream in self._active]
             self._shortest_ns = min((stream.period_ns for stream in self._active),
                                     default=NEVER_NS)
-            self._deliveries.clear()
+            self._deliveries: dict[tuple[int, ...], Delivery] = {}      # by places in `_active`
             self.ready.clear()
             self._work = None
             self.computed_ns = min(self._next_ns, default=NEVER_NS)
@@ -117,9 +109,8 @@ class Schedule:
         """
         Compute a block if there are samples due up to `until_ns` that are not computed.
 
-        now_ns : simulated time up to which everything is sent [ns]
-        until_ns : simulated time [ns]
-        budget_ns : time after which to stop and return False [ns]; the next call goes on there
+        Everything is sent up to `now_ns`.  Where a block takes longer than `budget_ns`, return
+        False: the next call goes on there.
         """
         if self._work is None:
             self.update(now_ns)

@@ -22,8 +22,6 @@ class Segment:
     """
     A motion from its start, or from a command, until the next command, in simulated time.
 
-    Attributes
-    ----------
     solver : its t = 0 is `start_ns`; only the segment lets it step
     start, start_ns : where it begins, and at which simulated time [ns]
     reached_ns : simulated time up to which no further steps are needed [ns]

@@ -18,8 +18,6 @@ class Stream:
     """
     One topic: samples at t = k * period, k = 0, 1, 2.., whoever listens and however ticks fall.
 
-    Attributes
-    ----------
     parameter : prefix of its parameters
     topic, type_name : of its messages
     template : Template
@@ -32,9 +30,9 @@ class Stream:
     parameter: str
     topic: str
     type_name: str
-    template: Template
 
-    def __init__(self, values: Mapping[str, Any]) -> None:
+    def __init__(self, values: Mapping[str, Any], template: Template) -> None:
+        self.template = template
         self._publish: Callable[[bytes], object] | None = None
         self.log_index: int | None = None
         self.on_change: Callable[[], None] = lambda: None

@@ -13,7 +13,7 @@ from typing import Any
 
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams import messages
-from spinning_top_sim.streams.cdr import Field
+from spinning_top_sim.streams.cdr import Field, Template
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.markers import Markers
 from spinning_top_sim.streams.segment import Segment
@@ -31,8 +31,7 @@ class Pose(Stream):
     parameter, topic, type_name = 'pose', 'pose', 'geometry_msgs/msg/PoseStamped'
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values)
-        self.template = messages.pose_stamped(values['world_frame'])
+        super().__init__(values, messages.pose_stamped(values['world_frame']))
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         return (states.rows_quaternion,)
@@ -44,8 +43,7 @@ class JointStates(Stream):
     parameter, topic, type_name = 'joint_states', 'joint_states', 'sensor_msgs/msg/JointState'
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values)
-        self.template = messages.joint_state(JOINTS)
+        super().__init__(values, messages.joint_state(JOINTS))
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         return ((states.phi, states.theta, states.psi),
@@ -59,8 +57,7 @@ class GroundTruthOdometry(Stream):
                                    'nav_msgs/msg/Odometry')
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values)
-        self.template = messages.odometry(values['world_frame'], values['body_frame'])
+        super().__init__(values, messages.odometry(values['world_frame'], values['body_frame']))
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         return states.rows_quaternion, states.rows_angular_velocity
@@ -73,22 +70,20 @@ class ImuStream(Stream):
     has_orientation, is_noisy = True, False
 
     def __init__(self, values: Mapping[str, Any], imu: Imu) -> None:
-        super().__init__(values)
-        self._frame_id: str = values['imu.frame_id']
-        self._imu = imu
-        self._use_sensor(values['imu.rate'])
+        self._frame_id, self._imu = values['imu.frame_id'], imu
+        super().__init__(values, self._template(values['imu.rate']))
 
     def apply(self, values: Mapping[str, Any]) -> None:
         super().apply(values)
         if 'imu.rate' in values:
-            self._use_sensor(values['imu.rate'])
+            self.template = self._template(values['imu.rate'])
             self.on_change()
 
-    def _use_sensor(self, rate: float) -> None:
-        # A density says how much noise a sample has at a rate.
-        self._sensor = self._imu.sensor(period_ns(rate))
+    def _template(self, imu_rate: float) -> Template:
+        """Use the sensor of this rate: a density says how much noise a sample has at a rate."""
+        self._sensor = self._imu.sensor(period_ns(imu_rate))
         variances = self._sensor.rate_variance, self._sensor.force_variance
-        self.template = messages.imu(
+        return messages.imu(
             self._frame_id,
             messages.EXACT if self.has_orientation else messages.UNKNOWN_ORIENTATION,
             *(messages.diagonal(variance if self.is_noisy else 0.0) for variance in variances))
@@ -138,8 +133,7 @@ class Invariants(Stream):
 
     parameter, topic, type_name = 'invariants', '~/invariants', 'std_msgs/msg/Float64MultiArray'
     def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values)
-        self.template = messages.float64_multi_array(INVARIANTS)
+        super().__init__(values, messages.float64_multi_array(INVARIANTS))
 
     def follow(self, segment: Segment) -> None:
         self._segment = segment
@@ -158,8 +152,7 @@ class Clock(Stream):
     parameter, topic, type_name = 'clock', '/clock', 'rosgraph_msgs/msg/Clock'
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values)
-        self.template = messages.clock()
+        super().__init__(values, messages.clock())
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         return ()
