@@ -94,8 +94,7 @@ class Template:
         """
         Return n messages as rows of bytes (n, size), valid until the next call.
 
-        stamps_ns : (n,) [ns]
-        values : the numbers of each field
+        They have these stamps (n,) [ns], and the numbers of each field.
         """
         count = len(stamps_ns)
         if len(self._rows) < count:

@@ -25,8 +25,6 @@ from spinning_top_sim.physics.states import States
 # Six columns or rows: three axes of the gyroscope, three of the accelerometer.
 Rows = NDArray[np.float64]
 NO_ERRORS = np.zeros((6, 1))
-# At rates that are changed often, old ones are forgotten.
-SENSORS_KEPT = 4
 # The bias changes this often, whatever the rate of the IMU.
 WALK_STEP_NS = 1_000_000
 # Random numbers are drawn for so many samples, or steps of the walk, together.
@@ -39,15 +37,15 @@ class Imu:
     """
     One IMU: at `imu.lever_arm` [m] and `imu.rpy` [rad] of the body frame.
 
-    What it measures there is `true`; what it reads there, `sensor(period_ns).read`.  `sensor`
-    takes the period of its samples [ns].
+    What it measures there is `true`; what it reads there with samples every `period_ns`,
+    `sensor(period_ns).read`.
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self._lever_arm: tuple[float, float, float] = values['imu.lever_arm']
         self._is_rotated = any(values['imu.rpy'])
         self._mounting = _quaternion(*values['imu.rpy'])
-        self.sensor: Callable[[int], Sensor] = lru_cache(SENSORS_KEPT)(partial(Sensor, values))
+        self.sensor: Callable[[int], Sensor] = lru_cache(4)(partial(Sensor, values))
 
     def orientation(self, states: States) -> Quaternion:
         """Return q(world <- IMU): columns x, y, z, w."""

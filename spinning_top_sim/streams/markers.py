@@ -36,10 +36,9 @@ class Markers(Stream):
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         shape = self._shape = shape_of(parameters.top_of(values))
-        length_ns = round(values['markers.trace_length'] * NANOSECONDS)
-        self._count = min(values['markers.trace_points'], length_ns)
-        self._spacing_ns = max(1, length_ns // max(self._count, 1))
-        self._length_ns = length_ns
+        self._length_ns = round(values['markers.trace_length'] * NANOSECONDS)
+        self._count = min(values['markers.trace_points'], self._length_ns)
+        self._spacing_ns = max(1, self._length_ns // max(self._count, 1))
         self._segments: deque[Segment] = deque()
         side = math.copysign(0.5 * shape.height, shape.tip)
         # Slightly outside, to be seen.

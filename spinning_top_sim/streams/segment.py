@@ -39,8 +39,7 @@ class Segment:
         """
         The exact solution of the same motion; None for a motion whose constants it cannot hold.
 
-        It is set up when it is first asked for: that takes milliseconds, and may be done in
-        another thread than the simulation's.
+        Its set-up takes milliseconds, and may be done in another thread than the simulation's.
         """
         if isinstance(self.solver, ExactSolution):
             return self.solver
