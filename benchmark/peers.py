@@ -299,9 +299,9 @@ class _Quadratic(Runner):
         q = tuple(quaternion.T)
         momentum = y[:, 4], y[:, 5], self.case.start.lz
         top = self.case.top
-        omega1, omega2 = (x / top.lambda1 for x in attitude.transverse_in_body(q, momentum))
-        along = sum(a * b for a, b in zip(attitude.axis_in_world(q), momentum, strict=True))
-        return Samples(quaternion, np.stack((omega1, omega2, along / top.lambda3), axis=1))
+        first, second, third = attitude.in_body(q, momentum)
+        return Samples(quaternion, np.stack(
+            (first / top.lambda1, second / top.lambda1, third / top.lambda3), axis=1))
 
 
 class _HeyokaQuadratic(_Quadratic):

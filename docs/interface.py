@@ -5,8 +5,7 @@
 from pathlib import Path
 
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.all_streams import all_streams
-from spinning_top_sim.streams.topics import INVARIANTS, JOINTS
+from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, all_streams
 
 HEAD = """<!-- Written by docs/interface.py from the code. -->
 # Interface of sim_node
@@ -29,8 +28,10 @@ AFTER_TOPICS = """| `/diagnostics` | diagnostic_msgs/msg/DiagnosticArray | 1 | y
 - `joint_states`: {joints}: φ, θ, ψ [rad], unwrapped, and their rates [rad/s].
 - `imu/data_raw` (REP-145): angular velocity [rad/s] and specific force [m/s²] in `imu.frame_id`, +g
   upwards at rest; `orientation_covariance[0]` = −1, because it has no orientation.
-- `imu/data`: the same with the orientation of the IMU in the world.
-- `ground_truth/imu_bias`: the bias that `imu/data_raw` contains.
+- `imu/data`: the same with the orientation of the IMU in the world. There is one IMU, which takes a
+  sample every 1/`imu.rate`: at other rates a reading has the white noise of the newest sample.
+- `ground_truth/imu_bias`: the bias that the readings contain. It depends on time and `seed` alone, and
+  changes every millisecond.
 - `ground_truth/imu`, `ground_truth/odom`: noise-free, with covariances of 0. The twist of the odometry
   is in the body frame.
 - `~/invariants`: one labelled dimension, {invariants}. Drifts are relative to the value at the start of

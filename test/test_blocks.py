@@ -64,9 +64,7 @@ def apply(simulation, what, first, second):
     if what == 'command':
         simulation.command(first * simulation.l3, second * simulation.lz)
     else:
-        for stream in simulation.streams:
-            if stream.parameter == first:
-                stream.set_rate(second)
+        simulation.apply({f'{first}.rate': second})
 
 
 class Run:

@@ -22,6 +22,7 @@ from spinning_top_sim.streams.imu import Imu, Sensor
 FIRST = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
 SECOND = np.array([-1 / 560, 8 / 315, -1 / 5, 8 / 5, -205 / 72, 8 / 5, -1 / 5, 8 / 315, -1 / 560])
 SECOND_NS = 1_000_000_000
+PERIOD_NS = 5_000_000
 NOISY = {'imu.gyroscope_noise_density': 1e-3, 'imu.gyroscope_random_walk': 2e-4,
          'imu.accelerometer_noise_density': 2e-2, 'imu.accelerometer_random_walk': 3e-3,
          'imu.gyroscope_turn_on_bias': 0.01, 'imu.accelerometer_turn_on_bias': 0.05}
@@ -108,23 +109,23 @@ def test_a_pendulum_reads_what_the_textbook_says():
 STILL = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
-def read(sensor, samples, exact=STILL):
-    """Return readings and bias in consecutive samples, (n, 6) each."""
-    return tuple(np.column_stack([np.broadcast_to(axis, len(samples)) for kind in found
+def read(sensor, times, exact=STILL):
+    """Return readings and bias at these times, (n, 6) each."""
+    return tuple(np.column_stack([np.broadcast_to(axis, len(times)) for kind in found
                                   for axis in kind])
-                 for found in (sensor.read(exact, samples), sensor.bias(samples)))
+                 for found in (sensor.read(exact, times), sensor.bias(times)))
 
 
-def readings(values, count, period_ns=5_000_000):
+def readings(values, count, period_ns=PERIOD_NS):
     """Return what an IMU at rest reads, (count, 6), its bias, and the sensor."""
     sensor = Sensor(parameters.checked(values), period_ns)
-    return *read(sensor, range(count)), sensor
+    return *read(sensor, range(0, count * period_ns, period_ns)), sensor
 
 
 def test_noise_has_the_covariance_that_is_published():
     rows, biases, sensor = readings(NOISY, 40_000)
     white = rows - biases
-    published = np.repeat([sensor.gyroscope.variance, sensor.accelerometer.variance], 3)
+    published = np.repeat([sensor.rate_variance, sensor.force_variance], 3)
     # A sample variance of n normal numbers has a relative deviation of sqrt(2/n): 5 of them.
     assert np.var(white, axis=0) == pytest.approx(published, rel=5.0 * math.sqrt(2.0 / 40_000))
     assert np.abs(np.mean(white, axis=0) / np.sqrt(published)).max() < 5.0 / math.sqrt(40_000)
@@ -205,22 +206,95 @@ def test_bias_walks_with_its_own_variance():
     walk = np.repeat([2e-4, 3e-3], 3) * math.sqrt(0.005)
     assert np.std(steps, axis=0) == pytest.approx(walk, rel=5.0 / math.sqrt(2.0 * 40_000))
     assert np.abs(np.mean(steps[:, :1] * steps[:, 1:2])) < 5.0 * walk[0] ** 2 / math.sqrt(40_000)
-    # No seam between blocks.
-    assert np.abs(steps[511::512] / walk).max() < 5.0
+    # A random walk at every scale, and no seam between the blocks in which it is drawn.
+    for apart in (1, 10, 100, 1000):
+        far = (biases[apart:] - biases[:-apart])[::apart]
+        assert np.std(far, axis=0) == pytest.approx(walk * math.sqrt(apart), rel=5.0 / math.sqrt(
+            2.0 * len(far)))
+    seams = np.flatnonzero(np.diff(np.arange(40_000) * 5 // 512))
+    assert np.abs(steps[seams] / walk).max() < 5.0
 
 
 def test_sample_k_depends_on_seed_and_k_alone():
     """Read forwards, backwards, at random, one by one and many together, across blocks of 512."""
     readings_at_once, biases, _ = readings(NOISY, 20_000)
-    sensor = Sensor(parameters.checked(NOISY), 5_000_000)
-    begins = [0, 511, 512, 1024, 19_999, *range(0, 19_000, 973)]
+    sensor = Sensor(parameters.checked(NOISY), PERIOD_NS)
+    begins = [0, 102, 103, 511, 512, 1024, 19_999, *range(0, 19_000, 973)]
     for order in (begins, begins[::-1], random.Random(1).sample(begins, len(begins))):
         for begin in order:
             for count in (1, 2, 600):
-                samples = range(begin, min(begin + count, 20_000))
-                found, bias = read(sensor, samples)
-                assert np.array_equal(found, readings_at_once[samples.start:samples.stop])
-                assert np.array_equal(bias, biases[samples.start:samples.stop])
+                end = min(begin + count, 20_000)
+                found, bias = read(sensor, range(begin * PERIOD_NS, end * PERIOD_NS, PERIOD_NS))
+                assert np.array_equal(found, readings_at_once[begin:end])
+                assert np.array_equal(bias, biases[begin:end])
+
+
+def by_time(simulation, taken, topic):
+    """Return the readings that were recorded of a stream: {t [ns]: rates and force, (6,)}."""
+    decode = stream(simulation, topic).template.decode
+    return {t_ns: np.ravel(decode(data)[1:]).tolist()
+            for name, t_ns, data in taken if name == topic}
+
+
+@pytest.mark.parametrize(('rate', 'other'), [(200.0, 100.0), (100.0, 250.0), (400.0, 400.0),
+                                             (1000.0, 40.0), (125.0, 1000.0)])
+def test_one_imu_has_one_noise_and_one_bias_at_all_rates(rate, other):
+    simulation = simulate(NOISY, imu__rate=rate, imu_data__rate=other)
+    taken = record(simulation)
+    simulation.advance(3 * SECOND_NS)
+    raw, data, bias = (by_time(simulation, taken, topic) for topic in (
+        'imu/data_raw', 'imu/data', 'ground_truth/imu_bias'))
+    common = raw.keys() & data.keys()
+    assert len(common) >= 4 and len(data) == 1 + 3 * other
+    assert all(raw[t_ns] == data[t_ns] for t_ns in common)
+    # White noise about the one bias, in every sample of the other rate too.
+    exact = simulate(imu_data__rate=other)
+    taken = record(exact, 'imu/data')
+    exact.advance(3 * SECOND_NS)
+    truth = by_time(exact, taken, 'imu/data')
+    path = Sensor(parameters.checked(NOISY), PERIOD_NS)
+    white = np.repeat([1e-3, 2e-2], 3) * math.sqrt(rate)
+    for t_ns, reading in data.items():
+        (offset,) = read(path, range(t_ns, t_ns + 1))[1].tolist()
+        assert bias.get(t_ns, offset) == offset
+        assert np.abs((np.array(reading) - truth[t_ns] - offset) / white).max() < 5.5
+
+
+def test_a_change_of_the_rate_leaves_the_bias_on_its_path():
+    def biases(*rates):
+        simulation = simulate(NOISY, imu__rate=200.0)
+        taken = record(simulation, 'ground_truth/imu_bias')
+        for number, rate in enumerate(rates, 1):
+            simulation.advance(number * SECOND_NS // 2 + 7)
+            simulation.apply({'imu.rate': rate})
+        simulation.advance(2 * SECOND_NS)
+        return by_time(simulation, taken, 'ground_truth/imu_bias')
+
+    steady, changed = biases(), biases(100.0, 1000.0, 40.0)
+    common = steady.keys() & changed.keys()
+    assert len(common) > 250
+    assert all(steady[t_ns] == changed[t_ns] for t_ns in common)
+
+
+def test_a_change_of_the_rate_changes_the_noise_of_every_topic():
+    simulation = simulate(NOISY)
+    simulation.apply({'imu.rate': 50.0})
+    for topic in ('imu/data_raw', 'imu/data'):
+        variances = doubles(stream(simulation, topic).template.encode_one(0), 24)[3:12:4]
+        assert variances == pytest.approx(3 * [1e-3 ** 2 * 50.0]), topic
+
+
+@pytest.mark.parametrize('t_ns', [86_400 * SECOND_NS, 10 ** 18])
+def test_a_jump_draws_few_numbers(t_ns, monkeypatch):
+    sensor = Sensor(parameters.checked({**NOISY, 'seed': t_ns}), PERIOD_NS)
+    draws, philox = [], np.random.Philox
+    monkeypatch.setattr(np.random, 'Philox',
+                        lambda **keys: (draws.append(keys), philox(**keys))[1])
+    there, _ = read(sensor, range(t_ns, t_ns + SECOND_NS, PERIOD_NS))
+    assert 3 < len(draws) < 100
+    later, _ = read(sensor, range(t_ns + SECOND_NS, t_ns + 2 * SECOND_NS, PERIOD_NS))
+    assert len(draws) < 120
+    assert np.std(there - later, axis=0).min() > 0.0
 
 
 def test_different_seeds_are_uncorrelated():
@@ -247,11 +321,12 @@ def test_readings_saturate_and_are_rounded():
                                  'imu.accelerometer_range': 20.0})
     sensor = Sensor(values, 5_000_000)
     exact = (((1.1, -0.1), (-9.0, 0.2), (3.99, 9.0)), ((1.1, 2.0), (-30.0, 2.0), (25.0, -2.0)))
-    found, _ = read(sensor, range(7, 9), tuple(tuple(map(np.array, kind)) for kind in exact))
+    found, _ = read(sensor, range(0, 2 * PERIOD_NS, PERIOD_NS),
+                    tuple(tuple(map(np.array, kind)) for kind in exact))
     assert found.tolist() == [[1.0, -4.0, 4.0, 1.1, -20.0, 20.0],
                               [0.0, 0.25, 4.0, 2.0, 2.0, -2.0]]
     assert not np.signbit(found[1, 0]), 'no reading is -0'
-    assert sensor.gyroscope.variance == pytest.approx(0.25 ** 2 / 12.0)
+    assert sensor.rate_variance == pytest.approx(0.25 ** 2 / 12.0)
 
 
 def test_equal_seeds_give_equal_bytes_in_any_company():
@@ -271,11 +346,11 @@ def test_equal_seeds_give_equal_bytes_in_any_company():
 
 
 def test_noise_that_was_read_is_not_kept():
-    sensor = Sensor(parameters.checked(NOISY), 1_000_000)
+    sensor = Sensor(parameters.checked(NOISY), PERIOD_NS)
 
     def in_use_after(*blocks):
         for block in blocks:
-            read(sensor, range(512 * block, 512 * block + 1))
+            read(sensor, range(512 * block * PERIOD_NS, 512 * block * PERIOD_NS + 1))
         gc.collect()
         return tracemalloc.get_traced_memory()[0]
 

@@ -176,7 +176,7 @@ def test_commands_for_hours_are_not_kept():
     for k in range(200):
         simulation.advance(k * 100_000_000)
         simulation.command(1.6, 1.3 + 0.001 * (k % 2))
-    assert len(stream(simulation, 'markers').past._references) < 15
+    assert len(stream(simulation, 'markers')._segments) < 15
 
 
 @pytest.mark.parametrize(('length', 'points'), [(0.0, 200), (1e-9, 1), (3e-9, 200), (0.1, 1),

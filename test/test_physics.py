@@ -106,8 +106,8 @@ def test_vectors_turn_into_the_body():
     v = (0.3, -1.1, 0.7)
     for _, state in random_states(10):
         into_body = rotation_of(state).inv()
-        transverse = np.array(attitude.transverse_in_body(state.rows_quaternion, v))[:, 0]
-        assert transverse == pytest.approx(into_body.apply(v)[:2], abs=1e-14)
+        in_body = np.array(attitude.in_body(state.rows_quaternion, v))[:, 0]
+        assert in_body == pytest.approx(into_body.apply(v), abs=1e-14)
         assert np.array(state.rows_vertical)[:, 0] == pytest.approx(
             into_body.apply((0.0, 0.0, 1.0)), abs=1e-14)
         assert np.array(state.rows_axis)[:, 0] == pytest.approx(

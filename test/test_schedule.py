@@ -93,7 +93,8 @@ def test_samples_of_one_instant_are_together_with_their_sinks():
 
 def test_without_sinks_nothing_is_ever_due():
     schedule, simulation = schedule_of()
-    assert schedule.next_due(-1) == NEVER_NS
+    schedule.update(-1)
+    assert schedule.computed_ns == NEVER_NS
     states = states_of(simulation)
     assert schedule.prepare(-1, 60 * SECOND)
     assert not schedule.ready and states.count == 0
@@ -189,7 +190,7 @@ def test_what_was_computed_ahead_is_dropped_when_it_no_longer_holds(change):
         if change == 'command':
             simulation.command(2.0, 1.5)
         elif change == 'rate':
-            pose.set_rate(300.0)
+            simulation.apply({'pose.rate': 300.0})
         elif change == 'subscriber':
             raw.publish = taken.append
         elif change == 'no subscriber':

@@ -13,7 +13,7 @@ from spinning_top_sim.nodes.pacing import FairLock
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.pipeline import Log, Simulation
-from spinning_top_sim.streams.topics import Stream
+from spinning_top_sim.streams.stream import Stream
 
 # Opening a log imports and loads libraries, so that is done where a log is opened.
 if TYPE_CHECKING:

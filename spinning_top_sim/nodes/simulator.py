@@ -119,7 +119,7 @@ class Simulator(Node):
             return
         self.destroy_timer(self._begin_timer)
         if self._values['max_error'] > 0.0:
-            self._simulation.segment.reference.prepare()    # its modules take a while to import
+            _ = self._simulation.segment.exact    # its modules take a while to import
         now_ns = self._date_ns()
         self._simulation.epoch_ns = next_epoch(now_ns)
         if not self._follows:
@@ -273,7 +273,7 @@ class Simulator(Node):
                 'clock slips; a recording stays complete, and /diagnostics counts', once=True)
         if self._values['max_error'] > 0.0:
             # Without the lock: it takes milliseconds, and ticks would wait.
-            self._simulation.segment.reference.prepare()
+            _ = self._simulation.segment.exact
         with self._lock:
             message = self._report.diagnostics(
                 self.get_clock().now().to_msg(), self.get_fully_qualified_name().lstrip('/'),
@@ -281,7 +281,7 @@ class Simulator(Node):
         self._diagnostics.publish(message)
 
     def _show_status(self) -> None:
-        self._simulation.segment.reference.prepare()
+        _ = self._simulation.segment.exact
         with self._lock:
             motion, line = self._report.new_motion(), self._report.status_line()
         if motion:

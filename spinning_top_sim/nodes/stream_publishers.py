@@ -14,7 +14,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from spinning_top_sim.nodes.recording_session import Topic
 from spinning_top_sim.streams import journal
-from spinning_top_sim.streams.topics import Stream
+from spinning_top_sim.streams.stream import Stream
 
 RECORDED_POLICIES = ('history', 'depth', 'reliability', 'durability', 'liveliness')
 

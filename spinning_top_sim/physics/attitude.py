@@ -58,14 +58,16 @@ def vertical_in_body(q: Quaternion) -> tuple[Column, Column, Column]:
     return (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), (w * w + z * z) - (x * x + y * y))
 
 
-def transverse_in_body(q: Quaternion, v: Vector) -> tuple[Column, Column]:
-    """Return the first two components in the body frame of a vector given in the world frame."""
+def in_body(q: Quaternion, v: Vector) -> tuple[Column, Column, Column]:
+    """Return the components in the body frame of a vector given in the world frame."""
     x, y, z, w = q
     vx, vy, vz = v
     return ((w * w + x * x - y * y - z * z) * vx + 2.0 * (x * y + w * z) * vy
             + 2.0 * (x * z - w * y) * vz,
             2.0 * (x * y - w * z) * vx + (w * w - x * x + y * y - z * z) * vy
-            + 2.0 * (y * z + w * x) * vz)
+            + 2.0 * (y * z + w * x) * vz,
+            2.0 * (x * z + w * y) * vx + 2.0 * (y * z - w * x) * vy
+            + (w * w - x * x - y * y + z * z) * vz)
 
 
 def precession_rate(top: Top, l3: float, lz: float, cos2_half: Number,

@@ -143,7 +143,7 @@ def regime(top: Top, state: State, coincide: float = COINCIDE) -> str:
     l3, lz = state.l3, state.lz
     scale = abs(l3) + abs(lz)
     low, high = swing(top, state)
-    resting = axis_rests(top, state, coincide)
+    resting = high - low <= coincide
     if top.gravity_torque == 0.0:
         return 'free top' if scale or state.theta_dot else 'at rest'
     if resting and 1.0 - abs(low) <= coincide:
@@ -161,23 +161,20 @@ def regime(top: Top, state: State, coincide: float = COINCIDE) -> str:
         return 'steady precession'
     if l3 == 0.0:
         return 'spherical pendulum'
-    turning = lz / l3
+    reversal = lz / l3          # cos(theta) at which phi' changes sign
     if lz == l3 and high >= 1.0 - coincide:
         return 'through the top'
     if lz == -l3 and low <= -1.0 + coincide:
         return 'through the bottom'
-    if min(abs(turning - low), abs(turning - high)) <= coincide * max(1.0, abs(turning)):
+    if min(abs(reversal - low), abs(reversal - high)) <= coincide * max(1.0, abs(reversal)):
         return 'cusps'
-    return 'loops' if low < turning < high else 'waves'
+    return 'loops' if low < reversal < high else 'waves'
 
 
 def precession_extremes(top: Top, state: State, theta_min: float,
                         theta_max: float) -> tuple[float, float]:
-    """
-    Return the least and the greatest phi' [rad/s] while theta swings between two tilts.
-
-    They lie at the ends, or where d phi'/du = 0: L3 u^2 - 2 Lz u + L3 = 0.
-    """
+    """Return the least and the greatest phi' [rad/s] while theta swings between two tilts."""
+    # They lie at the ends, or where d phi'/du = 0: L3 u^2 - 2 Lz u + L3 = 0.
     tilts = [theta_min, theta_max]
     l3, lz = state.l3, state.lz
     if abs(lz) > abs(l3) > 0.0:

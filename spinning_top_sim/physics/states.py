@@ -12,8 +12,6 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.top import State, Top
 
-PIVOT = (0.0, 0.0, 0.0)
-
 
 class States:
     """
@@ -149,7 +147,7 @@ class States:
 
     def specific_force(self, point: tuple[float, float, float]) -> Vector:
         """Return the specific force at a point r of the body [m], in the body frame [m/s^2]."""
-        if point == PIVOT:          # at rest: no rate is needed
+        if not any(point):          # the pivot is at rest: no rate is needed
             gravity = self.top.gravity
             x, y, z = self.rows_vertical
             return gravity * x, gravity * y, gravity * z

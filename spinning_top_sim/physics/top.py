@@ -132,12 +132,10 @@ def _freeze_as_floats(record: Top | State) -> None:
     """Store every field as a finite float, or say which one is not."""
     for field in fields(record):
         value = getattr(record, field.name)
-        if isinstance(value, bool):
-            raise ValueError(f'{field.name} = {value!r}: must be a finite number')
         try:
-            number = float(value)
+            number = math.nan if isinstance(value, bool) else float(value)
         except (TypeError, ValueError, OverflowError):
-            raise ValueError(f'{field.name} = {value!r}: must be a finite number') from None
+            number = math.nan
         if not math.isfinite(number):
             raise ValueError(f'{field.name} = {value!r}: must be a finite number')
         object.__setattr__(record, field.name, number)

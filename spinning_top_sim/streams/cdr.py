@@ -24,32 +24,38 @@ Field = NDArray[np.float64] | Sequence[NDArray[np.float64] | float]
 
 
 class CdrWriter:
-    """Appends fields in the order of the message definition; returns the offsets of numbers."""
+    """
+    Appends the parts of a message in the order of its definition.
+
+    stamps_at : offsets of its stamps
+    fields : offset and number of the doubles of each field, which differ from message to message
+    """
 
     def __init__(self) -> None:
         self.buffer = bytearray(ENCAPSULATION)
+        self.stamps_at: list[int] = []
+        self.fields: list[tuple[int, int]] = []
 
-    def append(self, code: str, *values: float) -> int:
-        """Append numbers of one type, a code of `struct`; return the offset of the first."""
+    def append(self, code: str, *values: float) -> None:
+        """Append numbers of one type, a code of `struct`."""
         if values:
             size = struct.calcsize('<' + code)
             self.buffer += bytes(-(len(self.buffer) - len(ENCAPSULATION)) % size)
-        at = len(self.buffer)
         self.buffer += struct.pack(f'<{len(values)}{code}', *values)
-        return at
 
-    def doubles(self, *values: float) -> int:
-        """Append a fixed array of doubles."""
-        return self.append('d', *values)
+    def doubles(self, *values: float) -> None:
+        """Append doubles that are the same in every message."""
+        self.append('d', *values)
 
-    def double_sequence(self, values: Sequence[float]) -> int:
-        """Append a sequence of doubles."""
-        self.append('I', len(values))
-        return self.doubles(*values)
+    def field(self, count: int) -> None:
+        """Append doubles that differ from message to message."""
+        self.doubles(*(count * (0.0,)))
+        self.fields.append((len(self.buffer) - 8 * count, count))
 
-    def stamp(self) -> int:
-        """Append a builtin_interfaces/Time of zero."""
-        return self.append('I', 0, 0)
+    def stamp(self) -> None:
+        """Append a builtin_interfaces/Time that differs from message to message."""
+        self.append('I', 0, 0)
+        self.stamps_at.append(len(self.buffer) - 8)
 
     def string(self, text: str) -> None:
         """Append a string."""
@@ -57,35 +63,19 @@ class CdrWriter:
         self.append('I', len(data))
         self.buffer += data
 
-    def strings(self, texts: Sequence[str]) -> None:
-        """Append a sequence of strings."""
-        self.append('I', len(texts))
-        for text in texts:
-            self.string(text)
-
-    def end(self) -> None:
-        """Pad to four bytes, as RTPS does: what arrives is then what was sent."""
-        self.buffer += bytes(-len(self.buffer) % 4)
+    def header(self, frame_id: str) -> None:
+        """Append a std_msgs/Header."""
+        self.stamp()
+        self.string(frame_id)
 
 
 class Template:
-    """
-    A serialized message whose stamp and numbers are replaced, many messages at a time.
+    """A serialized message whose stamps and fields are replaced, many messages at a time."""
 
-    Bytes outside of stamps and fields stay as they are.
-
-    Parameters
-    ----------
-    writer : the message
-    stamps_at : offsets of its stamps: none, one, or one of each part of an array
-    fields : offset and number of the doubles of each field
-    """
-
-    def __init__(self, writer: CdrWriter, stamps_at: Sequence[int],
-                 fields: Sequence[tuple[int, int]]) -> None:
-        self._buffer = writer.buffer
-        self._stamps_at = tuple(stamps_at)
-        self._fields = tuple(fields)
+    def __init__(self, writer: CdrWriter) -> None:
+        # Padded to four bytes, as RTPS does: what arrives is then what was sent.
+        self._buffer = writer.buffer + bytes(-len(writer.buffer) % 4)
+        self._stamps_at, self._fields = tuple(writer.stamps_at), tuple(writer.fields)
         # A message as a numpy type: the fields, and the stamps if there are any.
         columns = [(f'field{i}', f'({count},)f8', at)
                    for i, (at, count) in enumerate(self._fields)]
@@ -104,8 +94,7 @@ class Template:
         """
         Return n messages as rows of bytes (n, size), valid until the next call.
 
-        stamps_ns : (n,) [ns]
-        values : the numbers of each field
+        They have these stamps (n,) [ns], and the numbers of each field.
         """
         count = len(stamps_ns)
         if len(self._rows) < count:

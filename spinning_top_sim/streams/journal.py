@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from spinning_top_sim.streams import messages
-from spinning_top_sim.streams.topics import Stream
+from spinning_top_sim.streams.stream import Stream
 
 NODE_NAME = 'spinning_top'
 COMMANDS, EVENTS = '~/commands', '~/events'
@@ -28,12 +28,7 @@ def recorded_streams(streams: Sequence[Stream], values: Mapping[str, Any]) -> li
 
 
 def resolve_topic(topic: str, namespace: str) -> str:
-    """
-    Return a topic's full name, as ROS resolves it for the node spinning_top.
-
-    topic : relative ('pose'), private ('~/commands') or absolute ('/clock')
-    namespace : of the node, with or without slashes at its ends
-    """
+    """Return the full name of a topic, as ROS resolves it for the node in this namespace."""
     if topic.startswith('/'):
         return topic
     parts = [namespace.strip('/'), topic.replace('~', NODE_NAME, 1)]
@@ -54,10 +49,8 @@ def command(l3: float, lz: float) -> bytes:
 
 def event(name: str, t_ns: int, sent_ns: int, **details: object) -> bytes:
     """
-    Return an event as it is logged: std_msgs/String of JSON.
+    Return an event at the simulated time `t_ns` as it is logged: std_msgs/String of JSON.
 
-    name : what happened
-    t_ns : simulated time [ns]
     sent_ns : up to there all samples had been sent (-1: not even that of t = 0), of the motion
         that a reset ended [ns]
     details : further members of the JSON object

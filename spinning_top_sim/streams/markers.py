@@ -15,37 +15,8 @@ from spinning_top_sim.physics.shape import shape_of
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams import messages, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS, Field
-from spinning_top_sim.streams.segment import Axis, Reference, Segment
-from spinning_top_sim.streams.topics import Stream
-
-
-class PastAxis:
-    """
-    Where the symmetry axis was in the last `length_ns`, over all segments, by the exact solution.
-
-    Each segment is followed from its start to the command that ended it, that instant included.
-    """
-
-    def __init__(self, length_ns: int) -> None:
-        self._length_ns = length_ns
-        self._references: deque[Reference] = deque()
-
-    def begin(self, reference: Reference) -> None:
-        """Begin a new segment; forget those that the trace does not reach any more."""
-        self._references.append(reference)
-        oldest_ns = reference.start_ns - self._length_ns
-        while len(self._references) > 1 and self._references[1].start_ns < oldest_ns:
-            self._references.popleft()
-
-    def axis(self, times_ns: NDArray[np.int64]) -> Axis:
-        """Return the axis in the world at ascending simulated times (n,) [ns]."""
-        begins = [reference.start_ns for reference in self._references]
-        # A segment ends with the command that begins the next one.
-        ends = np.searchsorted(times_ns, begins[1:], 'right')
-        parts = [reference.axis(times) for reference, times in zip(
-            self._references, np.split(times_ns, ends), strict=True) if len(times)]
-        x, y, z = (np.concatenate(rows) for rows in zip(*parts, strict=True))
-        return x, y, z
+from spinning_top_sim.streams.segment import Axis, Segment
+from spinning_top_sim.streams.stream import Stream
 
 
 class Markers(Stream):
@@ -64,12 +35,11 @@ class Markers(Stream):
     parameter, topic, type_name = 'markers', 'markers', 'visualization_msgs/msg/MarkerArray'
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values)
         shape = self._shape = shape_of(parameters.top_of(values))
-        length_ns = round(values['markers.trace_length'] * NANOSECONDS)
-        self._count = min(values['markers.trace_points'], length_ns)
-        self._spacing_ns = max(1, length_ns // max(self._count, 1))
-        self.past = PastAxis(length_ns)
+        self._length_ns = round(values['markers.trace_length'] * NANOSECONDS)
+        self._count = min(values['markers.trace_points'], self._length_ns)
+        self._spacing_ns = max(1, self._length_ns // max(self._count, 1))
+        self._segments: deque[Segment] = deque()
         side = math.copysign(0.5 * shape.height, shape.tip)
         # Slightly outside, to be seen.
         rim, far, near = (1.01 * shape.radius, shape.centre + 1.01 * side,
@@ -78,12 +48,16 @@ class Markers(Stream):
                  0.0, 0.0, far, rim, 0.0, far,
                  rim, 0.0, far, rim, 0.0, near,
                  rim, 0.0, near, 0.0, 0.0, near)
-        self.template = messages.markers(
+        super().__init__(values, messages.markers(
             values['world_frame'], (2.0 * shape.radius, 2.0 * shape.radius, shape.height), lines,
-            0.02 * abs(shape.tip), self._count + 1 if self._count else 0)
+            0.02 * abs(shape.tip), self._count + 1 if self._count else 0))
 
     def follow(self, segment: Segment) -> None:
-        self.past.begin(segment.reference)
+        """Begin a new segment; forget those that the trace does not reach any more."""
+        self._segments.append(segment)
+        oldest_ns = segment.start_ns - self._length_ns
+        while len(self._segments) > 1 and self._segments[1].start_ns < oldest_ns:
+            self._segments.popleft()
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         axis = states.rows_axis
@@ -99,10 +73,19 @@ class Markers(Stream):
         fresh = np.minimum(np.diff(newest, prepend=newest[0] - count), count)
         ends = np.cumsum(fresh)
         grid = np.repeat(newest + 1 - ends, fresh) + np.arange(ends[-1])
-        points = np.stack(self.past.axis(np.maximum(grid * self._spacing_ns, 0)), axis=-1)
+        points = self._past_axis(np.maximum(grid * self._spacing_ns, 0))
         traces = np.empty((len(times), count + 1, 3))
         for row, end in zip(traces, ends.tolist(), strict=True):
             row[:-1] = points[end - count:end]
         traces[:, -1] = np.stack(axis, axis=-1)
         traces *= self._shape.tip
         return traces.reshape(len(times), -1)
+
+    def _past_axis(self, times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the axis in the world at ascending times of the last `trace_length`, (n, 3)."""
+        begins = [segment.start_ns for segment in self._segments]
+        # A segment ends with the command that begins the next one, that instant included.
+        ends = np.searchsorted(times_ns, begins[1:], 'right')
+        parts = [np.stack(segment.exact_axis(times), axis=-1) for segment, times in zip(
+            self._segments, np.split(times_ns, ends), strict=True) if len(times)]
+        return np.concatenate(parts)

@@ -35,16 +35,18 @@ class Parameter:
     """
     One parameter.  Its type is that of the default; None is a double that may be left unset.
 
-    minimum, maximum: inclusive;  above: exclusive lower bound;  choices: allowed strings
+    minimum, maximum : of a number, or of each number in a list
+    or_zero : 0 is allowed too
+    choices : allowed strings
     """
 
     name: str
     default: Value
     text: str
     unit: str = ''
-    minimum: float | None = None
-    maximum: float | None = None
-    above: float | None = None
+    minimum: float = -math.inf
+    maximum: float = math.inf
+    or_zero: bool = False
     choices: tuple[str, ...] = ()
     effect: Effect = Effect.NOW
 
@@ -57,13 +59,9 @@ class Parameter:
     def description(self) -> str:
         """Return text, unit, range and effect as one line."""
         unit = f' [{self.unit}]' if self.unit else ''
-        allowed = f'; {self.allowed}' if self.choices or self._bounds() else ''
+        allowed = f'; {self.allowed}' if self.choices or self.maximum < math.inf else ''
         unset = '; unset: L3 cos(theta0), the cusp' if self.default is None else ''
         return f'{self.text}{unit}{allowed}{unset}; a change takes effect {self.effect.value}'
-
-    def _bounds(self) -> str:
-        bounds = ('>', self.above), ('>=', self.minimum), ('<=', self.maximum)
-        return ' and '.join(f'{sign} {bound:g}' for sign, bound in bounds if bound is not None)
 
     @property
     def allowed(self) -> str:
@@ -75,13 +73,15 @@ class Parameter:
         if isinstance(self.default, tuple):
             kind = ('a list of strings' if isinstance(self.default[0], str)
                     else f'a list of {len(self.default)} numbers')
-        return f'must be {kind} {self._bounds()}'.rstrip()
+        zero = '0 or ' if self.or_zero else ''
+        bounds = (f' from {self.minimum:g} to {self.maximum:g}' if self.maximum < math.inf else '')
+        return f'must be {zero}{kind}{bounds}'
 
     def check(self, value: Value) -> Value:
         """Return the value in its own type.  Raises ValueError with name, value, allowed."""
         if value is None and self.default is None:
             return None
-        with contextlib.suppress(TypeError, OverflowError):
+        with contextlib.suppress(TypeError):
             if self._is_allowed(value):
                 if isinstance(self.default, tuple):
                     return tuple(type(self.default[0])(item) for item in value)
@@ -91,23 +91,18 @@ class Parameter:
     def _is_allowed(self, value: Value) -> bool:
         default = self.default
         if isinstance(default, tuple):
-            items = tuple(value)
             if isinstance(value, str | bytes):
                 return False
             if isinstance(default[0], str):
-                return all(isinstance(item, str) for item in items)
-            return len(items) == len(default) and all(map(_is_number, items))
+                return all(isinstance(item, str) for item in value)
+            return len(value) == len(default) and all(map(self._is_in_range, value))
         if isinstance(default, bool | str):
             return isinstance(value, type(default)) and (not self.choices or value in self.choices)
-        return (_is_number(value) and (self.is_double or isinstance(value, int))
-                and (self.above is None or value > self.above)
-                and (self.minimum is None or value >= self.minimum)
-                and (self.maximum is None or value <= self.maximum))
+        return (self.is_double or isinstance(value, int)) and self._is_in_range(value)
 
-
-def _is_number(value: Value) -> bool:
-    return (isinstance(value, int | float) and not isinstance(value, bool)
-            and math.isfinite(value))
+    def _is_in_range(self, number: Value) -> bool:
+        return (isinstance(number, int | float) and not isinstance(number, bool)
+                and (self.minimum <= number <= self.maximum or (self.or_zero and number == 0)))
 
 
 # name, default rate [Hz], on by default, what it is
@@ -122,23 +117,27 @@ STREAM_DEFAULTS = (
     ('markers', 20.0, False, 'markers (visualization_msgs/MarkerArray)'),
     ('clock', 100.0, False, '/clock (rosgraph_msgs/Clock)'),
 )
-HIGHEST_RATE = 10_000.0
+LOWEST_RATE, HIGHEST_RATE = 1e-6, 10_000.0
 
 
-def _streams() -> list[Parameter]:
-    rows = []
-    for name, rate, enabled, text in STREAM_DEFAULTS:
-        rows.append(Parameter(f'{name}.enabled', enabled, f'Whether there is {text}'))
-        rows.append(Parameter(f'{name}.rate', rate, f'Rate of {text}', 'Hz', above=0.0,
-                              maximum=HIGHEST_RATE))
-    return rows
+# Values of physics up to here have squares and products that doubles hold.
+LARGEST, SMALLEST = 1e30, 1e-30
+# The longest time of anything [s], three years.
+LONGEST = 1e8
+
+
+def _stream(name: str, rate: float, enabled: bool, text: str) -> tuple[Parameter, Parameter]:
+    return (Parameter(f'{name}.enabled', enabled, f'Whether there is {text}; a recording keeps '
+                      'the streams that it began with'),
+            Parameter(f'{name}.rate', rate, f'Rate of {text}', 'Hz', LOWEST_RATE, HIGHEST_RATE))
 
 
 def _axes(kind: str, unit: str) -> list[Parameter]:
     """Return the error model of three axes; names and units of the first two are kalibr's."""
     walk = {'rad/s': 'rad/s^2', 'm/s^2': 'm/s^3'}[unit]
     return [
-        Parameter(f'imu.{kind}_{name}', 0.0, text, unit_text, minimum=0.0, effect=Effect.RESET)
+        Parameter(f'imu.{kind}_{name}', 0.0, text, unit_text, 1e-12, 1e12, or_zero=True,
+                  effect=Effect.RESET)
         for name, text, unit_text in (
             ('noise_density', f'White noise of the {kind}, 0 = none', f'{unit}/sqrt(Hz)'),
             ('random_walk', f'Random walk of the bias of the {kind}, 0 = none',
@@ -149,78 +148,78 @@ def _axes(kind: str, unit: str) -> list[Parameter]:
 
 
 TABLE: tuple[Parameter, ...] = (
-    Parameter('top.mass', 2.0, 'Mass of the top', 'kg', minimum=0.0, effect=Effect.RESET),
+    Parameter('top.mass', 2.0, 'Mass of the top', 'kg', 0.0, LARGEST, effect=Effect.RESET),
     Parameter('top.com_distance', 0.15, 'From the pivot to the centre of mass along the axis, '
-              'signed', 'm', effect=Effect.RESET),
+              'signed', 'm', -LARGEST, LARGEST, effect=Effect.RESET),
     Parameter('top.lambda1', 0.123, 'Moment of inertia across the axis, about the pivot',
-              'kg m^2', above=0.0, effect=Effect.RESET),
-    Parameter('top.lambda3', 0.15, 'Moment of inertia along the axis', 'kg m^2', above=0.0,
+              'kg m^2', SMALLEST, LARGEST, effect=Effect.RESET),
+    Parameter('top.lambda3', 0.15, 'Moment of inertia along the axis', 'kg m^2', SMALLEST,
+              LARGEST, effect=Effect.RESET),
+    Parameter('top.gravity', 9.80665, 'Gravity, downwards positive', 'm/s^2', -LARGEST, LARGEST,
               effect=Effect.RESET),
-    Parameter('top.gravity', 9.80665, 'Gravity, downwards positive', 'm/s^2',
+    Parameter('initial.theta', math.radians(30.0), 'Tilt at the start', 'rad', 0.0, math.pi,
               effect=Effect.RESET),
-    Parameter('initial.theta', math.radians(30.0), 'Tilt at the start', 'rad', minimum=0.0,
-              maximum=math.pi, effect=Effect.RESET),
-    Parameter('initial.theta_dot', 0.0, 'Nutation rate at the start', 'rad/s',
+    Parameter('initial.theta_dot', 0.0, 'Nutation rate at the start', 'rad/s', -1e12, 1e12,
               effect=Effect.RESET),
-    Parameter('initial.phi', 0.0, 'Precession angle at the start', 'rad', effect=Effect.RESET),
-    Parameter('initial.psi', 0.0, 'Spin angle at the start', 'rad', effect=Effect.RESET),
+    Parameter('initial.phi', 0.0, 'Precession angle at the start', 'rad', -1e12, 1e12,
+              effect=Effect.RESET),
+    Parameter('initial.psi', 0.0, 'Spin angle at the start', 'rad', -1e12, 1e12,
+              effect=Effect.RESET),
     Parameter('spin.l3', 1.6, 'Angular momentum along the axis; a change is a command',
-              'kg m^2/s'),
+              'kg m^2/s', -LARGEST, LARGEST),
     Parameter('spin.lz', None, 'Angular momentum along the vertical; a change is a command',
-              'kg m^2/s'),
+              'kg m^2/s', -LARGEST, LARGEST),
     Parameter('solver.method', 'rk45', 'Dormand-Prince steps or the closed form',
               choices=METHODS, effect=Effect.RESET),
     Parameter('solver.equations', 'transport', "rk45: regular form, or the paper's to the letter",
               choices=EQUATIONS, effect=Effect.RESET),
-    Parameter('solver.rtol', 1e-11, 'rk45: relative tolerance of a step', minimum=1e-14,
-              maximum=1e-2, effect=Effect.RESET),
-    Parameter('solver.atol', 1e-12, 'rk45: absolute tolerance of a step', minimum=0.0,
-              maximum=1e-2, effect=Effect.RESET),
+    Parameter('solver.rtol', 1e-11, 'rk45: relative tolerance of a step', '', 1e-14, 1e-2,
+              effect=Effect.RESET),
+    Parameter('solver.atol', 1e-12, 'rk45: absolute tolerance of a step', '', 0.0, 1e-2,
+              effect=Effect.RESET),
     Parameter('max_error', 1e-6, 'rk45: warn in /diagnostics when the orientation is further '
-              'from the exact solution; 0 = do not look', 'rad', minimum=0.0),
+              'from the exact solution; 0 = do not look', 'rad', 0.0, 1e6),
     Parameter('pacing', 'timer', 'Without effect, and accepted for older files: a thread with '
               'absolute deadlines makes the ticks', choices=('timer', 'thread'),
               effect=Effect.START),
-    Parameter('tick_rate', 200.0, 'How often due samples are sent', 'Hz', above=0.0,
-              maximum=HIGHEST_RATE),
-    Parameter('time_scale', 1.0, 'Simulated over real time', above=0.0, maximum=1e6),
+    Parameter('tick_rate', 200.0, 'How often due samples are sent', 'Hz', 1e-2, HIGHEST_RATE),
+    Parameter('time_scale', 1.0, 'Simulated over real time', '', 1e-6, 1e6),
     Parameter('start_paused', False, 'Wait for ~/set_pause or ~/step', effect=Effect.START),
     Parameter('publish_clock', False, 'Publish /clock (the same as clock.enabled)',
               effect=Effect.START),
     Parameter('world_frame', 'world', 'Frame of the pivot, z up', effect=Effect.START),
     Parameter('body_frame', 'base_link', 'Frame of the body, z along its axis',
               effect=Effect.START),
-    Parameter('seed', 0, 'Seed of the noise', minimum=0, maximum=2 ** 63 - 1,
-              effect=Effect.RESET),
-    *_streams(),
+    Parameter('seed', 0, 'Seed of the noise', '', 0, 2 ** 63 - 1, effect=Effect.RESET),
+    *(parameter for row in STREAM_DEFAULTS for parameter in _stream(*row)),
     Parameter('imu.frame_id', 'imu_link', 'Frame of the IMU', effect=Effect.START),
-    Parameter('imu.lever_arm', (0.0, 0.0, 0.0), 'Position of the IMU in the body', 'm',
-              effect=Effect.RESET),
+    Parameter('imu.lever_arm', (0.0, 0.0, 0.0), 'Position of the IMU in the body', 'm', -1e12,
+              1e12, effect=Effect.RESET),
     Parameter('imu.rpy', (0.0, 0.0, 0.0), 'Orientation of the IMU in the body, roll, pitch and '
-              'yaw about fixed axes', 'rad', effect=Effect.RESET),
+              'yaw about fixed axes', 'rad', -1e6, 1e6, effect=Effect.RESET),
     *_axes('gyroscope', 'rad/s'),
     *_axes('accelerometer', 'm/s^2'),
     Parameter('markers.trace_length', 4.0, 'How far back the trace of the tip goes, 0 = no trace',
-              's', minimum=0.0, maximum=3600.0, effect=Effect.RESET),
-    Parameter('markers.trace_points', 200, 'Points of the trace, evenly spaced in time',
-              minimum=1, maximum=10_000, effect=Effect.RESET),
-    Parameter('duration', 0.0, 'End after this much simulated time, 0 = never', 's',
-              minimum=0.0),
+              's', 0.0, 3600.0, effect=Effect.RESET),
+    Parameter('markers.trace_points', 200, 'Points of the trace, evenly spaced in time', '', 1,
+              10_000, effect=Effect.RESET),
+    Parameter('duration', 0.0, 'End after this much simulated time, 0 = never', 's', 1e-9,
+              LONGEST, or_zero=True),
     Parameter('record.enabled', False, 'Record from the start', effect=Effect.START),
     Parameter('record.uri', '', 'File or folder of a recording; empty: '
               'spinning_top_<date>_<time>.mcap here', effect=Effect.RECORDING),
     Parameter('record.streams', ('all',), 'Which streams to record, by name; all: each enabled '
               'one', effect=Effect.RECORDING),
-    Parameter('record.max_loss', 0.5, 'At most this much is lost by a power cut', 's',
-              minimum=0.01, maximum=60.0, effect=Effect.RECORDING),
+    Parameter('record.max_loss', 0.5, 'At most this much is lost by a power cut', 's', 0.01, 60.0,
+              effect=Effect.RECORDING),
     Parameter('record.compression', 'zstd', 'Compression of the chunks',
               choices=('zstd', 'lz4', 'none'), effect=Effect.RECORDING),
     Parameter('record.min_free_bytes', 100_000_000, 'Stop recording when the disk has less free',
-              'bytes', minimum=0, effect=Effect.RECORDING),
-    Parameter('step.count', 1, 'Steps of one ~/step', minimum=1, maximum=1_000_000),
-    Parameter('step.dt', 0.01, 'Simulated time of one step', 's', minimum=1e-6, maximum=1e3),
-    Parameter('status_period', 1.0, 'Of the status line on the terminal, 0 = none', 's',
-              minimum=0.0),
+              'bytes', 0, 2 ** 62, effect=Effect.RECORDING),
+    Parameter('step.count', 1, 'Steps of one ~/step', '', 1, 1_000_000),
+    Parameter('step.dt', 0.01, 'Simulated time of one step', 's', 1e-6, 1e3),
+    Parameter('status_period', 1.0, 'Of the status line on the terminal, 0 = none', 's', 0.01,
+              LONGEST, or_zero=True),
 )
 BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in TABLE}
 

@@ -21,18 +21,16 @@ from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.solvers.propagator import Propagator, propagate
+from spinning_top_sim.solvers.propagator import propagate
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.all_streams import all_streams
+from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.schedule import Instant, Schedule
 from spinning_top_sim.streams.segment import Segment
-from spinning_top_sim.streams.topics import Stream
+from spinning_top_sim.streams.stream import Stream
+from spinning_top_sim.streams.topics import all_streams
 
-# Integration steps between two looks at whether to give way: about 5 ms.
-STEPS_AT_ONCE = 500
-# Steps of a block offline: their interpolants stay in the cache.
-STEPS_IN_A_BLOCK = 2000
-
+# Steps that the first nanosecond may take; of a block offline: interpolants stay in the cache.
+FIRST_STEPS, OFFLINE_STEPS = 500, 2000
 # A motion whose exact solution ends before three years is refused when it begins.
 SHORTEST_RUN_NS = 10 ** 17
 
@@ -48,21 +46,15 @@ class Simulation:
     """
     One top in motion.
 
-    Parameters
-    ----------
-    values : checked parameters, see `parameters.checked`
     epoch_ns : stamp of t = 0 [ns]
-
-    Attributes
-    ----------
-    values, top : parameters of the run, and the top that they describe
+    values, top : checked parameters of the run, and the top that they describe
     streams : every stream; the caller sets `publish` of each, and records them with `log_to`
     now_ns : simulated time up to which every sample has been sent (-1: not even that of t = 0)
     l3, lz : as last commanded [kg m^2/s]
     history : applied commands since the start as (t_ns, l3, lz)
     segment : the motion since the last command
 
-    Raises ValueError or IntegrationError where there is no motion from the start state.
+    Raises ValueError where there is no motion from the start state.
     """
 
     def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
@@ -75,8 +67,7 @@ class Simulation:
         """
         Go back to the start state of these parameters; sinks, counts and stamps remain.
 
-        Raises ValueError or IntegrationError where there is no motion from there; then the present
-        one goes on.
+        Raises ValueError where there is no motion from there; then the present one goes on.
         """
         counts = self.steps, self.evaluations
         self._load(values, self.epoch_ns)
@@ -85,7 +76,7 @@ class Simulation:
     def _load(self, values: Mapping[str, Any], epoch_ns: int) -> None:
         # All that may be refused, before anything changes.
         top, start = parameters.top_of(values), parameters.start_state(values)
-        segment = Segment(_propagate(top, start, values), start, 0)
+        segment = _segment(top, start, 0, values)
         streams = all_streams(values)
         self.values, self.top = dict(values), top
         self.history: list[tuple[int, float, float]] = []
@@ -152,34 +143,30 @@ class Simulation:
 
     def describe(self) -> Description | None:
         """Return the present motion in numbers; None where the closed form cannot hold it."""
-        exact = self.segment.reference.solution
+        exact = self.segment.exact
         return None if exact is None else exact.describe()
 
     # ------------------------------------------------------------------------------ sending
 
-    def log_to(self, write: Log, streams: Sequence[Stream]) -> None:
+    def log_to(self, write: Log | None, streams: Sequence[Stream] = ()) -> None:
         """
-        Record these streams from now on; no streams: record nothing.
+        Record these streams from now on, and no others.
 
-        A stream has the number in the log that it has in `streams`.
+        write : takes their samples from `advance`; None if `advance_in_blocks` sends them
+        streams : a stream has the number in the log that it has here
         """
         self._log = write
         for stream in self.streams:
             stream.log_index = streams.index(stream) if stream in streams else None
         self._schedule.invalidate()
 
-    def record_blocks(self, streams: Sequence[Stream]) -> None:
-        """Record these streams by `advance_in_blocks` from now on."""
-        self.log_to(lambda *_: None, streams)
-
     def advance(self, target_ns: int, publish_from_ns: int = 0,
                 give_way: Callable[[], bool] = lambda: False) -> bool:
         """
         Send every sample due up to `target_ns`; return whether that was reached.
 
-        target_ns : simulated time [ns]
         publish_from_ns : earlier samples are recorded, not published: they are too late
-        give_way : asked between samples, and within long integrations; True ends the call early.
+        give_way : asked between samples and between blocks of steps; True ends the call early.
             Nothing is lost: the next call goes on there.
 
         Raises IntegrationError if the equations cannot go on.
@@ -188,25 +175,25 @@ class Simulation:
             for stream in self.streams:
                 if stream.publish is not None and stream.log_index is None:
                     stream.skip(self.now_ns, publish_from_ns)
-        schedule = self._schedule
+        schedule, segment = self._schedule, self.segment
         ready = schedule.ready
-        sent = False
+        moved = False
         while True:
-            due_ns = ready[0][0] if ready else schedule.next_due(self.now_ns)
-            if due_ns > target_ns:
-                break
-            if sent and give_way():
+            schedule.update(self.now_ns)
+            due_ns = ready[0][0] if ready else schedule.computed_ns
+            if due_ns > target_ns and target_ns <= segment.reached_ns:
+                self.now_ns = max(self.now_ns, target_ns)
+                return True
+            if moved and give_way():
                 return False
+            moved = True
             if not ready:
-                if due_ns > schedule.reached_ns and not self._reach(due_ns, give_way):
-                    return False
                 schedule.compute(self.now_ns, target_ns)
-            self._send(ready.popleft(), due_ns >= publish_from_ns)
-            sent = True
-        if target_ns > schedule.reached_ns and not self._reach(target_ns, give_way):
-            return False
-        self.now_ns = max(self.now_ns, target_ns)
-        return True
+            if ready and due_ns <= target_ns:
+                self._send(ready.popleft(), due_ns >= publish_from_ns)
+            else:               # there were only steps to take
+                self.now_ns = max(self.now_ns, min(segment.reached_ns, due_ns - 1, target_ns))
+                segment.release(self.now_ns)
 
     def send_ready(self, target_ns: int) -> bool:
         """
@@ -216,7 +203,7 @@ class Simulation:
         rest.
         """
         schedule = self._schedule
-        if target_ns >= schedule.computed_ns or target_ns > schedule.reached_ns:
+        if target_ns >= schedule.computed_ns or target_ns > self.segment.reached_ns:
             return False
         ready = schedule.ready
         while ready and ready[0][0] <= target_ns:
@@ -234,22 +221,10 @@ class Simulation:
         """Compute ahead what is due up to `until_ns`; see `Schedule.prepare`."""
         return self._schedule.prepare(self.now_ns, until_ns, budget_ns)
 
-    def _reach(self, t_ns: int, give_way: Callable[[], bool]) -> bool:
-        """Take the steps up to `t_ns`, before which no sample is due; return whether it did."""
-        solver, start_ns = self.segment.solver, self.segment.start_ns
-        while not solver.reach(t_ns - start_ns, STEPS_AT_ONCE):
-            self.now_ns = max(self.now_ns, min(start_ns + solver.latest_ns, t_ns - 1))
-            solver.release(self.now_ns - start_ns)
-            if give_way():
-                return False
-        self._schedule.reached_ns = start_ns + solver.latest_ns
-        return True
-
     def _send(self, instant: Instant, publishes: bool = True) -> None:
         """Hand out the samples of an instant; count those that are too late to be published."""
         t_ns, delivery, messages = instant
-        if delivery.log_indices:
-            assert self._log is not None
+        if self._log is not None and delivery.log_indices:
             logged = delivery.logged
             self._log(delivery.log_indices, self.epoch_ns + t_ns,
                       messages if logged is None else [messages[k] for k in logged],
@@ -271,16 +246,16 @@ class Simulation:
         The same bytes as `advance` sends, in another order; for offline use.  Raises
         IntegrationError if the equations cannot go on; the samples before that are sent.
         """
+        segment = self.segment
         self._schedule.invalidate()
-        solver, start_ns = self.segment.solver, self.segment.start_ns
         while self.now_ns < target_ns:
-            failure = None
             try:
-                solver.reach(target_ns - start_ns, STEPS_IN_A_BLOCK)
-            except IntegrationError as error:
-                failure = error
-            until_ns = min(target_ns, start_ns + solver.latest_ns)
-            states = cache(self.segment.states)
+                segment.reach(target_ns, OFFLINE_STEPS)
+            except IntegrationError:
+                if segment.reached_ns <= self.now_ns:   # else what is due before is sent first
+                    raise
+            until_ns = min(target_ns, segment.reached_ns)
+            states = cache(segment.states)
             for stream in self.streams:
                 times = stream.times(self.now_ns, until_ns)
                 if stream.log_index is not None and times:
@@ -288,9 +263,7 @@ class Simulation:
                     send(stream, self.epoch_ns + np.arange(times.start, times.stop, times.step),
                          rows)
             self.now_ns = max(self.now_ns, until_ns)
-            solver.release(self.now_ns - start_ns)
-            if failure is not None:
-                raise failure
+            segment.release(self.now_ns)
 
     # ----------------------------------------------------------------------------- commands
 
@@ -314,33 +287,32 @@ class Simulation:
                 f'{theta!r} rad), where lz must equal {pole!r}; command both together')
         start = ContinuedState(theta=theta, theta_dot=float(now.theta_dot[0]),
                                phi=float(now.phi[0]), psi=float(now.psi[0]), l3=l3, lz=lz)
-        try:
-            segment = Segment(_propagate(self.top, start, self.values), start, at_ns)
-        except (ArithmeticError, ValueError, RuntimeError) as error:
-            raise ValueError(f'l3 = {l3!r}, lz = {lz!r} kg m^2/s: no motion from theta = '
-                             f'{theta!r} rad: {error}') from error
+        segment = _segment(self.top, start, at_ns, self.values)
         self._steps_before, self._evaluations_before = self.steps, self.evaluations
         self._begin(segment)
         self.history.append((at_ns, l3, lz))
 
 
-def _propagate(top: Top, start: State, values: Mapping[str, Any]) -> Propagator:
+def _segment(top: Top, start: State, start_ns: int, values: Mapping[str, Any]) -> Segment:
     """
-    Return the motion from `start` with the solver of the parameters.
+    Return the motion from `start` at `start_ns` with the solver of the parameters.
 
     Raises ValueError where the first nanosecond shows that there is none.
     """
-    solver = propagate(top, start, method=values['solver.method'],
-                       equations=values['solver.equations'], rtol=values['solver.rtol'],
-                       atol=values['solver.atol'])
-    rates = (f'theta_dot = {start.theta_dot!r} rad/s, l3 = {start.l3!r}, lz = {start.lz!r} '
-             'kg m^2/s')
-    energy = float(solver.states(range(1)).energy[0])
-    if not math.isfinite(energy):
-        raise ValueError(f'the energy would be {energy!r} J with {rates}')
-    if not solver.reach(1, STEPS_AT_ONCE):
-        raise ValueError(f'{rates} turn the top too fast: over {STEPS_AT_ONCE} steps a nanosecond')
-    if isinstance(solver, ExactSolution) and solver.ns_limit < SHORTEST_RUN_NS:
-        raise ValueError(f'{rates} turn the top too fast: after {solver.time_limit:.3g} s a phase '
-                         'reaches 2^52 turns')
-    return solver
+    try:
+        solver = propagate(top, start, method=values['solver.method'],
+                           equations=values['solver.equations'], rtol=values['solver.rtol'],
+                           atol=values['solver.atol'])
+        segment = Segment(solver, start, start_ns)
+        if not math.isfinite(segment.energy):
+            raise ValueError(f'the energy would be {segment.energy!r} J')
+        if not segment.reach(start_ns + 1, FIRST_STEPS):
+            raise ValueError(f'it turns too fast: over {FIRST_STEPS} steps a nanosecond')
+        if isinstance(solver, ExactSolution) and solver.ns_limit < SHORTEST_RUN_NS:
+            raise ValueError(f'it turns too fast: after {solver.time_limit:.3g} s, not '
+                             f'{SHORTEST_RUN_NS / NANOSECONDS:g} s, a phase reaches 2^52 turns')
+    except (ArithmeticError, RuntimeError, ValueError) as error:
+        raise ValueError(f'no motion from theta = {start.theta!r} rad, theta_dot = '
+                         f'{start.theta_dot!r} rad/s with l3 = {start.l3!r}, lz = {start.lz!r} '
+                         f'kg m^2/s: {error}') from error
+    return segment

@@ -13,7 +13,7 @@ from typing import TypeVar
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.segment import Segment
-from spinning_top_sim.streams.topics import Stream
+from spinning_top_sim.streams.stream import Stream
 
 Item = TypeVar('Item')
 
@@ -36,8 +36,6 @@ class Delivery:
     """
     The sinks for one set of streams that are due together.
 
-    Attributes
-    ----------
     log_indices : numbers of the recorded streams in the log
     logged : places of their messages among all; None if all are recorded
     size : of the recorded messages together [bytes]
@@ -65,32 +63,22 @@ class Schedule:
     The messages of the streams of one run, in order of time.
 
     Blocks are computed where there is time: `prepare` in pieces after a tick, `compute` at once.
-    What is sent does not depend on it.  `follow` comes first.  Samples are sent up to
-    `Simulation.now_ns`, computed before `computed_ns`, and the solver has steps to `reached_ns`.
+    What is sent does not depend on it.  `follow` comes first.
 
-    Attributes
-    ----------
     epoch_ns : stamp of t = 0 [ns]; after a change, call `invalidate`
     ready : instants that are computed and not yet sent
     computed_ns : every sample before this simulated time is sent or in `ready` [ns]
-    reached_ns : the solver needs no further steps up to this time [ns]
     """
 
     def __init__(self, streams: Sequence[Stream], epoch_ns: int) -> None:
         self._streams, self.epoch_ns = streams, epoch_ns
         self.ready: deque[Instant] = deque()
-        # Streams with sinks, and the first sample of each that is not computed.
-        self._active: list[Stream] = []
-        self._next_ns: list[int] = []
-        self._deliveries: dict[tuple[int, ...], Delivery] = {}      # by places in `_active`
-        self._shortest_ns = NEVER_NS
         for stream in streams:
             stream.on_change = self.invalidate
 
     def follow(self, segment: Segment) -> None:
         """Go on with another segment."""
         self._segment = segment
-        self.reached_ns = segment.start_ns
         self.invalidate()
 
     def invalidate(self) -> None:
@@ -100,43 +88,50 @@ class Schedule:
         self.computed_ns = -1
         self._block = SMALLEST_BLOCK
 
-    def next_due(self, now_ns: int) -> int:
+    def update(self, now_ns: int) -> None:
         """
-        Return the time of the first sample after `now_ns` that is not computed [ns].
+        Begin anew after `now_ns` if nothing is computed beyond it: see which streams have sinks.
 
-        If nothing is computed beyond `now_ns`, look first which streams have sinks now.
+        Then `computed_ns` is the time of the first sample that is not computed.
         """
         if self.computed_ns <= now_ns:
             self._active = [stream for stream in self._streams if stream.has_sinks]
+            # The first sample of each that is not computed.
             self._next_ns = [stream.first_after(now_ns) for stream in self._active]
             self._shortest_ns = min((stream.period_ns for stream in self._active),
                                     default=NEVER_NS)
-            self._deliveries.clear()
+            self._deliveries: dict[tuple[int, ...], Delivery] = {}      # by places in `_active`
             self.ready.clear()
             self._work = None
             self.computed_ns = min(self._next_ns, default=NEVER_NS)
-        return self.computed_ns
 
     def prepare(self, now_ns: int, until_ns: int, budget_ns: int | None = None) -> bool:
         """
         Compute a block if there are samples due up to `until_ns` that are not computed.
 
-        now_ns : simulated time up to which everything is sent [ns]
-        until_ns : simulated time [ns]
-        budget_ns : time after which to stop and return False [ns]; the next call goes on there
+        Everything is sent up to `now_ns`.  Where a block takes longer than `budget_ns`, return
+        False: the next call goes on there.
         """
         if self._work is None:
-            due_ns = self.next_due(now_ns)
-            if due_ns > until_ns:
+            self.update(now_ns)
+            if self.computed_ns > until_ns:
                 return True
             span_ns = min((self._block - 1) * self._shortest_ns, LONGEST_BLOCK_NS)
             self._block = min(2 * self._block, LARGEST_BLOCK)
-            self._work = self._pieces(now_ns, max(until_ns, due_ns + span_ns))
-        return self._go_on(None if budget_ns is None else time.monotonic_ns() + budget_ns)
+            self._work = self._pieces(now_ns, max(until_ns, self.computed_ns + span_ns))
+        # Deferred: `compute` raises the error when it is called for that time.
+        with contextlib.suppress(IntegrationError):
+            return self._go_on(None if budget_ns is None else time.monotonic_ns() + budget_ns)
+        return True
 
     def compute(self, now_ns: int, until_ns: int) -> None:
-        """Finish the block under way, or if there is none compute one up to `until_ns` at most."""
+        """
+        Finish the block under way, or if there is none compute one up to `until_ns` at most.
+
+        Raises IntegrationError if the equations do not go on from `now_ns`.
+        """
         if self._work is None:
+            self.update(now_ns)
             self._work = self._pieces(now_ns, until_ns)
         self._go_on(None)
 
@@ -155,40 +150,22 @@ class Schedule:
 
     def _pieces(self, now_ns: int, until_ns: int) -> Iterator[None]:
         """Compute a block, as far as the steps allow, in pieces of some 0.1 to 0.3 ms."""
-        until_ns = min(until_ns,
-                       self.next_due(now_ns) + (LARGEST_BLOCK - 1) * self._shortest_ns)
-        self._segment.solver.release(now_ns - self._segment.start_ns)
-        yield from self._take_steps(until_ns)
-        until_ns = min(until_ns, self.reached_ns)
+        segment = self._segment
+        until_ns = min(until_ns, self.computed_ns + (LARGEST_BLOCK - 1) * self._shortest_ns)
+        segment.release(now_ns)
+        try:
+            for _ in range(MOST_PIECES):
+                if segment.reach(until_ns, STEPS_IN_A_PIECE):
+                    break
+                yield
+        except IntegrationError:
+            if segment.reached_ns <= now_ns:    # else what is due before that is sent first
+                raise
+        until_ns = min(until_ns, segment.reached_ns)
         blocks = [range(first_ns, until_ns + 1, stream.period_ns)
                   for stream, first_ns in zip(self._active, self._next_ns, strict=True)]
         instants: dict[int, tuple[list[int], list[bytes]]] = {}
-        yield from self._encode(blocks, instants)
-        # All at once: a block that is dropped before this leaves nothing behind.
-        for t_ns, (places, messages) in sorted(instants.items()):
-            key = tuple(places)
-            if key not in self._deliveries:
-                self._deliveries[key] = Delivery([self._active[k] for k in places])
-            self.ready.append((t_ns, self._deliveries[key], messages))
-        self._next_ns = [first_ns + len(times) * times.step
-                         for first_ns, times in zip(self._next_ns, blocks, strict=True)]
-        self.computed_ns = min(self._next_ns, default=NEVER_NS)
-
-    def _take_steps(self, until_ns: int) -> Iterator[None]:
-        """Let the solver step up to a time, or as far as one block allows."""
-        solver, start_ns = self._segment.solver, self._segment.start_ns
-        # Deferred: `Simulation.advance` raises the error when it reaches that time.
-        with contextlib.suppress(IntegrationError):
-            for _ in range(MOST_PIECES):
-                if solver.reach(until_ns - start_ns, STEPS_IN_A_PIECE):
-                    break
-                yield
-        self.reached_ns = max(self.reached_ns, start_ns + solver.latest_ns)
-
-    def _encode(self, blocks: Sequence[range],
-                instants: dict[int, tuple[list[int], list[bytes]]]) -> Iterator[None]:
-        """Add the messages of the active streams at these times, and their places, by time."""
-        states = cache(self._segment.states)        # once for all streams of one rate
+        states = cache(segment.states)              # once for all streams of one rate
         for place, (stream, times) in enumerate(zip(self._active, blocks, strict=True)):
             if not times:
                 continue
@@ -201,9 +178,18 @@ class Schedule:
                 places.append(place)
                 messages.append(data[number * size:(number + 1) * size])
             yield
+        # All at once: a block that is dropped before this leaves nothing behind.
+        for t_ns, (places, messages) in sorted(instants.items()):
+            key = tuple(places)
+            if key not in self._deliveries:
+                self._deliveries[key] = Delivery([self._active[k] for k in places])
+            self.ready.append((t_ns, self._deliveries[key], messages))
+        self._next_ns = [first_ns + len(times) * times.step
+                         for first_ns, times in zip(self._next_ns, blocks, strict=True)]
+        self.computed_ns = min(self._next_ns, default=NEVER_NS)
 
 
-def offline_block_ns(streams: Sequence[Stream]) -> int:
+def offline_block_ns(streams: Iterable[Stream]) -> int:
     """Return the simulated time in which the messages of these streams fill a block [ns]."""
     bytes_per_ns = sum(len(stream.template) / stream.period_ns for stream in streams)
     return max(int(OFFLINE_BYTES / max(bytes_per_ns, OFFLINE_BYTES / LONGEST_OFFLINE_NS)), 1)
@@ -212,10 +198,9 @@ def offline_block_ns(streams: Sequence[Stream]) -> int:
 def offline_targets(now_ns: int, stops: Iterable[tuple[int, Item]], block_ns: int,
                     ) -> Iterator[tuple[int, Item | None]]:
     """
-    Yield the times up to which to advance, one after the other.
+    Yield the times up to which to advance, at most `block_ns` apart.
 
     stops : times in ascending order [ns], each with an item that is yielded with it
-    block_ns : longest time between two targets [ns]
     """
     for stop_ns, item in stops:
         while stop_ns - now_ns > block_ns:

@@ -11,70 +11,57 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.states import States
-from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.physics.top import State
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.propagator import Propagator
 
 Axis = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 
-class Reference:
-    """
-    The exact solution of the motion of a top from `start` at the simulated time `start_ns` [ns].
-
-    It is set up when it is first asked for, unless it is given: that takes milliseconds and may
-    run in another thread than the simulation.
-    """
-
-    def __init__(self, top: Top, start: State, start_ns: int,
-                 solution: ExactSolution | None = None) -> None:
-        self.top, self.start, self.start_ns = top, start, start_ns
-        if solution is not None:
-            self.solution = solution
-
-    @cached_property
-    def solution(self) -> ExactSolution | None:
-        """The exact solution; None for a motion whose constants it cannot hold."""
-        try:
-            return ExactSolution(self.top, self.start)
-        except ValueError:
-            return None
-
-    def prepare(self) -> None:
-        """Set up the solution if it is not there yet."""
-        _ = self.solution
-
-    def axis(self, times_ns: NDArray[np.int64]) -> Axis:
-        """
-        Return the symmetry axis in the world at simulated times (n,) [ns].
-
-        Without an exact solution it stands still.
-        """
-        if self.solution is not None:
-            return self.solution.states(times_ns - self.start_ns).rows_axis
-        theta, phi, ones = self.start.theta, self.start.phi, np.ones(len(times_ns))
-        return (math.sin(theta) * math.cos(phi) * ones, math.sin(theta) * math.sin(phi) * ones,
-                math.cos(theta) * ones)
-
-
 class Segment:
     """
-    A motion from its start, or from a command, until the next command.
+    A motion from its start, or from a command, until the next command, in simulated time.
 
-    Attributes
-    ----------
-    solver : its t = 0 is `start_ns`
-    start_ns : simulated time at which it begins [ns]
+    solver : its t = 0 is `start_ns`; only the segment lets it step
+    start, start_ns : where it begins, and at which simulated time [ns]
+    reached_ns : simulated time up to which no further steps are needed [ns]
     energy, l3, lz : constants of the motion, as it began
-    reference : the exact solution of the same motion
     """
 
     def __init__(self, solver: Propagator, start: State, start_ns: int) -> None:
-        self.solver, self.start_ns = solver, start_ns
+        self.solver, self.start, self.start_ns = solver, start, start_ns
+        self.reached_ns = start_ns + solver.latest_ns
         first = solver.states(range(1))
         self.energy, self.l3, self.lz = float(first.energy[0]), start.l3, start.lz
-        self.reference = Reference(solver.top, start, start_ns,
-                                   solver if isinstance(solver, ExactSolution) else None)
+
+    @cached_property
+    def exact(self) -> ExactSolution | None:
+        """
+        The exact solution of the same motion; None for a motion whose constants it cannot hold.
+
+        Its set-up takes milliseconds, and may be done in another thread than the simulation's.
+        """
+        if isinstance(self.solver, ExactSolution):
+            return self.solver
+        try:
+            return ExactSolution(self.solver.top, self.start)
+        except ValueError:
+            return None
+
+    def reach(self, t_ns: int, max_steps: int) -> bool:
+        """
+        Let the solver step up to a simulated time [ns]; return False if that takes more steps.
+
+        Raises IntegrationError if the equations cannot go on; `reached_ns` has where they stop.
+        """
+        try:
+            return self.solver.reach(t_ns - self.start_ns, max_steps)
+        finally:
+            self.reached_ns = self.start_ns + self.solver.latest_ns
+
+    def release(self, before_ns: int) -> None:
+        """Forget the steps that only states before this simulated time [ns] need."""
+        self.solver.release(before_ns - self.start_ns)
 
     def states(self, times: range) -> States:
         """Return the states at ascending simulated times [ns]."""
@@ -89,10 +76,22 @@ class Segment:
 
         0 for the exact solution itself; NaN for a motion that it cannot hold.
         """
-        exact = self.reference.solution
-        if exact is None:
+        if self.exact is None:
             return np.full(len(times), math.nan)
-        if exact is self.solver:
+        if self.exact is self.solver:
             return np.zeros(len(times))
-        return attitude.angle_between(states.rows_quaternion,
-                                      exact.states(self._since_start(times)).rows_quaternion)
+        return attitude.angle_between(
+            states.rows_quaternion, self.exact.states(self._since_start(times)).rows_quaternion)
+
+    def exact_axis(self, times_ns: NDArray[np.int64]) -> Axis:
+        """
+        Return the symmetry axis in the world by the exact solution at simulated times (n,) [ns].
+
+        Without an exact solution it stands still.
+        """
+        if self.exact is not None:
+            return self.exact.states(times_ns - self.start_ns).rows_axis
+        start, ones = self.start, np.ones(len(times_ns))
+        across = math.sin(start.theta)
+        return (across * math.cos(start.phi) * ones, across * math.sin(start.phi) * ones,
+                math.cos(start.theta) * ones)

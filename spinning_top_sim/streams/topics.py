@@ -2,132 +2,27 @@
 """
 The streams: for each a topic, a message type, a rate, and how states become bytes.
 
-A new stream is a subclass of `Stream` here, a template in messages.py, its place in all_streams.py
+A new stream is a subclass of `Stream` here, its place in `all_streams`, a template in messages.py
 and a line in parameters.STREAM_DEFAULTS.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams import messages
-from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
+from spinning_top_sim.streams.cdr import Field, Template
 from spinning_top_sim.streams.imu import Imu
+from spinning_top_sim.streams.markers import Markers
 from spinning_top_sim.streams.segment import Segment
+from spinning_top_sim.streams.stream import Stream, period_ns
 
 JOINTS = ('precession_joint', 'nutation_joint', 'spin_joint')
 INVARIANTS = ('energy', 'l3', 'lz', 'energy_drift', 'l3_drift', 'lz_drift',
               'quaternion_norm_error', 'orientation_error')
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
-
-
-class Stream:
-    """
-    One topic: samples at t = k * period, k = 0, 1, 2.., whoever listens and however ticks fall.
-
-    Attributes
-    ----------
-    parameter : prefix of its parameters
-    topic, type_name : of its messages
-    template : Template
-    period_ns : of its samples [ns]
-    log_index : its number in the log that records it, None for no log; see `Simulation.log_to`
-    sent, skipped : counts of samples published, and of those that came too late for that
-    on_change : called when its sinks, its rate or the numbers in its samples change
-    """
-
-    parameter: str
-    topic: str
-    type_name: str
-    template: Template
-
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        self._publish: Callable[[bytes], object] | None = None
-        self.log_index: int | None = None
-        self.on_change: Callable[[], None] = lambda: None
-        self.sent = self.skipped = 0
-        self._skipped_until_ns = 0
-        self.period_ns = 1
-        self.set_rate(values[f'{self.parameter}.rate'])
-
-    @property
-    def publish(self) -> Callable[[bytes], object] | None:
-        """What a sample is handed to in time; None while there are no subscribers."""
-        return self._publish
-
-    @publish.setter
-    def publish(self, sink: Callable[[bytes], object] | None) -> None:
-        if sink != self._publish:
-            self._publish = sink
-            self.on_change()
-
-    def follow(self, segment: Segment) -> None:
-        """Begin with the samples of a motion, or of the one after a command."""
-
-    def apply(self, values: Mapping[str, Any]) -> None:
-        """
-        Take over parameters that take effect at once: the rate, where it is among `values`.
-
-        A stream with others of its own takes them here too, and calls `on_change`.
-        """
-        rate = values.get(f'{self.parameter}.rate')
-        if rate is not None and _period_ns(rate) != self.period_ns:
-            self.set_rate(rate)
-
-    def set_rate(self, rate: float) -> None:
-        """Put the samples on the grid of another rate [Hz]."""
-        self.period_ns = _period_ns(rate)
-        self.on_change()
-
-    @property
-    def has_sinks(self) -> bool:
-        """Whether it has subscribers or is recorded: else nothing is computed."""
-        return self._publish is not None or self.log_index is not None
-
-    def first_after(self, t_ns: int) -> int:
-        """Return the time of the first sample later than `t_ns` that is not skipped [ns]."""
-        return (max(t_ns, self._skipped_until_ns - 1) // self.period_ns + 1) * self.period_ns
-
-    def times(self, after_ns: int, until_ns: int) -> range:
-        """Return the times of the samples after `after_ns` and up to `until_ns` [ns]."""
-        return range(self.first_after(after_ns), until_ns + 1, self.period_ns)
-
-    def skip(self, after_ns: int, before_ns: int) -> None:
-        """Leave out and count the samples after `after_ns` and before `before_ns` [ns]."""
-        count = len(self.times(after_ns, before_ns - 1))
-        if count:
-            self.skipped += count
-            self._skipped_until_ns = before_ns
-            self.on_change()
-
-    def encode(self, states: States, epoch_ns: int, times: range) -> NDArray[np.uint8]:
-        """
-        Return the messages at sample times as rows of bytes (n, size), valid until the next call.
-
-        states : the states at `times`
-        epoch_ns : stamp of t = 0 [ns]
-        times : of n samples [ns]; see `times`
-        """
-        stamps_ns = np.arange(epoch_ns + times.start, epoch_ns + times.stop, times.step)
-        return self.template.encode(stamps_ns, *self.fields(states, times))
-
-    def fields(self, states: States, times: range) -> Sequence[Field]:
-        """Return the numbers that go into the fields of `template`."""
-        raise NotImplementedError
-
-    def indices(self, times: range) -> range:
-        """Return the numbers k of the samples at these times."""
-        first = times.start // self.period_ns
-        return range(first, first + len(times))
-
-
-def _period_ns(rate: float) -> int:
-    return max(1, round(NANOSECONDS / rate))
 
 
 class Pose(Stream):
@@ -136,8 +31,7 @@ class Pose(Stream):
     parameter, topic, type_name = 'pose', 'pose', 'geometry_msgs/msg/PoseStamped'
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values)
-        self.template = messages.pose_stamped(values['world_frame'])
+        super().__init__(values, messages.pose_stamped(values['world_frame']))
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         return (states.rows_quaternion,)
@@ -149,8 +43,7 @@ class JointStates(Stream):
     parameter, topic, type_name = 'joint_states', 'joint_states', 'sensor_msgs/msg/JointState'
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values)
-        self.template = messages.joint_state(JOINTS)
+        super().__init__(values, messages.joint_state(JOINTS))
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         return ((states.phi, states.theta, states.psi),
@@ -164,33 +57,36 @@ class GroundTruthOdometry(Stream):
                                    'nav_msgs/msg/Odometry')
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values)
-        self.template = messages.odometry(values['world_frame'], values['body_frame'])
+        super().__init__(values, messages.odometry(values['world_frame'], values['body_frame']))
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         return states.rows_quaternion, states.rows_angular_velocity
 
 
 class ImuStream(Stream):
-    """What all IMU topics share: the mounting, and the sensor at the stream's rate."""
+    """What all IMU topics share: the IMU, which takes its samples at `imu.rate`."""
 
     type_name = 'sensor_msgs/msg/Imu'
     has_orientation, is_noisy = True, False
 
     def __init__(self, values: Mapping[str, Any], imu: Imu) -> None:
-        self._frame_id: str = values['imu.frame_id']
-        self._imu = imu
-        super().__init__(values)
+        self._frame_id, self._imu = values['imu.frame_id'], imu
+        super().__init__(values, self._template(values['imu.rate']))
 
-    def set_rate(self, rate: float) -> None:
-        super().set_rate(rate)
-        # A density says how much noise a sample has at a rate.
-        self._sensor = self._imu.sensor(self.period_ns)
-        kinds = self._sensor.gyroscope, self._sensor.accelerometer
-        self.template = messages.imu(
+    def apply(self, values: Mapping[str, Any]) -> None:
+        super().apply(values)
+        if 'imu.rate' in values:
+            self.template = self._template(values['imu.rate'])
+            self.on_change()
+
+    def _template(self, imu_rate: float) -> Template:
+        """Use the sensor of this rate: a density says how much noise a sample has at a rate."""
+        self._sensor = self._imu.sensor(period_ns(imu_rate))
+        variances = self._sensor.rate_variance, self._sensor.force_variance
+        return messages.imu(
             self._frame_id,
             messages.EXACT if self.has_orientation else messages.UNKNOWN_ORIENTATION,
-            *(messages.diagonal(kind.variance if self.is_noisy else 0.0) for kind in kinds))
+            *(messages.diagonal(variance if self.is_noisy else 0.0) for variance in variances))
 
 
 class ImuRaw(ImuStream):
@@ -200,7 +96,7 @@ class ImuRaw(ImuStream):
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         orientation = self._imu.orientation(states) if self.has_orientation else IDENTITY
-        return (orientation, *self._sensor.read(self._imu.true(states), self.indices(times)))
+        return (orientation, *self._sensor.read(self._imu.true(states), times))
 
 
 class ImuData(ImuRaw):
@@ -210,12 +106,12 @@ class ImuData(ImuRaw):
 
 
 class ImuBias(ImuStream):
-    """The bias that `ImuRaw` carries."""
+    """The bias that the readings contain."""
 
     parameter, topic, has_orientation = 'imu', 'ground_truth/imu_bias', False
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
-        return (IDENTITY, *self._sensor.bias(self.indices(times)))
+        return (IDENTITY, *self._sensor.bias(times))
 
 
 class GroundTruthImu(ImuStream):
@@ -237,8 +133,7 @@ class Invariants(Stream):
 
     parameter, topic, type_name = 'invariants', '~/invariants', 'std_msgs/msg/Float64MultiArray'
     def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values)
-        self.template = messages.float64_multi_array(INVARIANTS)
+        super().__init__(values, messages.float64_multi_array(INVARIANTS))
 
     def follow(self, segment: Segment) -> None:
         self._segment = segment
@@ -257,8 +152,15 @@ class Clock(Stream):
     parameter, topic, type_name = 'clock', '/clock', 'rosgraph_msgs/msg/Clock'
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values)
-        self.template = messages.clock()
+        super().__init__(values, messages.clock())
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         return ()
+
+
+def all_streams(values: Mapping[str, Any]) -> list[Stream]:
+    """Return every stream, in the order in which samples of one instant are sent."""
+    imu = Imu(values)
+    return [Clock(values), Pose(values), JointStates(values), ImuRaw(values, imu),
+            ImuData(values, imu), ImuBias(values, imu), GroundTruthImu(values, imu),
+            GroundTruthOdometry(values), Invariants(values), Markers(values)]

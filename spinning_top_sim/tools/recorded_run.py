@@ -13,10 +13,10 @@ from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.writer import METADATA_NAME
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.streams.all_streams import all_streams
 from spinning_top_sim.streams.cdr import ENCAPSULATION
 from spinning_top_sim.streams.pipeline import Simulation, TakeRows
 from spinning_top_sim.streams.schedule import offline_block_ns, offline_targets
+from spinning_top_sim.streams.topics import all_streams
 
 EVENT_NAMES = ('start', 'command', 'parameters', 'reset')
 
@@ -150,8 +150,8 @@ def rerun(run: RunDescription, end_ns: int,
     simulation.now_ns = -1 if run.begun_ns < 0 else max(run.begun_ns, simulation.now_ns)
     simulation.apply(run.now)
     if send is not None:
-        simulation.record_blocks(
-            [stream for stream in simulation.streams if stream.topic in run.topics])
+        simulation.log_to(None, [stream for stream in simulation.streams
+                                 if stream.topic in run.topics])
     yield simulation, Event('start', run.epoch_ns, 0, simulation.now_ns, {})
     for item in (*(event for event in run.events if event.name != 'start'), None):
         stop_ns = end_ns - simulation.epoch_ns if item is None else item.sent_ns

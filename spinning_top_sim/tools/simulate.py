@@ -22,7 +22,7 @@ from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.streams.schedule import offline_block_ns, offline_targets
-from spinning_top_sim.streams.topics import Stream
+from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools.cli import OK, exit_code, print_line, progress
 from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
 from spinning_top_sim.tools.table import Stop, write_table
@@ -145,7 +145,7 @@ def write_log(path: Path, values: Mapping[str, Any], stops: Sequence[Stop],
     commands_topic, events_topic = len(streams), len(streams) + 1
     metadata = provenance(values, epoch_ns, -1, (), values)
     file = create_file(path, topics, metadata, compression=values['record.compression'])
-    simulation.record_blocks(streams)
+    simulation.log_to(None, streams)
     with contextlib.closing(_LogWriter(file, streams)) as writer:
         writer.write(events_topic, epoch_ns, journal.event('start', 0, -1))
         for target_ns, momenta in offline_targets(0, stops, offline_block_ns(streams)):

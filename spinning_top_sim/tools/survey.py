@@ -23,7 +23,7 @@ from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.streams.segment import Segment
-from spinning_top_sim.streams.topics import Stream
+from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools import analysis, recorded_run
 from spinning_top_sim.tools.analysis import Attitudes, Measured, Reals
 from spinning_top_sim.tools.recorded_run import RunDescription
@@ -236,7 +236,7 @@ def _analyse(found: Survey, section: Section, topic: str, samples: list[LogMessa
         for series, value, start in zip(
                 drifts.values(), values, (segment.energy, segment.l3, segment.lz), strict=True):
             series.add(data.stamps_ns, (value - start) / (abs(start) or 1.0))
-    exact = segment.reference.solution
+    exact = segment.exact
     if exact is not None:
         truth = exact.states(data.stamps_ns - motion.origin_ns).rows_quaternion
         found.errors.setdefault(topic, Series()).add(

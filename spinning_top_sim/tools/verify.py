@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.recording.provenance import surroundings
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import journal
-from spinning_top_sim.streams.topics import Stream
+from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools.recorded_run import DepartureError, RunDescription, rerun
 
 # Names in the message definition of the arrays of numbers in a template, in their order.

@@ -143,10 +143,8 @@ def simulated(log, metadata, until_ns):
             simulation.advance(event['t_ns'])
         if event['event'] == 'command':
             simulation.command(event['l3'], event['lz'])
-        for stream in simulation.streams:
-            rate = event.get(f'{stream.parameter}.rate')
-            if event['event'] == 'parameters' and rate is not None:
-                stream.set_rate(rate)
+        if event['event'] == 'parameters':
+            simulation.apply(event)
     simulation.advance(until_ns)
     rows = {stream.topic: [] for stream in simulation.streams}
     for topic, t_ns, data in taken:
