@@ -16,7 +16,7 @@ import dataclasses
 import os
 import struct
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -45,8 +45,9 @@ from spinning_top_sim.recording.chunks import (
     PlainChunk,
     compressor,
     message_indexes,
+    time_span,
 )
-from spinning_top_sim.recording.rosbag2 import BAG_METADATA, BagTopic, Qos, bag_metadata_yaml
+from spinning_top_sim.recording.rosbag2 import BAG_METADATA, bag_metadata_yaml
 
 if TYPE_CHECKING:
     import numpy as np
@@ -81,7 +82,7 @@ class McapWriter:
         self._end = 0, 0    # size and checksum of the file; one assignment, so always consistent
         self._next_sequence: dict[int, int] = {}
         self._type_names: dict[int, str] = {}       # by schema id
-        self._bag_topics: dict[int, BagTopic] = {}  # by channel id
+        self._channels: dict[int, Channel] = {}
         # Records of the summary.  Serialized: thousands of objects would take memory.
         self._summary_records: dict[Opcode, list[bytes]] = {kind: [] for kind in (
             Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.CHUNK_INDEX,
@@ -124,17 +125,12 @@ class McapWriter:
             self._type_names[schema.id] = schema.name
             self._summary_records[Opcode.SCHEMA].append(record)
 
-    def write_channel(
-        self, channel: Channel, record: bytes = b'', qos_profiles: Sequence[Qos] = (),
-    ) -> None:
+    def write_channel(self, channel: Channel, record: bytes = b'') -> None:
         """Write a channel, after its schema; the rest is as in `write_schema`."""
         record = record or record_bytes(channel)
         self._write([record])
-        if channel.id not in self._bag_topics:
-            self._bag_topics[channel.id] = BagTopic(
-                channel.topic, self._type_names.get(channel.schema_id, ''),
-                channel.metadata.get('topic_type_hash', ''), channel.message_encoding,
-                qos_profiles)
+        if channel.id not in self._channels:
+            self._channels[channel.id] = channel
             self._summary_records[Opcode.CHANNEL].append(record)
             self.message_counts[channel.id] = self._next_sequence[channel.id] = 0
 
@@ -202,22 +198,15 @@ class McapWriter:
             self._put(self._chunk)
 
     def _put(self, chunk: PlainChunk) -> None:
-        span = chunk.start_ns, chunk.end_ns
+        start_ns, end_ns = time_span(chunk.entries)
         self.copy_chunk(Chunk(
             compression=self._compression, data=self._compress(chunk.data),
             uncompressed_size=chunk.size, uncompressed_crc=zlib.crc32(chunk.data),
-            message_start_time=span[0], message_end_time=span[1]), chunk.entries, span)
+            message_start_time=start_ns, message_end_time=end_ns), chunk.entries)
         chunk.clear()
 
-    def copy_chunk(
-        self, chunk: Chunk, entries: Entries, span: tuple[int, int], record: bytes = b'',
-    ) -> None:
-        """
-        Write a compressed chunk and its message indexes.
-
-        span : the earliest and the latest log time [ns]
-        record : as in `write_schema`
-        """
+    def copy_chunk(self, chunk: Chunk, entries: Entries, record: bytes = b'') -> None:
+        """Write a compressed chunk and its message indexes; `record` is as in `write_schema`."""
         record = record or record_bytes(chunk)
         indexes = message_indexes(entries)
         index_offsets = {}
@@ -238,8 +227,9 @@ class McapWriter:
         self.chunk_count += 1
         if indexes:
             empty = not any(self.message_counts.values())
-            self._start_ns = span[0] if empty else min(self._start_ns, span[0])
-            self._end_ns = max(self._end_ns, span[1])
+            start_ns = chunk.message_start_time
+            self._start_ns = start_ns if empty else min(self._start_ns, start_ns)
+            self._end_ns = max(self._end_ns, chunk.message_end_time)
             for channel_id in indexes:
                 self.message_counts[channel_id] += len(entries[channel_id]) // 2
 
@@ -264,8 +254,9 @@ class McapWriter:
         """
         try:
             if bag:
-                topics = [(topic, self.message_counts[channel_id])
-                          for channel_id, topic in self._bag_topics.items()]
+                topics = [(channel, self._type_names.get(channel.schema_id, ''),
+                           self.message_counts[channel.id])
+                          for channel in self._channels.values()]
                 self.write_metadata(Metadata(BAG_METADATA, {
                     'serialized_metadata': bag_metadata_yaml(
                         topics, file_name=file_name or self._path.name, start_ns=self._start_ns,

@@ -8,12 +8,11 @@ Memory holds the chunks that overlap in time: one in a log that was written in o
 
 from __future__ import annotations
 
-import bisect
 import functools
+import heapq
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,9 +30,9 @@ from spinning_top_sim.recording.records import (
     break_up,
     open_chunk,
 )
-from spinning_top_sim.recording.rosbag2 import Qos, parse_offered_qos
+from spinning_top_sim.recording.rosbag2 import Qos, qos_profiles
 from spinning_top_sim.recording.scanner import Scanner
-from spinning_top_sim.recording.summary import MAGIC_SIZE, McapSource, read_summary
+from spinning_top_sim.recording.summary import MAGIC_SIZE, McapSource, indexed_messages, read_summary
 from spinning_top_sim.recording.writer import OUR_LIBRARY
 
 _RUN_BYTES = 1 << 20  # of messages outside of chunks that are read at a time
@@ -147,7 +146,7 @@ class LogReader:
     @property
     def span(self) -> tuple[int, int]:
         """The earliest and the latest log time [ns]; both 0 without messages."""
-        spans = [span for span in self._index.spans if span.end_ns]
+        spans = self._index.spans
         return (min((span.start_ns for span in spans), default=0),
                 max((span.end_ns for span in spans), default=0))
 
@@ -161,31 +160,42 @@ class LogReader:
         topics : names, default: all
         start, end : log times [ns]; `end` is exclusive
         """
-        index = self._index
         names = None if topics is None else frozenset(topics)
         channels = {number: channel.topic for number, channel in self._summary.channels.items()
                     if (names is None or channel.topic in names) and self._summary.knows(number)}
-
-        # Chunks that overlap in time are merged: log time, place in the file, message.
-        pending: list[tuple[int, int, int, LogMessage]] = []
-        for span in index.spans:
+        overlapping: list[_Span] = []
+        overlap_end = 0
+        for span in self._index.spans:
             if (start is not None and span.end_ns < start) or (
                     end is not None and span.start_ns >= end):
                 continue
-            pending.sort()
-            ready = bisect.bisect_left(pending, span.start_ns, key=itemgetter(0))
-            yield from map(itemgetter(3), pending[:ready])
-            del pending[:ready]
-            contents = self._read(span)
-            for number, (time_ns, channel, sequence, publish_ns, begin, stop) in enumerate(
-                    contents.messages):
-                if (channel in channels and (start is None or time_ns >= start)
-                        and (end is None or time_ns < end)):
-                    pending.append((time_ns, span.offset, number, LogMessage(
-                        channels[channel], time_ns, publish_ns, sequence,
-                        contents.plain[begin:stop], channel)))
-        pending.sort()
-        yield from map(itemgetter(3), pending)
+            if span.start_ns > overlap_end:
+                yield from self._merge(overlapping, channels, start, end)
+                overlapping = []
+            overlapping.append(span)
+            overlap_end = max(overlap_end, span.end_ns)
+        yield from self._merge(overlapping, channels, start, end)
+
+    def _merge(self, spans: list[_Span], channels: Mapping[int, str], start: int | None,
+               end: int | None) -> Iterator[LogMessage]:
+        """Yield messages of spans in order; a span is read when its time comes."""
+        streams = (self._stream(span, channels)
+                   for span in sorted(spans, key=lambda span: span.offset))
+        for message in heapq.merge(*streams, key=lambda message: message.log_time):
+            if message.channel_id != _NO_MESSAGE and (start is None or message.log_time >= start) and (
+                    end is None or message.log_time < end):
+                yield message
+
+    def _stream(self, span: _Span, channels: Mapping[int, str]) -> Iterator[LogMessage]:
+        """Yield what stands for the time at which a span begins, then its messages in order."""
+        yield LogMessage('', span.start_ns, 0, 0, b'', -1)
+        contents = self._read(span)
+        for channel_id in contents.entries.keys() - channels:
+            del contents.entries[channel_id]
+        plain = contents.plain
+        for channel_id, sequence, log_time, publish_time, begin, end in contents.sorted_messages():
+            yield LogMessage(channels[channel_id], log_time, publish_time, sequence,
+                             bytes(plain[begin:end]), channel_id)
 
     def scan(self) -> Scanner:
         """Begin a scan of all usable records in file order, with what former ones know."""
@@ -205,7 +215,8 @@ class LogReader:
             if isinstance(record, Metadata):
                 metadata[record.name] = record.metadata
         spans = [_Span(chunk.message_start_time, offset, offset + chunk.chunk_length,
-                       chunk.message_end_time) for offset, chunk in self._summary.chunks.items()]
+                       chunk.message_end_time) for offset, chunk in self._summary.chunks.items()
+                 if indexed_messages(chunk)]
         return _Index(sorted(spans), metadata)
 
     @functools.cached_property
@@ -258,7 +269,7 @@ def _scan_all(scanner: Scanner) -> _Index:
     for scanned in scanner:
         if isinstance(scanned.record, Metadata):
             metadata[scanned.record.name] = scanned.record.metadata
-        if scanned.contents is None or not scanned.contents.messages:
+        if scanned.contents is None or not scanned.contents.entries:
             continue
         start_ns, end_ns = time_span(scanned.contents.entries)
         span = _Span(start_ns, scanned.offset, scanned.end, end_ns)
@@ -270,8 +281,3 @@ def _scan_all(scanner: Scanner) -> _Index:
         spans.append(span)
         run = span if scanned.record is None else None
     return _Index(sorted(spans), metadata)
-
-
-def qos_profiles(channel: Channel) -> tuple[Qos, ...]:
-    """Return the QoS profiles in the metadata of a channel."""
-    return tuple(parse_offered_qos(channel.metadata.get('offered_qos_profiles', '')))

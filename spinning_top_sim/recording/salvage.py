@@ -14,11 +14,10 @@ from pathlib import Path
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, Chunk, Header, Metadata, Schema
 
-from spinning_top_sim.recording.chunks import time_span
 from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.errors import NothingToSaveError, OutputError
 from spinning_top_sim.recording.mcap_writer import McapWriter, sync_directory
-from spinning_top_sim.recording.reader import LogReader, qos_profiles
+from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA
 from spinning_top_sim.recording.scanner import ScannedRecord, Scanner
 
@@ -141,10 +140,9 @@ class _Copy:
             self._declare(self._scanner.channels[channel_id])
         if isinstance(scanned.record, Chunk) and not scanned.unknown:
             self._writer.write_chunk()  # what came before stays before
-            self._writer.copy_chunk(
-                scanned.record, contents.entries, time_span(contents.entries), scanned.raw)
+            self._writer.copy_chunk(scanned.record, contents.entries, scanned.raw)
             return
-        for message in contents.messages:
+        for message in contents.messages():
             if self._writer.add_message(
                     message.channel_id, message.sequence, message.log_time,
                     message.publish_time, contents.plain[message.start:message.end]):
@@ -163,7 +161,7 @@ class _Copy:
                 self._declare(schema)
             elif record.schema_id:
                 return      # no reader takes a channel without its schema
-            self._writer.write_channel(record, raw, qos_profiles(record))
+            self._writer.write_channel(record, raw)
         self._declared.add(key)
 
 

@@ -285,8 +285,7 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
                     id=number, topic=topic.name, message_encoding='cdr',
                     schema_id=schema_ids[topic.type_name],
                     metadata={'offered_qos_profiles': offered_qos_yaml(topic),
-                              'topic_type_hash': definitions[topic.type_name].type_hash}),
-                    qos_profiles=(topic.qos,))
+                              'topic_type_hash': definitions[topic.type_name].type_hash}))
             file.sync()
             sync_directory(path.parent)
     except FileExistsError as error:
