@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import os
 import struct
 import zlib
@@ -29,7 +30,6 @@ from mcap.records import (
     ChunkIndex,
     DataEnd,
     Footer,
-    Header,
     McapRecord,
     Metadata,
     MetadataIndex,
@@ -56,19 +56,16 @@ if TYPE_CHECKING:
 
 class McapWriter:
     """
-    A new MCAP file, written by one thread at a time.
+    A new MCAP file, which must not exist (FileExistsError), written by one thread at a time.
 
     Every write goes to an explicit position behind the last whole record, so neither an OSError
     nor an interrupt can shift what follows.  After an OSError `finish` may still be tried.
 
-    path : the file, which must not exist (FileExistsError)
-    profile, library : what the header says
+    header : the record
     compression : of chunks that are made here, 'zstd', 'lz4' or 'none'
-    header : the header as another file has it, default: made of `profile` and `library`
     """
 
-    def __init__(self, path: Path, *, profile: str, library: str, compression: str,
-                 header: bytes = b'') -> None:
+    def __init__(self, path: Path, *, header: bytes, compression: str) -> None:
         self._path = path
         self._compression = '' if compression == 'none' else compression
         self._compress = compressor(compression)
@@ -90,7 +87,7 @@ class McapWriter:
 
         self._file = open(path, 'xb', buffering=0)  # noqa: SIM115
         with self.discarded_on_failure():
-            self._write([MCAP0_MAGIC, header or record_bytes(Header(profile, library))])
+            self._write([MCAP0_MAGIC, header])
 
     @property
     def size(self) -> int:
@@ -113,50 +110,42 @@ class McapWriter:
                 self._path.unlink()
             raise
 
-    def write_schema(self, schema: Schema, record: bytes = b'') -> None:
-        """
-        Write a schema; the summary repeats the first one of each id.
+    # `raw` is a record as another file has it.  By default it is made from the other argument.
 
-        `record` is the record as another file has it, by default it is made from `schema`.
-        """
-        record = record or record_bytes(schema)
-        self._write([record])
+    def write_schema(self, schema: Schema, raw: bytes = b'') -> None:
+        """Write a schema; the summary repeats the first one of each id."""
+        raw = raw or record_bytes(schema)
+        self._write([raw])
         if schema.id not in self._type_names:
             self._type_names[schema.id] = schema.name
-            self._summary_records[Opcode.SCHEMA].append(record)
+            self._summary_records[Opcode.SCHEMA].append(raw)
 
-    def write_channel(self, channel: Channel, record: bytes = b'') -> None:
-        """Write a channel, after its schema; the rest is as in `write_schema`."""
-        record = record or record_bytes(channel)
-        self._write([record])
+    def write_channel(self, channel: Channel, raw: bytes = b'') -> None:
+        """Write a channel, after its schema; the summary repeats the first one of each id."""
+        raw = raw or record_bytes(channel)
+        self._write([raw])
         if channel.id not in self._channels:
             self._channels[channel.id] = channel
-            self._summary_records[Opcode.CHANNEL].append(record)
+            self._summary_records[Opcode.CHANNEL].append(raw)
             self.message_counts[channel.id] = self._next_sequence[channel.id] = 0
 
-    def write_metadata(self, metadata: Metadata, record: bytes = b'') -> None:
-        """Write a metadata record; `record` is as in `write_schema`."""
-        record = record or record_bytes(metadata)
-        index = MetadataIndex(offset=self.size, length=len(record), name=metadata.name)
-        self._write([record])
+    def write_metadata(self, metadata: Metadata, raw: bytes = b'') -> None:
+        """Write a metadata record."""
+        raw = raw or record_bytes(metadata)
+        index = MetadataIndex(offset=self.size, length=len(raw), name=metadata.name)
+        self._write([raw])
         self._summary_records[Opcode.METADATA_INDEX].append(record_bytes(index))
 
-    def copy_attachment(self, index: AttachmentIndex, blocks: Iterable[bytes]) -> None:
-        """Write an attachment of another file; its record comes in blocks of any size."""
-        index = dataclasses.replace(index, offset=self.size)
+    def copy_record(self, blocks: Iterable[bytes], index: AttachmentIndex | None = None) -> None:
+        """Write an attachment, or a record of unknown kind, in blocks of any size."""
+        offset = self.size
         self._write(blocks)
-        self._summary_records[Opcode.ATTACHMENT_INDEX].append(record_bytes(index))
-
-    def copy_record(self, blocks: Iterable[bytes]) -> None:
-        """Write a record that nothing in the summary refers to, in blocks of any size."""
-        self._write(blocks)
+        if index is not None:
+            self._summary_records[Opcode.ATTACHMENT_INDEX].append(
+                record_bytes(dataclasses.replace(index, offset=offset)))
 
     def append(self, topic_index: int, log_time_ns: int, data: bytes) -> bool:
-        """
-        Add the next message of a topic to the chunk in memory; return whether the chunk is full.
-
-        topic_index : channel id - 1
-        """
+        """Add the next message of channel `topic_index + 1`; return whether the chunk is full."""
         return self.add_message(topic_index + 1, self._number(topic_index, 1), log_time_ns,
                                 log_time_ns, data)
 
@@ -164,7 +153,7 @@ class McapWriter:
         self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int,
         data: bytes | memoryview,
     ) -> bool:
-        """Add a message with a given sequence number; see `append`."""
+        """Add a message to the chunk in memory; return whether the chunk is full."""
         self._chunk.add(channel_id, sequence, log_time_ns, publish_time_ns, data)
         return self._chunk.size >= CHUNK_BYTES
 
@@ -174,7 +163,7 @@ class McapWriter:
         """
         Make a chunk for `put_plain_chunk`, which another thread may be running.
 
-        blocks : index of a topic, log times of its next messages (n,) [ns], messages (n, size)
+        blocks : topic index, log times of the next messages (n,) [ns], messages (n, size)
         """
         chunk = self._spare_chunks.pop() if self._spare_chunks else PlainChunk()
         for topic_index, times_ns, rows in blocks:
@@ -205,24 +194,20 @@ class McapWriter:
             message_start_time=start_ns, message_end_time=end_ns), chunk.entries)
         chunk.clear()
 
-    def copy_chunk(self, chunk: Chunk, entries: Entries, record: bytes = b'') -> None:
-        """Write a compressed chunk and its message indexes; `record` is as in `write_schema`."""
-        record = record or record_bytes(chunk)
+    def copy_chunk(self, chunk: Chunk, entries: Entries, raw: bytes = b'') -> None:
+        """Write a compressed chunk and its message indexes."""
+        raw = raw or record_bytes(chunk)
         indexes = message_indexes(entries)
-        index_offsets = {}
-        offset = self.size + len(record)
-        for channel_id, index in indexes.items():
-            index_offsets[channel_id] = offset
-            offset += len(index)
+        offsets = list(itertools.accumulate(
+            map(len, indexes.values()), initial=self.size + len(raw)))
         chunk_index = record_bytes(ChunkIndex(
-            chunk_start_offset=self.size, chunk_length=len(record),
-            message_index_offsets=index_offsets,
-            message_index_length=offset - self.size - len(record),
+            chunk_start_offset=self.size, chunk_length=len(raw),
+            message_index_offsets=dict(zip(indexes, offsets, strict=False)),
+            message_index_length=offsets[-1] - offsets[0],
             compression=chunk.compression, compressed_size=len(chunk.data),
             uncompressed_size=chunk.uncompressed_size,
             message_start_time=chunk.message_start_time, message_end_time=chunk.message_end_time))
-
-        self._write([record, *indexes.values()])
+        self._write([raw, *indexes.values()])
         self._summary_records[Opcode.CHUNK_INDEX].append(chunk_index)
         self.chunk_count += 1
         if indexes:
@@ -249,7 +234,7 @@ class McapWriter:
         Write the bag metadata and the summary, bring all to the disk and close the file.
 
         bag : whether the file has a `rosbag2` metadata record
-        file_name : the name of the file in it, default: that of the file
+        file_name : in that record, default: that of the file
         former_bag : the bag metadata of the log that this one is made from
         """
         try:

@@ -13,6 +13,7 @@ import heapq
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +23,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording.chunks import time_span
 from spinning_top_sim.recording.damage import Damage
-from spinning_top_sim.recording.errors import NotMcapError
+from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.records import (
     MAX_BYTES,
     ChunkContents,
@@ -72,11 +73,8 @@ class _Span(NamedTuple):
     end_ns: int
 
 
-class _Index(NamedTuple):
-    """Where the messages are, and the metadata records by name."""
-
-    spans: list[_Span]
-    metadata: dict[str, dict[str, str]]
+# Where the messages are, and the metadata records by name.
+_Index = tuple[list[_Span], dict[str, dict[str, str]]]
 
 
 class LogReader:
@@ -86,8 +84,8 @@ class LogReader:
     max_bytes : largest record, and largest uncompressed chunk, that is read into memory
 
     A file with a usable summary opens at once.  Any other is scanned before its topics, metadata
-    or messages are returned, and so is every file for its `damage`.  Damage raises nothing.
-    Raises NotMcapError if it is no MCAP file; any method may raise LogAccessError.
+    or messages are returned, and so is every file for its `damage`.  Damage raises nothing; what
+    is no MCAP file, or cannot be read, raises LogError.
     """
 
     def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> None:
@@ -136,7 +134,7 @@ class LogReader:
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
         """The metadata records by name; of several with one name, the last."""
-        return self._index.metadata
+        return self._index[1]
 
     @property
     def damage(self) -> Damage:
@@ -146,7 +144,7 @@ class LogReader:
     @property
     def span(self) -> tuple[int, int]:
         """The earliest and the latest log time [ns]; both 0 without messages."""
-        spans = self._index.spans
+        spans, _ = self._index
         return (min((span.start_ns for span in spans), default=0),
                 max((span.end_ns for span in spans), default=0))
 
@@ -160,30 +158,29 @@ class LogReader:
         topics : names, default: all
         start, end : log times [ns]; `end` is exclusive
         """
+        spans, _ = self._index      # also makes the channels known
         names = None if topics is None else frozenset(topics)
         channels = {number: channel.topic for number, channel in self._summary.channels.items()
                     if (names is None or channel.topic in names) and self._summary.knows(number)}
+        times = range(start or 0, 1 << 64 if end is None else end)
         overlapping: list[_Span] = []
         overlap_end = 0
-        for span in self._index.spans:
-            if (start is not None and span.end_ns < start) or (
-                    end is not None and span.start_ns >= end):
+        for span in spans:
+            if span.end_ns < times.start or span.start_ns >= times.stop:
                 continue
             if span.start_ns > overlap_end:
-                yield from self._merge(overlapping, channels, start, end)
+                yield from self._merge(overlapping, channels, times)
                 overlapping = []
             overlapping.append(span)
             overlap_end = max(overlap_end, span.end_ns)
-        yield from self._merge(overlapping, channels, start, end)
+        yield from self._merge(overlapping, channels, times)
 
-    def _merge(self, spans: list[_Span], channels: Mapping[int, str], start: int | None,
-               end: int | None) -> Iterator[LogMessage]:
+    def _merge(self, spans: Iterable[_Span], channels: Mapping[int, str], times: range,
+               ) -> Iterator[LogMessage]:
         """Yield messages of spans in order; a span is read when its time comes."""
-        streams = (self._stream(span, channels)
-                   for span in sorted(spans, key=lambda span: span.offset))
-        for message in heapq.merge(*streams, key=lambda message: message.log_time):
-            if message.channel_id != _NO_MESSAGE and (start is None or message.log_time >= start) and (
-                    end is None or message.log_time < end):
+        streams = [self._stream(span, channels) for span in sorted(spans, key=attrgetter('offset'))]
+        for message in heapq.merge(*streams, key=attrgetter('log_time')):
+            if message.channel_id >= 0 and message.log_time in times:
                 yield message
 
     def _stream(self, span: _Span, channels: Mapping[int, str]) -> Iterator[LogMessage]:
@@ -217,7 +214,7 @@ class LogReader:
         spans = [_Span(chunk.message_start_time, offset, offset + chunk.chunk_length,
                        chunk.message_end_time) for offset, chunk in self._summary.chunks.items()
                  if indexed_messages(chunk)]
-        return _Index(sorted(spans), metadata)
+        return sorted(spans), metadata
 
     @functools.cached_property
     def _survey(self) -> tuple[_Index, Damage]:
@@ -230,12 +227,12 @@ class LogReader:
         return index, scanner.damage()
 
     def _read_header(self) -> Header:
-        """Return the header; raises NotMcapError if neither magic nor header is there."""
+        """Return the header; raises LogError if neither magic nor header is there."""
         magic = self.source.read(0, MAGIC_SIZE)
         if not magic:
-            raise NotMcapError(f'cannot read {self.path}: it is empty')
+            raise LogError(f'cannot read {self.path}: it is empty')
         if magic != MCAP0_MAGIC and MCAP0_MAGIC.startswith(magic):
-            raise NotMcapError(
+            raise LogError(
                 f'cannot read {self.path}: it ends after {self.size} bytes of an MCAP file')
         try:
             header = self.source.record(MAGIC_SIZE, self.size)
@@ -244,7 +241,7 @@ class LogReader:
         if isinstance(header, Header):
             return header
         if magic != MCAP0_MAGIC:
-            raise NotMcapError(f'cannot read {self.path}: it is no MCAP file')
+            raise LogError(f'cannot read {self.path}: it is no MCAP file')
         return Header(profile='ros2', library='')
 
     def _read(self, span: _Span) -> ChunkContents:
@@ -265,19 +262,18 @@ def _scan_all(scanner: Scanner) -> _Index:
     """Return what is found in a scan."""
     spans: list[_Span] = []
     metadata = {}
-    run: _Span | None = None  # adjacent messages outside of chunks
+    run_end = 0     # of adjacent messages outside of chunks, the last span
     for scanned in scanner:
         if isinstance(scanned.record, Metadata):
             metadata[scanned.record.name] = scanned.record.metadata
         if scanned.contents is None or not scanned.contents.entries:
             continue
+        offset = scanned.offset
         start_ns, end_ns = time_span(scanned.contents.entries)
-        span = _Span(start_ns, scanned.offset, scanned.end, end_ns)
-        if (scanned.record is None and run is not None and run.end == span.offset
-                and run.end - run.offset < _RUN_BYTES):
-            run = spans[-1] = _Span(min(run.start_ns, start_ns), run.offset, span.end,
-                                    max(run.end_ns, end_ns))
-            continue
-        spans.append(span)
-        run = span if scanned.record is None else None
-    return _Index(sorted(spans), metadata)
+        if scanned.record is None and run_end == offset < spans[-1].offset + _RUN_BYTES:
+            run = spans.pop()
+            offset = run.offset
+            start_ns, end_ns = min(run.start_ns, start_ns), max(run.end_ns, end_ns)
+        spans.append(_Span(start_ns, offset, scanned.end, end_ns))
+        run_end = scanned.end if scanned.record is None else 0
+    return sorted(spans), metadata

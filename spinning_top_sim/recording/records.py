@@ -72,10 +72,10 @@ class ChunkContents:
     """
 
     plain: bytes | bytearray    # uncompressed
-    # What the message indexes should say; messages of other channels are left out.
-    entries: dict[int, array[int]] = field(default_factory=dict)
+    entries: dict[int, array[int]] = field(default_factory=dict)    # of the message indexes
     declared: list[Schema | Channel] = field(default_factory=list)
     in_time_order: bool = True
+    complete: bool = True   # no entries were left out, whose channel is unknown
 
     def messages(self) -> Iterator[StoredMessage]:
         """Yield the messages in the order of the file."""

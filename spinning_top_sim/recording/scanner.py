@@ -65,7 +65,6 @@ class ScannedRecord:
     raw: bytes = b''
     # Messages of known channels, of a chunk or a single one.
     contents: ChunkContents | None = None
-    unknown: bool = False   # messages were left out, whose channel or its schema is unknown
 
 
 class Scanner:
@@ -91,10 +90,9 @@ class Scanner:
         self._losses: list[Loss] = []
         self._defects: list[str] = []
         self._crc = zlib.crc32(MCAP0_MAGIC)     # over the records as they should be
-        self._found: Counter[int] = Counter()           # whole messages by channel
-        self._span: tuple[int, int] | None = None       # their earliest and latest log time
-        self._in_lost_chunks: Counter[int] = Counter()  # messages by channel
-        self._gaps: Counter[int] = Counter()            # by sequence numbers
+        self._span: tuple[int, int] | None = None       # of the log times of whole messages
+        # Messages by channel: whole ones, of damaged chunks, missing by the sequence numbers.
+        self._found, self._in_lost_chunks, self._gaps = Counter[int](), Counter[int](), Counter[int]()
         self._next_sequence: dict[int, int] = {}
         self._unknown: dict[int, Loss] = {}             # messages by unknown channel
 
@@ -121,12 +119,11 @@ class Scanner:
                 continue
             for block in self.blocks(scanned):
                 self._crc = zlib.crc32(block, self._crc)
-            if scanned.contents is None:
-                yield scanned
-                continue
-            yield self._count(scanned, scanned.contents)
-            if scanned.opcode == Opcode.CHUNK:
-                offset = self._check_indexes(offset, scanned.contents.entries)
+            if scanned.contents is not None:
+                if scanned.opcode == Opcode.CHUNK:
+                    offset = self._check_indexes(offset, scanned.contents.entries)
+                self._count(scanned.offset, scanned.contents)
+            yield scanned
         self._check_end(offset)
 
     def blocks(self, scanned: ScannedRecord) -> Iterator[bytes]:
@@ -157,14 +154,11 @@ class Scanner:
         missing: Counter[str] = Counter()
         for number, messages in sorted((+lost).items()):
             missing[self.channels[number].topic if self._summary.knows(number) else ''] += messages
-        return Damage(
-            truncated=not self._summary.closed, losses=tuple(losses),
-            defects=tuple(self._defects), missing=dict(missing),
-            missing_exactly=statistics is not None,
-            start_ns=self._span[0] if self._span else 0,
-            end_ns=self._span[1] if self._span else 0)
+        start_ns, end_ns = self._span or (0, 0)
+        return Damage(not self._summary.closed, tuple(losses), tuple(self._defects),
+                      dict(missing), statistics is not None, start_ns, end_ns)
 
-    # Reading records.  All of these raise DamagedError.
+    # Reading records: raises DamagedError
 
     def _scan(self, offset: int) -> ScannedRecord | None:
         """Return the record there with all of its messages, None where the data section ends."""
@@ -242,39 +236,31 @@ class Scanner:
 
     def _declare(self, offset: int, record: Schema | Channel) -> Schema | Channel:
         """Make a schema or channel known, and return what is right about it."""
-        known: Schema | Channel
-        if isinstance(record, Schema):
-            known = self.schemas.setdefault(record.id, record)
-        else:
-            known = self.channels.setdefault(record.id, record)
+        known = (self.schemas.setdefault(record.id, record) if isinstance(record, Schema)
+                 else self.channels.setdefault(record.id, record))
         if known != record:
             self._defects.append(
                 f'the {type(record).__name__.lower()} {record.id} at byte {offset} is not what '
                 'the file says elsewhere')
         return known
 
-    def _count(self, scanned: ScannedRecord, contents: ChunkContents) -> ScannedRecord:
-        """Count messages, and return the record with those of known channels."""
-        unknown = {number for number in contents.entries if not self._summary.knows(number)}
-        if unknown:
-            for message in contents.messages():
-                number = message.channel_id
-                if number in unknown:
-                    loss = self._unknown.setdefault(number, Loss(
-                        scanned.offset, 0, f'messages of channel {number}',
-                        'the record of their channel or schema is lost', messages=0))
-                    loss.bytes += message.end - message.start
-                    loss.messages = (loss.messages or 0) + 1
-            known = {number: entries for number, entries in contents.entries.items()
-                     if number not in unknown}
-            contents = replace(contents, entries=known)
-            scanned = replace(scanned, contents=contents, unknown=True)
+    def _count(self, offset: int, contents: ChunkContents) -> None:
+        """Count messages, and leave out those of unknown channels."""
+        for number in [*contents.entries]:
+            messages = len(contents.entries[number]) // 2
+            if self._summary.knows(number):
+                self._found[number] += messages
+                continue
+            loss = self._unknown.setdefault(number, Loss(
+                offset, 0, f'messages of channel {number}',
+                'the record of their channel or schema is lost', messages=0))
+            loss.messages = (loss.messages or 0) + messages
+            del contents.entries[number]
+            contents.complete = False
         if contents.entries:
             first, last = time_span(contents.entries)
             begin, end = self._span or (first, last)
             self._span = min(begin, first), max(end, last)
-        for number, entries in contents.entries.items():
-            self._found[number] += len(entries) // 2
         if self._ours:
             for message in contents.messages():
                 number = message.channel_id
@@ -282,7 +268,6 @@ class Scanner:
                 if gap < 1 << 31:  # else it is out of order
                     self._gaps[number] += gap
                     self._next_sequence[number] = message.sequence + 1
-        return scanned
 
     # Message indexes
 
@@ -328,7 +313,7 @@ class Scanner:
             return 0
         kind = self._source.read(offset, 1)
         if kind != _INDEX_KIND and self._finder.is_record(offset) and not any(
-                self._source.read(offset + 1, len(raw) - 1) == raw[1:]
+                self._source.read(offset + 1, len(raw) - 1) == raw[1:]  # but for its kind
                 for raw in expected.values()):
             return 0
         end = offset + sum(map(len, expected.values()))
@@ -369,7 +354,6 @@ class Scanner:
         return end
 
     def _lose(self, offset: int, end: int, opcode: int, damage: DamagedError) -> Loss:
-        """Note that a record of this kind is lost."""
         index = self._summary.chunks.get(offset)
         loss = Loss(offset, end - offset, name_of(opcode if index is None else Opcode.CHUNK),
                     str(damage), refused=isinstance(damage, TooLargeError))

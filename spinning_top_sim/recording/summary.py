@@ -28,7 +28,7 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording.chunks import ENTRY_SIZE, INDEX_HEAD
-from spinning_top_sim.recording.errors import LogAccessError
+from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.records import (
     HEAD,
     DamagedError,
@@ -46,12 +46,10 @@ _ATTACHMENT_HEAD = 1 << 16  # bytes; more than any name and media type
 
 class McapSource:
     """
-    Random access to a file, up to the size that it has now.
+    Random access to a file, up to the size that it has now; raises LogError where that fails.
 
-    max_bytes : largest record, and largest uncompressed chunk, that is read into memory
-
-    Any method may raise LogAccessError.  A record stands between `offset` and `end`; what reads
-    one raises DamagedError if it is not what it says it is.
+    A record stands between `offset` and `end`; what reads one raises DamagedError if it is not
+    what it says it is.
     """
 
     def __init__(self, path: Path, max_bytes: int) -> None:
@@ -60,7 +58,7 @@ class McapSource:
         with self._access():
             # Opening a pipe would block.
             if not stat.S_ISREG(os.stat(path).st_mode):
-                raise LogAccessError(f'cannot read {path}: it is no regular file')
+                raise LogError(f'cannot read {path}: it is no regular file')
             self._file = open(path, 'rb')  # noqa: SIM115
             status = os.fstat(self._file.fileno())
         self.size = status.st_size
@@ -75,7 +73,7 @@ class McapSource:
         try:
             yield
         except OSError as error:
-            raise LogAccessError(
+            raise LogError(
                 f'cannot read {self._path}: {error.strerror or error}') from error
 
     def read(self, offset: int, length: int) -> bytes:
