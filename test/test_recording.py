@@ -489,12 +489,6 @@ def test_topics_twice_and_bad_metadata_are_refused(tmp_path):
         McapRecorder.open(tmp_path / 'run.mcap', TOPICS, {'seed': 7})  # type: ignore[dict-item]
 
 
-@pytest.mark.parametrize('qos', [{'reliability': 9}, {'histroy': 1}])
-def test_a_wrong_qos_is_named(qos):
-    with pytest.raises(ValueError, match=next(iter(qos))):
-        RecordedTopic('/a', ARRAY, qos)
-
-
 # Running and ending
 
 def test_what_is_written_reaches_the_disk_without_being_closed(tmp_path, monkeypatch):

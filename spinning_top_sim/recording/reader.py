@@ -33,7 +33,12 @@ from spinning_top_sim.recording.records import (
 )
 from spinning_top_sim.recording.rosbag2 import Qos, qos_profiles
 from spinning_top_sim.recording.scanner import Scanner
-from spinning_top_sim.recording.summary import MAGIC_SIZE, McapSource, indexed_messages, read_summary
+from spinning_top_sim.recording.summary import (
+    MAGIC_SIZE,
+    McapSource,
+    indexed_messages,
+    read_summary,
+)
 from spinning_top_sim.recording.writer import OUR_LIBRARY
 
 _RUN_BYTES = 1 << 20  # of messages outside of chunks that are read at a time
@@ -178,7 +183,8 @@ class LogReader:
     def _merge(self, spans: Iterable[_Span], channels: Mapping[int, str], times: range,
                ) -> Iterator[LogMessage]:
         """Yield messages of spans in order; a span is read when its time comes."""
-        streams = [self._stream(span, channels) for span in sorted(spans, key=attrgetter('offset'))]
+        spans = sorted(spans, key=attrgetter('offset'))
+        streams = [self._stream(span, channels) for span in spans]
         for message in heapq.merge(*streams, key=attrgetter('log_time')):
             if message.channel_id >= 0 and message.log_time in times:
                 yield message

@@ -10,8 +10,8 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeGuard
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
 
 import yaml
 
@@ -48,22 +48,12 @@ _POLICY_NAMES = {
 }
 
 
-@dataclass(frozen=True)
-class RecordedTopic:
-    """One topic of a recording.  Raises ValueError for a policy that rosbag2 does not know."""
+class RecordedTopic(NamedTuple):
+    """One topic of a recording."""
 
     name: str               # resolved, such as '/imu/data_raw'
     type_name: str          # 'package/msg/Type'
-    qos: Qos = field(default_factory=dict)  # offered; what is left out is as in DEFAULT_QOS
-
-    def __post_init__(self) -> None:
-        for key, value in self.qos.items():
-            if key not in DEFAULT_QOS:
-                raise ValueError(f'qos of {self.name}: {key!r} is none of {list(DEFAULT_QOS)}')
-            names = _POLICY_NAMES.get(key)
-            if names is not None and not 0 <= value < len(names):
-                raise ValueError(
-                    f'qos of {self.name}: {key} = {value!r}: must be in [0, {len(names) - 1}]')
+    qos: Qos = MappingProxyType({})     # offered; what is left out is as in DEFAULT_QOS
 
 
 def offered_qos_yaml(topic: RecordedTopic) -> str:
