@@ -64,7 +64,7 @@ class PlainChunk:
         return self._memory[:self.size]
 
     def add(self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int,
-            data: bytes | memoryview) -> None:
+            data: bytes | bytearray | memoryview) -> None:
         """Add a message."""
         offset = self.size
         start = offset + MESSAGE.size

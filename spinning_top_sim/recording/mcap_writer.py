@@ -110,37 +110,31 @@ class McapWriter:
                 self._path.unlink()
             raise
 
-    # `raw` is a record as another file has it.  By default it is made from the other argument.
+    def write(self, record: Schema | Channel | Metadata, raw: bytes = b'') -> None:
+        """
+        Write a record, a schema before its channels; the summary repeats the first of each id.
 
-    def write_schema(self, schema: Schema, raw: bytes = b'') -> None:
-        """Write a schema; the summary repeats the first one of each id."""
-        raw = raw or record_bytes(schema)
+        raw : the record as another file has it, default: made from `record`
+        """
+        offset = self.size
+        raw = raw or record_bytes(record)
         self._write([raw])
-        if schema.id not in self._type_names:
-            self._type_names[schema.id] = schema.name
+        if isinstance(record, Metadata):
+            self._summary_records[Opcode.METADATA_INDEX].append(
+                record_bytes(MetadataIndex(offset=offset, length=len(raw), name=record.name)))
+        elif isinstance(record, Schema) and record.id not in self._type_names:
+            self._type_names[record.id] = record.name
             self._summary_records[Opcode.SCHEMA].append(raw)
-
-    def write_channel(self, channel: Channel, raw: bytes = b'') -> None:
-        """Write a channel, after its schema; the summary repeats the first one of each id."""
-        raw = raw or record_bytes(channel)
-        self._write([raw])
-        if channel.id not in self._channels:
-            self._channels[channel.id] = channel
+        elif isinstance(record, Channel) and record.id not in self._channels:
+            self._channels[record.id] = record
             self._summary_records[Opcode.CHANNEL].append(raw)
-            self.message_counts[channel.id] = self._next_sequence[channel.id] = 0
+            self.message_counts[record.id] = self._next_sequence[record.id] = 0
 
-    def write_metadata(self, metadata: Metadata, raw: bytes = b'') -> None:
-        """Write a metadata record."""
-        raw = raw or record_bytes(metadata)
-        index = MetadataIndex(offset=self.size, length=len(raw), name=metadata.name)
-        self._write([raw])
-        self._summary_records[Opcode.METADATA_INDEX].append(record_bytes(index))
-
-    def copy_record(self, blocks: Iterable[bytes], index: AttachmentIndex | None = None) -> None:
+    def copy_record(self, blocks: Iterable[bytes], index: McapRecord | None = None) -> None:
         """Write an attachment, or a record of unknown kind, in blocks of any size."""
         offset = self.size
         self._write(blocks)
-        if index is not None:
+        if isinstance(index, AttachmentIndex):
             self._summary_records[Opcode.ATTACHMENT_INDEX].append(
                 record_bytes(dataclasses.replace(index, offset=offset)))
 
@@ -151,7 +145,7 @@ class McapWriter:
 
     def add_message(
         self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int,
-        data: bytes | memoryview,
+        data: bytes | bytearray | memoryview,
     ) -> bool:
         """Add a message to the chunk in memory; return whether the chunk is full."""
         self._chunk.add(channel_id, sequence, log_time_ns, publish_time_ns, data)
@@ -195,7 +189,7 @@ class McapWriter:
         chunk.clear()
 
     def copy_chunk(self, chunk: Chunk, entries: Entries, raw: bytes = b'') -> None:
-        """Write a compressed chunk and its message indexes."""
+        """Write a compressed chunk and its message indexes; `raw` is as in `write`."""
         raw = raw or record_bytes(chunk)
         indexes = message_indexes(entries)
         offsets = list(itertools.accumulate(
@@ -242,7 +236,7 @@ class McapWriter:
                 topics = [(channel, self._type_names.get(channel.schema_id, ''),
                            self.message_counts[channel.id])
                           for channel in self._channels.values()]
-                self.write_metadata(Metadata(BAG_METADATA, {
+                self.write(Metadata(BAG_METADATA, {
                     'serialized_metadata': bag_metadata_yaml(
                         topics, file_name=file_name or self._path.name, start_ns=self._start_ns,
                         end_ns=self._end_ns, former=former_bag)}))

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Header, Metadata
+from mcap.records import Chunk, Header, Metadata
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording.chunks import time_span

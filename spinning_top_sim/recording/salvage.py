@@ -116,21 +116,20 @@ class _Copy:
             self._put_messages(scanned, scanned.contents)
         elif isinstance(record, Schema | Channel):
             self._declare(record, scanned.raw)
+        elif isinstance(record, Metadata) and record.name == BAG_METADATA:
+            self.former_bag = record.metadata.get('serialized_metadata', '')
         elif isinstance(record, Metadata):
-            if record.name == BAG_METADATA:
-                self.former_bag = record.metadata.get('serialized_metadata', '')
-            else:
-                self._writer.write_metadata(record, scanned.raw)
-        elif isinstance(record, AttachmentIndex):
+            self._writer.write(record, scanned.raw)
+        elif isinstance(record, AttachmentIndex) or scanned.opcode > Opcode.DATA_END:
             self._writer.copy_record(self._scanner.blocks(scanned), record)
-        elif scanned.opcode > Opcode.DATA_END:
-            self._writer.copy_record(self._scanner.blocks(scanned))
 
     def put_rest(self) -> None:
         """Write what is left: messages, and channels that only the summary tells."""
         self._writer.write_chunk()
-        for record in (*self._scanner.schemas.values(), *self._scanner.channels.values()):
-            self._declare(record)
+        for schema in self._scanner.schemas.values():
+            self._declare(schema)
+        for channel in self._scanner.channels.values():
+            self._declare(channel)
 
     def _put_messages(self, scanned: ScannedRecord, contents: ChunkContents) -> None:
         for channel_id in contents.entries:
@@ -150,15 +149,11 @@ class _Copy:
         key = type(record), record.id
         if key in self._declared:
             return
-        if isinstance(record, Schema):
-            self._writer.write_schema(record, raw)
-        elif not record.schema_id:
-            self._writer.write_channel(record, raw)
-        elif record.schema_id in self._scanner.schemas:
+        if isinstance(record, Channel) and record.schema_id:
+            if record.schema_id not in self._scanner.schemas:
+                return      # no reader takes a channel without its schema
             self._declare(self._scanner.schemas[record.schema_id])
-            self._writer.write_channel(record, raw)
-        else:
-            return      # no reader takes a channel without its schema
+        self._writer.write(record, raw)
         self._declared.add(key)
 
 

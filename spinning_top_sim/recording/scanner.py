@@ -248,28 +248,29 @@ class Scanner:
 
     def _count(self, offset: int, contents: ChunkContents) -> None:
         """Count messages, and leave out those of unknown channels."""
-        for number in [*contents.entries]:
-            messages = len(contents.entries[number]) // 2
-            if self._summary.knows(number):
-                self._found[number] += messages
-                continue
-            loss = self._unknown.setdefault(number, Loss(
-                offset, 0, f'messages of channel {number}',
-                'the record of their channel or schema is lost', messages=0))
-            loss.messages = (loss.messages or 0) + messages
-            del contents.entries[number]
-            contents.complete = False
-        if contents.entries:
-            first, last = time_span(contents.entries)
-            begin, end = self._span or (first, last)
-            self._span = min(begin, first), max(end, last)
-        if self._ours:
-            for message in contents.messages():
-                number = message.channel_id
+        unknown = {number for number in contents.entries if not self._summary.knows(number)}
+        for message in contents.messages() if unknown or self._ours else ():
+            number = message.channel_id
+            if number in unknown:
+                loss = self._unknown.setdefault(number, Loss(
+                    offset, 0, f'messages of channel {number}',
+                    'the record of their channel or schema is lost', messages=0))
+                loss.bytes += message.end - message.start
+                loss.messages = (loss.messages or 0) + 1
+            elif self._ours:
                 gap = (message.sequence - self._next_sequence.get(number, 0)) & 0xFFFFFFFF
                 if gap < 1 << 31:  # else it is out of order
                     self._gaps[number] += gap
                     self._next_sequence[number] = message.sequence + 1
+        for number in unknown:
+            del contents.entries[number]
+            contents.complete = False
+        for number, entries in contents.entries.items():
+            self._found[number] += len(entries) // 2
+        if contents.entries:
+            first, last = time_span(contents.entries)
+            begin, end = self._span or (first, last)
+            self._span = min(begin, first), max(end, last)
 
     # Message indexes
 

@@ -268,14 +268,14 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
         file = McapWriter(path, header=record_bytes(header), compression=compression)
         with file.discarded_on_failure():
             _check_space(file, min_free_bytes)
-            file.write_metadata(Metadata(METADATA_NAME, dict(metadata)))
+            file.write(Metadata(METADATA_NAME, dict(metadata)))
             schema_ids = {}
             for number, (name, definition) in enumerate(definitions.items(), start=1):
                 schema_ids[name] = number
-                file.write_schema(Schema(
+                file.write(Schema(
                     id=number, name=name, encoding='ros2msg', data=definition.text.encode()))
             for number, topic in enumerate(topics, start=1):
-                file.write_channel(Channel(
+                file.write(Channel(
                     id=number, topic=topic.name, message_encoding='cdr',
                     schema_id=schema_ids[topic.type_name],
                     metadata={'offered_qos_profiles': offered_qos_yaml(topic),
