@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import mmap
 import struct
-import sys
 from array import array
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
@@ -30,7 +29,7 @@ CHUNK_BYTES = 1 << 20   # uncompressed; a single larger message still makes a ch
 ZSTD_LEVEL = 1
 
 # Message index entries of a chunk by channel id: log time, offset in the uncompressed chunk, log
-# time, offset, .. (uint64).
+# time, offset, .. (uint64), as in the file: no platform of ROS 2 Jazzy is big-endian.
 Entries = Mapping[int, 'array[int]']
 
 MESSAGE = struct.Struct('<BQHIQQ')  # opcode, length, channel, sequence, log and publish time
@@ -38,9 +37,8 @@ MESSAGE_FIELDS = 2 + 4 + 8 + 8      # what `length` counts besides the data
 _MESSAGE_DTYPE = [('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
                   ('log_time', '<u8'), ('publish_time', '<u8')]
 _MESSAGE_OPCODE = int(Opcode.MESSAGE)   # is packed faster
-_INDEX = struct.Struct('<BQHI')     # opcode, length, channel, length of the entries
-
-_NO_TIME = 1 << 64
+INDEX_HEAD = struct.Struct('<BQHI')     # opcode, length, channel, length of the entries
+ENTRY_SIZE = 8 + 8                      # of a message index
 
 
 class PlainChunk:
@@ -57,8 +55,7 @@ class PlainChunk:
 
     def clear(self) -> None:
         """Remove all messages."""
-        self.size = 0                               # [bytes]
-        self.start_ns, self.end_ns = _NO_TIME, 0    # earliest and latest log time
+        self.size = 0       # [bytes]
         self.entries: dict[int, array[int]] = {}
 
     @property
@@ -67,7 +64,7 @@ class PlainChunk:
         return self._memory[:self.size]
 
     def add(self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int,
-            data: bytes | memoryview) -> None:
+            data: bytes | bytearray | memoryview) -> None:
         """Add a message."""
         offset = self.size
         start = offset + MESSAGE.size
@@ -84,10 +81,6 @@ class PlainChunk:
         entries.append(log_time_ns)
         entries.append(offset)
         self.size = end
-        if log_time_ns < self.start_ns:     # noqa: PLR1730 - faster than min and max
-            self.start_ns = log_time_ns
-        if log_time_ns > self.end_ns:       # noqa: PLR1730
-            self.end_ns = log_time_ns
 
     def add_rows(self, channel_id: int, sequence: int, times_ns: NDArray[np.integer],
                  rows: NDArray[np.uint8]) -> None:
@@ -115,8 +108,6 @@ class PlainChunk:
         entries = np.column_stack((times_ns, np.arange(offset, end, length))).astype('u8')
         self.entries.setdefault(channel_id, array('Q')).frombytes(entries.tobytes())
         self.size = end
-        self.start_ns = min(self.start_ns, int(times_ns.min()))
-        self.end_ns = max(self.end_ns, int(times_ns.max()))
 
     def _enlarge(self, size: int) -> None:
         larger = _new_memory(size)
@@ -144,23 +135,16 @@ def compressor(compression: str) -> Callable[[memoryview], bytes]:
 def message_indexes(entries: Entries) -> dict[int, bytes]:
     """Return the message index records behind a chunk by channel id, in ascending order."""
     return {
-        channel_id: _INDEX.pack(
+        channel_id: INDEX_HEAD.pack(
             Opcode.MESSAGE_INDEX, 2 + 4 + 8 * len(numbers), channel_id, 8 * len(numbers))
-        + _little_endian(numbers)
-        for channel_id, numbers in sorted(entries.items()) if numbers}
+        + numbers.tobytes()
+        for channel_id, numbers in sorted(entries.items())}
 
 
 def time_span(entries: Entries) -> tuple[int, int]:
     """Return the earliest and the latest stamp in the entries of a chunk; (0, 0) in none."""
-    times = [time for numbers in entries.values() for time in numbers[::2]]
-    return min(times, default=0), max(times, default=0)
-
-
-def _little_endian(numbers: array[int]) -> bytes:
-    if sys.byteorder == 'big':
-        numbers = array('Q', numbers)
-        numbers.byteswap()
-    return numbers.tobytes()
+    times = [numbers[::2] for numbers in entries.values()]
+    return min(map(min, times), default=0), max(map(max, times), default=0)
 
 
 def _new_memory(size: int) -> memoryview:

@@ -20,7 +20,6 @@ from pathlib import Path
 from spinning_top_sim.recording.errors import DefinitionNotFoundError
 
 _SEPARATOR = '=' * 80
-_TYPE_NAME = re.compile(r'([a-zA-Z0-9_]+)/(?:msg/)?([a-zA-Z0-9_]+)', re.ASCII)
 # rosbag2's own expression: it takes the word before white space at the start of a line.
 _FIELD_TYPE = re.compile(r'(?:^|\n)\s*([a-zA-Z0-9_/]+)(?:\[[^\]]*\])?\s+', re.ASCII)
 _PRIMITIVES = frozenset({
@@ -73,10 +72,7 @@ def _find_hash(type_name: str) -> str:
 
 def _read(type_name: str, suffix: str) -> str:
     """Return the text of share/<package>/msg/<Type><suffix>, from the first place that has it."""
-    match = _TYPE_NAME.fullmatch(type_name)
-    if match is None:
-        raise DefinitionNotFoundError(f'{type_name!r} is not the name of a message type')
-    package, name = match.groups()
+    package, _, name = type_name.replace('/msg/', '/').partition('/')
     searched = []
     for prefix in _prefixes(package):
         path = prefix / 'share' / package / 'msg' / f'{name}{suffix}'

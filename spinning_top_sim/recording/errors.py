@@ -12,19 +12,3 @@ class DefinitionNotFoundError(RecordingError):
 
 class LogError(Exception):
     """A log cannot be read or recovered; the text names the path and the reason."""
-
-
-class LogAccessError(LogError):
-    """The file is not there, is no regular file, may not be read, or the disk fails."""
-
-
-class NotMcapError(LogError):
-    """The file is empty or no MCAP file."""
-
-
-class NothingToSaveError(LogError):
-    """A damaged log holds no whole message."""
-
-
-class OutputError(LogError):
-    """The recovered log cannot be written, or its name is taken."""

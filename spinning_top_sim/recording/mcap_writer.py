@@ -13,10 +13,11 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import os
 import struct
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,7 +30,6 @@ from mcap.records import (
     ChunkIndex,
     DataEnd,
     Footer,
-    Header,
     McapRecord,
     Metadata,
     MetadataIndex,
@@ -45,8 +45,9 @@ from spinning_top_sim.recording.chunks import (
     PlainChunk,
     compressor,
     message_indexes,
+    time_span,
 )
-from spinning_top_sim.recording.rosbag2 import BAG_METADATA, BagTopic, Qos, bag_metadata_yaml
+from spinning_top_sim.recording.rosbag2 import BAG_METADATA, bag_metadata_yaml
 
 if TYPE_CHECKING:
     import numpy as np
@@ -55,19 +56,16 @@ if TYPE_CHECKING:
 
 class McapWriter:
     """
-    A new MCAP file, written by one thread at a time.
+    A new MCAP file, which must not exist (FileExistsError), written by one thread at a time.
 
     Every write goes to an explicit position behind the last whole record, so neither an OSError
     nor an interrupt can shift what follows.  After an OSError `finish` may still be tried.
 
-    path : the file, which must not exist (FileExistsError)
-    profile, library : what the header says
+    header : the record
     compression : of chunks that are made here, 'zstd', 'lz4' or 'none'
-    header : the header as another file has it, default: made of `profile` and `library`
     """
 
-    def __init__(self, path: Path, *, profile: str, library: str, compression: str,
-                 header: bytes = b'') -> None:
+    def __init__(self, path: Path, *, header: bytes, compression: str) -> None:
         self._path = path
         self._compression = '' if compression == 'none' else compression
         self._compress = compressor(compression)
@@ -81,7 +79,7 @@ class McapWriter:
         self._end = 0, 0    # size and checksum of the file; one assignment, so always consistent
         self._next_sequence: dict[int, int] = {}
         self._type_names: dict[int, str] = {}       # by schema id
-        self._bag_topics: dict[int, BagTopic] = {}  # by channel id
+        self._channels: dict[int, Channel] = {}
         # Records of the summary.  Serialized: thousands of objects would take memory.
         self._summary_records: dict[Opcode, list[bytes]] = {kind: [] for kind in (
             Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.CHUNK_INDEX,
@@ -89,7 +87,7 @@ class McapWriter:
 
         self._file = open(path, 'xb', buffering=0)  # noqa: SIM115
         with self.discarded_on_failure():
-            self._write([MCAP0_MAGIC, header or record_bytes(Header(profile, library))])
+            self._write([MCAP0_MAGIC, header])
 
     @property
     def size(self) -> int:
@@ -112,63 +110,44 @@ class McapWriter:
                 self._path.unlink()
             raise
 
-    def write_schema(self, schema: Schema, record: bytes = b'') -> None:
+    def write(self, record: Schema | Channel | Metadata, raw: bytes = b'') -> None:
         """
-        Write a schema; the summary repeats the first one of each id.
+        Write a record, a schema before its channels; the summary repeats the first of each id.
 
-        `record` is the record as another file has it, by default it is made from `schema`.
+        raw : the record as another file has it, default: made from `record`
         """
-        record = record or record_bytes(schema)
-        self._write([record])
-        if schema.id not in self._type_names:
-            self._type_names[schema.id] = schema.name
-            self._summary_records[Opcode.SCHEMA].append(record)
+        offset = self.size
+        raw = raw or record_bytes(record)
+        self._write([raw])
+        if isinstance(record, Metadata):
+            self._summary_records[Opcode.METADATA_INDEX].append(
+                record_bytes(MetadataIndex(offset=offset, length=len(raw), name=record.name)))
+        elif isinstance(record, Schema) and record.id not in self._type_names:
+            self._type_names[record.id] = record.name
+            self._summary_records[Opcode.SCHEMA].append(raw)
+        elif isinstance(record, Channel) and record.id not in self._channels:
+            self._channels[record.id] = record
+            self._summary_records[Opcode.CHANNEL].append(raw)
+            self.message_counts[record.id] = self._next_sequence[record.id] = 0
 
-    def write_channel(
-        self, channel: Channel, record: bytes = b'', qos_profiles: Sequence[Qos] = (),
-    ) -> None:
-        """Write a channel, after its schema; the rest is as in `write_schema`."""
-        record = record or record_bytes(channel)
-        self._write([record])
-        if channel.id not in self._bag_topics:
-            self._bag_topics[channel.id] = BagTopic(
-                channel.topic, self._type_names.get(channel.schema_id, ''),
-                channel.metadata.get('topic_type_hash', ''), channel.message_encoding,
-                qos_profiles)
-            self._summary_records[Opcode.CHANNEL].append(record)
-            self.message_counts[channel.id] = self._next_sequence[channel.id] = 0
-
-    def write_metadata(self, metadata: Metadata, record: bytes = b'') -> None:
-        """Write a metadata record; `record` is as in `write_schema`."""
-        record = record or record_bytes(metadata)
-        index = MetadataIndex(offset=self.size, length=len(record), name=metadata.name)
-        self._write([record])
-        self._summary_records[Opcode.METADATA_INDEX].append(record_bytes(index))
-
-    def copy_attachment(self, index: AttachmentIndex, blocks: Iterable[bytes]) -> None:
-        """Write an attachment of another file; its record comes in blocks of any size."""
-        index = dataclasses.replace(index, offset=self.size)
+    def copy_record(self, blocks: Iterable[bytes], index: McapRecord | None = None) -> None:
+        """Write an attachment, or a record of unknown kind, in blocks of any size."""
+        offset = self.size
         self._write(blocks)
-        self._summary_records[Opcode.ATTACHMENT_INDEX].append(record_bytes(index))
-
-    def copy_record(self, blocks: Iterable[bytes]) -> None:
-        """Write a record that nothing in the summary refers to, in blocks of any size."""
-        self._write(blocks)
+        if isinstance(index, AttachmentIndex):
+            self._summary_records[Opcode.ATTACHMENT_INDEX].append(
+                record_bytes(dataclasses.replace(index, offset=offset)))
 
     def append(self, topic_index: int, log_time_ns: int, data: bytes) -> bool:
-        """
-        Add the next message of a topic to the chunk in memory; return whether the chunk is full.
-
-        topic_index : channel id - 1
-        """
+        """Add the next message of channel `topic_index + 1`; return whether the chunk is full."""
         return self.add_message(topic_index + 1, self._number(topic_index, 1), log_time_ns,
                                 log_time_ns, data)
 
     def add_message(
         self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int,
-        data: bytes | memoryview,
+        data: bytes | bytearray | memoryview,
     ) -> bool:
-        """Add a message with a given sequence number; see `append`."""
+        """Add a message to the chunk in memory; return whether the chunk is full."""
         self._chunk.add(channel_id, sequence, log_time_ns, publish_time_ns, data)
         return self._chunk.size >= CHUNK_BYTES
 
@@ -178,7 +157,7 @@ class McapWriter:
         """
         Make a chunk for `put_plain_chunk`, which another thread may be running.
 
-        blocks : index of a topic, log times of its next messages (n,) [ns], messages (n, size)
+        blocks : topic index, log times of the next messages (n,) [ns], messages (n, size)
         """
         chunk = self._spare_chunks.pop() if self._spare_chunks else PlainChunk()
         for topic_index, times_ns, rows in blocks:
@@ -202,44 +181,34 @@ class McapWriter:
             self._put(self._chunk)
 
     def _put(self, chunk: PlainChunk) -> None:
-        span = chunk.start_ns, chunk.end_ns
+        start_ns, end_ns = time_span(chunk.entries)
         self.copy_chunk(Chunk(
             compression=self._compression, data=self._compress(chunk.data),
             uncompressed_size=chunk.size, uncompressed_crc=zlib.crc32(chunk.data),
-            message_start_time=span[0], message_end_time=span[1]), chunk.entries, span)
+            message_start_time=start_ns, message_end_time=end_ns), chunk.entries)
         chunk.clear()
 
-    def copy_chunk(
-        self, chunk: Chunk, entries: Entries, span: tuple[int, int], record: bytes = b'',
-    ) -> None:
-        """
-        Write a compressed chunk and its message indexes.
-
-        span : the earliest and the latest log time [ns]
-        record : as in `write_schema`
-        """
-        record = record or record_bytes(chunk)
+    def copy_chunk(self, chunk: Chunk, entries: Entries, raw: bytes = b'') -> None:
+        """Write a compressed chunk and its message indexes; `raw` is as in `write`."""
+        raw = raw or record_bytes(chunk)
         indexes = message_indexes(entries)
-        index_offsets = {}
-        offset = self.size + len(record)
-        for channel_id, index in indexes.items():
-            index_offsets[channel_id] = offset
-            offset += len(index)
+        offsets = list(itertools.accumulate(
+            map(len, indexes.values()), initial=self.size + len(raw)))
         chunk_index = record_bytes(ChunkIndex(
-            chunk_start_offset=self.size, chunk_length=len(record),
-            message_index_offsets=index_offsets,
-            message_index_length=offset - self.size - len(record),
+            chunk_start_offset=self.size, chunk_length=len(raw),
+            message_index_offsets=dict(zip(indexes, offsets, strict=False)),
+            message_index_length=offsets[-1] - offsets[0],
             compression=chunk.compression, compressed_size=len(chunk.data),
             uncompressed_size=chunk.uncompressed_size,
             message_start_time=chunk.message_start_time, message_end_time=chunk.message_end_time))
-
-        self._write([record, *indexes.values()])
+        self._write([raw, *indexes.values()])
         self._summary_records[Opcode.CHUNK_INDEX].append(chunk_index)
         self.chunk_count += 1
         if indexes:
             empty = not any(self.message_counts.values())
-            self._start_ns = span[0] if empty else min(self._start_ns, span[0])
-            self._end_ns = max(self._end_ns, span[1])
+            start_ns = chunk.message_start_time
+            self._start_ns = start_ns if empty else min(self._start_ns, start_ns)
+            self._end_ns = max(self._end_ns, chunk.message_end_time)
             for channel_id in indexes:
                 self.message_counts[channel_id] += len(entries[channel_id]) // 2
 
@@ -259,14 +228,15 @@ class McapWriter:
         Write the bag metadata and the summary, bring all to the disk and close the file.
 
         bag : whether the file has a `rosbag2` metadata record
-        file_name : the name of the file in it, default: that of the file
+        file_name : in that record, default: that of the file
         former_bag : the bag metadata of the log that this one is made from
         """
         try:
             if bag:
-                topics = [(topic, self.message_counts[channel_id])
-                          for channel_id, topic in self._bag_topics.items()]
-                self.write_metadata(Metadata(BAG_METADATA, {
+                topics = [(channel, self._type_names.get(channel.schema_id, ''),
+                           self.message_counts[channel.id])
+                          for channel in self._channels.values()]
+                self.write(Metadata(BAG_METADATA, {
                     'serialized_metadata': bag_metadata_yaml(
                         topics, file_name=file_name or self._path.name, start_ns=self._start_ns,
                         end_ns=self._end_ns, former=former_bag)}))

@@ -8,22 +8,22 @@ Memory holds the chunks that overlap in time: one in a log that was written in o
 
 from __future__ import annotations
 
-import bisect
 import functools
+import heapq
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from operator import itemgetter
+from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Header, Metadata
+from mcap.records import Chunk, Header, Metadata
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording.chunks import time_span
 from spinning_top_sim.recording.damage import Damage
-from spinning_top_sim.recording.errors import NotMcapError
+from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.records import (
     MAX_BYTES,
     ChunkContents,
@@ -31,9 +31,14 @@ from spinning_top_sim.recording.records import (
     break_up,
     open_chunk,
 )
-from spinning_top_sim.recording.rosbag2 import Qos, parse_offered_qos
+from spinning_top_sim.recording.rosbag2 import Qos, qos_profiles
 from spinning_top_sim.recording.scanner import Scanner
-from spinning_top_sim.recording.summary import MAGIC_SIZE, McapSource, read_summary
+from spinning_top_sim.recording.summary import (
+    MAGIC_SIZE,
+    McapSource,
+    indexed_messages,
+    read_summary,
+)
 from spinning_top_sim.recording.writer import OUR_LIBRARY
 
 _RUN_BYTES = 1 << 20  # of messages outside of chunks that are read at a time
@@ -73,11 +78,8 @@ class _Span(NamedTuple):
     end_ns: int
 
 
-class _Index(NamedTuple):
-    """Where the messages are, and the metadata records by name."""
-
-    spans: list[_Span]
-    metadata: dict[str, dict[str, str]]
+# Where the messages are, and the metadata records by name.
+_Index = tuple[list[_Span], dict[str, dict[str, str]]]
 
 
 class LogReader:
@@ -87,8 +89,8 @@ class LogReader:
     max_bytes : largest record, and largest uncompressed chunk, that is read into memory
 
     A file with a usable summary opens at once.  Any other is scanned before its topics, metadata
-    or messages are returned, and so is every file for its `damage`.  Damage raises nothing.
-    Raises NotMcapError if it is no MCAP file; any method may raise LogAccessError.
+    or messages are returned, and so is every file for its `damage`.  Damage raises nothing; what
+    is no MCAP file, or cannot be read, raises LogError.
     """
 
     def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> None:
@@ -137,7 +139,7 @@ class LogReader:
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
         """The metadata records by name; of several with one name, the last."""
-        return self._index.metadata
+        return self._index[1]
 
     @property
     def damage(self) -> Damage:
@@ -147,7 +149,7 @@ class LogReader:
     @property
     def span(self) -> tuple[int, int]:
         """The earliest and the latest log time [ns]; both 0 without messages."""
-        spans = [span for span in self._index.spans if span.end_ns]
+        spans, _ = self._index
         return (min((span.start_ns for span in spans), default=0),
                 max((span.end_ns for span in spans), default=0))
 
@@ -161,31 +163,42 @@ class LogReader:
         topics : names, default: all
         start, end : log times [ns]; `end` is exclusive
         """
-        index = self._index
+        spans, _ = self._index      # also makes the channels known
         names = None if topics is None else frozenset(topics)
         channels = {number: channel.topic for number, channel in self._summary.channels.items()
                     if (names is None or channel.topic in names) and self._summary.knows(number)}
-
-        # Chunks that overlap in time are merged: log time, place in the file, message.
-        pending: list[tuple[int, int, int, LogMessage]] = []
-        for span in index.spans:
-            if (start is not None and span.end_ns < start) or (
-                    end is not None and span.start_ns >= end):
+        times = range(start or 0, 1 << 64 if end is None else end)
+        overlapping: list[_Span] = []
+        overlap_end = 0
+        for span in spans:
+            if span.end_ns < times.start or span.start_ns >= times.stop:
                 continue
-            pending.sort()
-            ready = bisect.bisect_left(pending, span.start_ns, key=itemgetter(0))
-            yield from map(itemgetter(3), pending[:ready])
-            del pending[:ready]
-            contents = self._read(span)
-            for number, (time_ns, channel, sequence, publish_ns, begin, stop) in enumerate(
-                    contents.messages):
-                if (channel in channels and (start is None or time_ns >= start)
-                        and (end is None or time_ns < end)):
-                    pending.append((time_ns, span.offset, number, LogMessage(
-                        channels[channel], time_ns, publish_ns, sequence,
-                        contents.plain[begin:stop], channel)))
-        pending.sort()
-        yield from map(itemgetter(3), pending)
+            if span.start_ns > overlap_end:
+                yield from self._merge(overlapping, channels, times)
+                overlapping = []
+            overlapping.append(span)
+            overlap_end = max(overlap_end, span.end_ns)
+        yield from self._merge(overlapping, channels, times)
+
+    def _merge(self, spans: Iterable[_Span], channels: Mapping[int, str], times: range,
+               ) -> Iterator[LogMessage]:
+        """Yield messages of spans in order; a span is read when its time comes."""
+        spans = sorted(spans, key=attrgetter('offset'))
+        streams = [self._stream(span, channels) for span in spans]
+        for message in heapq.merge(*streams, key=attrgetter('log_time')):
+            if message.channel_id >= 0 and message.log_time in times:
+                yield message
+
+    def _stream(self, span: _Span, channels: Mapping[int, str]) -> Iterator[LogMessage]:
+        """Yield what stands for the time at which a span begins, then its messages in order."""
+        yield LogMessage('', span.start_ns, 0, 0, b'', -1)
+        contents = self._read(span)
+        for channel_id in contents.entries.keys() - channels:
+            del contents.entries[channel_id]
+        plain = contents.plain
+        for channel_id, sequence, log_time, publish_time, begin, end in contents.sorted_messages():
+            yield LogMessage(channels[channel_id], log_time, publish_time, sequence,
+                             bytes(plain[begin:end]), channel_id)
 
     def scan(self) -> Scanner:
         """Begin a scan of all usable records in file order, with what former ones know."""
@@ -205,8 +218,9 @@ class LogReader:
             if isinstance(record, Metadata):
                 metadata[record.name] = record.metadata
         spans = [_Span(chunk.message_start_time, offset, offset + chunk.chunk_length,
-                       chunk.message_end_time) for offset, chunk in self._summary.chunks.items()]
-        return _Index(sorted(spans), metadata)
+                       chunk.message_end_time) for offset, chunk in self._summary.chunks.items()
+                 if indexed_messages(chunk)]
+        return sorted(spans), metadata
 
     @functools.cached_property
     def _survey(self) -> tuple[_Index, Damage]:
@@ -219,12 +233,12 @@ class LogReader:
         return index, scanner.damage()
 
     def _read_header(self) -> Header:
-        """Return the header; raises NotMcapError if neither magic nor header is there."""
+        """Return the header; raises LogError if neither magic nor header is there."""
         magic = self.source.read(0, MAGIC_SIZE)
         if not magic:
-            raise NotMcapError(f'cannot read {self.path}: it is empty')
+            raise LogError(f'cannot read {self.path}: it is empty')
         if magic != MCAP0_MAGIC and MCAP0_MAGIC.startswith(magic):
-            raise NotMcapError(
+            raise LogError(
                 f'cannot read {self.path}: it ends after {self.size} bytes of an MCAP file')
         try:
             header = self.source.record(MAGIC_SIZE, self.size)
@@ -233,7 +247,7 @@ class LogReader:
         if isinstance(header, Header):
             return header
         if magic != MCAP0_MAGIC:
-            raise NotMcapError(f'cannot read {self.path}: it is no MCAP file')
+            raise LogError(f'cannot read {self.path}: it is no MCAP file')
         return Header(profile='ros2', library='')
 
     def _read(self, span: _Span) -> ChunkContents:
@@ -254,24 +268,18 @@ def _scan_all(scanner: Scanner) -> _Index:
     """Return what is found in a scan."""
     spans: list[_Span] = []
     metadata = {}
-    run: _Span | None = None  # adjacent messages outside of chunks
+    run_end = 0     # of adjacent messages outside of chunks, the last span
     for scanned in scanner:
         if isinstance(scanned.record, Metadata):
             metadata[scanned.record.name] = scanned.record.metadata
-        if scanned.contents is None or not scanned.contents.messages:
+        if scanned.contents is None or not scanned.contents.entries:
             continue
+        offset = scanned.offset
         start_ns, end_ns = time_span(scanned.contents.entries)
-        span = _Span(start_ns, scanned.offset, scanned.end, end_ns)
-        if (scanned.record is None and run is not None and run.end == span.offset
-                and run.end - run.offset < _RUN_BYTES):
-            run = spans[-1] = _Span(min(run.start_ns, start_ns), run.offset, span.end,
-                                    max(run.end_ns, end_ns))
-            continue
-        spans.append(span)
-        run = span if scanned.record is None else None
-    return _Index(sorted(spans), metadata)
-
-
-def qos_profiles(channel: Channel) -> tuple[Qos, ...]:
-    """Return the QoS profiles in the metadata of a channel."""
-    return tuple(parse_offered_qos(channel.metadata.get('offered_qos_profiles', '')))
+        if scanned.record is None and run_end == offset < spans[-1].offset + _RUN_BYTES:
+            run = spans.pop()
+            offset = run.offset
+            start_ns, end_ns = min(run.start_ns, start_ns), max(run.end_ns, end_ns)
+        spans.append(_Span(start_ns, offset, scanned.end, end_ns))
+        run_end = scanned.end if scanned.record is None else 0
+    return sorted(spans), metadata

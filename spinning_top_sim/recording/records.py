@@ -9,11 +9,12 @@ later versions of the format may add fields (MCAP specification, "Records").
 
 from __future__ import annotations
 
-import functools
+import itertools
 import struct
 import sys
 import zlib
 from array import array
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from typing import BinaryIO, NamedTuple
@@ -26,7 +27,7 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Schema
 
-from spinning_top_sim.recording.chunks import MESSAGE, MESSAGE_FIELDS, Entries
+from spinning_top_sim.recording.chunks import ENTRY_SIZE, INDEX_HEAD, MESSAGE, MESSAGE_FIELDS
 from spinning_top_sim.recording.mcap_writer import record_bytes
 
 MAX_BYTES = 256 << 20               # of one record or one uncompressed chunk in memory
@@ -34,11 +35,10 @@ HEAD = struct.Struct('<BQ')         # of every record: opcode, length of what fo
 
 _BLOCK = 1 << 20    # bytes decompressed at a time
 _MESSAGE_OPCODE = int(Opcode.MESSAGE)   # compares faster
-_FIELDS = struct.Struct('<HIQQ')    # of a message: channel, sequence, log and publish time
 # mcap's class of each kind that is parsed as a whole: that of CHUNK_INDEX is ChunkIndex.
 _CLASSES: dict[int, type[McapRecord]] = {
-    opcode: getattr(mcap.records, opcode.name.title().replace('_', ''))
-    for opcode in Opcode if opcode not in (Opcode.MESSAGE, Opcode.ATTACHMENT)}
+    opcode: getattr(mcap.records, opcode.name.title().replace('_', '')) for opcode in Opcode
+    if opcode not in (Opcode.MESSAGE, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT)}
 
 
 class DamagedError(Exception):
@@ -55,9 +55,9 @@ class TooLargeError(DamagedError):
 class StoredMessage(NamedTuple):
     """A message, with the place of its data in the bytes that hold it; times in ns."""
 
-    log_time: int
     channel_id: int
     sequence: int
+    log_time: int
     publish_time: int
     start: int
     end: int
@@ -65,30 +65,46 @@ class StoredMessage(NamedTuple):
 
 @dataclass
 class ChunkContents:
-    """The content of a chunk whose checksum is right, or of messages outside of chunks."""
+    """
+    The content of a chunk whose checksum is right, or of messages outside of chunks.
 
-    plain: bytes    # uncompressed
-    messages: list[StoredMessage] = field(default_factory=list)     # in the order of the file
+    Millions of tiny messages fit into a chunk, so there are only numbers of each.
+    """
+
+    plain: bytes | bytearray    # uncompressed
+    entries: dict[int, array[int]] = field(default_factory=dict)    # of the message indexes
     declared: list[Schema | Channel] = field(default_factory=list)
+    in_time_order: bool = True
+    complete: bool = True   # no entries were left out, whose channel is unknown
 
-    @functools.cached_property
-    def entries(self) -> Entries:
-        """The message index entries that belong to the chunk."""
-        found: dict[int, array[int]] = {}
-        for log_time, channel_id, _, _, start, _ in self.messages:
-            numbers = found.get(channel_id)
-            if numbers is None:
-                numbers = found[channel_id] = array('Q')
-            numbers.append(log_time)
-            numbers.append(start - MESSAGE.size)
-        return found
+    def messages(self) -> Iterator[StoredMessage]:
+        """Yield the messages in the order of the file."""
+        return self._messages_at(sorted(itertools.chain.from_iterable(
+            numbers[1::2] for numbers in self.entries.values())))
+
+    def sorted_messages(self) -> Iterator[StoredMessage]:
+        """Yield the messages in the order of their log times, equal ones in that of the file."""
+        if self.in_time_order:
+            return self.messages()
+        places = sorted(time << 64 | offset for numbers in self.entries.values()
+                        for time, offset in zip(numbers[::2], numbers[1::2], strict=True))
+        return self._messages_at(place & (1 << 64) - 1 for place in places)
+
+    def _messages_at(self, offsets: Iterable[int]) -> Iterator[StoredMessage]:
+        plain, unpack = self.plain, MESSAGE.unpack_from
+        for offset in offsets:
+            _, length, channel_id, sequence, log_time, publish_time = unpack(plain, offset)
+            yield StoredMessage(channel_id, sequence, log_time, publish_time,
+                                offset + MESSAGE.size, offset + HEAD.size + length)
 
 
 class StrictStream(ReadDataStream):
-    """A stream of one record's content that gives what is asked for or raises EndOfFile."""
+    """A stream of a record behind its head that gives what is asked for or raises EndOfFile."""
 
-    def __init__(self, content: bytes) -> None:
-        super().__init__(BytesIO(content))
+    def __init__(self, raw: bytes) -> None:
+        stream = BytesIO(raw)
+        stream.seek(HEAD.size)
+        super().__init__(stream)
 
     def read(self, length: int) -> bytes:
         """Return exactly `length` bytes."""
@@ -100,30 +116,44 @@ class StrictStream(ReadDataStream):
 
 def name_of(opcode: int) -> str:
     """Return what a kind of record is called in reports."""
-    if opcode in _CLASSES or opcode in (Opcode.MESSAGE, Opcode.ATTACHMENT):
-        return Opcode(opcode).name.lower().replace('_', ' ')
-    return f'record of unknown kind {opcode:#04x}'
-
-
-def parse(opcode: int, content: bytes) -> tuple[McapRecord, int]:
-    """
-    Return the record with this content, and how many bytes stand behind its known fields.
-
-    Raises DamagedError, also for messages and attachments.
-    """
-    if opcode not in _CLASSES:
-        raise DamagedError('there is no such kind of record')
-    stream = StrictStream(content)
     try:
-        record: McapRecord = _CLASSES[opcode].read(stream)  # type: ignore[attr-defined]
+        return Opcode(opcode).name.lower().replace('_', ' ')
+    except ValueError:
+        return f'record of unknown kind {opcode:#04x}'
+
+
+def parse(raw: bytes) -> tuple[McapRecord, int]:
+    """
+    Return the record, and how many bytes stand behind its known fields.
+
+    Raises DamagedError, also for messages, message indexes and attachments.
+    """
+    record_class = _CLASSES.get(raw[0])
+    if record_class is None:
+        raise DamagedError('there is no such kind of record')
+    stream = StrictStream(raw)
+    try:
+        record: McapRecord = record_class.read(stream)  # type: ignore[attr-defined]
     except McapError:
         raise DamagedError('a length inside of it leads beyond its end') from None
     except UnicodeDecodeError:
         raise DamagedError('a text in it is no UTF-8') from None
     # mcap may run over the end of a map.  A chunk has none, and writing it would copy its data.
-    if opcode != Opcode.CHUNK and not content.startswith(record_bytes(record)[HEAD.size:]):
+    if not isinstance(record, Chunk) and not raw.startswith(
+            record_bytes(record)[HEAD.size:], HEAD.size):
         raise DamagedError('its length is not that of its content')
-    return record, len(content) - stream.count
+    return record, len(raw) - HEAD.size - stream.count
+
+
+def parse_message_index(raw: bytes) -> tuple[int, array[int], int]:
+    """Return the channel of a message index, its entries, and how many bytes stand behind them."""
+    extra = len(raw) - INDEX_HEAD.size
+    if extra >= 0:
+        _, _, channel_id, size = INDEX_HEAD.unpack_from(raw)
+        extra -= size
+    if extra < 0 or size % ENTRY_SIZE:
+        raise DamagedError('its length is not that of its content')
+    return channel_id, array('Q', raw[INDEX_HEAD.size:INDEX_HEAD.size + size]), extra
 
 
 def open_chunk(chunk: Chunk, max_bytes: int) -> ChunkContents:
@@ -133,47 +163,54 @@ def open_chunk(chunk: Chunk, max_bytes: int) -> ChunkContents:
     A chunk without checksum (0) is right when it decompresses and breaks up into records.
     """
     plain = _decompress(chunk, max_bytes)
-    if len(plain) != chunk.uncompressed_size:
-        raise DamagedError('it has not the size that it says it has')
     if chunk.uncompressed_crc and zlib.crc32(plain) != chunk.uncompressed_crc:
         raise DamagedError('its checksum is wrong')
     return break_up(plain)
 
 
-def break_up(plain: bytes) -> ChunkContents:
+def break_up(plain: bytes | bytearray) -> ChunkContents:
     """Return the messages and declarations among records that stand one after the other."""
     contents = ChunkContents(plain)
+    entries = contents.entries
+    last_time = 0
     size = len(plain)
     offset = 0
     while offset < size:
         if size - offset < HEAD.size:
             raise DamagedError('a record in it is truncated')
         opcode, length = HEAD.unpack_from(plain, offset)
-        start = offset + HEAD.size
-        offset = start + length
-        if offset > size:
+        end = offset + HEAD.size + length
+        if end > size:
             raise DamagedError('a record in it leads beyond its end')
         if opcode == _MESSAGE_OPCODE:
             if length < MESSAGE_FIELDS:
                 raise DamagedError('a message is shorter than a message can be')
-            channel_id, sequence, log_time, publish_time = _FIELDS.unpack_from(plain, start)
-            contents.messages.append(StoredMessage(
-                log_time, channel_id, sequence, publish_time, start + MESSAGE_FIELDS, offset))
+            _, _, channel_id, _, log_time, _ = MESSAGE.unpack_from(plain, offset)
+            numbers = entries.get(channel_id)
+            if numbers is None:
+                numbers = entries[channel_id] = array('Q')
+            numbers.append(log_time)
+            numbers.append(offset)
+            if log_time < last_time:
+                contents.in_time_order = False
+            last_time = log_time
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            record, _ = parse(opcode, plain[start:offset])
+            record, _ = parse(bytes(plain[offset:end]))
             assert isinstance(record, Schema | Channel)
             contents.declared.append(record)
+        offset = end
     return contents
 
 
-def _decompress(chunk: Chunk, max_bytes: int) -> bytes:
-    """Return the uncompressed bytes of all frames, but never many more than the chunk states."""
-    if chunk.uncompressed_size > max_bytes:
-        raise TooLargeError(chunk.uncompressed_size, max_bytes)
-    if chunk.compression == '':
-        return chunk.data
+def _decompress(chunk: Chunk, max_bytes: int) -> bytes | bytearray:
+    """Return the uncompressed bytes of all frames, never more than the chunk states."""
+    size = chunk.uncompressed_size
+    if size > max_bytes:
+        raise TooLargeError(size, max_bytes)
     stream: BinaryIO
-    if chunk.compression == 'zstd':
+    if chunk.compression == '':
+        stream = BytesIO(chunk.data)
+    elif chunk.compression == 'zstd':
         stream = zstandard.ZstdDecompressor().stream_reader(chunk.data, read_across_frames=True)
     elif chunk.compression == 'lz4':
         stream = lz4.frame.open(BytesIO(chunk.data))
@@ -181,8 +218,10 @@ def _decompress(chunk: Chunk, max_bytes: int) -> bytes:
         raise DamagedError(f'its compression {chunk.compression[:20]!r} is unknown')
     plain = bytearray()
     try:
-        while len(plain) <= chunk.uncompressed_size and (block := stream.read(_BLOCK)):
+        while len(plain) < size and (block := stream.read(min(_BLOCK, size - len(plain)))):
             plain += block
+        if len(plain) < size or stream.read(1):
+            raise DamagedError('it has not the size that it says it has')
     except (zstandard.ZstdError, RuntimeError, EOFError, ValueError, MemoryError):
         raise DamagedError('it cannot be decompressed') from None
-    return bytes(plain)
+    return plain

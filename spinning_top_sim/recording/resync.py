@@ -15,6 +15,7 @@ from spinning_top_sim.recording.records import (
     TooLargeError,
     open_chunk,
     parse,
+    parse_message_index,
 )
 from spinning_top_sim.recording.summary import McapSource
 
@@ -57,6 +58,8 @@ class RecordFinder:
                 self._source.attachment(offset, end)
             elif opcode in _NAME_OFFSETS:
                 self._prove(opcode, offset, end)
+            elif opcode == Opcode.MESSAGE_INDEX:
+                parse_message_index(self._source.raw(offset, end))
             else:
                 self._source.record(offset, end)
         except TooLargeError:
@@ -89,10 +92,10 @@ class RecordFinder:
         self._effort -= end - start
         if self._effort < 0:
             raise DamagedError('the file has candidates everywhere')
-        record, _ = parse(opcode, self._source.content(offset, end))
+        record, _ = parse(self._source.raw(offset, end))
         if isinstance(record, Chunk):
             contents = open_chunk(record, self._source.max_bytes)
-            if not contents.messages and not contents.declared:
+            if not contents.entries and not contents.declared:
                 raise DamagedError('it is empty')       # zeros in data look like that
 
 

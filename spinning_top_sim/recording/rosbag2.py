@@ -10,10 +10,13 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, TypeGuard
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
 
 import yaml
+
+if TYPE_CHECKING:
+    from mcap.records import Channel
 
 # A profile: the keys of DEFAULT_QOS, integer policies as in rmw, durations as {'sec', 'nsec'}.
 Qos = Mapping[str, Any]
@@ -45,33 +48,12 @@ _POLICY_NAMES = {
 }
 
 
-@dataclass(frozen=True)
-class RecordedTopic:
-    """One topic of a recording.  Raises ValueError for a policy that rosbag2 does not know."""
+class RecordedTopic(NamedTuple):
+    """One topic of a recording."""
 
     name: str               # resolved, such as '/imu/data_raw'
     type_name: str          # 'package/msg/Type'
-    qos: Qos = field(default_factory=dict)  # offered; what is left out is as in DEFAULT_QOS
-
-    def __post_init__(self) -> None:
-        for key, value in self.qos.items():
-            if key not in DEFAULT_QOS:
-                raise ValueError(f'qos of {self.name}: {key!r} is none of {list(DEFAULT_QOS)}')
-            names = _POLICY_NAMES.get(key)
-            if names is not None and not 0 <= value < len(names):
-                raise ValueError(
-                    f'qos of {self.name}: {key} = {value!r}: must be in [0, {len(names) - 1}]')
-
-
-@dataclass
-class BagTopic:
-    """What the bag metadata say of a topic."""
-
-    name: str
-    type_name: str
-    type_hash: str              # 'RIHS01_...' or ''
-    encoding: str
-    profiles: Sequence[Qos]     # what its publishers offer
+    qos: Qos = MappingProxyType({})     # offered; what is left out is as in DEFAULT_QOS
 
 
 def offered_qos_yaml(topic: RecordedTopic) -> str:
@@ -83,21 +65,21 @@ def offered_qos_yaml(topic: RecordedTopic) -> str:
     return _dump([{**DEFAULT_QOS, **topic.qos}])
 
 
-def parse_offered_qos(text: str) -> list[Qos]:
+def qos_profiles(channel: Channel) -> tuple[Qos, ...]:
     """
-    Parse the `offered_qos_profiles` of a channel, with policies by number or name.
+    Return the QoS profiles in the metadata of a channel, with policies by number or name.
 
     A policy that is missing or not understood is as in DEFAULT_QOS; a text that is no list of
     profiles has none.
     """
     try:
-        profiles = yaml.safe_load(text)
+        profiles = yaml.safe_load(channel.metadata.get('offered_qos_profiles', ''))
     except (yaml.YAMLError, ValueError, TypeError, OverflowError, RecursionError):
-        return []
+        return ()
     if not isinstance(profiles, list) or not all(isinstance(one, dict) for one in profiles):
-        return []
-    return [{key: _parsed_policy(key, profile.get(key)) for key in DEFAULT_QOS}
-            for profile in profiles]
+        return ()
+    return tuple({key: _parsed_policy(key, profile.get(key)) for key in DEFAULT_QOS}
+                 for profile in profiles)
 
 
 def _parsed_policy(key: str, value: object) -> int | bool | Mapping[str, int]:
@@ -121,13 +103,13 @@ def _is_int64(value: object) -> TypeGuard[int]:
 
 
 def bag_metadata_yaml(
-    topics: Sequence[tuple[BagTopic, int]], *, file_name: str, start_ns: int, end_ns: int,
+    topics: Sequence[tuple[Channel, str, int]], *, file_name: str, start_ns: int, end_ns: int,
     former: str = '',
 ) -> str:
     """
     Return the `serialized_metadata` of the `rosbag2` record.
 
-    topics : with the number of their messages, in the order of the file
+    topics : channels with their type and the number of their messages, in the order of the file
     start_ns, end_ns : the earliest and the latest stamp; both 0 in an empty log
     former : the metadata of the log that this one is made from; its ROS distribution and custom
         data stay, as they are
@@ -136,7 +118,7 @@ def bag_metadata_yaml(
     file_name = file_name.encode(errors='replace').decode()
     start = {'nanoseconds_since_epoch': start_ns}
     duration = {'nanoseconds': end_ns - start_ns}
-    total = sum(messages for _, messages in topics)
+    total = sum(messages for _, _, messages in topics)
     return '\n'.join((
         _dump({
             'version': _METADATA_VERSION,
@@ -146,12 +128,12 @@ def bag_metadata_yaml(
             'message_count': total,
             'topics_with_message_count': [
                 {'topic_metadata': {
-                    'name': topic.name,
-                    'type': topic.type_name,
-                    'serialization_format': topic.encoding,
-                    'offered_qos_profiles': [_named(profile) for profile in topic.profiles],
-                    'type_description_hash': topic.type_hash},
-                 'message_count': messages} for topic, messages in topics],
+                    'name': channel.topic,
+                    'type': type_name,
+                    'serialization_format': channel.message_encoding,
+                    'offered_qos_profiles': [_named(qos) for qos in qos_profiles(channel)],
+                    'type_description_hash': channel.metadata.get('topic_type_hash', '')},
+                 'message_count': messages} for channel, type_name, messages in topics],
             'compression_format': '',
             'compression_mode': '',
             'relative_file_paths': [file_name],
@@ -163,9 +145,9 @@ def bag_metadata_yaml(
 
 
 def _named(profile: Qos) -> Qos:
-    """Return a whole profile with its policies by name."""
+    """Return a profile with its policies by name."""
     return {key: _POLICY_NAMES[key][value] if key in _POLICY_NAMES else value
-            for key, value in {**DEFAULT_QOS, **profile}.items()}
+            for key, value in profile.items()}
 
 
 def _block(text: str, key: str) -> str:

@@ -14,11 +14,11 @@ from pathlib import Path
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, Chunk, Header, Metadata, Schema
 
-from spinning_top_sim.recording.chunks import time_span
 from spinning_top_sim.recording.damage import Damage
-from spinning_top_sim.recording.errors import NothingToSaveError, OutputError
-from spinning_top_sim.recording.mcap_writer import McapWriter, sync_directory
-from spinning_top_sim.recording.reader import LogReader, qos_profiles
+from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.recording.mcap_writer import McapWriter, record_bytes, sync_directory
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.records import ChunkContents
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA
 from spinning_top_sim.recording.scanner import ScannedRecord, Scanner
 
@@ -48,23 +48,24 @@ def recover(
 
     Chunks and records of unknown kinds are copied as they are, messages outside of chunks are put
     into some; message indexes, statistics, summary and the `rosbag2` record are made anew.
-    Raises LogError: OutputError if the output exists or cannot be written, NothingToSaveError if
-    a file that was not closed holds no whole message.
+    Raises LogError, also if a file that was not closed holds no whole message.
     """
     output = Path(output)
-    if os.path.lexists(output):
-        raise _exists(output)
     draft = output.with_name(f'.recover-{secrets.token_hex(8)}.tmp')
     try:
+        if os.path.lexists(output):
+            raise FileExistsError
         try:
             return _recover(reader, output, draft, progress)
         except _FoundLateError:
             return _recover(reader, output, draft, progress)
+    except FileExistsError:
+        raise LogError(f'{output} exists, and nothing is overwritten') from None
     except FileNotFoundError as error:
-        raise OutputError(
+        raise LogError(
             f'cannot write {output}: there is no directory {output.parent}') from error
     except OSError as error:
-        raise OutputError(f'cannot write {output}: {error.strerror or error}') from error
+        raise LogError(f'cannot write {output}: {error.strerror or error}') from error
 
 
 class _FoundLateError(Exception):
@@ -77,9 +78,9 @@ def _recover(
     scanner = reader.scan()
     records = iter(scanner)
     first = next(records, None)
-    header = first.raw if first is not None and isinstance(first.record, Header) else b''
-    writer = McapWriter(draft, profile=reader.profile, library=reader.library,
-                        compression=_COMPRESSION, header=header)
+    header = (first.raw if first is not None and isinstance(first.record, Header)
+              else record_bytes(Header(reader.profile, reader.library)))
+    writer = McapWriter(draft, header=header, compression=_COMPRESSION)
     with writer.discarded_on_failure():
         copy = _Copy(scanner, writer)
         for scanned in filter(None, itertools.chain([first], records)):
@@ -88,10 +89,9 @@ def _recover(
         if scanner.found_late:
             raise _FoundLateError
         copy.put_rest()
-        messages = sum(writer.message_counts.values())
+        messages = sum(writer.counts)
         if not messages and not reader.whole:
-            raise NothingToSaveError(
-                f'nothing to save in {reader.path}: there is no whole message in it')
+            raise LogError(f'nothing to save in {reader.path}: there is no whole message in it')
         os.chmod(draft, reader.source.mode)
         writer.finish(bag=reader.profile == 'ros2' or bool(copy.former_bag),
                       file_name=output.name, former_bag=copy.former_bag)
@@ -101,7 +101,7 @@ def _recover(
 
 
 class _Copy:
-    """Writes scanned records into a new file."""
+    """Writes scanned records into a new file, as they are or as they should be."""
 
     def __init__(self, scanner: Scanner, writer: McapWriter) -> None:
         self._scanner = scanner
@@ -110,21 +110,18 @@ class _Copy:
         self.former_bag = ''  # the `rosbag2` record of the log
 
     def put(self, scanned: ScannedRecord) -> None:
-        """Write a record, as it is or as it should be."""
+        """Write a record."""
         record = scanned.record
         if scanned.contents is not None:
-            self._put_messages(scanned)
+            self._put_messages(scanned, scanned.contents)
         elif isinstance(record, Schema | Channel):
             self._declare(record, scanned.raw)
+        elif isinstance(record, Metadata) and record.name == BAG_METADATA:
+            self.former_bag = record.metadata.get('serialized_metadata', '')
         elif isinstance(record, Metadata):
-            if record.name == BAG_METADATA:
-                self.former_bag = record.metadata.get('serialized_metadata', '')
-            else:
-                self._writer.write_metadata(record, scanned.raw)
-        elif isinstance(record, AttachmentIndex):
-            self._writer.copy_attachment(record, self._scanner.blocks(scanned))
-        elif scanned.opcode > Opcode.DATA_END:
-            self._writer.copy_record(self._scanner.blocks(scanned))
+            self._writer.write(record, scanned.raw)
+        elif isinstance(record, AttachmentIndex) or scanned.opcode > Opcode.DATA_END:
+            self._writer.copy_record(self._scanner.blocks(scanned), record)
 
     def put_rest(self) -> None:
         """Write what is left: messages, and channels that only the summary tells."""
@@ -134,17 +131,14 @@ class _Copy:
         for channel in self._scanner.channels.values():
             self._declare(channel)
 
-    def _put_messages(self, scanned: ScannedRecord) -> None:
-        contents = scanned.contents
-        assert contents is not None
+    def _put_messages(self, scanned: ScannedRecord, contents: ChunkContents) -> None:
         for channel_id in contents.entries:
             self._declare(self._scanner.channels[channel_id])
-        if isinstance(scanned.record, Chunk) and not scanned.unknown:
+        if isinstance(scanned.record, Chunk) and contents.complete:
             self._writer.write_chunk()  # what came before stays before
-            self._writer.copy_chunk(
-                scanned.record, contents.entries, time_span(contents.entries), scanned.raw)
+            self._writer.copy_chunk(scanned.record, contents.entries, scanned.raw)
             return
-        for message in contents.messages:
+        for message in contents.messages():
             if self._writer.add_message(
                     message.channel_id, message.sequence, message.log_time,
                     message.publish_time, contents.plain[message.start:message.end]):
@@ -155,34 +149,26 @@ class _Copy:
         key = type(record), record.id
         if key in self._declared:
             return
-        if isinstance(record, Schema):
-            self._writer.write_schema(record, raw)
-        else:
-            schema = self._scanner.schemas.get(record.schema_id)
-            if schema is not None:
-                self._declare(schema)
-            elif record.schema_id:
+        if isinstance(record, Channel) and record.schema_id:
+            if record.schema_id not in self._scanner.schemas:
                 return      # no reader takes a channel without its schema
-            self._writer.write_channel(record, raw, qos_profiles(record))
+            self._declare(self._scanner.schemas[record.schema_id])
+        self._writer.write(record, raw)
         self._declared.add(key)
 
 
 def _publish(draft: Path, output: Path) -> None:
-    """Give a file its name without taking that of another."""
+    """Give a file its name without taking that of another (FileExistsError)."""
     try:
         os.link(draft, output)
     except FileExistsError:
-        raise _exists(output) from None
+        raise
     except OSError:
         # A file system without links: between the look and the renaming nothing protects.
         if os.path.lexists(output):
-            raise _exists(output) from None
+            raise FileExistsError from None
         os.rename(draft, output)
     else:
         with contextlib.suppress(OSError):
             draft.unlink()
     sync_directory(output.parent)
-
-
-def _exists(output: Path) -> OutputError:
-    return OutputError(f'{output} exists, and nothing is overwritten')

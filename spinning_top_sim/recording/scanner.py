@@ -17,24 +17,16 @@ from __future__ import annotations
 import bisect
 import struct
 import zlib
+from array import array
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from mcap.opcode import Opcode
-from mcap.records import (
-    Channel,
-    Chunk,
-    DataEnd,
-    Header,
-    McapRecord,
-    MessageIndex,
-    Metadata,
-    Schema,
-)
+from mcap.records import Channel, Chunk, DataEnd, Header, McapRecord, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from spinning_top_sim.recording.chunks import message_indexes, time_span
+from spinning_top_sim.recording.chunks import Entries, message_indexes, time_span
 from spinning_top_sim.recording.damage import Damage, Loss
 from spinning_top_sim.recording.mcap_writer import record_bytes
 from spinning_top_sim.recording.records import (
@@ -46,15 +38,17 @@ from spinning_top_sim.recording.records import (
     name_of,
     open_chunk,
     parse,
+    parse_message_index,
 )
 from spinning_top_sim.recording.resync import RecordFinder
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA
-from spinning_top_sim.recording.summary import INDEX_SIZE, MAGIC_SIZE, McapSource, Summary
+from spinning_top_sim.recording.summary import MAGIC_SIZE, McapSource, Summary
 
 _DATA_END_SIZE = HEAD.size + 4
 _TIMES = struct.Struct('<QQ')       # of a chunk, behind its head
 _SUMMARY_KINDS = (Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.METADATA_INDEX,
                   Opcode.ATTACHMENT_INDEX, Opcode.SUMMARY_OFFSET, Opcode.FOOTER)
+_INDEX_KIND = bytes([Opcode.MESSAGE_INDEX])
 
 
 @dataclass(frozen=True)
@@ -64,14 +58,13 @@ class ScannedRecord:
     opcode: int             # above DATA_END: of an application, or of a later version of MCAP
     offset: int             # in the file
     end: int
-    # As it should be.  The index of an attachment; None for single messages and unknown kinds.
+    # As it should be.  The index of an attachment; None for single messages, message indexes and
+    # unknown kinds.
     record: McapRecord | None = None
     # The record as it should be, with its head and its extra fields; only what fits into memory.
     raw: bytes = b''
     # Messages of known channels, of a chunk or a single one.
     contents: ChunkContents | None = None
-    unknown: bool = False   # messages were left out, whose channel or its schema is unknown
-    indexes: Mapping[int, bytes] = field(default_factory=dict)  # that should follow, by channel
 
 
 class Scanner:
@@ -97,14 +90,11 @@ class Scanner:
         self._losses: list[Loss] = []
         self._defects: list[str] = []
         self._crc = zlib.crc32(MCAP0_MAGIC)     # over the records as they should be
-        # What should follow a chunk: its message indexes by channel; what a lost one held.
-        self._expected: dict[int, bytes] = {}
-        self._lost_chunk: Loss | None = None
-
-        self._found: Counter[int] = Counter()           # whole messages by channel
-        self._span: tuple[int, int] | None = None       # their earliest and latest log time
-        self._in_lost_chunks: Counter[int] = Counter()  # messages by channel
-        self._gaps: Counter[int] = Counter()            # by sequence numbers
+        self._span: tuple[int, int] | None = None       # of the log times of whole messages
+        # Messages by channel: whole ones, of damaged chunks, missing by the sequence numbers.
+        self._found: Counter[int] = Counter()
+        self._in_lost_chunks: Counter[int] = Counter()
+        self._gaps: Counter[int] = Counter()
         self._next_sequence: dict[int, int] = {}
         self._unknown: dict[int, Loss] = {}             # messages by unknown channel
 
@@ -124,15 +114,18 @@ class Scanner:
                 continue
             if scanned is None:
                 break
+            offset = scanned.end
             in_summary = scanned.opcode in _SUMMARY_KINDS or (
                 in_summary and scanned.opcode in (Opcode.SCHEMA, Opcode.CHANNEL))
-            if not in_summary:
-                if scanned.opcode != Opcode.MESSAGE_INDEX:
-                    self._expected, self._lost_chunk = {**scanned.indexes}, None
-                for block in self.blocks(scanned):
-                    self._crc = zlib.crc32(block, self._crc)
-                yield scanned
-            offset = scanned.end
+            if in_summary:
+                continue
+            for block in self.blocks(scanned):
+                self._crc = zlib.crc32(block, self._crc)
+            if scanned.contents is not None:
+                if scanned.opcode == Opcode.CHUNK:
+                    offset = self._check_indexes(offset, scanned.contents.entries)
+                self._count(scanned.offset, scanned.contents)
+            yield scanned
         self._check_end(offset)
 
     def blocks(self, scanned: ScannedRecord) -> Iterator[bytes]:
@@ -163,74 +156,67 @@ class Scanner:
         missing: Counter[str] = Counter()
         for number, messages in sorted((+lost).items()):
             missing[self.channels[number].topic if self._summary.knows(number) else ''] += messages
-        return Damage(
-            truncated=not self._summary.closed, losses=tuple(losses),
-            defects=tuple(self._defects), missing=dict(missing),
-            missing_exactly=statistics is not None,
-            start_ns=self._span[0] if self._span else 0,
-            end_ns=self._span[1] if self._span else 0)
+        start_ns, end_ns = self._span or (0, 0)
+        return Damage(not self._summary.closed, tuple(losses), tuple(self._defects),
+                      dict(missing), statistics is not None, start_ns, end_ns)
 
-    # Reading records.  All of these raise DamagedError.
+    # Reading records: raises DamagedError
 
     def _scan(self, offset: int) -> ScannedRecord | None:
-        """Return the record there, None where the data section ends."""
+        """Return the record there with all of its messages, None where the data section ends."""
         opcode, end = self._source.head(offset, self._limit)
         if self._places.get(offset, opcode) != opcode or end > self._next_place(offset):
             raise DamagedError('the summary tells of another record there')
-        if opcode != Opcode.MESSAGE_INDEX and self._is_index_but_for_its_kind(offset, end):
-            raise DamagedError('it is a message index but for its kind')
         if opcode == Opcode.ATTACHMENT:
             return self._scan_attachment(offset, end)
         if opcode > Opcode.DATA_END:
             if self._ours:
                 raise DamagedError('there is no such kind of record')
             return ScannedRecord(opcode, offset, end)
-        content = self._source.content(offset, end)
-        raw = HEAD.pack(opcode, len(content)) + content
+        raw = self._source.raw(offset, end)
         if opcode == Opcode.MESSAGE:
             return self._scan_message(offset, raw)
         if opcode == Opcode.MESSAGE_INDEX:
-            channel_id = int.from_bytes(content[:2], 'little')
-            if self._expected.get(channel_id) == raw:   # parsing it would take much longer
-                del self._expected[channel_id]
-                return ScannedRecord(opcode, offset, end, raw=raw)
-        record, extra = parse(opcode, content)
-        # Nothing but what follows proves that bytes behind the known fields belong to the record.
-        if extra and (self._ours or not self._finder.is_record(end)):
-            raise DamagedError('its length is not that of its content')
-        if opcode == Opcode.DATA_END and (
+            _, entries, extra = parse_message_index(raw)
+            self._check_extra(extra, end)
+            if entries:
+                self._defects.append(f'the message index at byte {offset} is wrong')
+            return ScannedRecord(opcode, offset, end, raw=raw)
+        record, extra = parse(raw)
+        self._check_extra(extra, end)
+        if isinstance(record, DataEnd) and (
                 end == self._limit if self._has_limit else not extra):
             return None
         # Without extra fields, what belongs to a summary is no chunk of a damaged kind.
-        if opcode == Opcode.DATA_END or (
-                opcode in _SUMMARY_KINDS and (self._has_limit or extra)):
-            raise DamagedError('it has no place before the end of the data section')
+        if (isinstance(record, DataEnd) or (isinstance(record, Header) and offset != MAGIC_SIZE)
+                or (opcode in _SUMMARY_KINDS and (self._has_limit or extra))):
+            raise DamagedError('it has no place there')
         scanned = ScannedRecord(opcode, offset, end, record, raw)
         if isinstance(record, Chunk):
             return self._scan_chunk(scanned, record)
-        if isinstance(record, MessageIndex):
-            self._check_message_index(offset, record)
-        elif isinstance(record, Schema | Channel):
+        if isinstance(record, Schema | Channel):
             known = self._declare(offset, record)
             if known != record:
-                scanned = replace(scanned, record=known, raw=record_bytes(known))
-        elif isinstance(record, Header) and offset != MAGIC_SIZE:
-            raise DamagedError('it has no place but at the beginning')
+                return replace(scanned, record=known, raw=record_bytes(known))
         return scanned
+
+    def _check_extra(self, extra: int, end: int) -> None:
+        # Nothing but what follows proves that bytes behind the known fields belong to the record.
+        if extra and (self._ours or not self._finder.is_record(end)):
+            raise DamagedError('its length is not that of its content')
 
     def _scan_chunk(self, scanned: ScannedRecord, chunk: Chunk) -> ScannedRecord:
         contents = open_chunk(chunk, self._source.max_bytes)
         for record in contents.declared:
             self._declare(scanned.offset, record)
-        raw = scanned.raw
-        start_ns, end_ns = time_span(contents.entries)
-        if contents.messages and (start_ns, end_ns) != (
-                chunk.message_start_time, chunk.message_end_time):
+        times = time_span(contents.entries)
+        if contents.entries and times != (chunk.message_start_time, chunk.message_end_time):
             self._defects.append(f'the chunk at byte {scanned.offset} has wrong times in its head')
-            chunk = replace(chunk, message_start_time=start_ns, message_end_time=end_ns)
-            raw = raw[:HEAD.size] + _TIMES.pack(start_ns, end_ns) + raw[HEAD.size + _TIMES.size:]
-        return self._take_messages(contents, replace(
-            scanned, record=chunk, raw=raw, indexes=message_indexes(contents.entries)))
+            chunk = replace(chunk, message_start_time=times[0], message_end_time=times[1])
+            raw = scanned.raw[:HEAD.size] + _TIMES.pack(*times) + scanned.raw[
+                HEAD.size + _TIMES.size:]
+            scanned = replace(scanned, record=chunk, raw=raw)
+        return replace(scanned, contents=contents)
 
     def _scan_message(self, offset: int, raw: bytes) -> ScannedRecord:
         contents = break_up(raw)
@@ -240,13 +226,11 @@ class Scanner:
         # Nothing in a message proves its length but the record that follows, perhaps truncated.
         if end < self._limit and not 0 < self._source.read(end, 1)[0] <= Opcode.DATA_END:
             self._source.head(end, self._limit)
-        return self._take_messages(
-            contents, ScannedRecord(Opcode.MESSAGE, offset, end, raw=raw))
+        return ScannedRecord(Opcode.MESSAGE, offset, end, raw=raw, contents=contents)
 
     def _scan_attachment(self, offset: int, end: int) -> ScannedRecord:
         index, crc_offset = self._source.attachment(offset, end)
-        if crc_offset + 4 < end and not self._finder.is_record(end):
-            raise DamagedError('its length is not that of its content')
+        self._check_extra(end - crc_offset - 4, end)
         crc = int.from_bytes(self._source.read(crc_offset, 4), 'little')
         if crc not in (0, self._source.crc(offset + HEAD.size, crc_offset)):
             raise DamagedError('its checksum is wrong')
@@ -254,89 +238,97 @@ class Scanner:
 
     def _declare(self, offset: int, record: Schema | Channel) -> Schema | Channel:
         """Make a schema or channel known, and return what is right about it."""
-        known: Schema | Channel
-        if isinstance(record, Schema):
-            known = self.schemas.setdefault(record.id, record)
-        else:
-            known = self.channels.setdefault(record.id, record)
+        known = (self.schemas.setdefault(record.id, record) if isinstance(record, Schema)
+                 else self.channels.setdefault(record.id, record))
         if known != record:
             self._defects.append(
                 f'the {type(record).__name__.lower()} {record.id} at byte {offset} is not what '
                 'the file says elsewhere')
         return known
 
-    def _take_messages(self, contents: ChunkContents, scanned: ScannedRecord) -> ScannedRecord:
-        """Count messages, and return the record with those of known channels."""
+    def _count(self, offset: int, contents: ChunkContents) -> None:
+        """Count messages, and leave out those of unknown channels."""
         unknown = {number for number in contents.entries if not self._summary.knows(number)}
-        if unknown:
-            for message in contents.messages:
-                number = message.channel_id
-                if number in unknown:
-                    loss = self._unknown.setdefault(number, Loss(
-                        scanned.offset, 0, f'messages of channel {number}',
-                        'the record of their channel or schema is lost'))
-                    loss.bytes += message.end - message.start
-                    loss.messages = (loss.messages or 0) + 1
-            contents = ChunkContents(contents.plain, [
-                message for message in contents.messages if message.channel_id not in unknown])
-        if contents.messages:
-            first, last = time_span(contents.entries)
-            begin, end = self._span or (first, last)
-            self._span = min(begin, first), max(end, last)
-        for number, entries in contents.entries.items():
-            self._found[number] += len(entries) // 2
-        if self._ours:
-            for message in contents.messages:
-                number = message.channel_id
+        for message in contents.messages() if unknown or self._ours else ():
+            number = message.channel_id
+            if number in unknown:
+                loss = self._unknown.setdefault(number, Loss(
+                    offset, 0, f'messages of channel {number}',
+                    'the record of their channel or schema is lost', messages=0))
+                loss.bytes += message.end - message.start
+                loss.messages = (loss.messages or 0) + 1
+            elif self._ours:
                 gap = (message.sequence - self._next_sequence.get(number, 0)) & 0xFFFFFFFF
                 if gap < 1 << 31:  # else it is out of order
                     self._gaps[number] += gap
                     self._next_sequence[number] = message.sequence + 1
-        return replace(scanned, contents=contents, unknown=bool(unknown))
+        for number in unknown:
+            del contents.entries[number]
+            contents.complete = False
+        for number, entries in contents.entries.items():
+            self._found[number] += len(entries) // 2
+        if contents.entries:
+            first, last = time_span(contents.entries)
+            begin, end = self._span or (first, last)
+            self._span = min(begin, first), max(end, last)
 
     # Message indexes
 
-    def _check_message_index(self, offset: int, index: MessageIndex) -> None:
-        """Compare an index with its chunk; behind a lost chunk, learn what that held."""
-        messages = len(index.records)
-        if self._lost_chunk is not None:
-            self._lost_chunk.messages = (self._lost_chunk.messages or 0) + messages
-            self._in_lost_chunks[index.channel_id] += messages
-            return
-        expected = self._expected.get(index.channel_id)
-        # The entries may be in any order, and a channel without messages may have an index.
-        if messages and (expected is None or sorted(index.records) != sorted(
-                struct.iter_unpack('<QQ', expected[INDEX_SIZE:]))):
-            if self._damaged_indexes_end(offset):
-                raise DamagedError('it does not agree with its chunk')
-            self._defects.append(f'the message index at byte {offset} is wrong')
-        self._expected.pop(index.channel_id, None)
+    def _check_indexes(self, offset: int, entries: Entries) -> int:
+        """Compare the message indexes behind a chunk with it, and return where they end."""
+        expected = message_indexes(entries)
+        for raw, channel_id, found in self._indexes(offset):
+            # The entries may be in any order, and a channel without messages may have an index.
+            if found and raw != expected.get(channel_id) and (
+                    sorted(found) != sorted(entries.get(channel_id, ()))):
+                if self._damaged_indexes_end(offset, expected):
+                    break
+                self._defects.append(f'the message index at byte {offset} is wrong')
+            self._crc = zlib.crc32(raw, self._crc)
+            expected.pop(channel_id, None)
+            offset += len(raw)
+        end = self._damaged_indexes_end(offset, expected)
+        if not end:
+            return offset
+        self._defects.append(f'the message index at byte {offset} is wrong')
+        for raw in expected.values():
+            self._crc = zlib.crc32(raw, self._crc)
+        return end
 
-    def _damaged_indexes_end(self, offset: int) -> int:
+    def _indexes(self, offset: int) -> Iterator[tuple[bytes, int, array[int]]]:
+        """Yield the message indexes that follow one another there: record, channel, entries."""
+        try:
+            while True:
+                opcode, end = self._source.head(offset, self._next_place(offset))
+                if opcode != Opcode.MESSAGE_INDEX:
+                    return
+                raw = self._source.raw(offset, end)
+                channel_id, entries, extra = parse_message_index(raw)
+                self._check_extra(extra, end)
+                yield raw, channel_id, entries
+                offset = end
+        except DamagedError:
+            return
+
+    def _damaged_indexes_end(self, offset: int, expected: Mapping[int, bytes]) -> int:
         """Return where the indexes that are expected there end, 0 if something else is there."""
-        end = offset + sum(map(len, self._expected.values()))
+        if not expected:
+            return 0
+        kind = self._source.read(offset, 1)
+        if kind != _INDEX_KIND and self._finder.is_record(offset) and not any(
+                self._source.read(offset + 1, len(raw) - 1) == raw[1:]  # but for its kind
+                for raw in expected.values()):
+            return 0
+        end = offset + sum(map(len, expected.values()))
         if end > self._limit and not self._summary.closed:
             # Truncated within an index, which tells nothing of its own.
-            first = self._source.read(offset, 1)
-            return self._limit if first == bytes([Opcode.MESSAGE_INDEX]) else 0
-        return end if self._expected and self._finder.is_record(end) else 0
-
-    def _is_index_but_for_its_kind(self, offset: int, end: int) -> bool:
-        return any(
-            len(expected) == end - offset
-            and self._source.read(offset + 1, len(expected) - 1) == expected[1:]
-            for expected in self._expected.values())
+            return self._limit if kind == _INDEX_KIND else 0
+        return end if self._finder.is_record(end) else 0
 
     # Damage
 
     def _skip(self, offset: int, damage: DamagedError) -> int:
         """Note what is damaged, and return where the scan goes on."""
-        end = self._damaged_indexes_end(offset)
-        if end:
-            self._defects.append(f'the message index at byte {offset} is wrong')
-            self._crc = zlib.crc32(b''.join(self._expected.values()), self._crc)
-            self._expected = {}
-            return end
         opcode = self._source.read(offset, 1)[0]
         try:
             _, end = self._source.head(offset, self._next_place(offset))
@@ -344,7 +336,13 @@ class Scanner:
             pass
         else:
             if self._finder.is_record(end):
-                self._lose(offset, end, opcode, damage)
+                loss = self._lose(offset, end, opcode, damage)
+                if loss.what == name_of(Opcode.CHUNK):
+                    # Its indexes tell what it held.
+                    for raw, channel_id, entries in self._indexes(end):
+                        end += len(raw)
+                        loss.messages = (loss.messages or 0) + len(entries) // 2
+                        self._in_lost_chunks[channel_id] += len(entries) // 2
                 return end
         if self._summary.indexes_all_chunks:
             end = self._next_place(offset)
@@ -356,12 +354,9 @@ class Scanner:
             if 0 < opcode <= Opcode.DATA_END and type(damage) is DamagedError:
                 damage = DamagedError('the file ends within it')
         self._lose(offset, end, opcode, damage)
-        self._lost_chunk = None     # the indexes that follow may be those of another chunk
         return end
 
-    def _lose(self, offset: int, end: int, opcode: int, damage: DamagedError) -> None:
-        """Note that a record of this kind is lost."""
-        self._expected, self._lost_chunk = {}, None
+    def _lose(self, offset: int, end: int, opcode: int, damage: DamagedError) -> Loss:
         index = self._summary.chunks.get(offset)
         loss = Loss(offset, end - offset, name_of(opcode if index is None else Opcode.CHUNK),
                     str(damage), refused=isinstance(damage, TooLargeError))
@@ -373,8 +368,7 @@ class Scanner:
             start_ns, end_ns = _TIMES.unpack(times) if len(times) == _TIMES.size else (0, 0)
             if 0 < start_ns <= end_ns:
                 loss.start_ns, loss.end_ns = start_ns, end_ns
-        if loss.what == name_of(Opcode.CHUNK):
-            self._lost_chunk = loss
+        return loss
 
     def _is_redundant(self, offset: int, opcode: int) -> bool:
         """Return whether a truncated record tells nothing of its own."""

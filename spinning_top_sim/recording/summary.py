@@ -27,7 +27,8 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
-from spinning_top_sim.recording.errors import LogAccessError
+from spinning_top_sim.recording.chunks import ENTRY_SIZE, INDEX_HEAD
+from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.records import (
     HEAD,
     DamagedError,
@@ -37,7 +38,6 @@ from spinning_top_sim.recording.records import (
 )
 
 MAGIC_SIZE = len(MCAP0_MAGIC)
-INDEX_SIZE = HEAD.size + 2 + 4  # of a message index without its entries, 16 bytes each
 
 _FOOTER_SIZE = HEAD.size + 8 + 8 + 4
 _BLOCK = 1 << 20  # bytes read at a time where a record is not needed whole
@@ -46,12 +46,10 @@ _ATTACHMENT_HEAD = 1 << 16  # bytes; more than any name and media type
 
 class McapSource:
     """
-    Random access to a file, up to the size that it has now.
+    Random access to a file, up to the size that it has now; raises LogError where that fails.
 
-    max_bytes : largest record, and largest uncompressed chunk, that is read into memory
-
-    Any method may raise LogAccessError.  A record stands between `offset` and `end`; what reads
-    one raises DamagedError if it is not what it says it is.
+    A record stands between `offset` and `end`; what reads one raises DamagedError if it is not
+    what it says it is.
     """
 
     def __init__(self, path: Path, max_bytes: int) -> None:
@@ -60,7 +58,7 @@ class McapSource:
         with self._access():
             # Opening a pipe would block.
             if not stat.S_ISREG(os.stat(path).st_mode):
-                raise LogAccessError(f'cannot read {path}: it is no regular file')
+                raise LogError(f'cannot read {path}: it is no regular file')
             self._file = open(path, 'rb')  # noqa: SIM115
             status = os.fstat(self._file.fileno())
         self.size = status.st_size
@@ -75,7 +73,7 @@ class McapSource:
         try:
             yield
         except OSError as error:
-            raise LogAccessError(
+            raise LogError(
                 f'cannot read {self._path}: {error.strerror or error}') from error
 
     def read(self, offset: int, length: int) -> bytes:
@@ -109,22 +107,21 @@ class McapSource:
                 return opcode, offset + HEAD.size + length
         raise DamagedError('no record can be read there')
 
-    def content(self, offset: int, end: int) -> bytes:
-        """Return the content of a record.  Raises TooLargeError."""
+    def raw(self, offset: int, end: int) -> bytes:
+        """Return the bytes of a record.  Raises TooLargeError."""
         length = end - offset - HEAD.size
         if length > self.max_bytes:
             raise TooLargeError(length, self.max_bytes)
-        return self.read(offset + HEAD.size, length)
+        return self.read(offset, end - offset)
 
     def record(self, offset: int, limit: int) -> McapRecord:
-        """Return the record there, which is no message and no attachment."""
-        opcode, end = self.head(offset, limit)
-        return parse(opcode, self.content(offset, end))[0]
+        """Return the record there, of a kind that `parse` takes."""
+        _, end = self.head(offset, limit)
+        return parse(self.raw(offset, end))[0]
 
     def attachment(self, offset: int, end: int) -> tuple[AttachmentIndex, int]:
         """Return the index of the attachment there, and the offset of its checksum."""
-        start = offset + HEAD.size
-        stream = StrictStream(self.read(start, min(end - start, _ATTACHMENT_HEAD)))
+        stream = StrictStream(self.read(offset, min(end - offset, _ATTACHMENT_HEAD)))
         try:
             index = AttachmentIndex(
                 offset=offset, length=end - offset, log_time=stream.read8(),
@@ -132,7 +129,7 @@ class McapSource:
                 media_type=stream.read_prefixed_string(), data_size=stream.read8())
         except (McapError, UnicodeDecodeError):
             raise DamagedError('its name or its type cannot be read') from None
-        crc_offset = start + stream.count + index.data_size
+        crc_offset = offset + HEAD.size + stream.count + index.data_size
         if crc_offset + 4 > end:
             raise DamagedError('its length is not that of its content')
         return index, crc_offset
@@ -168,10 +165,8 @@ class Summary:
     @property
     def indexes_all_messages(self) -> bool:
         """Whether the chunk indexes lead to as many messages as the statistics count."""
-        indexed = sum(
-            (index.message_index_length - INDEX_SIZE * len(index.message_index_offsets)) // 16
-            for index in self.chunks.values())
-        return self.statistics is not None and indexed == self.statistics.message_count
+        return self.statistics is not None and self.statistics.message_count == sum(
+            map(indexed_messages, self.chunks.values()))
 
     @property
     def is_complete(self) -> bool:
@@ -188,6 +183,12 @@ class Summary:
         return {**dict.fromkeys(self.chunks, int(Opcode.CHUNK)),
                 **{index.offset: int(Opcode.METADATA) for index in self.metadata},
                 **{index.offset: int(Opcode.ATTACHMENT) for index in self.attachments}}
+
+
+def indexed_messages(index: ChunkIndex) -> int:
+    """Return how many messages of a chunk its message indexes have, by their length."""
+    return (index.message_index_length
+            - INDEX_HEAD.size * len(index.message_index_offsets)) // ENTRY_SIZE
 
 
 def read_summary(source: McapSource) -> Summary:
@@ -225,7 +226,7 @@ def _read_section(source: McapSource, start: int, end: int) -> Summary:
         try:
             opcode, record_end = source.head(offset, end)
             if opcode <= Opcode.DATA_END:
-                record, _ = parse(opcode, source.content(offset, record_end))
+                record, _ = parse(source.raw(offset, record_end))
                 found[type(record)].append(record)
         except DamagedError as damage:
             raise DamagedError(f'the summary is damaged: {damage}') from None

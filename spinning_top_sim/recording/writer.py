@@ -25,9 +25,9 @@ from spinning_top_sim.recording.provenance import version
 from spinning_top_sim.recording.rosbag2 import RecordedTopic, offered_qos_yaml
 
 try:
-    from mcap.records import Channel, Metadata, Schema
+    from mcap.records import Channel, Header, Metadata, Schema
 
-    from spinning_top_sim.recording.mcap_writer import McapWriter, sync_directory
+    from spinning_top_sim.recording.mcap_writer import McapWriter, record_bytes, sync_directory
 except ImportError as error:
     raise RecordingError(
         f'recording needs the Python package mcap with zstandard and lz4: {error}') from error
@@ -106,16 +106,9 @@ class McapRecorder:
         min_free_bytes: int = 100_000_000,
     ) -> Self:
         """
-        Create a file and start recording into it.
+        Create a file and start recording into it; raises as `create_file`.
 
-        path : the file, which must not exist
-        topics : a message refers to them by index
-        metadata : the `spinning_top_sim` record at the head of the file
         max_loss : most wall time whose messages a SIGKILL or a power loss may take [s], > 0
-        compression : one of COMPRESSIONS
-        min_free_bytes : recording stops if the disk has less left than this, >= 0
-
-        Raises ValueError for an argument out of range, RecordingError as `create_file`.
         """
         path = Path(path)
         if not 0.0 < max_loss <= threading.TIMEOUT_MAX:
@@ -127,10 +120,10 @@ class McapRecorder:
     @property
     def room(self) -> bool:
         """
-        Whether the queue has room.
+        Whether the queue has room, or the recording has stopped.
 
         Where it has none, hold the simulation's clock instead of dropping anything; a burst that
-        began with room may be written to its end.  True also when the recording has stopped.
+        began with room may be written to its end.
         """
         return self._bytes_in - self._bytes_out < QUEUE_BYTES
 
@@ -153,15 +146,13 @@ class McapRecorder:
     def write_all(self, topic_indices: Sequence[int], log_time_ns: int,
                   messages: Sequence[bytes], size: int) -> None:
         """
-        Hand over messages of one stamp, from one thread at a time; they keep their order.
+        Hand over messages (CDR) of one stamp, from one thread at a time; they keep their order.
 
         Never waits for the disk, never raises for its sake.  After the recording stopped the
         messages are only counted, as lost.
 
         topic_indices : the topic of each, an index of the `topics` of `open`
-        log_time_ns : log and publish time, >= 0
-        messages : CDR, each with its four bytes of header
-        size : the size of all [bytes]
+        size : of all messages [bytes]
         """
         self._offered += len(messages)
         if self._accepting:
@@ -182,9 +173,8 @@ class McapRecorder:
         """
         Bring everything to the disk, write the summary, and return what the file holds.
 
-        May be called again, also after an interrupted call.  Where the disk does not finish
-        within `timeout` [s], the summary's `error` says so and the file goes on being closed in
-        the background.
+        May be called again.  Where the disk does not finish within `timeout` [s], the summary's
+        `error` says so and the file goes on being closed in the background.
         """
         self._accepting = False
         self._wake.set()
@@ -260,33 +250,36 @@ class McapRecorder:
 def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[str, str], *,
                 compression: str, min_free_bytes: int = 0) -> McapWriter:
     """
-    Create a log and bring its head to the disk; the parameters are those of `McapRecorder.open`.
+    Create a log and bring its head to the disk.
 
-    All topics stand before the first chunk, so that a truncated file tells them in any case.
+    path : the file, which must not exist
+    topics : all stand before the first chunk, so that a truncated file tells them in any case
+    metadata : the `spinning_top_sim` record at the head of the file
+    compression : one of COMPRESSIONS
+    min_free_bytes : a recording stops if the disk has less left than this, >= 0
 
-    Raises RecordingError, naming path or type and the reason.
+    Raises ValueError for an argument out of range, RecordingError naming path or type.
     """
     _check_arguments(topics, metadata, compression, min_free_bytes)
     definitions = {
         name: find_definition(name) for name in dict.fromkeys(topic.type_name for topic in topics)}
     try:
-        file = McapWriter(path, profile='ros2', compression=compression,
-                          library=OUR_LIBRARY + version('spinning_top_sim'))
+        header = Header(profile='ros2', library=OUR_LIBRARY + version('spinning_top_sim'))
+        file = McapWriter(path, header=record_bytes(header), compression=compression)
         with file.discarded_on_failure():
             _check_space(file, min_free_bytes)
-            file.write_metadata(Metadata(METADATA_NAME, dict(metadata)))
+            file.write(Metadata(METADATA_NAME, dict(metadata)))
             schema_ids = {}
             for number, (name, definition) in enumerate(definitions.items(), start=1):
                 schema_ids[name] = number
-                file.write_schema(Schema(
+                file.write(Schema(
                     id=number, name=name, encoding='ros2msg', data=definition.text.encode()))
             for number, topic in enumerate(topics, start=1):
-                file.write_channel(Channel(
+                file.write(Channel(
                     id=number, topic=topic.name, message_encoding='cdr',
                     schema_id=schema_ids[topic.type_name],
                     metadata={'offered_qos_profiles': offered_qos_yaml(topic),
-                              'topic_type_hash': definitions[topic.type_name].type_hash}),
-                    qos_profiles=(topic.qos,))
+                              'topic_type_hash': definitions[topic.type_name].type_hash}))
             file.sync()
             sync_directory(path.parent)
     except FileExistsError as error:
