@@ -7,6 +7,7 @@ are the places of records in a file.  Children are killed for good after a timeo
 """
 
 import contextlib
+import functools
 import io
 import os
 import random
@@ -21,6 +22,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import yaml  # type: ignore[import-untyped]
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Message
@@ -93,8 +95,18 @@ def log(tmp_path_factory):
 
 @pytest.fixture
 def no_sync(monkeypatch):
-    """For thousands of recoveries that nobody pulls the plug on."""
+    """For thousands of recoveries that nobody pulls the plug on; of one YAML, parsed once."""
+    dumped, dump = {}, yaml.dump
+
+    def dump_once(value, **options):
+        key = repr((value, sorted(options)))
+        if key not in dumped:
+            dumped[key] = dump(value, **options)
+        return dumped[key]
+
     monkeypatch.setattr(os, 'fsync', lambda descriptor: None)
+    monkeypatch.setattr(yaml, 'dump', dump_once)
+    monkeypatch.setattr(yaml, 'safe_load', functools.cache(yaml.safe_load))
 
 
 def records_of(content: bytes) -> list[tuple[int, int, int]]:
