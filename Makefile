@@ -8,6 +8,7 @@ SCENE ?= cusp
 LOGS ?= logs
 ARGS ?=
 TESTS ?= test
+WORKERS ?= 4
 
 MAKEFLAGS += --no-builtin-rules
 .SUFFIXES:
@@ -42,7 +43,8 @@ help:
 	@echo 'make run     simulate the scene config/SCENE.yaml until Ctrl-C and record into $(LOGS)/'
 	@echo '             SCENE=$(SCENE)  (one of: $(SCENES))'
 	@echo '             ARGS=...  more arguments, such as ARGS="-p time_scale:=0.5 -r __ns:=/top"'
-	@echo 'make test    run the tests;  TESTS=... selects some, ARGS=... is passed to pytest'
+	@echo 'make test    run the tests;  TESTS=... selects some, ARGS=... is passed to pytest, which has'
+	@echo '             WORKERS=$(WORKERS) processes (0: none but its own, as ARGS=--pdb wants)'
 	@echo 'make stress  kill 200 recording nodes (KILLS=...), then run 100 000 random tops (STRESS=...)'
 	@echo '             with both solvers; takes an hour'
 	@echo 'make performance  measure node, start-up, a long run, solvers and simulate, and write'
@@ -72,9 +74,10 @@ check-scene:
 
 dependencies: $(VENV)/.deps-test $(VENV)/.package
 
-# `pytest`, not `python -m pytest`, so that the installed package is tested.
+# `pytest`, not `python -m pytest`, so that the installed package is tested.  Tests of nodes wait
+# more than they compute: so there are more workers than processors.
 test: dependencies
-	'$(VENV)/bin/pytest' $(TESTS) $(ARGS)
+	'$(VENV)/bin/pytest' -n $(WORKERS) $(TESTS) $(ARGS)
 
 STRESS ?= 100000
 KILLS ?= 200

@@ -64,6 +64,7 @@ setup(
             'mcap-ros2-support>=0.5.5,<0.7',
             'pyarrow>=14,<30',
             'pytest>=7.4,<10',
+            'pytest-xdist>=3.5,<4',     # make test: several workers
             'rosbags>=0.10.11,<0.12',
             'vqf>=2.1,<3',
             'xacro>=2.1,<3',

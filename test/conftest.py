@@ -1,7 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fixtures of the tests that talk to running nodes."""
+"""Fixtures of the tests that talk to running nodes, and the order of many workers."""
 
+import helpers.own_domain  # noqa: F401, before any node starts
 import pytest
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    if config.getvalue('dist') != 'load':
+        return None
+    from helpers.scheduling import BySharedFixture
+
+    return BySharedFixture(config, log)
 
 
 @pytest.fixture(scope='module')

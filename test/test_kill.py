@@ -43,6 +43,7 @@ def test_a_killed_node_leaves_a_log_that_recovers(peer, tmp_path, run):
     with SimNode(tmp_path, PARAMETERS, namespace=f'/kill{run}') as node:
         poses = peer.listen(node.topic('pose'), PoseStamped)
         poses.wait(200)
+        wait_for('a log', lambda: list(node.folder.glob('*.mcap')))
         torn = the_log(node.folder)
         # Whenever the machine lets the recorder keep its time, it does.
         wait_for('a chunk of less than max_loss', lambda: any(

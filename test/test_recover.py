@@ -7,6 +7,7 @@ are the places of records in a file.  Children are killed for good after a timeo
 """
 
 import contextlib
+import functools
 import io
 import os
 import random
@@ -21,6 +22,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import yaml  # type: ignore[import-untyped]
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Message
@@ -93,8 +95,24 @@ def log(tmp_path_factory):
 
 @pytest.fixture
 def no_sync(monkeypatch):
-    """For thousands of recoveries that nobody pulls the plug on."""
+    """For thousands of recoveries that nobody pulls the plug on; of one YAML, parsed once."""
+    dumped, dump = {}, yaml.dump
+
+    def dump_once(value, **options):
+        key = repr((value, sorted(options)))
+        if key not in dumped:
+            dumped[key] = dump(value, **options)
+        return dumped[key]
+
     monkeypatch.setattr(os, 'fsync', lambda descriptor: None)
+    monkeypatch.setattr(yaml, 'dump', dump_once)
+    monkeypatch.setattr(yaml, 'safe_load', functools.cache(yaml.safe_load))
+
+
+def write_anew(path, content):
+    """Write a file, not over the one before: that would wait for the disk."""
+    path.unlink(missing_ok=True)
+    path.write_bytes(content)
 
 
 def records_of(content: bytes) -> list[tuple[int, int, int]]:
@@ -209,7 +227,7 @@ def test_every_cut_keeps_every_whole_chunk(tmp_path, log, no_sync):
 def test_a_cut_file_can_be_read(tmp_path, log):
     torn = tmp_path / 'torn.mcap'
     for size in range(len(MCAP0_MAGIC), len(log.content), 5):
-        torn.write_bytes(log.content[:size])
+        write_anew(torn, log.content[:size])
         whole_chunks = sum(end <= size for _, _, end in log.chunks)
         with LogReader(torn) as reader:
             assert not reader.whole
@@ -305,7 +323,7 @@ def test_a_flipped_bit_is_never_passed_over(tmp_path, log, no_sync):
     output.unlink()
     codes = {}
     for position in places(log):
-        broken.write_bytes(flipped(log.content, position, random_bits.randrange(8)))
+        write_anew(broken, flipped(log.content, position, random_bits.randrange(8)))
         code, out, err = run(broken, '-o', output)
         assert code in (ALL_KEPT, SOME_LOST), (position, err)
         assert 'found: ' in out or 'lost: ' in out, (position, out)
@@ -340,7 +358,7 @@ def test_flipped_bits_in_a_torn_file_spare_the_other_chunks(tmp_path, log, no_sy
     for position in places(log):
         if not log.chunks[0][1] <= position < len(torn):
             continue
-        broken.write_bytes(flipped(torn, position, random_bits.randrange(8)))
+        write_anew(broken, flipped(torn, position, random_bits.randrange(8)))
         code, out, _ = run(broken, '-o', output)
         touched = [start <= position < end for _, start, end in log.chunks]
         must = [message for number, message in enumerate(log.messages)
@@ -357,7 +375,7 @@ def test_flipped_bits_in_the_head_of_a_torn_file_crash_nothing(tmp_path, log, no
     random_bits = random.Random(3)
     texts = {data for _, _, data in log.messages}
     for position in range(log.chunks[0][1]):
-        broken.write_bytes(flipped(torn, position, random_bits.randrange(8)))
+        write_anew(broken, flipped(torn, position, random_bits.randrange(8)))
         code, _, err = run(broken, '-o', output)
         assert code in (ALL_KEPT, SOME_LOST), (position, err)
         assert {data for _, _, data in seen_by_mcap(output)} <= texts
@@ -659,7 +677,7 @@ def test_a_torn_file_of_a_stranger_keeps_what_stands_before_the_tear(tmp_path, k
               for opcode, start, end in records if opcode == Opcode.CHUNK]
     firsts = [*firsts[1:], len(messages)] if firsts else range(1, len(messages) + 1)
     for size in range(8, len(content), 17):
-        torn.write_bytes(content[:size])
+        write_anew(torn, content[:size])
         whole = sum(end <= size for end in ends)
         kept = firsts[whole - 1] if whole else 0
         code, _, err = run(torn, '-o', output)
@@ -789,7 +807,7 @@ def test_noise_crashes_nothing(tmp_path, no_sync):
         if noise.random() < 0.3:
             content += struct.pack('<BQQQI', 2, 20, noise.randrange(2 * len(content)), 0, 0)
             content += MCAP0_MAGIC
-        path.write_bytes(content)
+        write_anew(path, content)
         with LogReader(path) as reader:
             list(reader.messages())
             assert isinstance(reader.damage.lines(), list)

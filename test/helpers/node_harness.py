@@ -2,17 +2,14 @@
 """
 What tests of running nodes need: a node in a process of its own, and a peer who talks to it.
 
-Importing this keeps the traffic on this machine and takes a domain that no other test process
-here has, so it is imported before anything is made with rclpy.  Whatever a test waits for, it
-waits for its arrival, PATIENCE_S long: how fast this machine is decides nothing.
+Nodes and peer are in the domain of own_domain.  Whatever a test waits for, it waits for its
+arrival, PATIENCE_S long: how fast this machine is decides nothing.
 """
 
 from __future__ import annotations
 
 import array
-import atexit
 import contextlib
-import fcntl
 import itertools
 import json
 import os
@@ -20,58 +17,33 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from pathlib import Path
 
-PATIENCE_S = 60.0           # for what takes a second on an idle machine
-LIFETIME_S = 300.0          # a node that is still there is killed
-DOMAINS = range(1, 101)
-
-
-def _own_domain() -> tuple[int, object]:
-    """Return a domain id and what keeps it ours as long as this process lives."""
-    folder = Path(tempfile.gettempdir()) / f'spinning_top_sim_domains_{os.getuid()}'
-    folder.mkdir(exist_ok=True)
-    for offset in DOMAINS:
-        domain = 1 + (os.getpid() + offset) % len(DOMAINS)
-        handle = (folder / str(domain)).open('w')
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            handle.close()
-        else:
-            return domain, handle
-    raise RuntimeError('all domains are taken')
-
-
-DOMAIN_ID, _DOMAIN_LOCK = _own_domain()
-os.environ['ROS_DOMAIN_ID'] = str(DOMAIN_ID)
-os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-os.environ.pop('ROS_LOCALHOST_ONLY', None)
-os.environ['ROS_LOG_DIR'] = tempfile.mkdtemp(prefix='spinning_top_sim_log_')
-atexit.register(shutil.rmtree, os.environ['ROS_LOG_DIR'], ignore_errors=True)
-
-import rclpy  # noqa: E402
-import yaml  # noqa: E402
-from rcl_interfaces.msg import Parameter as ParameterMessage  # noqa: E402
-from rcl_interfaces.srv import (  # noqa: E402
+import rclpy
+import yaml
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import (
     GetParameters,
     ListParameters,
     SetParameters,
     SetParametersAtomically,
 )
-from rclpy.context import Context  # noqa: E402
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor  # noqa: E402
-from rclpy.node import Node  # noqa: E402
-from rclpy.parameter import Parameter, parameter_value_to_python  # noqa: E402
-from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
-from rclpy.serialization import deserialize_message  # noqa: E402
-from std_msgs.msg import Float64MultiArray  # noqa: E402
-from std_srvs.srv import SetBool, Trigger  # noqa: E402
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import SetBool, Trigger
 
-import spinning_top_sim  # noqa: E402
+import helpers.own_domain  # noqa: F401, for programs without conftest.py
+import spinning_top_sim
+
+PATIENCE_S = 60.0           # for what takes a second on an idle machine
+LIFETIME_S = 300.0          # a node that is still there is killed
 
 
 def wait_for(what, condition, timeout=PATIENCE_S):
