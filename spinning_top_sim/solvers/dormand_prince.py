@@ -87,6 +87,11 @@ class Equations(ABC):
         return y_new
 
 
+def largest(errors: Sequence[float]) -> float:
+    """Return the largest error, infinity if one is no number: `max` may pass over a NaN."""
+    return max(errors) if sum(errors) < math.inf else math.inf
+
+
 StepFunction = Callable[..., tuple[Vector, Vector, Vector]]
 
 
@@ -168,7 +173,7 @@ class Integrator:
             y_new, derivative_new, difference = self._step(equations.derivative, h, y, derivative)
             self.evaluations += 6
             error = equations.error(y, y_new, difference)
-            # NaN, no number at all, is not <= 1: it shrinks the step until that collapses.
+            # An infinite one shrinks the step until that collapses.
             factor = max(SHRINK, SAFETY * error ** -0.2) if error else GROW
             if error <= 1.0:
                 break

@@ -30,7 +30,7 @@ import numpy as np
 
 from spinning_top_sim.physics.attitude import Column, precession_rate
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.dormand_prince import Equations, Rows, Vector
+from spinning_top_sim.solvers.dormand_prince import Equations, Rows, Vector, largest
 
 # The energy error is taken out of the nutation rate where its square is this share of the
 # largest |m|^2 or more: at a turning point the energy does not tell the rate.
@@ -132,9 +132,7 @@ class TransportEquations(Equations):
     def error(self, y: Vector, y_new: Vector, difference: Vector) -> float:
         """Return the largest of the three errors, each over its scale and the tolerance."""
         da, db, dm = difference
-        errors = abs(da), abs(db), abs(dm) / self._scale
-        # A NaN may be any of them, and `max` finds only the first.
-        return (max(errors) if sum(errors) < math.inf else math.inf) / self.tolerance
+        return largest((abs(da), abs(db), abs(dm) / self._scale)) / self.tolerance
 
     def accepted(self, y: Vector, y_new: Vector) -> Vector:
         """Return the projected end of a step."""
