@@ -741,7 +741,7 @@ def test_long_decimal_functions():
 
 @pytest.mark.parametrize('seed', range(4))
 def test_the_roots_of_the_cubic_are_right_relative_to_themselves(seed):
-    """However far they and their gaps are apart in size: starts next to a pole, a turning point."""
+    """However far they and their gaps are apart in size."""
     rng = random.Random(seed)
 
     def size():
