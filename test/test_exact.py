@@ -28,6 +28,7 @@ from scipy.integrate import solve_ivp
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics.attitude import quaternion_of_angles
 from spinning_top_sim.physics.top import ContinuedState
+from spinning_top_sim.solvers import theta_setup
 from spinning_top_sim.solvers.decimal_math import (
     atan2,
     carlson_rf,
@@ -759,6 +760,25 @@ def test_the_roots_of_the_cubic_are_right_relative_to_themselves(seed):
         with precision(60):
             found = _cubic_roots(*(+f for f in (f0, f1, f2, f3)))
             assert max(abs(a / b - 1) for a, b in zip(found, true, strict=True)) < Decimal('1e-36')
+
+
+@pytest.mark.parametrize('state', [
+    start(1e-29, 9.0, l3=0.1, lz=0.1), start(1e-40, 1e-38, l3=0.7, lz=0.7),
+    start(1e-21, l3=2.0, lz=2.0), start(1.1, 1e-31, l3=0.4, lz=0.4 * math.cos(1.1)),
+    start(math.pi - 1e-9, -3.0, l3=0.4, lz=-0.4)])
+@pytest.mark.parametrize('root', ['y1', 'y2', 'y3'])
+def test_roots_of_other_constants_of_the_motion_are_not_taken(state, root, monkeypatch):
+    """However small the root is: the start alone may not tell."""
+    def cubic_roots(*cubic):
+        roots = _cubic_roots(*cubic)
+        return roots._replace(**{root: getattr(roots, root) * Decimal('1.' + 25 * '0' + '1')})
+    motion = set_up(UNIT, state)
+    monkeypatch.setattr(theta_setup, '_cubic_roots', cubic_roots)
+    if root == 'y2' and state.theta_dot == 0.0:                 # 0 stays 0
+        assert set_up(UNIT, state) == motion
+    else:
+        with pytest.raises(ValueError, match='digits can tell'):
+            set_up(UNIT, state)
 
 
 # ------------------------------------------------------------------------------------ imports
