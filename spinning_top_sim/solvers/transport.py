@@ -9,11 +9,12 @@ m = i (L_x + i L_y)/(2 lambda1).  From q' = (1/2) omega q and L' = torque,
     beta'  =  i (Lz + c)/(2 lambda1) beta  - m conj(alpha)
     m'     = -(P/lambda1) alpha beta
 
-Here the body frame turns about e3 at its true rate less chi: the known uniform
-spin exp(+-i chi t/2), chi = L3/lambda3 - (L3 - c)/lambda1, is put on when a state is read, so the
-step size follows the nutation and not the spin.  With c = 0 the frame keeps the whole transverse
-rotation, with c = L3 it is transported parallel; c = L3/2 centres the spectrum of alpha and beta
-about zero and takes the fewest evaluations on cusps, the commonest of motions (docs/gauge.md).
+They are those of a frame that turns about e3 with the body, less a known uniform rate
+chi = L3/lambda3 - (L3 - c)/lambda1.  The factor exp(+-i chi t/2) is put on when a state is read,
+so the step size follows the nutation and not the spin.  With c = 0 the frame keeps the whole
+transverse rotation, with c = L3 it is transported parallel; c = L3/2 centres the spectrum of alpha
+and beta about zero and takes the fewest evaluations on cusps, the commonest of motions
+(docs/gauge.md).
 
 The invariants |q| = 1, L.e3 = L3 and the energy are restored after each step and in each sample
 (projection, Hairer, Lubich & Wanner, *Geometric Numerical Integration*, sect. IV.4).
