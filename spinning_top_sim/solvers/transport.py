@@ -80,8 +80,7 @@ class TransportEquations(Equations):
         self.top, self.l3, self.lz = top, l3, lz
         carried = carried_share * l3                                    # c
         self.spin_rate = l3 / top.lambda3 - (l3 - carried) / lambda1
-        self.uniform_rates = (-0.5 * carried / lambda1,
-                              0.5 * (l3 * (1.0 / top.lambda3 - 1.0 / lambda1)))
+        self.uniform_rates = -0.5 * carried / lambda1, 0.5 * (l3 / top.lambda3 - l3 / lambda1)
         self._turn_alpha = 0.5j * (lz - carried) / lambda1
         self._turn_beta = 0.5j * (lz + carried) / lambda1
         self._fall = complex(-torque / lambda1)
