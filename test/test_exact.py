@@ -28,6 +28,7 @@ from scipy.integrate import solve_ivp
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics.attitude import quaternion_of_angles
 from spinning_top_sim.physics.top import ContinuedState
+from spinning_top_sim.solvers import theta_setup
 from spinning_top_sim.solvers.decimal_math import (
     atan2,
     carlson_rf,
@@ -38,7 +39,7 @@ from spinning_top_sim.solvers.decimal_math import (
 )
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.rotations import Rotations
-from spinning_top_sim.solvers.theta_setup import set_up
+from spinning_top_sim.solvers.theta_setup import _cubic_roots, set_up
 from spinning_top_sim.solvers.times import LARGEST_NS, Rate, Times
 
 BOUND = 5e-15
@@ -737,6 +738,47 @@ def test_long_decimal_functions():
         # K(1/2), that is Gamma(1/4)^2/(4 sqrt(pi)) [DLMF 19.25.1]
         assert abs(carlson_rf(Decimal(0), Decimal('0.5'), Decimal(1)) - Decimal(
             '1.85407467730137191843385034719526004621759882352176690558597')) < digits
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_the_roots_of_the_cubic_are_right_relative_to_themselves(seed):
+    """However far they and their gaps are apart in size."""
+    rng = random.Random(seed)
+
+    def size():
+        return Decimal(rng.uniform(1.0, 10.0)) * Decimal(10) ** rng.choice((
+            0, -1, -15, -58, -130, -300, -600))
+    for _ in range(40):
+        with precision(2000):
+            f3, gap32 = size(), size()
+            y1, y2 = -size(), size()
+            f0, f1, f2 = -f3 * y1 * y2 * (y2 + gap32), f3 * (
+                y1 * y2 + (y1 + y2) * (y2 + gap32)), -f3 * (y1 + 2 * y2 + gap32)
+            true = y1, y2, y2 + gap32, y2 - y1, gap32
+        if gap32 < max(y2, -y1) * Decimal('1e-10'):         # takes more digits
+            continue
+        with precision(60):
+            found = _cubic_roots(*(+f for f in (f0, f1, f2, f3)))
+            assert max(abs(a / b - 1) for a, b in zip(found, true, strict=True)) < Decimal('1e-36')
+
+
+@pytest.mark.parametrize('state', [
+    start(1e-29, 9.0, l3=0.1, lz=0.1), start(1e-40, 1e-38, l3=0.7, lz=0.7),
+    start(1e-21, l3=2.0, lz=2.0), start(1.1, 1e-31, l3=0.4, lz=0.4 * math.cos(1.1)),
+    start(math.pi - 1e-9, -3.0, l3=0.4, lz=-0.4)])
+@pytest.mark.parametrize('root', ['y1', 'y2', 'y3'])
+def test_roots_of_other_constants_of_the_motion_are_not_taken(state, root, monkeypatch):
+    """However small the root is: the start alone may not tell."""
+    def cubic_roots(*cubic):
+        roots = _cubic_roots(*cubic)
+        return roots._replace(**{root: getattr(roots, root) * Decimal('1.' + 25 * '0' + '1')})
+    motion = set_up(UNIT, state)
+    monkeypatch.setattr(theta_setup, '_cubic_roots', cubic_roots)
+    if root == 'y2' and state.theta_dot == 0.0:                 # 0 stays 0
+        assert set_up(UNIT, state) == motion
+    else:
+        with pytest.raises(ValueError, match='digits can tell'):
+            set_up(UNIT, state)
 
 
 # ------------------------------------------------------------------------------------ imports

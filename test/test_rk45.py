@@ -6,7 +6,9 @@ The judge is the reference data (30 digits), and where that has no time the exac
 test_exact.py holds against the same data.
 """
 
+import gc
 import math
+import weakref
 from fractions import Fraction
 
 import numpy as np
@@ -492,10 +494,86 @@ def test_phases_are_followed_past_the_poles(l3, lz, rtol, bound):
     assert phases.begins.shape == (3, len(t) - 30)
 
 
-def test_an_error_that_is_no_number_is_no_small_error():
-    equations = TransportEquations(top_of(LOOPING), start_of(LOOPING), 1e-9, 1e-10)
+@both_equations
+def test_an_error_that_is_no_number_is_no_small_error(equations_type):
+    equations = equations_type(top_of(LOOPING), start_of(LOOPING), 1e-9, 1e-10)
     y = equations.start
-    for place in range(3):
-        difference = [0j, 0j, 0j]
-        difference[place] = complex(math.nan)
+    for place in range(len(y)):
+        difference = [0.0 * unknown for unknown in y]
+        difference[place] = math.nan + 0.0 * y[place]
         assert not equations.error(y, y, tuple(difference)) <= 1.0
+
+
+# Tops that need 1e8 and more steps for the time that is asked for, alone or as the last of many.
+FAST_TOPS = {
+    'spin': (Top(lambda1=1e-8, lambda3=1e-8, mass=1.0, com_distance=0.1, gravity=9.81),
+             State(theta=0.7, l3=40.0, lz=-11.0)),
+    'gravity': (Top(lambda1=1.0, lambda3=0.5, mass=3e9, com_distance=4e8, gravity=-9.81),
+                State(theta=0.7, theta_dot=1.0, l3=0.4, lz=0.1)),
+    'no gravity': (Top(lambda1=1.0, lambda3=0.5, mass=0.0, com_distance=1.0, gravity=9.81),
+                   State(theta=0.7, theta_dot=1e10, l3=1e9, lz=1e6)),
+}
+
+
+@pytest.mark.parametrize('name', FAST_TOPS)
+@pytest.mark.parametrize('equations', ['transport', 'euler'])
+@pytest.mark.parametrize('t', [[1.0], np.linspace(0.0, 1.0, 100_001)])
+def test_a_time_that_takes_too_many_steps_is_refused_at_once(name, equations, t):
+    top, start = FAST_TOPS[name]
+    if name == 'no gravity' and equations == 'transport':       # takes no steps
+        assert np.isfinite(solve(top, start, t, method='rk45').quaternion).all()
+        return
+    with pytest.raises(IntegrationError, match=r'steps of .* s away: use|leapt over a pole'):
+        solve(top, start, t, method='rk45', equations=equations, rtol=1e-6)
+
+
+@pytest.mark.parametrize('settings', [
+    {'method': 'exact'}, {'method': 'rk45'}, {'method': 'rk45', 'equations': 'euler'}])
+def test_a_motion_leaves_nothing_for_the_garbage_collector(settings):
+    """A node makes one at each command; its states go too."""
+    motion = propagate(top_of(LOOPING), start_of(LOOPING), **settings)
+    states = motion.states(range(0, SECOND, SECOND // 10))
+    assert states.phi.shape == states.rows_quaternion[0].shape == (10,)
+    there = [weakref.ref(thing) for thing in (motion, states)]
+    gc.disable()
+    try:
+        del motion, states
+        assert [reference() for reference in there] == [None, None]
+    finally:
+        gc.enable()
+
+
+def of_size(lambda1, lambda3, torque, **start):
+    return (Top(lambda1=lambda1, lambda3=lambda3, mass=1.0, com_distance=torque, gravity=1.0),
+            State(**{'phi': 0.3, 'psi': -0.7, **start}))
+
+
+# Time scales, rates and products of rates at the ends of the range of doubles.
+EXTREMES = {
+    'slow': of_size(1e20, 1e20, 5e-324, theta=1.0, theta_dot=0.0, l3=0.0, lz=0.0),
+    'slow spin': of_size(1e30, 1e25, 1e-300, theta=2.0, theta_dot=-1e-310, l3=1e-150, lz=1e-151),
+    'fast': of_size(1e8, 1e8, 1e290, theta=1e-8, theta_dot=-1e-20, l3=0.0, lz=0.0),
+    'thin': of_size(0.006, 5e-324, 0.1, theta=2.0, theta_dot=-0.003, l3=0.0, lz=0.0),
+    'thin, spinning': of_size(1e-8, 1e-310, 1e-309, theta=math.pi, theta_dot=-1e-150, l3=-1e-310,
+                              lz=1e-310),
+    'thick': of_size(1e150, 1e-150, -1e-143, theta=1e-8, theta_dot=-1e3, l3=-1e20, lz=-1e20),
+    'light': of_size(1e-8, 1e-8, 1e-20, theta=0.4, theta_dot=3.0, l3=1e-9, lz=1e-10),
+    'heavy': of_size(1e8, 2e8, 1e8, theta=3.1, theta_dot=0.3, l3=1e6, lz=-1e6),
+}
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('equations', ['transport', 'euler'])
+@pytest.mark.parametrize('name', EXTREMES)
+def test_tops_of_extreme_sizes_are_solved_or_refused(name, equations):
+    top, start = EXTREMES[name]
+    for t in ([0.0, 1e-3], [100.0], [0.0, 1e171]):
+        try:
+            motion = solve(top, start, t, method='rk45', equations=equations, rtol=1e-6)
+            for column in ('theta', 'phi', 'psi', 'theta_dot', 'phi_dot', 'psi_dot', 'quaternion',
+                           'angular_velocity', 'angular_acceleration', 'energy'):
+                assert np.isfinite(getattr(motion, column)).all(), column
+        except (ValueError, IntegrationError) as refusal:
+            assert len(str(refusal)) > 25
+        else:
+            assert motion.theta[0] == pytest.approx(start.theta, abs=1e-9) or t[0] > 0.0

@@ -45,6 +45,8 @@ ERROR = tuple(fifth - fourth
 # Hairer et al. eq. (4.13): aim a little below the tolerance and change the step within limits.
 SAFETY = 0.9
 SHRINK, GROW = 0.2, 5.0
+# Of rates above, and of steps beyond, doubles do not hold the powers.
+FASTEST_RATE, LONGEST_STEP = 1e100, 1e100       # [rad/s], [s]
 # A step of fewer units in the last place of t is a collapse, not progress.
 SMALLEST_STEP_ULPS = 16
 
@@ -85,6 +87,11 @@ class Equations(ABC):
         Raises IntegrationError if it cannot be trusted.
         """
         return y_new
+
+
+def largest(errors: Sequence[float]) -> float:
+    """Return the largest error, infinity if one is no number: `max` may pass over a NaN."""
+    return max(errors) if sum(errors) < math.inf else math.inf
 
 
 StepFunction = Callable[..., tuple[Vector, Vector, Vector]]
@@ -147,6 +154,8 @@ class Integrator:
         self._step = unrolled_step(len(start), equations.is_complex)
         derivative = equations.derivative(*start)
         self.newest = Step(0.0, start, derivative, 0.0, start, derivative)
+        if not equations.fastest_rate <= FASTEST_RATE:
+            raise OverflowError(f'{equations.fastest_rate:.3g} rad/s')
         # A careful first step: the control finds the right one within a few.
         self._next_step = 0.1 * math.pow(equations.tolerance, 0.2) / (
             equations.fastest_rate or 1.0)
@@ -159,16 +168,16 @@ class Integrator:
         t, y, derivative = newest.t1, newest.y1, newest.derivative1
         grow = GROW
         while True:
-            end = t + self._next_step
+            end = t + min(self._next_step, LONGEST_STEP)
             h = end - t                         # what the sum really made of it
-            if not h > SMALLEST_STEP_ULPS * math.ulp(t) or not math.isfinite(end):
+            if not h > SMALLEST_STEP_ULPS * math.ulp(t):
                 raise IntegrationError(
                     f'the step size collapsed to {self._next_step:.3g} s at t = {t:.9g} s '
                     f'({equations.name} equations)')
             y_new, derivative_new, difference = self._step(equations.derivative, h, y, derivative)
             self.evaluations += 6
             error = equations.error(y, y_new, difference)
-            # NaN, no number at all, is not <= 1: it shrinks the step until that collapses.
+            # An infinite one shrinks the step until that collapses.
             factor = max(SHRINK, SAFETY * error ** -0.2) if error else GROW
             if error <= 1.0:
                 break

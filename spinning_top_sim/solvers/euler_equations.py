@@ -19,7 +19,13 @@ import math
 import numpy as np
 
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.dormand_prince import Equations, IntegrationError, Rows, Vector
+from spinning_top_sim.solvers.dormand_prince import (
+    Equations,
+    IntegrationError,
+    Rows,
+    Vector,
+    largest,
+)
 
 # |sin(theta)| at which the rounding of cos(theta), 1.1e-16, costs phi' a millionth of L3/lambda1.
 SMALLEST_SINE = math.sqrt(2.0 ** -53 / 1e-6)
@@ -74,8 +80,8 @@ class EulerEquations(Equations):
 
     def error(self, y: Vector, y_new: Vector, difference: Vector) -> float:
         """Return the largest error over atol + rtol |y|, component by component."""
-        return max([abs(e) / (self._atol + self._rtol * max(abs(a), abs(b)) or math.ulp(0.0))
-                    for e, a, b in zip(difference, y, y_new, strict=True)])
+        return largest([abs(e) / (self._atol + self._rtol * max(abs(a), abs(b)) or math.ulp(0.0))
+                        for e, a, b in zip(difference, y, y_new, strict=True)])
 
     def accepted(self, y: Vector, y_new: Vector) -> Vector:
         """Raise IntegrationError if the step leapt over a pole: phi and psi would be lost."""

@@ -82,8 +82,8 @@ def propagate(top: Top, start: State, *, method: str, equations: str = 'transpor
         with np.errstate(over='raise', divide='raise', invalid='raise'):
             motion = _stepped(top, start, equations, rtol, atol)
             first = motion.states(range(1))
-            held = all(abs(float(column[0])) <= MOST
-                       for column in (first.energy, first.phi_dot, first.psi_dot))
+            held = all(abs(float(column[0])) <= MOST for column in (
+                first.energy, first.phi_dot, first.psi_dot, *first.angular_acceleration.T))
     except ArithmeticError:
         held = False
     if not held:

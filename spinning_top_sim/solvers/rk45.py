@@ -28,8 +28,8 @@ from spinning_top_sim.solvers.times import NANOSECONDS, Times
 from spinning_top_sim.solvers.transport import TransportEquations, Unknowns
 from spinning_top_sim.solvers.unwrap import PhaseUnwrapper
 
-# A time that so many steps of the present size do not reach is refused at once: 3 hours of work.
-MOST_STEPS = 1e9
+# A time that so many steps of the present size do not reach is refused: minutes of work.
+MOST_STEPS = 1e7
 # Steps that are kept to be read together; more would only take memory.
 STEPS_TOGETHER = 256
 
@@ -65,11 +65,8 @@ class SteppedMotion(ABC):
 
     def reach(self, ns: int, max_steps: int | None = None) -> bool:
         """Take steps up to `ns`; return False if `max_steps` were too few."""
-        return self._reach(ns / NANOSECONDS, max_steps)
-
-    def _reach(self, t: float, max_steps: int | None = None) -> bool:
         taken = 0
-        while self._kept[-1].t1 < t:
+        while self._kept[-1].t1 < ns / NANOSECONDS:
             if taken == max_steps:
                 return False
             self._kept.append(self._integrator.step())
@@ -102,22 +99,25 @@ class SteppedMotion(ABC):
                              f'begins at {self._kept[0].t0!r} s')
         parts, begin = [], 0
         while begin < len(t):
-            while not self._reach(t[begin], STEPS_TOGETHER):
-                length = self._kept[-1].t1 - self._kept[-1].t0
-                if t[begin] - self._kept[-1].t1 > MOST_STEPS * length:
-                    raise IntegrationError(
-                        f't = {t[begin]:.9g} s is more than {MOST_STEPS:.0e} steps of '
-                        f"{length:.3g} s away: use method = 'exact'")
-                self._forget(len(self._kept) - 1)
             while self._kept[-1].t1 < t[-1] and len(self._kept) < STEPS_TOGETHER:
                 self._kept.append(self._integrator.step())
+            self._refuse_beyond(t[-1])
             end = int(np.searchsorted(t, self._kept[-1].t1, 'right'))
-            parts.append(self._unknowns(t[begin:end]))
-            begin = end
+            if end > begin:
+                parts.append(self._unknowns(t[begin:end]))
+                begin = end
             if begin < len(t):
                 self._forget(len(self._kept) - 1)
         unknowns = np.concatenate(parts, axis=1) if parts else self._unknowns(t[:0])
         return self._states_of(t.copy(), unknowns)
+
+    def _refuse_beyond(self, t: float) -> None:
+        """Raise IntegrationError if a time [s] takes too many steps as long as those kept."""
+        oldest, newest = self._kept[0], self._kept[-1]
+        length = (newest.t1 - oldest.t0) / len(self._kept)
+        if t - newest.t1 > MOST_STEPS * length:
+            raise IntegrationError(f't = {t:.9g} s is more than {MOST_STEPS:.0e} steps of '
+                                   f"{length:.3g} s away: use method = 'exact'")
 
     def _unknowns(self, t: Column) -> Rows:
         """Return the rows that `_states_of` needs at times [s] within the steps that are kept."""

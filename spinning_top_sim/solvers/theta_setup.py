@@ -48,6 +48,7 @@ FIRST_DIGITS = 60
 MOST_DIGITS = 480
 MOST_NEWTON_STEPS = 5000
 KEPT_DIGITS = 40        # what must be left of the digits after the discriminant has cancelled
+SAME = Decimal('1e-35')
 DIGITS_OF_SUMS = 1400   # the sum of any two doubles is exact
 NO_GRAVITY = Decimal('1e-1000')     # so small that u3 is infinite to all digits
 FULL_CIRCLE_M1 = Decimal('2e-4')    # below, the series of the real form cancels too much
@@ -304,6 +305,15 @@ def _cubic_roots(f0: Decimal, f1: Decimal, f2: Decimal, f3: Decimal) -> _Roots:
     return _Roots(low, high, y, gap, y - high)
 
 
+def _check_roots(roots: _Roots, a0: Decimal, a1: Decimal, a2: Decimal) -> None:
+    """Ask for more digits if the roots do not have the constants of the motion, by Vieta."""
+    y1, y2, y3 = roots[:3]
+    for wanted, terms in ((-a2, (y1, y2, y3)), (a1, (y1 * y2, y2 * y3, y3 * y1)),
+                          (-a0, (y1 * y2 * y3,))):
+        if abs(sum(terms) - wanted) > SAME * sum(map(abs, terms)):
+            raise _RootsTooCloseError
+
+
 # --------------------------------------------------------------- from the roots to theta functions
 
 
@@ -353,6 +363,7 @@ def _nutating(given: _Given, cubic: tuple[Decimal, Decimal, Decimal, Decimal]) -
     f0, f1, f2, f3 = cubic
     f3 = f3 or NO_GRAVITY * abs(f2)
     roots = _cubic_roots(f0, f1, f2, f3)
+    _check_roots(roots, f0 / f3, f1 / f3, f2 / f3)
     w = (f3 * roots.gap31 / 4).sqrt()           # of sn(w t)
     poles = _Poles.of(given, roots, f3)
     form = ThetaForm.of(roots.m, roots.m1)

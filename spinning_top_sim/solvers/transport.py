@@ -9,11 +9,12 @@ m = i (L_x + i L_y)/(2 lambda1).  From q' = (1/2) omega q and L' = torque,
     beta'  =  i (Lz + c)/(2 lambda1) beta  - m conj(alpha)
     m'     = -(P/lambda1) alpha beta
 
-Here the body frame turns about e3 at its true rate less chi: the known uniform
-spin exp(+-i chi t/2), chi = L3/lambda3 - (L3 - c)/lambda1, is put on when a state is read, so the
-step size follows the nutation and not the spin.  With c = 0 the frame keeps the whole transverse
-rotation, with c = L3 it is transported parallel; c = L3/2 centres the spectrum of alpha and beta
-about zero and takes the fewest evaluations on cusps, the commonest of motions (docs/gauge.md).
+They are those of a frame that turns about e3 with the body, less a known uniform rate
+chi = L3/lambda3 - (L3 - c)/lambda1.  The factor exp(+-i chi t/2) is put on when a state is read,
+so the step size follows the nutation and not the spin.  With c = 0 the frame keeps the whole
+transverse rotation, with c = L3 it is transported parallel; c = L3/2 centres the spectrum of alpha
+and beta about zero and takes the fewest evaluations on cusps, the commonest of motions
+(docs/gauge.md).
 
 The invariants |q| = 1, L.e3 = L3 and the energy are restored after each step and in each sample
 (projection, Hairer, Lubich & Wanner, *Geometric Numerical Integration*, sect. IV.4).
@@ -30,7 +31,7 @@ import numpy as np
 
 from spinning_top_sim.physics.attitude import Column, precession_rate
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.dormand_prince import Equations, Rows, Vector
+from spinning_top_sim.solvers.dormand_prince import Equations, Rows, Vector, largest
 
 # The energy error is taken out of the nutation rate where its square is this share of the
 # largest |m|^2 or more: at a turning point the energy does not tell the rate.
@@ -79,8 +80,7 @@ class TransportEquations(Equations):
         self.top, self.l3, self.lz = top, l3, lz
         carried = carried_share * l3                                    # c
         self.spin_rate = l3 / top.lambda3 - (l3 - carried) / lambda1
-        self.uniform_rates = (-0.5 * carried / lambda1,
-                              0.5 * (l3 * (1.0 / top.lambda3 - 1.0 / lambda1)))
+        self.uniform_rates = -0.5 * carried / lambda1, 0.5 * (l3 / top.lambda3 - l3 / lambda1)
         self._turn_alpha = 0.5j * (lz - carried) / lambda1
         self._turn_beta = 0.5j * (lz + carried) / lambda1
         self._fall = complex(-torque / lambda1)
@@ -132,9 +132,7 @@ class TransportEquations(Equations):
     def error(self, y: Vector, y_new: Vector, difference: Vector) -> float:
         """Return the largest of the three errors, each over its scale and the tolerance."""
         da, db, dm = difference
-        errors = abs(da), abs(db), abs(dm) / self._scale
-        # A NaN may be any of them, and `max` finds only the first.
-        return (max(errors) if sum(errors) < math.inf else math.inf) / self.tolerance
+        return largest((abs(da), abs(db), abs(dm) / self._scale)) / self.tolerance
 
     def accepted(self, y: Vector, y_new: Vector) -> Vector:
         """Return the projected end of a step."""

@@ -5,11 +5,11 @@ Unwrapped angles of a stepped motion, from the phases of the Cayley-Klein parame
 phi + psi and phi - psi are twice the phases of alpha and beta.  Each phase is the sum of a uniform
 part, +-Omega t/2 with Omega = L3/lambda3 - L3/lambda1, and of a part that turns one way only: that
 of alpha at the rate (Lz + L3)/(4 lambda1 cos^2(theta/2)), that of beta at the rate
-(Lz - L3)/(4 lambda1 sin^2(theta/2)).  A step turns it by half a turn at most, however close by a
-pole it passes.  So the phase of a sample is the first one ahead of that at the begin of its step,
-among the values that arctan2 leaves open.  If Lz + L3 or Lz - L3 is 0, alpha or beta only has the
-uniform part: it moves on a line through zero, and where the axis goes through that pole its
-modulus changes sign.
+(Lz - L3)/(4 lambda1 sin^2(theta/2)).  A step turns it by little more than half a turn at most,
+however close by a pole it passes.  So the phase of a sample is the first one ahead of that at the
+begin of its step, among the values that arctan2 leaves open.  If Lz + L3 or Lz - L3 is 0, alpha or
+beta only has the uniform part: it moves on a line through zero, and where the axis goes through
+that pole its modulus changes sign.
 """
 
 from __future__ import annotations
