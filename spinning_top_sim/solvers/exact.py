@@ -127,13 +127,20 @@ class ExactSolution:
 
     def _check_start(self) -> None:
         """Refuse constants so far apart that doubles lose the start among them."""
-        nutation = self._nutation.at(Times.from_ns(range(1)))
-        for name, value, wanted in (
-                ('theta', 2.0 * float(nutation.half_theta[0]), self.start.theta),
-                ('theta_dot', float(nutation.theta_dot[0]), self.start.theta_dot)):
-            if not abs(value - wanted) <= 1e-14 * max(1.0, abs(wanted)):
-                raise ValueError(f'{name} = {wanted!r} cannot be held in doubles: the constants '
-                                 f'of {self.top} and {self.start} are too far apart in size')
+        start, first = self.start, self._nutation.at(Times.from_ns(range(1)))
+        alpha, beta, theta_dot = (float(x[0]) for x in (first.alpha, first.beta, first.theta_dot))
+        cosine, sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
+        # Relative to the distance from either pole, and to a small velocity of the axis.
+        across = ((self._bottom_rate * (sine / cosine) if self._bottom_rate else 0.0)
+                  + (self._top_rate * (cosine / sine) if self._top_rate else 0.0))
+        for name, error, size in (
+                ('theta', beta * cosine - alpha * sine, alpha * sine),
+                ('theta_dot', theta_dot - start.theta_dot,
+                 min(math.hypot(start.theta_dot, across), max(1.0, abs(start.theta_dot))))):
+            if not abs(error) <= 1e-14 * abs(size):
+                raise ValueError(f'{name} = {getattr(start, name)!r} cannot be held in doubles: '
+                                 f'the constants of {self.top} and {start} are too far apart in '
+                                 'size')
 
     def describe(self) -> Description:
         """Return the motion in the numbers that a physicist asks for."""
