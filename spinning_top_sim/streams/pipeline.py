@@ -20,7 +20,7 @@ from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.solvers.exact import MOST_TURNS, ExactSolution
 from spinning_top_sim.solvers.propagator import propagate
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -309,8 +309,8 @@ def _segment(top: Top, start: State, start_ns: int, values: Mapping[str, Any]) -
         if not segment.reach(start_ns + 1, FIRST_STEPS):
             raise ValueError(f'it turns too fast: over {FIRST_STEPS} steps a nanosecond')
         if isinstance(solver, ExactSolution) and solver.ns_limit < SHORTEST_RUN_NS:
-            raise ValueError(f'it turns too fast: after {solver.time_limit:.3g} s, not '
-                             f'{SHORTEST_RUN_NS / NANOSECONDS:g} s, a phase reaches 2^52 turns')
+            raise ValueError('it turns too fast: at most '
+                             f'{MOST_TURNS / SHORTEST_RUN_NS * NANOSECONDS:.2g} turns a second')
     except (ArithmeticError, RuntimeError, ValueError) as error:
         raise ValueError(f'no motion from theta = {start.theta!r} rad, theta_dot = '
                          f'{start.theta_dot!r} rad/s with l3 = {start.l3!r}, lz = {start.lz!r} '
