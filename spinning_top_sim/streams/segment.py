@@ -15,6 +15,9 @@ from spinning_top_sim.physics.top import State
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.propagator import Propagator
 
+# A motion whose exact solution ends before three years is refused when it begins.
+SHORTEST_RUN_NS = 10 ** 17
+
 Axis = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 
@@ -37,16 +40,17 @@ class Segment:
     @cached_property
     def exact(self) -> ExactSolution | None:
         """
-        The exact solution of the same motion; None for a motion whose constants it cannot hold.
+        The exact solution of the same motion; None for a motion that it cannot hold for so long.
 
         Its set-up takes milliseconds, and may be done in another thread than the simulation's.
         """
         if isinstance(self.solver, ExactSolution):
             return self.solver
         try:
-            return ExactSolution(self.solver.top, self.start)
+            exact = ExactSolution(self.solver.top, self.start)
         except ValueError:
             return None
+        return exact if exact.ns_limit >= SHORTEST_RUN_NS else None
 
     def reach(self, t_ns: int, max_steps: int) -> bool:
         """
