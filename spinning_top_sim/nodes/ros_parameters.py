@@ -33,7 +33,7 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     lowest = parameter.minimum if parameter.above is None else parameter.above
     bounds = {'from_value': lowest, 'to_value': parameter.maximum}
     given = {name: bound for name, bound in bounds.items() if bound is not None}
-    if given and parameter.is_double:
+    if given and not isinstance(parameter.default, int):
         result.floating_point_range = [FloatingPointRange(
             **{'from_value': -sys.float_info.max, 'to_value': sys.float_info.max, **given})]
     elif given:
