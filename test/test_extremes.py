@@ -5,7 +5,7 @@ import math
 from collections import Counter
 
 import pytest
-from helpers import extremes
+from helpers import short_lives
 from helpers.simulations import MILLISECOND, SECOND, record, simulate, stream
 
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
@@ -115,13 +115,13 @@ def test_a_run_offline_whose_stamps_would_end_is_refused_before(tmp_path, capsys
 # ----------------------------------------------------------------------------- anything allowed
 
 def test_every_combination_that_the_ranges_allow_runs_or_is_refused():
-    found = Counter(extremes.live(seed) for seed in range(100))
+    found = Counter(short_lives.live(seed) for seed in range(100))
     assert found.keys() <= {'ran', 'refused', 'stopped'}
     assert found['ran'] > 40 and found['refused'] > 5
 
 
 def test_numbers_of_any_size_are_among_them():
-    sizes = [abs(value) for seed in range(300) for name, value in extremes.values(seed).items()
+    sizes = [abs(value) for seed in range(300) for name, value in short_lives.values(seed).items()
              if name == 'spin.l3' and value]
     assert min(sizes) < 1e-100 and max(sizes) > 1e100
     assert all(map(math.isfinite, sizes))

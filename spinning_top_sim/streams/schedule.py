@@ -34,6 +34,13 @@ OFFLINE_BYTES = 1 << 20
 LONGEST_OFFLINE_NS = 100 * NANOSECONDS
 
 
+def check_stamp(stamp_ns: int, error: type[Exception] = IntegrationError) -> None:
+    """Raise an error for a stamp [ns] that no message can hold."""
+    if not 0 <= stamp_ns <= LAST_STAMP_NS:
+        raise error(f'the stamp {stamp_ns / NANOSECONDS:.12g} s: must be from 0 to '
+                    f'{LAST_STAMP_NS / NANOSECONDS:.0f} s, in January 2038')
+
+
 class Delivery:
     """
     The sinks for one set of streams that are due together.
@@ -191,13 +198,6 @@ class Schedule:
         self._next_ns = [first_ns + len(times) * times.step
                          for first_ns, times in zip(self._next_ns, blocks, strict=True)]
         self.computed_ns = min(self._next_ns, default=NEVER_NS)
-
-
-def check_stamp(stamp_ns: int, error: type[Exception] = IntegrationError) -> None:
-    """Raise an error for a stamp [ns] that no message can hold."""
-    if not 0 <= stamp_ns <= LAST_STAMP_NS:
-        raise error(f'the stamp {stamp_ns / NANOSECONDS:.12g} s: must be from 0 to '
-                    f'{LAST_STAMP_NS / NANOSECONDS:.0f} s, in January 2038')
 
 
 def offline_targets(now_ns: int, stops: Iterable[tuple[int, Item]], streams: Iterable[Stream],
