@@ -143,11 +143,12 @@ def test_parameters_are_described(peer, pair):
         assert f'[{parameter.unit}]' in descriptor.description or not parameter.unit
         assert descriptor.additional_constraints.startswith('must be ')
         assert descriptor.read_only == (parameter.effect is parameters.Effect.START)
+        bounded = [bound for bound in (parameter.minimum, parameter.maximum, parameter.above)
+                   if bound is not None]
         ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
-        assert len(ranges) == (type(parameter.default) in (int, float, type(None)))
+        assert len(ranges) == bool(bounded), parameter.name
         for limits in ranges:
-            lowest = 0.0 if parameter.or_zero else parameter.minimum
-            assert (limits.from_value, limits.to_value) == (lowest, parameter.maximum)
+            assert {limits.from_value, limits.to_value} >= set(bounded), parameter.name
     described = {d.name: d for d in found}
     assert described['top.mass'].description.startswith('Mass of the top [kg]; must be a number')
     assert described['solver.method'].additional_constraints == 'must be one of rk45, exact'

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import difflib
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -29,12 +30,15 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
         name=parameter.name, description=parameter.description, dynamic_typing=True,
         read_only=parameter.effect is Effect.START,
         additional_constraints=parameter.allowed)
-    bounds = {'from_value': 0.0 if parameter.or_zero else parameter.minimum,
-              'to_value': parameter.maximum}
-    if parameter.is_double:
-        result.floating_point_range = [FloatingPointRange(**bounds)]
-    elif type(parameter.default) is int:
-        result.integer_range = [IntegerRange(**bounds)]
+    lowest = parameter.minimum if parameter.above is None else parameter.above
+    bounds = {'from_value': lowest, 'to_value': parameter.maximum}
+    given = {name: bound for name, bound in bounds.items() if bound is not None}
+    if given and not isinstance(parameter.default, int):
+        result.floating_point_range = [FloatingPointRange(
+            **{'from_value': -sys.float_info.max, 'to_value': sys.float_info.max, **given})]
+    elif given:
+        result.integer_range = [IntegerRange(
+            **{'from_value': -2 ** 63, 'to_value': 2 ** 63 - 1, **given})]
     return result
 
 

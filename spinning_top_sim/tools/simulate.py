@@ -75,6 +75,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(arguments: argparse.Namespace) -> int:
     values = _parameters(arguments)
+    if not 0.0 <= arguments.epoch <= 2.0 ** 31:
+        raise ValueError(f'--epoch {arguments.epoch!r}: must be from 0 to {2 ** 31} s')
     stops = parse_stops(arguments.command, round(values['duration'] * NANOSECONDS))
     output: Path = arguments.output
     file_format = arguments.format or output.suffix[1:]
