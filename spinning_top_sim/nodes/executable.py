@@ -13,6 +13,7 @@ from os import _exit
 from typing import TYPE_CHECKING, Protocol, cast
 
 if TYPE_CHECKING:
+    from rclpy.executors import Executor
     from rclpy.node import Node
     from rclpy.publisher import Publisher
     from rclpy.task import Future
@@ -56,13 +57,19 @@ def run(name: str, argv: list[str],
         rclpy.init(args=argv)
     except Exception as error:
         return _cannot_start(name, error)
-    node = None
+    node, started = None, False
     try:
         node = make_node()
-        return _spin(node, interrupts)
+        executor = _executor(node)
+        node.start()
+        started = True
+        # Without a timeout, the EventsExecutor of Jazzy hangs.
+        while rclpy.ok() and not interrupts and not node.finished.done():
+            executor.spin_once(SPIN_S)
+        return (node.finished.result() or 0) if node.finished.done() else 0
     except Exception as error:
         # A call that the end of the context interrupts may raise anything.
-        if rclpy.ok() and node is not None:
+        if rclpy.ok() and started:
             raise
         return _cannot_start(name, error) if rclpy.ok() else 0
     finally:
@@ -94,9 +101,8 @@ def _cannot_start(name: str, error: Exception) -> int:
     return 2
 
 
-def _spin(node: RunnableNode, interrupts: list[int]) -> int:
-    """Spin a node until it has finished, or a signal ends it; return the exit code."""
-    import rclpy  # noqa: PLC0415
+def _executor(node: RunnableNode) -> Executor:
+    """Return an executor that has the node, with little for the garbage collector to do."""
     try:
         # It takes least processor time.
         from rclpy.experimental import EventsExecutor as Executor  # noqa: PLC0415
@@ -110,11 +116,7 @@ def _spin(node: RunnableNode, interrupts: list[int]) -> int:
     # A full collection waits until there is a quarter more than the one before has found.
     # This one finds nothing, so the cyclic garbage of service calls does not pile up.
     gc.collect()
-    node.start()
-    # Without a timeout, the EventsExecutor of Jazzy hangs.
-    while rclpy.ok() and not interrupts and not node.finished.done():
-        executor.spin_once(SPIN_S)
-    return (node.finished.result() or 0) if node.finished.done() else 0
+    return executor
 
 
 def wait_for_all_acked(publishers: Iterable[Publisher], seconds: float,

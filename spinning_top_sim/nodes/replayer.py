@@ -64,7 +64,7 @@ class Replayer(Node):
         super().__init__('replay', parameter_overrides=given)
         self.finished: Future = Future()    # completes with the exit code when all is played
         self._log, self._options = log, options
-        self._terminal = reports.Terminal()
+        self._terminal = reports.Terminal(self)
         self._log_begin_ns, self._end_ns = log.span
         self._begin_ns = self._log_begin_ns + round(options.start * NANOSECONDS)
         self._span_ns = self._end_ns - self._begin_ns
@@ -95,7 +95,7 @@ class Replayer(Node):
         there = {channel.name for channel in self._log.topics}
         wanted = set(self._options.topics) or there
         for name in sorted(wanted - there):
-            self.get_logger().warning(f'the log has no topic {name}')
+            self._terminal.log.warning(f'the log has no topic {name}')
         channels: dict[tuple[str, str], list[LogTopic]] = defaultdict(list)
         for channel in self._log.topics:
             if channel.name in wanted:
@@ -105,7 +105,7 @@ class Replayer(Node):
             try:
                 publisher = self._publisher(alike)
             except Exception as error:      # whatever a log may ask for: the others are played
-                self.get_logger().warning(f'{name} is not played: {error}')
+                self._terminal.log.warning(f'{name} is not played: {error}')
             else:
                 outputs.update({channel.channel_id: publisher for channel in alike})
         if wanted and not outputs and not self._options.clock:
@@ -124,7 +124,7 @@ class Replayer(Node):
         recorded_hash = topic.metadata.get('topic_type_hash')
         with contextlib.suppress(DefinitionNotFoundError):
             if recorded_hash and recorded_hash != find_definition(topic.type_name).type_hash:
-                self.get_logger().warning(
+                self._terminal.log.warning(
                     f'{topic.name} was recorded with another {topic.type_name} than is installed: '
                     'subscribers may misread it')
         profiles = [profile for channel in channels for profile in channel.qos] or [DEFAULT_QOS]
@@ -133,7 +133,7 @@ class Replayer(Node):
                 raise ValueError('its publishers had different ones')
             qos = qos_profile(profiles[0])
         except ValueError as error:
-            self.get_logger().warning(f'{topic.name} is published with default QoS, not with the '
+            self._terminal.log.warning(f'{topic.name} is published with default QoS, not with the '
                                       f'recorded one: {error}')
             qos = qos_profile(DEFAULT_QOS)
         return self.create_publisher(
@@ -173,7 +173,7 @@ class Replayer(Node):
             code = 2 if self._tell_damage() else 0
         except Exception as error:
             if self.context.ok():           # publishing fails once the context is down
-                self.get_logger().error(f'cannot be played any further: {error}')
+                self._terminal.log.error(f'cannot be played any further: {error}')
             code = 2
         if self.context.ok():
             late = f', {self._playback.late} of them late' if self._playback.late else ''
@@ -199,7 +199,7 @@ class Replayer(Node):
         """Return whether messages are missing unexpectedly; say so once."""
         damaged = self._log.left_out > 0 and not self._options.partial
         if damaged:
-            self.get_logger().error(f'{self._log.path} is damaged inside, and messages are left '
+            self._terminal.log.error(f'{self._log.path} is damaged inside, and messages are left '
                                     'out: `recover` tells which', once=True)
         return damaged
 

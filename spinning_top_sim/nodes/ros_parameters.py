@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import array
+import contextlib
 import difflib
-import sys
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -20,6 +22,36 @@ SPIN = ('spin.l3', 'spin.lz')
 OF_RCLPY = ('use_sim_time', 'start_type_description_service')
 
 
+def overrides(argv: Sequence[str]) -> list[str]:
+    """
+    Return the `-p NAME:=VALUE` of a command line, as arguments for the node alone.
+
+    There they win over every file.  Among the arguments of the whole process rcl takes an integer
+    of a file and drops the double that overrides it.
+    """
+    return ['--ros-args', *(word for flag, rule in pairwise(argv) if flag in {'-p', '--param'}
+                            for word in (flag, rule))]
+
+
+def _check_files(argv: Sequence[str], given: Mapping[str, Any]) -> None:
+    """Raise ValueError where rcl has dropped what a later file says; see `overrides`."""
+    files = [path for flag, path in pairwise(argv) if flag == '--params-file']
+    if len(files) < 2:
+        return
+    from spinning_top_sim.tools.scene_file import read_scene  # noqa: PLC0415 - imports YAML
+
+    asked: dict[str, Any] = {}
+    for path in files:
+        with contextlib.suppress(OSError, ValueError):      # what rcl has taken is not judged
+            asked.update(read_scene(path))
+    named = {rule.partition(':=')[0].rpartition(':')[2] for rule in overrides(argv)}
+    for name, value in given.items():
+        later = asked.get(name, value)
+        if name not in named and type(later) is not type(value) and later != value:
+            raise ValueError(f'{name}: one parameter file has {value!r}, a later one {later!r}, '
+                             'which ROS drops because of its type: write both alike, as in 2.0')
+
+
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     """
     Return what `ros2 param describe` shows.
@@ -27,22 +59,23 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     Typing is dynamic because an integer is accepted for a double; `Parameter.check` decides.
     """
     result = ParameterDescriptor(
-        name=parameter.name, description=parameter.description, dynamic_typing=True,
-        read_only=parameter.effect is Effect.START,
-        additional_constraints=parameter.allowed)
+        name=parameter.name, description=parameter.summary, dynamic_typing=True,
+        read_only=parameter.effect is Effect.START)
     lowest = parameter.minimum if parameter.above is None else parameter.above
-    bounds = {'from_value': lowest, 'to_value': parameter.maximum}
-    given = {name: bound for name, bound in bounds.items() if bound is not None}
-    if given and parameter.is_double:
+    if lowest is None or parameter.maximum is None:
+        result.additional_constraints = parameter.allowed
+    elif parameter.is_double:
         result.floating_point_range = [FloatingPointRange(
-            **{'from_value': -sys.float_info.max, 'to_value': sys.float_info.max, **given})]
-    elif given:
+            from_value=float(lowest), to_value=float(parameter.maximum))]
+    else:
         result.integer_range = [IntegerRange(
-            **{'from_value': -2 ** 63, 'to_value': 2 ** 63 - 1, **given})]
+            from_value=int(lowest), to_value=int(parameter.maximum))]
+    if parameter.above is not None and result.floating_point_range:
+        result.additional_constraints = f'must be > {parameter.above:g}'
     return result
 
 
-def declare(node: Node) -> dict[str, Any]:
+def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
     """
     Declare the whole table, warn of unknown parameters, and return the checked start values.
 
@@ -57,13 +90,14 @@ def declare(node: Node) -> dict[str, Any]:
         if name in OF_RCLPY:
             continue
         if name in parameters.BY_NAME:
-            given[name] = value
+            given[name] = list(value) if isinstance(value, array.array) else value
         elif not name.startswith('qos_overrides.'):
             near = difflib.get_close_matches(name, parameters.BY_NAME, 1)
             hint = f'; did you mean {near[0]}?' if near else ''
             node.get_logger().warning(f'there is no parameter {name}: ignored{hint}')
         # It is declared with its descriptor, below or by `create_publisher`.
         node.undeclare_parameter(name)
+    _check_files(argv, given)
     values = parameters.checked(given)
     shown = {**values, 'spin.lz': parameters.start_state(values).lz}
     node.declare_parameters('', [
@@ -74,10 +108,27 @@ def declare(node: Node) -> dict[str, Any]:
 
 
 def with_doubles(given: Sequence[RosParameter]) -> list[RosParameter]:
-    """Make doubles of integers where the table has doubles, before rclpy looks at ranges."""
-    return [RosParameter(p.name, RosParameter.Type.DOUBLE, float(p.value))
-            if p.type_ is RosParameter.Type.INTEGER and p.name in parameters.BY_NAME
-            and parameters.BY_NAME[p.name].is_double else p for p in given]
+    """
+    Make doubles where the table has doubles: of integers, and of texts that are numbers.
+
+    It is called before rclpy looks at ranges.  `ros2 param` takes 1e-9 for a text, as YAML 1.1.
+    """
+    result = []
+    for one in given:
+        row, value = parameters.BY_NAME.get(one.name), one.value
+        if row is not None and row.is_double:
+            value = _as_double(value)
+        elif row is not None and isinstance(value, list | array.array):
+            of_doubles = isinstance(row.default, tuple) and isinstance(row.default[0], float)
+            value = [_as_double(item) if of_doubles else item for item in value]
+        result.append(one if value is one.value else RosParameter(one.name, value=value))
+    return result
+
+
+def _as_double(value: object) -> object:
+    with contextlib.suppress(ValueError):
+        return float(value) if type(value) in {int, str} else value     # type: ignore[arg-type]
+    return value
 
 
 def changed(values: Mapping[str, Any], changes: Mapping[str, Any],

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -12,7 +13,7 @@ from spinning_top_sim.nodes import executable
 if TYPE_CHECKING:
     from spinning_top_sim.nodes.simulator import Simulator
 
-USAGE = """usage: sim_node [--help] [--ros-args -p NAME:=VALUE --params-file FILE ...]
+USAGE = """usage: sim_node [--help] [--version] [--ros-args -p NAME:=VALUE --params-file FILE ...]
 
 Simulate the heavy symmetric top in real time, in namespace and with parameters as usual:
 
@@ -20,8 +21,12 @@ Simulate the heavy symmetric top in real time, in namespace and with parameters 
   ros2 run spinning_top_sim sim_node --ros-args --params-file config/looping.yaml
   ros2 run spinning_top_sim sim_node --ros-args -p spin.l3:=2.0 -p record.enabled:=true
 
-Parameters (a change by `ros2 param set` takes effect as said there):
-"""
+Subscribes to:
+  ~/commands (std_msgs/Float64MultiArray: [L3, Lz] in kg m^2/s); ~ is /spinning_top
+Services:
+  ~/set_pause, ~/record (std_srvs/SetBool); ~/step, ~/reset (std_srvs/Trigger)
+Publishes, where enabled:
+  /diagnostics (diagnostic_msgs/DiagnosticArray), always"""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -30,17 +35,46 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _prepare(argv: list[str]) -> Callable[[], Simulator] | None:
-    if not {'--help', '-h'}.intersection(argv[1:]):
-        from spinning_top_sim.nodes.simulator import Simulator  # noqa: PLC0415
-        return Simulator
     from spinning_top_sim.streams import parameters  # noqa: PLC0415
-    print(USAGE)
-    for parameter in parameters.TABLE:
-        default = parameter.default
-        shown = list(default) if isinstance(default, tuple) else default
-        print(f'  {parameter.name}  (default {"unset" if shown is None else shown})\n'
-              f'      {parameter.description}')
-    return None
+
+    if {'--help', '-h'}.intersection(argv[1:]):
+        print(USAGE)
+        for *_, text in parameters.STREAM_DEFAULTS:
+            print(f'  {text}')
+        print('Parameters:')
+        for parameter in parameters.TABLE:
+            default = parameter.default
+            shown = list(default) if isinstance(default, tuple) else default
+            print(f'  {parameter.name}  (default {"unset" if shown is None else shown})\n'
+                  f'      {parameter.description}')
+        return None
+    if '--version' in argv[1:]:
+        from spinning_top_sim.recording.provenance import version  # noqa: PLC0415
+        print(f'sim_node {version("spinning_top_sim")}')
+        return None
+    from rclpy.utilities import remove_ros_args  # noqa: PLC0415
+
+    try:
+        stray = remove_ros_args(argv)[1:]
+    except RuntimeError as error:
+        # Of arguments that it does not know, rcl says only which.
+        stray = re.findall("'(.*?)'", str(error)) if str(error).startswith('[') else []
+    if stray:
+        raise ValueError(f'{" ".join(stray)!r} is not expected here; parameters follow '
+                         f'--ros-args: sim_node --ros-args {_as_ros_args(stray)}')
+    from spinning_top_sim.nodes.simulator import Simulator  # noqa: PLC0415
+    return lambda: Simulator(argv)
+
+
+def _as_ros_args(stray: list[str]) -> str:
+    """Return what these arguments probably mean."""
+    words: list[str] = []
+    for word in stray:
+        flag = '-p' if ':=' in word else '--params-file' if word.endswith('.yaml') else ''
+        if flag and not (words and words[-1].startswith('-')):
+            words.append(flag)
+        words.append(word)
+    return ' '.join(words) if ':=' in words[-1] or flag else '-p NAME:=VALUE --params-file FILE'
 
 
 if __name__ == '__main__':

@@ -7,7 +7,7 @@ import functools
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -30,12 +30,15 @@ from spinning_top_sim.nodes.tick_loop import TickLoop, next_epoch
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.parameters import Effect
 from spinning_top_sim.streams.pipeline import Simulation
 
 # Threads let go of the interpreter this soon when a tick is due; Python's default is 5 ms.
 SWITCH_INTERVAL_S = 1e-4
 # How often the first message of a followed /clock is looked for.
 CLOCK_PERIOD_S = 0.02
+# A /clock that stands for longer is said to have stopped.
+CLOCK_PATIENCE_S = 2.0
 # At the end of `duration` all subscribers together are waited for at most this long.
 ACKNOWLEDGED_S = 1.0
 
@@ -48,10 +51,12 @@ class Simulator(Node):
     simulation.  `finished` completes after `duration`.  Raises ValueError for a bad parameter.
     """
 
-    def __init__(self) -> None:
-        super().__init__('spinning_top', automatically_declare_parameters_from_overrides=True)
+    def __init__(self, argv: Sequence[str] = ()) -> None:
+        super().__init__('spinning_top', cli_args=ros_parameters.overrides(argv),
+                         automatically_declare_parameters_from_overrides=True)
         self.finished: Future = Future()
-        values = ros_parameters.declare(self)
+        self._terminal = reports.Terminal(self)
+        values = ros_parameters.declare(self, argv)
         simulation = self._simulation = Simulation(values)
         # A reset goes back to this; an unset spin.lz is the cusp of the tilt that there is then.
         self._start_spin = {name: values[name] for name in SPIN}
@@ -63,21 +68,20 @@ class Simulator(Node):
         self._follows = (self.get_parameter('use_sim_time').value
                          and not journal.is_enabled('clock', values))
         self._date = self.get_clock() if self._follows else Clock(clock_type=ClockType.SYSTEM_TIME)
-        logger = self.get_logger()
-        followed = MonotonicClock(self._date_ns, lambda back_ns: logger.warning(
+        followed = MonotonicClock(self._date_ns, lambda back_ns: self._terminal.log.warning(
             f'/clock stepped back by {back_ns / NANOSECONDS:g} s: the motion and its stamps go on '
             'from where they are'))
+        self._clock_seen = 0, time.monotonic()      # newest date [ns], and when it was new [s]
         self._lock = FairLock()
         self._outputs = StreamPublishers(self)
         self._session = RecordingSession(simulation, self._lock, self._outputs.topics_to_record)
         self._loop = TickLoop(
-            simulation, values, self._session, error=logger.error,
+            simulation, values, self._session, error=self._terminal.error,
             update_subscribers=lambda: self._outputs.update_subscribers(simulation.streams),
             source=followed if self._follows else time.monotonic_ns)
         self._pacer = DeadlineThread(self._guarded(self._tick), self._guarded(self._idle),
                                      lambda: self._loop.grid)
         self._report = reports.MotionReport(simulation, self._loop, self._session)
-        self._terminal = reports.Terminal()
         self._outputs.open(simulation.streams, values)
         self._diagnostics = self._outputs.create(DiagnosticArray, '/diagnostics')
         self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
@@ -89,7 +93,7 @@ class Simulator(Node):
         self._status_timer: Timer | None = None
         self._set_status_period(values['status_period'])
         if not simulation.top.is_realizable:
-            logger.warning(
+            self._terminal.log.warning(
                 f'top.lambda3 = {simulation.top.lambda3!r} kg m^2: no rigid body has more than '
                 f'2 (lambda1 - M R^2) = {2.0 * simulation.top.lambda1_at_com:g}; simulated all '
                 'the same')
@@ -129,10 +133,22 @@ class Simulator(Node):
         self._pacer.start()
         if open_log is not None:
             try:
-                open_log()
+                self._terminal.log.info(open_log())
             except RecordingError as error:
                 self._session.error = str(error)
-                self.get_logger().error(f'not recording: {error}')
+                self._terminal.log.error(f'not recording: {error}')
+
+    def _watch_clock(self) -> None:
+        """Say that the /clock that is followed has stopped, or not begun, and that it goes on."""
+        date_ns, now = self._date_ns(), time.monotonic()
+        if date_ns != self._clock_seen[0]:
+            self._clock_seen = date_ns, now
+        waits = self._follows and (date_ns == 0 or now > self._clock_seen[1] + CLOCK_PATIENCE_S)
+        if waits and not self._loop.waits_for_clock:
+            self._terminal.log.warning('waiting for /clock (use_sim_time is set)')
+        elif self._loop.waits_for_clock and not waits:
+            self._terminal.log.info('/clock goes on')
+        self._loop.waits_for_clock = waits
 
     def stop(self) -> None:
         """End the motion and close the recording; safe whatever state the context is in."""
@@ -141,6 +157,8 @@ class Simulator(Node):
         summary = self._session.stop()
         if summary:
             self._terminal.tell(summary)
+        if summary and self._session.path.exists():
+            self._terminal.tell(f'next: inspect {self._session.path} --plot top.png')
 
     def _tick(self) -> bool:
         with self._lock:
@@ -168,7 +186,7 @@ class Simulator(Node):
         """Stop the motion after an unexpected error, and close the log while it is whole."""
         if not self.context.ok():       # publishing fails once the context is down
             return
-        self.get_logger().error(traceback.format_exc())
+        self._terminal.log.error(traceback.format_exc())
         reason = f'unexpected {type(error).__name__}: {error}'
         with self._lock:
             self._loop.fail(reason)
@@ -193,10 +211,14 @@ class Simulator(Node):
             self._loop.rejected_commands += 1
             reason = f'data has {len(message.data)} values: must be [L3, Lz]'
         if reason:
-            self.get_logger().warning(f'~/commands: refused: {reason}')
+            self._terminal.log.warning(f'~/commands: refused: {reason}')
 
     def _on_set_parameters(self, given: list[Parameter]) -> SetParametersResult:
         """Apply all changes together or none."""
+        for p in given:
+            if p.name == 'use_sim_time' and p.value != self.get_parameter(p.name).value:
+                return SetParametersResult(successful=False, reason=(
+                    f'{p.name} = {p.value!r}: cannot be changed while the node runs'))
         changes = {p.name: p.value for p in given if p.name in parameters.BY_NAME}
         if self._resetting or not changes:
             return SetParametersResult(successful=True)
@@ -219,6 +241,10 @@ class Simulator(Node):
                 if 'status_period' in rest:
                     self._set_status_period(values['status_period'])
                 self._loop.set_pace(values)
+        for effect in (Effect.RESET, Effect.RECORDING):
+            names = [name for name in rest if parameters.BY_NAME[name].effect is effect]
+            if names:
+                self._terminal.log.info(f'{", ".join(names)}: {effect.value}')
         self._values = values
 
     def _serve(self, act: Callable[[Any], str], request: object, response: Any) -> object:
@@ -227,7 +253,7 @@ class Simulator(Node):
 
     def _check_started(self) -> None:
         if not self._loop.started:
-            raise RuntimeError('waiting for the first /clock (use_sim_time is set)')
+            raise RuntimeError(self._loop.failure or 'waiting for /clock (use_sim_time is set)')
 
     def _set_pause(self, request: SetBool.Request) -> str:
         with self._lock:
@@ -264,11 +290,17 @@ class Simulator(Node):
 
     def _publish_diagnostics(self) -> None:
         """Look at the recording, and publish /diagnostics."""
+        self._watch_clock()
         reason = self._session.check()
         if reason:
-            self.get_logger().error(f'recording stopped: {reason}; the simulation goes on')
+            self._terminal.log.error(f'recording stopped: {reason}; the simulation goes on')
+        names = self.get_node_names_and_namespaces()
+        if names.count((self.get_name(), self.get_namespace())) > 1:
+            self._terminal.log.warning(
+                f'there is another node {self.get_fully_qualified_name()}: give one of them a '
+                'namespace, with --ros-args -r __ns:=/NAME', once=True)
         if self._report.overloaded:
-            self.get_logger().warning(
+            self._terminal.log.warning(
                 'this machine cannot keep up with these rates: live topics skip samples, or the '
                 'clock slips; a recording stays complete, and /diagnostics counts', once=True)
         if self._values['max_error'] > 0.0:
@@ -285,5 +317,5 @@ class Simulator(Node):
         with self._lock:
             motion, line = self._report.new_motion(), self._report.status_line()
         if motion:
-            self._terminal.tell(motion)
+            self._terminal.log.info(motion)
         self._terminal.show(line)

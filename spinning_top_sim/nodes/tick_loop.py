@@ -30,10 +30,15 @@ STEP_BUDGET_NS = 2_000_000_000
 LATEST_NS = 500_000_000
 # A simulation further behind than this lets its clock slip: its real-time factor falls below 1.
 LONGEST_LAG_NS = 1_000_000_000
+# A day before the seconds of a stamp, an int32, end: no look-ahead goes that far.
+LAST_STAMP_NS = (2 ** 31 - 86_400) * NANOSECONDS
+TOO_LATE = 'stamps cannot be later than 2038-01-18: the stamps of ROS messages end'
 
 
 def next_epoch(date_ns: int) -> int:
-    """Return the first stamp from this date on [ns] that t = 0 may have."""
+    """Return the first stamp from this date on [ns] that t = 0 may have.  Raises ValueError."""
+    if date_ns > LAST_STAMP_NS:
+        raise ValueError(TOO_LATE)
     return -(-date_ns // EPOCH_GRID_NS) * EPOCH_GRID_NS
 
 
@@ -60,6 +65,7 @@ class TickLoop:
         self.started = self.ended = False       # `ended`: all samples of `duration` are sent
         self.paused: bool = values['start_paused']
         self.failure: str | None = None         # why the motion stands still until `reset`
+        self.waits_for_clock = False            # whether the source has stopped, or not begun
         self.grid = 0.0, 0.0                    # a time for a tick on the steady clock, period [s]
         self._simulation, self._recording = simulation, recording
         self._update_subscribers, self._error = update_subscribers, error
@@ -151,6 +157,9 @@ class TickLoop:
         if not self._clock.running:
             return target_ns
         publish_from_ns = target_ns - int(LATEST_NS * self._time_scale)
+        if simulation.epoch_ns + target_ns > LAST_STAMP_NS:
+            self.fail(TOO_LATE)
+            return target_ns
         stop_at_ns = self._steady() + TICK_BUDGET_NS
         try:
             arrived = has_room() and simulation.advance(
@@ -182,6 +191,8 @@ class TickLoop:
             raise RuntimeError('running: ~/step works while paused (~/set_pause true)')
         self._update_subscribers()
         target_ns = self.now_ns + round(count * dt * NANOSECONDS)
+        if self._simulation.epoch_ns + target_ns > LAST_STAMP_NS:
+            raise RuntimeError(TOO_LATE)
         stop_at_ns = self._steady() + STEP_BUDGET_NS
 
         def give_way() -> bool:
@@ -217,8 +228,9 @@ class TickLoop:
         or IntegrationError if no motion begins there; the present one goes on then.
         """
         simulation, sent_ns = self._simulation, self._simulation.now_ns
+        epoch_ns = next_epoch(max(simulation.epoch_ns + sent_ns + 1, date_ns))
         simulation.restart(values)
-        simulation.epoch_ns = next_epoch(max(simulation.epoch_ns + sent_ns + 1, date_ns))
+        simulation.epoch_ns = epoch_ns
         self.failure = None
         self._sync_clock()
         self._recording.write_event('reset', sent_ns, epoch_ns=simulation.epoch_ns,
