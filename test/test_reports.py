@@ -138,7 +138,7 @@ def screen(monkeypatch):
 def test_the_status_line_fits_the_terminal_also_when_that_becomes_narrower(screen):
     terminal, out = screen(20)
     terminal.show('123456 | 123456 | 123456')
-    terminal.show('123456 | 1234567890 | 1')
+    terminal.show('123456 | 12345678901 | 1')
     out.columns = 5
     terminal.show('123456 | 123456 | 123456')
     assert out.getvalue().split('\r\x1b[K') == ['', '123456 | 123456', '123456', '1234']
