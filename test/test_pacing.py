@@ -40,7 +40,7 @@ class Run:
         monkeypatch.setattr(pacing, 'time', self.time)
         self.origin, self.period = BEGIN, PERIOD
         self.thread = pacing.DeadlineThread(self._tick, self._idle,
-                                            lambda: (self.origin, self.period))
+                                            lambda: (self.origin, self.period), pytest.fail)
         self.thread.run()
 
     def _tick(self):

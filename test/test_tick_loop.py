@@ -182,6 +182,43 @@ def test_a_step_that_takes_too_long_says_what_is_left(monkeypatch):
         run.loop.step(1, 10.0)
 
 
+LAST_S = 2 ** 31 - 86_400
+
+
+def test_stamps_end_before_their_seconds_do_and_a_reset_says_why_not():
+    run = started()
+    run.simulation.epoch_ns = (LAST_S - 1) * SECOND
+    run.ticks(250)
+    assert run.loop.failure == tick_loop.TOO_LATE
+    assert SECOND - 2 * TICK_NS < run.simulation.now_ns < 2 * SECOND
+    with pytest.raises(ValueError, match='2038'):
+        run.loop.reset(run.values, 0)
+    assert run.loop.failure == tick_loop.TOO_LATE
+
+
+def test_a_fast_clock_comes_no_further_than_the_last_stamp():
+    run = started(time_scale=1e6, pose__rate=1e-3, solver__method='exact')
+    run.simulation.epoch_ns = (LAST_S - 100_000) * SECOND
+    run.ticks(100)
+    assert run.loop.failure == tick_loop.TOO_LATE
+    assert max(run.stamps) < 2 ** 31 * SECOND
+
+
+def test_a_step_ends_at_the_last_stamp():
+    run = started(start_paused=True)
+    run.simulation.epoch_ns = (LAST_S - 1) * SECOND
+    run.loop.step(1, 0.5)
+    with pytest.raises(RuntimeError, match='2038'):
+        run.loop.step(1, 0.75)
+    assert max(run.stamps) <= LAST_S * SECOND
+
+
+@pytest.mark.parametrize('date_ns', [2 ** 31 * SECOND, 2 ** 62])
+def test_a_date_that_no_stamp_can_have_is_refused(date_ns):
+    with pytest.raises(ValueError, match='2038'):
+        tick_loop.next_epoch(date_ns)
+
+
 def test_started_paused_nothing_moves():
     run = started(start_paused=True).ticks(5)
     assert run.stamps == [] and run.loop.now_ns == 0

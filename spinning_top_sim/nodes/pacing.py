@@ -86,6 +86,7 @@ class DeadlineThread(threading.Thread):
     sleeping thread costs less processor time than an rclpy timer (`benchmark/wake_up.py`).
 
     grid : returns a deadline on the monotonic clock and the time between two [s]
+    failed : takes any error of these; the thread goes on
     """
 
     LONGEST_SLEEP = 0.05    # [s], so that `stop` is quick
@@ -95,27 +96,36 @@ class DeadlineThread(threading.Thread):
     SHORTEST_NAP = 1e-4
 
     def __init__(self, tick: Callable[[], object], idle: Callable[[], object],
-                 grid: Callable[[], tuple[float, float]]) -> None:
+                 grid: Callable[[], tuple[float, float]],
+                 failed: Callable[[Exception], object]) -> None:
         super().__init__(name='simulation', daemon=True)
-        self._tick, self._idle, self._grid = tick, idle, grid
+        self._tick, self._idle, self._grid, self._failed = tick, idle, grid, failed
         self._stopped = False
+        self._newest = 0                # number of the deadline of the newest tick
+        self._newest_grid: tuple[float, float] | None = None
 
     def run(self) -> None:
-        grid: tuple[float, float] | None = None
-        newest = 0              # number of the deadline of the newest tick
         while not self._stopped:
-            before, grid = grid, self._grid()
-            origin, period = grid
-            passed = int((time.monotonic() - origin) // period)
-            newest = max(passed, newest + 1) if grid == before else passed + 1
-            deadline = origin + newest * period
-            while (left := deadline - time.monotonic()) > 0.0 and not self._stopped:
-                time.sleep(min(left, self.LONGEST_SLEEP))
-            if not self._stopped and self._tick():
-                nap = min(self.NAP * period, self.LONGEST_SLEEP)
-                if nap >= self.SHORTEST_NAP:
-                    time.sleep(nap)
-                self._idle()
+            try:
+                self._wait_and_tick()
+            except Exception as error:
+                self._failed(error)
+                time.sleep(self.LONGEST_SLEEP)
+
+    def _wait_and_tick(self) -> None:
+        before, self._newest_grid = self._newest_grid, self._grid()
+        origin, period = self._newest_grid
+        passed = int((time.monotonic() - origin) // period)
+        self._newest = (max(passed, self._newest + 1) if self._newest_grid == before
+                        else passed + 1)
+        deadline = origin + self._newest * period
+        while (left := deadline - time.monotonic()) > 0.0 and not self._stopped:
+            time.sleep(min(left, self.LONGEST_SLEEP))
+        if not self._stopped and self._tick():
+            nap = min(self.NAP * period, self.LONGEST_SLEEP)
+            if nap >= self.SHORTEST_NAP:
+                time.sleep(nap)
+            self._idle()
 
     def stop(self) -> None:
         """Ask the thread to end, and wait for it."""

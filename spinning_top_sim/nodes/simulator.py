@@ -79,8 +79,7 @@ class Simulator(Node):
             simulation, values, self._session, error=self._terminal.error,
             update_subscribers=lambda: self._outputs.update_subscribers(simulation.streams),
             source=followed if self._follows else time.monotonic_ns)
-        self._pacer = DeadlineThread(self._guarded(self._tick), self._guarded(self._idle),
-                                     lambda: self._loop.grid)
+        self._pacer = DeadlineThread(self._tick, self._idle, lambda: self._loop.grid, self._fail)
         self._report = reports.MotionReport(simulation, self._loop, self._session)
         self._outputs.open(simulation.streams, values)
         self._diagnostics = self._outputs.create(DiagnosticArray, '/diagnostics')

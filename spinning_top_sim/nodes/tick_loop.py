@@ -191,8 +191,7 @@ class TickLoop:
             raise RuntimeError('running: ~/step works while paused (~/set_pause true)')
         self._update_subscribers()
         target_ns = self.now_ns + round(count * dt * NANOSECONDS)
-        if self._simulation.epoch_ns + target_ns > LAST_STAMP_NS:
-            raise RuntimeError(TOO_LATE)
+        last_ns = LAST_STAMP_NS - self._simulation.epoch_ns
         stop_at_ns = self._steady() + STEP_BUDGET_NS
 
         def give_way() -> bool:
@@ -201,12 +200,14 @@ class TickLoop:
             return self._steady() > stop_at_ns
 
         try:
-            self._simulation.advance(target_ns, give_way=give_way)
+            self._simulation.advance(min(target_ns, last_ns), give_way=give_way)
         except IntegrationError as error:
             self.fail(str(error))
         self._sync_clock()
         if self.failure:
             raise RuntimeError(self.failure)
+        if self.now_ns == last_ns:
+            raise RuntimeError(TOO_LATE)
         if self.now_ns < target_ns:
             raise RuntimeError(f'{self.time_text}: this takes too long, '
                                f'{(target_ns - self.now_ns) / NANOSECONDS:.9g} s are left')
@@ -232,6 +233,7 @@ class TickLoop:
         simulation.restart(values)
         simulation.epoch_ns = epoch_ns
         self.failure = None
+        self.set_pace(values)           # which a failed change has left half done
         self._sync_clock()
         self._recording.write_event('reset', sent_ns, epoch_ns=simulation.epoch_ns,
                                     parameters=values)
