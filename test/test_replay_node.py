@@ -478,15 +478,18 @@ def test_an_unknown_type_is_named_once_and_the_rest_plays(peer, tmp_path):
 
 def test_one_odd_channel_does_not_stop_the_others(peer, tmp_path):
     qos = {'/plain': [{}], '/deadline': [{'deadline': {'sec': -1, 'nsec': 0}}],
-           '/liveliness': [{'liveliness': 2}], '/depth': [{'depth': -1}],
+           '/lease': [{'liveliness_lease_duration': {'sec': -7, 'nsec': 1}}],
+           '/liveliness': [{'liveliness': 2}], '/depth': [{'depth': -5}],
            '/different': [{'depth': 3}, {'depth': 4}]}
-    odd = {'/no_schema': (0, 'cdr'), '/no_type': (3, 'cdr'), '/no_cdr': (1, 'json'),
-           'no name!': (1, 'cdr'), '/plain': (2, 'cdr')}
+    odd = {'/no_schema': (0, 'cdr'), '/no_type': (3, 'cdr'), '/no_package': (4, 'cdr'),
+           '/no_cdr': (1, 'json'), 'no name!': (1, 'cdr'), '/plain': (2, 'cdr'),
+           '/rosout': (1, 'cdr'), '//twice': (1, 'cdr'), '/' + 500 * 'x': (1, 'cdr'),
+           '/red\x1b[31m': (1, 'cdr')}
     path = tmp_path / 'odd.mcap'
     with path.open('wb') as file:
         log = McapWriter(file)
         log.start('ros2')
-        for name in (STRING, TWIST, 'no type; at all'):
+        for name in (STRING, TWIST, 'no type; at all', '/msg/X'):
             log.register_schema(name, 'ros2msg', b'')
         channels = [log.register_channel(name, 'cdr', 1, {
             'offered_qos_profiles': '\n'.join(
@@ -500,7 +503,11 @@ def test_one_odd_channel_does_not_stop_the_others(peer, tmp_path):
     raw, node = play_all(peer, tmp_path, path, [(name, STRING) for name in qos], depth=10)
     assert_same(raw, [[string_cdr(n)] for n in range(len(qos))])
     for name in odd:
-        assert node.err.count(f'{name} is not played') == 1
+        shown = name if len(name) < 300 else name[:300]
+        assert node.err.count(shown.replace('\x1b', '\\x1b') + (
+            ' is not played' if shown == name else ' ... ')) == 1
+    assert '\x1b' not in node.err
+    assert len(node.err.splitlines()) == len(odd) + len(qos) - 1
     for name in qos:
         warned = node.err.count(f'{name} is published with default QoS')
         assert warned == (name != '/plain')

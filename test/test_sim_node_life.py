@@ -2,6 +2,7 @@
 """How the node ends, what it does not do while nobody listens, and how it bears overload."""
 
 import json
+import os
 import signal
 import subprocess
 import time
@@ -428,6 +429,27 @@ def test_an_error_that_nobody_expects_stops_the_motion_loudly_until_a_reset(
     status = diagnostics.wait_for(node, 'the recording that ended',
                                   lambda s: 'recording: unexpected' in s.message)
     assert status.level == b'\x02'
+
+
+HUNG_DISK = """
+import os, runpy, time
+ordinary = os.fsync
+os.fsync = lambda file: time.sleep(1000.0) if os.path.exists('hung') else ordinary(file)
+runpy.run_module('spinning_top_sim.nodes.sim_node', run_name='__main__')
+"""
+
+
+def test_with_a_hung_disk_the_node_ends_all_the_same(peer, tmp_path):
+    with SimNode(tmp_path, {**QUIET, 'record.enabled': True, 'record.max_loss': 0.1},
+                 program=('-c', HUNG_DISK)) as node:
+        pose = peer.listen(node.topic('pose'), PoseStamped).wait(50)
+        (node.folder / 'hung').touch()
+        pose.wait_more(100)                 # the motion goes on meanwhile
+        os.killpg(node.process.pid, signal.SIGINT)
+        assert node.wait(60.0) == 0, node.err
+        peer.stop_listening(pose)
+    assert 'could not be closed within' in node.out
+    assert TRACEBACK not in node.err
 
 
 SMALL_FILES = """

@@ -93,12 +93,19 @@ def _ignore_signals() -> None:
 
 
 def _cannot_start(name: str, error: Exception) -> int:
-    """Say why in one line, without the places in the sources of rcl; return the exit code."""
-    text = ' '.join(re.sub(r',\s*at \S+:\d+', '', str(error)).split())
+    """Say why in one line; return the exit code."""
     kind = type(error).__name__
     expected = isinstance(error, ValueError | RuntimeError | OSError) or kind.startswith('Invalid')
-    print(f'{name}: cannot start: {text if expected else f"{kind}: {text}"}', file=sys.stderr)
+    print(f'{name}: cannot start: {"" if expected else f"{kind}: "}{one_line(error)}',
+          file=sys.stderr)
     return 2
+
+
+def one_line(text: object) -> str:
+    """Return a text as one line: no control characters, no places in the sources of rcl."""
+    line = ' '.join(re.sub(r',\s*at \S+:\d+', '', str(text)).split())
+    line = ''.join(char if char.isprintable() else ascii(char)[1:-1] for char in line)
+    return line if len(line) <= 600 else f'{line[:300]} ... {line[-300:]}'
 
 
 def _executor(node: RunnableNode) -> Executor:

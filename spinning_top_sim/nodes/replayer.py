@@ -30,7 +30,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes import reports
-from spinning_top_sim.nodes.executable import wait_for_all_acked
+from spinning_top_sim.nodes.executable import one_line, wait_for_all_acked
 from spinning_top_sim.nodes.playback import ROUND_GAP_NS, Message, Playback, ReadAhead, rounds
 from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import DefinitionNotFoundError, LogError
@@ -105,7 +105,7 @@ class Replayer(Node):
             try:
                 publisher = self._publisher(alike)
             except Exception as error:      # whatever a log may ask for: the others are played
-                self._terminal.log.warning(f'{name} is not played: {error}')
+                self._terminal.log.warning(one_line(f'{name} is not played: {error}'))
             else:
                 outputs.update({channel.channel_id: publisher for channel in alike})
         if wanted and not outputs and not self._options.clock:
@@ -267,7 +267,9 @@ def message_class(type_name: str) -> type:
                 sys.prefix]
     if any(Path(prefix, AMENT_INDEX, package).is_file() for prefix in prefixes):
         with contextlib.suppress(ImportError, AttributeError):
-            return getattr(importlib.import_module(f'{package}.msg'), name)
+            kind = getattr(importlib.import_module(f'{package}.msg'), name)
+            if hasattr(kind, 'get_fields_and_field_types'):
+                return kind
     raise LookupError(f'{type_name} is not installed')
 
 
