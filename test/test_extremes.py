@@ -27,7 +27,7 @@ class Run:
             write_event=lambda event, *_, **details: journal.event(event, 0, 0, **details))
         self.loop = TickLoop(
             self.simulation, values, recording, update_subscribers=lambda: None,
-            error=lambda text: None, source=lambda: self.now_ns,
+            tell=lambda *_: None, source=lambda: self.now_ns,
             steady=lambda: self.now_ns + time.monotonic_ns())
         self.simulation.log_to(self.count, [
             stream for stream in self.simulation.streams

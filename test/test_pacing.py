@@ -137,11 +137,3 @@ def test_simulated_time_knows_when_it_will_be_what():
     clock.set(clock.now(), running=False)
     now[0] += 100
     assert (clock.now(), clock.when(250)) == (250, None)
-
-
-def test_a_followed_clock_goes_on_where_it_steps_back():
-    readings = iter([100, 150, 40, 41, 90, 10, 20])
-    told = []
-    clock = pacing.MonotonicClock(lambda: next(readings), told.append)
-    assert [clock() for _ in range(7)] == [100, 150, 150, 151, 200, 200, 210]
-    assert told == [110, 80]

@@ -34,7 +34,7 @@ def reported():
     session = SimpleNamespace(error=None, size='', numbers=lambda: {'recorder': 'off'},
                               has_room=lambda: True,
                               write_command=print, write_event=lambda *_, **__: None)
-    loop = TickLoop(simulation, values, session, update_subscribers=lambda: None, error=print)
+    loop = TickLoop(simulation, values, session, update_subscribers=lambda: None, tell=print)
     loop.start()
     loop.step(1, 1.25)
     return SimpleNamespace(report=MotionReport(simulation, loop, session), loop=loop,
@@ -147,7 +147,7 @@ def test_the_status_line_fits_the_terminal_also_when_that_becomes_narrower(scree
 def test_what_is_logged_does_not_stand_behind_the_status_line(screen):
     terminal, out = screen(80)
     terminal.show('one | two')
-    terminal.error('wrong')
+    terminal.tell_of('wrong', failed=True)
     terminal.tell('done')
     terminal.end()
     assert out.getvalue() == '\r\x1b[Kone | two\n[ERROR] wrong\ndone\n'
@@ -158,5 +158,5 @@ def test_without_a_terminal_or_under_launch_lines_are_whole(screen, columns):
     terminal, out = screen(columns)
     terminal.show('a | ' * 50 + 'z')
     terminal.show('b')
-    terminal.error('wrong')
+    terminal.tell_of('wrong', failed=True)
     assert out.getvalue() == 'a | ' * 50 + 'z\nb\n[ERROR] wrong\n'

@@ -46,7 +46,7 @@ class Run:
                 has_room=room, write_command=lambda *_: self.told.append('command'),
                 write_event=lambda event, sent_ns, **_: self.told.append((event, sent_ns))),
             update_subscribers=lambda: self.told.append('subscribers'),
-            error=self.told.append, source=self.clock, steady=self.clock)
+            tell=lambda text, _: self.told.append(text), source=self.clock, steady=self.clock)
 
     @property
     def pose(self):
@@ -293,6 +293,18 @@ def test_a_time_scale_holds_from_its_moment_on():
     assert run.loop.grid == pytest.approx(((BEGIN_NS + 4 * TICK_NS - 2e6) / 1e9, 0.005), abs=0.0)
     run.tick()
     assert run.loop.now_ns == 4 * TICK_NS + 10 * TICK_NS
+
+
+@pytest.mark.parametrize('time_scale', [1.0, 3.0])
+def test_a_clock_that_steps_back_is_told_and_time_goes_on_from_where_it_is(time_scale):
+    run = started(time_scale=time_scale).ticks(9)
+    now_ns = run.loop.now_ns
+    run.tick(after_ns=-30 * SECOND)
+    assert run.loop.now_ns == now_ns
+    run.ticks(6)
+    assert run.loop.now_ns == now_ns + 6 * time_scale * TICK_NS
+    assert sum('/clock stepped back by 30 s' in told for told in run.told) == 1
+    assert run.stamps == grid(run.loop.now_ns)
 
 
 def test_a_reset_begins_again_at_a_later_stamp_and_a_pause_remains():

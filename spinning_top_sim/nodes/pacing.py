@@ -44,22 +44,6 @@ class SimulatedClock:
         return self._from_source + round((simulated_ns - self._from_simulated) / self._scale)
 
 
-class MonotonicClock:
-    """Follows a clock without its steps back, as of a log in a loop, and tells of these [ns]."""
-
-    def __init__(self, source: Callable[[], int], tell: Callable[[int], object]) -> None:
-        self._source, self._tell = source, tell
-        self._newest_ns = self._stepped_back_ns = 0
-
-    def __call__(self) -> int:
-        back_ns, self._newest_ns = self._newest_ns, self._source()
-        back_ns -= self._newest_ns
-        if back_ns > 0:
-            self._stepped_back_ns += back_ns
-            self._tell(back_ns)
-        return self._newest_ns + self._stepped_back_ns
-
-
 class FairLock:
     """
     A lock that threads get in turn.

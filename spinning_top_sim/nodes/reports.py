@@ -148,9 +148,12 @@ class Terminal:
         self.end()
         return self._node.get_logger()
 
-    def error(self, text: str) -> None:
-        """Log an error."""
-        self.log.error(text)
+    def tell_of(self, text: str, failed: bool) -> None:
+        """Log a warning, or an error where something has failed."""
+        if failed:
+            self.log.error(text)
+        else:
+            self.log.warning(text)
 
     def end(self) -> None:
         """Leave the cursor on a fresh line."""

@@ -26,56 +26,33 @@ def overrides(argv: Sequence[str]) -> list[str]:
     """
     Return the `-p NAME:=VALUE` of a command line, as arguments for the node alone.
 
-    There they win over every file.  Among the arguments of the whole process rcl takes an integer
-    of a file and drops the double that overrides it.
+    There they win.  Among those of the process, rcl drops a double that overrides an integer.
     """
     return ['--ros-args', *(word for flag, rule in pairwise(argv) if flag in {'-p', '--param'}
                             for word in (flag, rule))]
 
 
-def _check_files(argv: Sequence[str], given: Mapping[str, Any]) -> None:
-    """Raise ValueError where rcl has dropped what a later file says; see `overrides`."""
-    files = [path for flag, path in pairwise(argv) if flag == '--params-file']
-    if len(files) < 2:
-        return
-    from spinning_top_sim.tools.scene_file import read_scene  # noqa: PLC0415 - imports YAML
-
-    asked: dict[str, Any] = {}
-    for path in files:
-        with contextlib.suppress(OSError, ValueError):      # what rcl has taken is not judged
-            asked.update(read_scene(path))
-    named = {rule.partition(':=')[0].rpartition(':')[2] for rule in overrides(argv)}
-    for name, value in given.items():
-        later = asked.get(name, value)
-        if name not in named and type(later) is not type(value) and later != value:
-            raise ValueError(f'{name}: one parameter file has {value!r}, a later one {later!r}, '
-                             'which ROS drops because of its type: write both alike, as in 2.0')
-
-
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
-    """
-    Return what `ros2 param describe` shows.
-
-    Typing is dynamic because an integer is accepted for a double; `Parameter.check` decides.
-    """
+    """Return what `ros2 param describe` shows; dynamic types, as `Parameter.check` decides."""
     result = ParameterDescriptor(
         name=parameter.name, description=parameter.summary, dynamic_typing=True,
         read_only=parameter.effect is Effect.START)
     lowest = parameter.minimum if parameter.above is None else parameter.above
     if lowest is None or parameter.maximum is None:
         result.additional_constraints = parameter.allowed
-    elif parameter.is_double:
+        return result
+    if parameter.above is not None:
+        result.additional_constraints = f'must be > {parameter.above:g}'
+    if parameter.is_double:
         result.floating_point_range = [FloatingPointRange(
             from_value=float(lowest), to_value=float(parameter.maximum))]
     else:
         result.integer_range = [IntegerRange(
             from_value=int(lowest), to_value=int(parameter.maximum))]
-    if parameter.above is not None and result.floating_point_range:
-        result.additional_constraints = f'must be > {parameter.above:g}'
     return result
 
 
-def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
+def declare(node: Node) -> dict[str, Any]:
     """
     Declare the whole table, warn of unknown parameters, and return the checked start values.
 
@@ -97,7 +74,6 @@ def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
             node.get_logger().warning(f'there is no parameter {name}: ignored{hint}')
         # It is declared with its descriptor, below or by `create_publisher`.
         node.undeclare_parameter(name)
-    _check_files(argv, given)
     values = parameters.checked(given)
     shown = {**values, 'spin.lz': parameters.start_state(values).lz}
     node.declare_parameters('', [

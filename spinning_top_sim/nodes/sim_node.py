@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -55,26 +54,14 @@ def _prepare(argv: list[str]) -> Callable[[], Simulator] | None:
     from rclpy.utilities import remove_ros_args  # noqa: PLC0415
 
     try:
-        stray = remove_ros_args(argv)[1:]
-    except RuntimeError as error:
-        # Of arguments that it does not know, rcl says only which.
-        stray = re.findall("'(.*?)'", str(error)) if str(error).startswith('[') else []
+        stray = ' '.join(remove_ros_args(argv)[1:])
+    except RuntimeError as error:       # rcl does not know what stands behind --ros-args
+        stray = executable.one_line(error)
     if stray:
-        raise ValueError(f'{" ".join(stray)!r} is not expected here; parameters follow '
-                         f'--ros-args: sim_node --ros-args {_as_ros_args(stray)}')
+        raise ValueError(f'{stray!r} is not expected here; the form is: sim_node --ros-args '
+                         '-p NAME:=VALUE --params-file FILE')
     from spinning_top_sim.nodes.simulator import Simulator  # noqa: PLC0415
     return lambda: Simulator(argv)
-
-
-def _as_ros_args(stray: list[str]) -> str:
-    """Return what these arguments probably mean."""
-    words: list[str] = []
-    for word in stray:
-        flag = '-p' if ':=' in word else '--params-file' if word.endswith('.yaml') else ''
-        if flag and not (words and words[-1].startswith('-')):
-            words.append(flag)
-        words.append(word)
-    return ' '.join(words) if ':=' in words[-1] or flag else '-p NAME:=VALUE --params-file FILE'
 
 
 if __name__ == '__main__':

@@ -22,7 +22,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes import reports, ros_parameters
 from spinning_top_sim.nodes.executable import wait_for_all_acked
-from spinning_top_sim.nodes.pacing import DeadlineThread, FairLock, MonotonicClock
+from spinning_top_sim.nodes.pacing import DeadlineThread, FairLock
 from spinning_top_sim.nodes.recording_session import RecordingSession
 from spinning_top_sim.nodes.ros_parameters import SPIN
 from spinning_top_sim.nodes.stream_publishers import StreamPublishers
@@ -56,7 +56,7 @@ class Simulator(Node):
                          automatically_declare_parameters_from_overrides=True)
         self.finished: Future = Future()
         self._terminal = reports.Terminal(self)
-        values = ros_parameters.declare(self, argv)
+        values = ros_parameters.declare(self)
         simulation = self._simulation = Simulation(values)
         # A reset goes back to this; an unset spin.lz is the cusp of the tilt that there is then.
         self._start_spin = {name: values[name] for name in SPIN}
@@ -68,17 +68,14 @@ class Simulator(Node):
         self._follows = (self.get_parameter('use_sim_time').value
                          and not journal.is_enabled('clock', values))
         self._date = self.get_clock() if self._follows else Clock(clock_type=ClockType.SYSTEM_TIME)
-        followed = MonotonicClock(self._date_ns, lambda back_ns: self._terminal.log.warning(
-            f'/clock stepped back by {back_ns / NANOSECONDS:g} s: the motion and its stamps go on '
-            'from where they are'))
         self._clock_seen = 0, time.monotonic()      # newest date [ns], and when it was new [s]
         self._lock = FairLock()
         self._outputs = StreamPublishers(self)
         self._session = RecordingSession(simulation, self._lock, self._outputs.topics_to_record)
         self._loop = TickLoop(
-            simulation, values, self._session, error=self._terminal.error,
+            simulation, values, self._session, tell=self._terminal.tell_of,
             update_subscribers=lambda: self._outputs.update_subscribers(simulation.streams),
-            source=followed if self._follows else time.monotonic_ns)
+            source=self._date_ns if self._follows else time.monotonic_ns)
         self._pacer = DeadlineThread(self._tick, self._idle, lambda: self._loop.grid, self._fail)
         self._report = reports.MotionReport(simulation, self._loop, self._session)
         self._outputs.open(simulation.streams, values)
@@ -98,9 +95,13 @@ class Simulator(Node):
                 'the same')
 
     def _steady_timer(self, period: float, callback: Callable[[], object]) -> Timer:
-        """Create a timer that neither a step of the date nor /clock can hold up."""
-        return self.create_timer(period, self._guarded(callback),
-                                 clock=Clock(clock_type=ClockType.STEADY_TIME))
+        """Create a timer that no clock can hold up; unexpected errors stop the motion."""
+        def call() -> None:
+            try:
+                callback()
+            except Exception as error:
+                self._fail(error)
+        return self.create_timer(period, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _set_status_period(self, period: float) -> None:
         if self._status_timer is not None:
@@ -156,8 +157,8 @@ class Simulator(Node):
         summary = self._session.stop()
         if summary:
             self._terminal.tell(summary)
-        if summary and self._session.path.exists():
-            self._terminal.tell(f'next: inspect {self._session.path} --plot top.png')
+            if self._session.path.exists():
+                self._terminal.tell(f'next: inspect {self._session.path} --plot top.png')
 
     def _tick(self) -> bool:
         with self._lock:
@@ -170,16 +171,6 @@ class Simulator(Node):
     def _idle(self) -> None:
         with self._lock:
             self._loop.idle()
-
-    def _guarded(self, callback: Callable) -> Callable:
-        """Return a callback whose unexpected errors stop the motion, not the node or a thread."""
-        def call(*arguments: object) -> object:
-            try:
-                return callback(*arguments)
-            except Exception as error:
-                self._fail(error)
-                return None
-        return call
 
     def _fail(self, error: Exception) -> None:
         """Stop the motion after an unexpected error, and close the log while it is whole."""

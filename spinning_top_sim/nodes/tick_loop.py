@@ -51,14 +51,15 @@ class TickLoop:
 
     recording : where it has no room, nothing is sent
     update_subscribers : sets `publish` of each stream that has subscribers
-    error : takes a text for the log
+    tell : takes a text for the log, and whether the motion has failed
     source : returns the time that simulated time follows [ns]
     steady : returns steady time [ns]; decides which ticks are late and how long one may work
     """
 
     def __init__(self, simulation: Simulation, values: Mapping[str, Any],
-                 recording: RecordingSession, *, update_subscribers: Callable[[], object],
-                 error: Callable[[str], object], source: Callable[[], int] = time.monotonic_ns,
+                 recording: RecordingSession, *, tell: Callable[[str, bool], object],
+                 update_subscribers: Callable[[], object],
+                 source: Callable[[], int] = time.monotonic_ns,
                  steady: Callable[[], int] = time.monotonic_ns) -> None:
         self.late_ticks = self.skipped_ticks = self.slipped_ns = 0      # since the start
         self.commands = self.rejected_commands = 0
@@ -68,7 +69,7 @@ class TickLoop:
         self.waits_for_clock = False            # whether the source has stopped, or not begun
         self.grid = 0.0, 0.0                    # a time for a tick on the steady clock, period [s]
         self._simulation, self._recording = simulation, recording
-        self._update_subscribers, self._error = update_subscribers, error
+        self._update_subscribers, self._tell = update_subscribers, tell
         self._steady, self._is_steady = steady, source is steady
         self._clock = SimulatedClock(source, values['time_scale'])
         self._subscribers_due_ns = 0            # on the steady clock
@@ -112,7 +113,7 @@ class TickLoop:
         self._late_from_ns = steady_ns + self._late_after_ns
         due_ns = self._clock.now()
         # The fast path touches little memory: after a rest, little of it is in the caches.
-        if (due_ns < self._fast_until_ns and steady_ns <= late_from_ns
+        if (self._simulation.now_ns <= due_ns < self._fast_until_ns and steady_ns <= late_from_ns
                 and self._simulation.send_ready(due_ns)):
             return self._computing
         if not self._clock.running:
@@ -153,9 +154,16 @@ class TickLoop:
     def _advance(self) -> int:
         """Send what is due, or what one tick has time for; return the simulated time due [ns]."""
         simulation, has_room = self._simulation, self._recording.has_room
-        target_ns = min(self._clock.now(), self._duration_ns)
+        due_ns = self._clock.now()
+        target_ns = min(due_ns, self._duration_ns)
         if not self._clock.running:
             return target_ns
+        if due_ns < simulation.now_ns:          # as where a log is played in a loop
+            back_s = (simulation.now_ns - due_ns) / self._time_scale / NANOSECONDS
+            self._tell(f'/clock stepped back by {back_s:g} s: the motion and its stamps go on '
+                       'from where they are', False)
+            self._sync_clock()
+            return simulation.now_ns
         publish_from_ns = target_ns - int(LATEST_NS * self._time_scale)
         if simulation.epoch_ns + target_ns > LAST_STAMP_NS:
             self.fail(TOO_LATE)
@@ -242,7 +250,7 @@ class TickLoop:
         """Hold the motion until `reset`."""
         self.failure = reason
         self._sync_clock()
-        self._error(f'{reason}; the motion stands still until ~/reset')
+        self._tell(f'{reason}; the motion stands still until ~/reset', True)
 
     def set_pace(self, values: Mapping[str, Any]) -> None:
         """Take over tick_rate, time_scale and duration."""
