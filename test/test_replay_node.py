@@ -33,8 +33,8 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from spinning_top_sim.nodes import playback
-from spinning_top_sim.nodes.playback import ROUND_GAP_NS, Playback, ReadAhead, rounds
+from spinning_top_sim.nodes import pacing
+from spinning_top_sim.nodes.pacing import ROUND_GAP_NS, Playback, ReadAhead, rounds
 from spinning_top_sim.nodes.replayer import message_class
 from spinning_top_sim.recording import writer
 from spinning_top_sim.recording.definitions import find_definition
@@ -211,11 +211,11 @@ def test_reading_ahead_is_bounded_in_order_and_ends():
     assert [number for number, _, _ in first] == list(range(1_000))
     ahead.stop()
     assert not ahead._thread.is_alive()
-    most = (playback.BATCHES + 3) * playback.BATCH_MESSAGES
+    most = (pacing.BATCHES + 3) * pacing.BATCH_MESSAGES
     assert last[0] < 1_000 + most
 
 
-@pytest.mark.parametrize('count', [1, playback.BATCH_MESSAGES, 700])
+@pytest.mark.parametrize('count', [1, pacing.BATCH_MESSAGES, 700])
 def test_what_reading_raises_comes_after_what_was_read(count):
     def broken():
         for number in range(count):

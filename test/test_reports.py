@@ -124,14 +124,13 @@ class Screen(io.StringIO):
 
 @pytest.fixture
 def screen(monkeypatch):
-    """Return a terminal of so many columns (None: no terminal), its node, and what is shown."""
+    """Return a terminal of so many columns (None: no terminal), and what is shown."""
     def of(columns):
         out = Screen(columns)
         monkeypatch.setattr(reports.sys, 'stdout', out)
         monkeypatch.setattr(reports.os, 'get_terminal_size', lambda *_: os.terminal_size(
             (out.columns, 24)))
-        logger = SimpleNamespace(error=lambda text: out.write(f'[ERROR] {text}\n'))
-        return reports.Terminal(SimpleNamespace(get_logger=lambda: logger)), out
+        return reports.Terminal(), out
     return of
 
 
@@ -144,13 +143,14 @@ def test_the_status_line_fits_the_terminal_also_when_that_becomes_narrower(scree
     assert out.getvalue().split('\r\x1b[K') == ['', '123456 | 123456', '123456', '1234']
 
 
-def test_what_is_logged_does_not_stand_behind_the_status_line(screen):
+def test_nothing_stands_behind_the_status_line(screen):
     terminal, out = screen(80)
     terminal.show('one | two')
-    terminal.tell_of('wrong', failed=True)
-    terminal.tell('done')
     terminal.end()
-    assert out.getvalue() == '\r\x1b[Kone | two\n[ERROR] wrong\ndone\n'
+    terminal.end()
+    terminal.show('three')
+    terminal.tell('done')
+    assert out.getvalue() == '\r\x1b[Kone | two\n\r\x1b[Kthree\ndone\n'
 
 
 @pytest.mark.parametrize('columns', [None, 0])
@@ -158,5 +158,5 @@ def test_without_a_terminal_or_under_launch_lines_are_whole(screen, columns):
     terminal, out = screen(columns)
     terminal.show('a | ' * 50 + 'z')
     terminal.show('b')
-    terminal.tell_of('wrong', failed=True)
-    assert out.getvalue() == 'a | ' * 50 + 'z\nb\n[ERROR] wrong\n'
+    terminal.end()
+    assert out.getvalue() == 'a | ' * 50 + 'z\nb\n'

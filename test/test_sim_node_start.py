@@ -130,6 +130,7 @@ def test_a_second_node_of_the_same_name_is_warned_about(peer, tmp_path):
         for node in (one, two):
             wait_for('a warning', lambda node=node:
                      'there is another node /twins/spinning_top' in node.err)
+        for node in (one, two):
             assert_clean_end(node, node.end())
 
 

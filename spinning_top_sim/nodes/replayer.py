@@ -31,7 +31,7 @@ from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes import reports
 from spinning_top_sim.nodes.executable import one_line, wait_for_all_acked
-from spinning_top_sim.nodes.playback import ROUND_GAP_NS, Message, Playback, ReadAhead, rounds
+from spinning_top_sim.nodes.pacing import ROUND_GAP_NS, Message, Playback, ReadAhead, rounds
 from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import DefinitionNotFoundError, LogError
 from spinning_top_sim.recording.reader import LogReader, LogTopic
@@ -63,8 +63,8 @@ class Replayer(Node):
         given = [] if options.rate is None else [Parameter('rate', value=options.rate)]
         super().__init__('replay', parameter_overrides=given)
         self.finished: Future = Future()    # completes with the exit code when all is played
-        self._log, self._options = log, options
-        self._terminal = reports.Terminal(self)
+        self._reader, self._options = log, options
+        self._terminal = reports.Terminal()
         self._log_begin_ns, self._end_ns = log.span
         self._begin_ns = self._log_begin_ns + round(options.start * NANOSECONDS)
         self._span_ns = self._end_ns - self._begin_ns
@@ -90,14 +90,20 @@ class Replayer(Node):
         self._thread = threading.Thread(target=self._play, name='playback', daemon=True)
         self._ahead = ReadAhead(rounds(self._messages, self._span_ns, options.loop))
 
+    @property
+    def _log(self) -> Any:
+        """The logger; what it says does not stand behind the status line."""
+        self._terminal.end()
+        return self.get_logger()
+
     def _open_publishers(self) -> dict[int, Publisher]:
         """Return the publishers by channel; warn of the topics that cannot be played."""
-        there = {channel.name for channel in self._log.topics}
+        there = {channel.name for channel in self._reader.topics}
         wanted = set(self._options.topics) or there
         for name in sorted(wanted - there):
-            self._terminal.log.warning(f'the log has no topic {name}')
+            self._log.warning(f'the log has no topic {name}')
         channels: dict[tuple[str, str], list[LogTopic]] = defaultdict(list)
-        for channel in self._log.topics:
+        for channel in self._reader.topics:
             if channel.name in wanted:
                 channels[channel.name, channel.type_name].append(channel)
         outputs = {}
@@ -105,7 +111,7 @@ class Replayer(Node):
             try:
                 publisher = self._publisher(alike)
             except Exception as error:      # whatever a log may ask for: the others are played
-                self._terminal.log.warning(one_line(f'{name} is not played: {error}'))
+                self._log.warning(one_line(f'{name} is not played: {error}'))
             else:
                 outputs.update({channel.channel_id: publisher for channel in alike})
         if wanted and not outputs and not self._options.clock:
@@ -124,7 +130,7 @@ class Replayer(Node):
         recorded_hash = topic.metadata.get('topic_type_hash')
         with contextlib.suppress(DefinitionNotFoundError):
             if recorded_hash and recorded_hash != find_definition(topic.type_name).type_hash:
-                self._terminal.log.warning(
+                self._log.warning(
                     f'{topic.name} was recorded with another {topic.type_name} than is installed: '
                     'subscribers may misread it')
         profiles = [profile for channel in channels for profile in channel.qos] or [DEFAULT_QOS]
@@ -133,7 +139,7 @@ class Replayer(Node):
                 raise ValueError('its publishers had different ones')
             qos = qos_profile(profiles[0])
         except ValueError as error:
-            self._terminal.log.warning(f'{topic.name} is published with default QoS, not with the '
+            self._log.warning(f'{topic.name} is published with default QoS, not with the '
                                       f'recorded one: {error}')
             qos = qos_profile(DEFAULT_QOS)
         return self.create_publisher(
@@ -160,7 +166,7 @@ class Replayer(Node):
         self._ahead.stop()
         if self._thread.is_alive():
             self._thread.join(1.0)
-        self._log.close()
+        self._reader.close()
         self._terminal.end()
 
     def _play(self) -> None:
@@ -173,7 +179,7 @@ class Replayer(Node):
             code = 2 if self._tell_damage() else 0
         except Exception as error:
             if self.context.ok():           # publishing fails once the context is down
-                self._terminal.log.error(f'cannot be played any further: {error}')
+                self._log.error(f'cannot be played any further: {error}')
             code = 2
         if self.context.ok():
             late = f', {self._playback.late} of them late' if self._playback.late else ''
@@ -183,23 +189,23 @@ class Replayer(Node):
 
     def _messages(self) -> Iterator[Message]:
         """Yield the messages of a round."""
-        names = {channel.name for channel in self._log.topics
+        names = {channel.name for channel in self._reader.topics
                  if channel.channel_id in self._outputs}
         # A reader that is told where to start takes the index's word for it.
         start = self._begin_ns if self._options.start else None
-        for message in self._log.messages(names, start):
+        for message in self._reader.messages(names, start):
             at_ns = message.log_time or self._begin_ns      # 0: recorded before there was a time
             if not self._log_begin_ns <= at_ns <= self._end_ns:
-                raise ValueError(f'the index of {self._log.path} does not fit its messages: '
+                raise ValueError(f'the index of {self._reader.path} does not fit its messages: '
                                  '`recover` makes a log with a right one')
             if message.channel_id in self._outputs:
                 yield at_ns, message.channel_id, message.data
 
     def _tell_damage(self) -> bool:
         """Return whether messages are missing unexpectedly; say so once."""
-        damaged = self._log.left_out > 0 and not self._options.partial
+        damaged = self._reader.left_out > 0 and not self._options.partial
         if damaged:
-            self._terminal.log.error(f'{self._log.path} is damaged inside, and messages are left '
+            self._log.error(f'{self._reader.path} is damaged inside, and messages are left '
                                     'out: `recover` tells which', once=True)
         return damaged
 

@@ -7,11 +7,10 @@ import math
 import os
 import sys
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.node import Node
 from std_msgs.msg import Header
 
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -121,8 +120,7 @@ class Terminal:
     A terminal without a width is one that a launch reads line by line.
     """
 
-    def __init__(self, node: Node) -> None:
-        self._node = node
+    def __init__(self) -> None:
         self._columns = os.get_terminal_size(1).columns if sys.stdout.isatty() else 0
         self._open = False              # the cursor stands behind a line
 
@@ -141,19 +139,6 @@ class Terminal:
         """Show a line that stays."""
         self.end()
         self._write(f'{line}\n')
-
-    @property
-    def log(self) -> Any:
-        """The node's logger, for a line that does not stand behind the newest one."""
-        self.end()
-        return self._node.get_logger()
-
-    def tell_of(self, text: str, failed: bool) -> None:
-        """Log a warning, or an error where something has failed."""
-        if failed:
-            self.log.error(text)
-        else:
-            self.log.warning(text)
 
     def end(self) -> None:
         """Leave the cursor on a fresh line."""

@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import sys
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -15,6 +16,9 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.task import Future
 from rclpy.timer import Timer
 from std_msgs.msg import Float64MultiArray
@@ -23,15 +27,15 @@ from std_srvs.srv import SetBool, Trigger
 from spinning_top_sim.nodes import reports, ros_parameters
 from spinning_top_sim.nodes.executable import wait_for_all_acked
 from spinning_top_sim.nodes.pacing import DeadlineThread, FairLock
-from spinning_top_sim.nodes.recording_session import RecordingSession
+from spinning_top_sim.nodes.recording_session import RecordingSession, Topic
 from spinning_top_sim.nodes.ros_parameters import SPIN
-from spinning_top_sim.nodes.stream_publishers import StreamPublishers
 from spinning_top_sim.nodes.tick_loop import TickLoop, next_epoch
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.parameters import Effect
 from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.topics import Stream
 
 # Threads let go of the interpreter this soon when a tick is due; Python's default is 5 ms.
 SWITCH_INTERVAL_S = 1e-4
@@ -41,6 +45,52 @@ CLOCK_PERIOD_S = 0.02
 CLOCK_PATIENCE_S = 2.0
 # At the end of `duration` all subscribers together are waited for at most this long.
 ACKNOWLEDGED_S = 1.0
+RECORDED_POLICIES = ('history', 'depth', 'reliability', 'durability', 'liveliness')
+
+
+class StreamPublishers:
+    """Has a publisher for each enabled stream."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self.by_topic: dict[str, Publisher] = {}
+
+    def create(self, message_class: type, topic: str) -> Publisher:
+        """Create a reliable publisher whose QoS can be overridden by parameters."""
+        return self._node.create_publisher(
+            message_class, topic, QoSProfile(depth=10),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+
+    def open(self, streams: Sequence[Stream], values: Mapping[str, Any]) -> None:
+        """Create the publishers of enabled streams; destroy those of others."""
+        for stream in streams:
+            enabled = journal.is_enabled(stream.parameter, values)
+            there = stream.topic in self.by_topic
+            if enabled and not there:
+                package, _, name = stream.type_name.split('/')
+                message_class = getattr(importlib.import_module(f'{package}.msg'), name)
+                self.by_topic[stream.topic] = self.create(message_class, stream.topic)
+            elif there and not enabled:
+                stream.publish = None
+                self._node.destroy_publisher(self.by_topic.pop(stream.topic))
+
+    def update_subscribers(self, streams: Sequence[Stream]) -> None:
+        """Let a stream publish if anybody subscribes to it; without that, it computes nothing."""
+        for stream in streams:
+            publisher = self.by_topic.get(stream.topic)
+            if publisher is not None:
+                heard = publisher.get_subscription_count() > 0
+                stream.publish = publisher.publish if heard else None
+
+    def topics_to_record(self, streams: Sequence[Stream]) -> list[Topic]:
+        """Return the topics of these streams, and behind them those of the journal."""
+        topics: list[Topic] = []
+        for stream in streams:
+            publisher = self.by_topic[stream.topic]
+            topics.append((publisher.topic_name, stream.type_name, {
+                name: int(getattr(publisher.qos_profile, name)) for name in RECORDED_POLICIES}))
+        return [*topics, *((self._node.resolve_topic_name(name), type_name, {})
+                           for name, type_name in journal.TOPICS)]
 
 
 class Simulator(Node):
@@ -55,7 +105,7 @@ class Simulator(Node):
         super().__init__('spinning_top', cli_args=ros_parameters.overrides(argv),
                          automatically_declare_parameters_from_overrides=True)
         self.finished: Future = Future()
-        self._terminal = reports.Terminal(self)
+        self._terminal = reports.Terminal()
         values = ros_parameters.declare(self)
         simulation = self._simulation = Simulation(values)
         # A reset goes back to this; an unset spin.lz is the cusp of the tilt that there is then.
@@ -73,7 +123,7 @@ class Simulator(Node):
         self._outputs = StreamPublishers(self)
         self._session = RecordingSession(simulation, self._lock, self._outputs.topics_to_record)
         self._loop = TickLoop(
-            simulation, values, self._session, tell=self._terminal.tell_of,
+            simulation, values, self._session, tell=self._tell,
             update_subscribers=lambda: self._outputs.update_subscribers(simulation.streams),
             source=self._date_ns if self._follows else time.monotonic_ns)
         self._pacer = DeadlineThread(self._tick, self._idle, lambda: self._loop.grid, self._fail)
@@ -89,10 +139,22 @@ class Simulator(Node):
         self._status_timer: Timer | None = None
         self._set_status_period(values['status_period'])
         if not simulation.top.is_realizable:
-            self._terminal.log.warning(
+            self._log.warning(
                 f'top.lambda3 = {simulation.top.lambda3!r} kg m^2: no rigid body has more than '
                 f'2 (lambda1 - M R^2) = {2.0 * simulation.top.lambda1_at_com:g}; simulated all '
                 'the same')
+
+    @property
+    def _log(self) -> Any:
+        """The logger; what it says does not stand behind the status line."""
+        self._terminal.end()
+        return self.get_logger()
+
+    def _tell(self, text: str, failed: bool) -> None:
+        if failed:
+            self._log.error(text)
+        else:
+            self._log.warning(text)
 
     def _steady_timer(self, period: float, callback: Callable[[], object]) -> Timer:
         """Create a timer that no clock can hold up; unexpected errors stop the motion."""
@@ -133,10 +195,10 @@ class Simulator(Node):
         self._pacer.start()
         if open_log is not None:
             try:
-                self._terminal.log.info(open_log())
+                self._log.info(open_log())
             except RecordingError as error:
                 self._session.error = str(error)
-                self._terminal.log.error(f'not recording: {error}')
+                self._log.error(f'not recording: {error}')
 
     def _watch_clock(self) -> None:
         """Say that the /clock that is followed has stopped, or not begun, and that it goes on."""
@@ -145,9 +207,9 @@ class Simulator(Node):
             self._clock_seen = date_ns, now
         waits = self._follows and (date_ns == 0 or now > self._clock_seen[1] + CLOCK_PATIENCE_S)
         if waits and not self._loop.waits_for_clock:
-            self._terminal.log.warning('waiting for /clock (use_sim_time is set)')
+            self._log.warning('waiting for /clock (use_sim_time is set)')
         elif self._loop.waits_for_clock and not waits:
-            self._terminal.log.info('/clock goes on')
+            self._log.info('/clock goes on')
         self._loop.waits_for_clock = waits
 
     def stop(self) -> None:
@@ -176,7 +238,7 @@ class Simulator(Node):
         """Stop the motion after an unexpected error, and close the log while it is whole."""
         if not self.context.ok():       # publishing fails once the context is down
             return
-        self._terminal.log.error(traceback.format_exc())
+        self._log.error(traceback.format_exc())
         reason = f'unexpected {type(error).__name__}: {error}'
         with self._lock:
             self._loop.fail(reason)
@@ -201,7 +263,7 @@ class Simulator(Node):
             self._loop.rejected_commands += 1
             reason = f'data has {len(message.data)} values: must be [L3, Lz]'
         if reason:
-            self._terminal.log.warning(f'~/commands: refused: {reason}')
+            self._log.warning(f'~/commands: refused: {reason}')
 
     def _on_set_parameters(self, given: list[Parameter]) -> SetParametersResult:
         """Apply all changes together or none."""
@@ -234,7 +296,7 @@ class Simulator(Node):
         for effect in (Effect.RESET, Effect.RECORDING):
             names = [name for name in rest if parameters.BY_NAME[name].effect is effect]
             if names:
-                self._terminal.log.info(f'{", ".join(names)}: {effect.value}')
+                self._log.info(f'{", ".join(names)}: {effect.value}')
         self._values = values
 
     def _serve(self, act: Callable[[Any], str], request: object, response: Any) -> object:
@@ -283,14 +345,14 @@ class Simulator(Node):
         self._watch_clock()
         reason = self._session.check()
         if reason:
-            self._terminal.log.error(f'recording stopped: {reason}; the simulation goes on')
+            self._log.error(f'recording stopped: {reason}; the simulation goes on')
         names = self.get_node_names_and_namespaces()
         if names.count((self.get_name(), self.get_namespace())) > 1:
-            self._terminal.log.warning(
+            self._log.warning(
                 f'there is another node {self.get_fully_qualified_name()}: give one of them a '
                 'namespace, with --ros-args -r __ns:=/NAME', once=True)
         if self._report.overloaded:
-            self._terminal.log.warning(
+            self._log.warning(
                 'this machine cannot keep up with these rates: live topics skip samples, or the '
                 'clock slips; a recording stays complete, and /diagnostics counts', once=True)
         if self._values['max_error'] > 0.0:
@@ -307,5 +369,5 @@ class Simulator(Node):
         with self._lock:
             motion, line = self._report.new_motion(), self._report.status_line()
         if motion:
-            self._terminal.log.info(motion)
+            self._log.info(motion)
         self._terminal.show(line)

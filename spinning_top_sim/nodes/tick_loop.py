@@ -67,7 +67,6 @@ class TickLoop:
         self.paused: bool = values['start_paused']
         self.failure: str | None = None         # why the motion stands still until `reset`
         self.waits_for_clock = False            # whether the source has stopped, or not begun
-        self.grid = 0.0, 0.0                    # a time for a tick on the steady clock, period [s]
         self._simulation, self._recording = simulation, recording
         self._update_subscribers, self._tell = update_subscribers, tell
         self._steady, self._is_steady = steady, source is steady
@@ -99,13 +98,12 @@ class TickLoop:
         self._fast_until_ns, self._late_from_ns = -1, NEVER_NS
         self._clock.set(self.now_ns, running=self.started and not (
             self.ended or self.paused or self.failure))
-        self._align()
 
-    def _align(self) -> None:
-        """Have ticks just after samples are due."""
+    @property
+    def grid(self) -> tuple[float, float]:
+        """Steady time of a tick, just after samples are due, and from tick to tick [s]."""
         origin_ns = self._clock.when(0) if self._is_steady else None
-        self.grid = (self.grid[0] if origin_ns is None else origin_ns / NANOSECONDS,
-                     self._tick_period_ns / NANOSECONDS)
+        return (origin_ns or 0) / NANOSECONDS, self._tick_period_ns / NANOSECONDS
 
     def tick(self) -> bool:
         """Send what is due; return whether `idle` has something to do before the next tick."""
@@ -262,4 +260,3 @@ class TickLoop:
             1.5 * self._tick_period_ns, min(TICKS_AHEAD * self._tick_period_ns, AHEAD_NS)))
         self._late_from_ns, self._fast_until_ns = NEVER_NS, -1
         self._clock.set_scale(self._time_scale)
-        self._align()
