@@ -35,10 +35,9 @@ class RunnableNode(Protocol):
 def run(name: str, argv: list[str],
         prepare: Callable[[list[str]], Callable[[], RunnableNode] | None]) -> int:
     """
-    Run a node; return 0 after an ordinary end, 2 if it cannot be started.
+    Run a node; return 0 after an ordinary end, 2 if it cannot be started, and say why.
 
-    `prepare` takes the arguments.  It returns a function that makes the node, or None if there is
-    nothing to run.  What either raises is shown in one line.
+    prepare : takes the arguments; returns what makes the node, or None if there is nothing to run
     """
     # Nothing is open yet, and a KeyboardInterrupt in the midst of imports is easily lost.
     _handle(signal.SIGINT, lambda *_: _exit(130))
@@ -120,9 +119,7 @@ def _executor(node: RunnableNode) -> Executor:
     node.finished.add_done_callback(lambda _: executor.wake())
     gc.collect()
     gc.freeze()             # no full collection goes through what is there from the start
-    # A full collection waits until there is a quarter more than the one before has found.
-    # This one finds nothing, so the cyclic garbage of service calls does not pile up.
-    gc.collect()
+    gc.collect()            # finds nothing, so that the next full one comes soon
     return executor
 
 

@@ -23,11 +23,7 @@ HIGHEST_PUBLISH_FREQUENCY = 1000.0
 
 def state_publisher(share: Path, values: Mapping[str, Any], namespace: str, joint_states: str,
                     use_sim_time: bool) -> list[Action]:
-    """
-    Return robot_state_publisher, or a warning that there is no TF.
-
-    `joint_states` is the full name of the topic.  Raises ValueError if the frames are impossible.
-    """
+    """Return robot_state_publisher, or a warning.  Raises ValueError for impossible frames."""
     try:
         get_package_prefix(STATE_PUBLISHER)
         description = robot_description(values, share / 'urdf')

@@ -11,15 +11,12 @@ from collections.abc import Callable, Iterable, Iterator
 
 Message = tuple[int, int, bytes]    # time [ns], which publisher, CDR
 
-# Between the last message of a round and the first of the next; also the period of a log whose
-# messages have all the same time.
+# Between the last message of a round and the first of the next.
 ROUND_GAP_NS = 10_000_000
 # A message sent later than this is counted.
 LATE_NS = 10_000_000
-
-BATCH_BYTES = 256_000
-BATCH_MESSAGES = 512
-BATCHES = 16
+# Read ahead.
+BATCH_BYTES, BATCH_MESSAGES, BATCHES = 256_000, 512, 16
 
 
 class SimulatedClock:
@@ -59,11 +56,7 @@ class SimulatedClock:
 
 
 class FairLock:
-    """
-    A lock that threads get in turn.
-
-    An ordinary one stays with a thread that takes it again and again, as an overloaded tick does.
-    """
+    """A lock in turn: an ordinary one stays with a thread that takes it again and again."""
 
     def __init__(self) -> None:
         self._lock, self._next = threading.Lock(), threading.Lock()
@@ -80,8 +73,8 @@ class DeadlineThread(threading.Thread):
     """
     Calls `tick` at absolute deadlines until it is stopped, and `idle` behind it where it asks so.
 
-    A late tick comes at once, deadlines that have passed are skipped, and their grid stays.  A
-    sleeping thread costs less processor time than an rclpy timer (`benchmark/wake_up.py`).
+    A late tick comes at once, and deadlines that have passed are skipped.  It costs less processor
+    time than an rclpy timer (`benchmark/wake_up.py`).
 
     grid : returns a deadline on the monotonic clock and the time between two [s]
     failed : takes any error of these; the thread goes on
@@ -145,12 +138,7 @@ def rounds(read: Callable[[], Iterable[Message]], span_ns: int, loop: bool) -> I
 
 
 class ReadAhead:
-    """
-    Iterates over messages that a thread reads ahead, a bounded number of them.
-
-    The thread that sends does not read, because every new chunk takes a while.  An error of the
-    reading is raised after the messages before it.
-    """
+    """Iterates over messages that a thread reads ahead, a bounded number; its error comes last."""
 
     def __init__(self, messages: Iterable[Message]) -> None:
         # Behind the batches comes the error, or None.
@@ -196,10 +184,7 @@ class ReadAhead:
 
 class Playback:
     """
-    Sends messages at their times, by a clock that can be paused and change its rate.
-
-    Each deadline is computed from the clock, never from the one before, so nothing drifts.  A
-    late message is sent at once and counted, not dropped.
+    Sends messages at their times, late ones at once, by a clock with pauses and a rate.
 
     begin_ns : time at which the clock starts [ns]
     send : takes the index of a publisher, and CDR

@@ -24,7 +24,7 @@ MOST_PENDING = 20_000
 
 # Full name, type, and offered QoS.
 Topic = tuple[str, str, dict[str, int]]
-# What `provenance` takes; the present parameters come last.
+# What `provenance` takes.
 Run = tuple[Mapping[str, Any], int, int, tuple[tuple[int, float, float], ...], Mapping[str, Any]]
 
 

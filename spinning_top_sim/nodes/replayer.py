@@ -53,11 +53,7 @@ SWITCH_INTERVAL_S = 0.0005
 
 
 class Replayer(Node):
-    """
-    The node: plays a log once it is started.  Raises ValueError if nothing of it can be played.
-
-    options : those of `replay_node`
-    """
+    """The node: plays a log once it is started.  Raises ValueError if nothing can be played."""
 
     def __init__(self, log: LogReader, options: argparse.Namespace) -> None:
         given = [] if options.rate is None else [Parameter('rate', value=options.rate)]
@@ -106,14 +102,12 @@ class Replayer(Node):
         for channel in self._reader.topics:
             if channel.name in wanted:
                 channels[channel.name, channel.type_name].append(channel)
-        outputs = {}
+        outputs: dict[int, Publisher] = {}
         for (name, _), alike in channels.items():
             try:
-                publisher = self._publisher(alike)
+                outputs |= dict.fromkeys([one.channel_id for one in alike], self._publisher(alike))
             except Exception as error:      # whatever a log may ask for: the others are played
                 self._log.warning(one_line(f'{name} is not played: {error}'))
-            else:
-                outputs.update({channel.channel_id: publisher for channel in alike})
         if wanted and not outputs and not self._options.clock:
             raise ValueError('none of the topics can be played; the log has '
                              f'{", ".join(sorted(there)) or "none at all"}')
@@ -127,12 +121,11 @@ class Replayer(Node):
         if topic.encoding != 'cdr':
             raise LookupError(f'its messages are encoded as {topic.encoding!r}, not as CDR')
         kind = message_class(topic.type_name)
-        recorded_hash = topic.metadata.get('topic_type_hash')
+        type_hash = topic.metadata.get('topic_type_hash')
         with contextlib.suppress(DefinitionNotFoundError):
-            if recorded_hash and recorded_hash != find_definition(topic.type_name).type_hash:
-                self._log.warning(
-                    f'{topic.name} was recorded with another {topic.type_name} than is installed: '
-                    'subscribers may misread it')
+            if type_hash and type_hash != find_definition(topic.type_name).type_hash:
+                self._log.warning(f'{topic.name} was recorded with another {topic.type_name} than '
+                                  'is installed: subscribers may misread it')
         profiles = [profile for channel in channels for profile in channel.qos] or [DEFAULT_QOS]
         try:
             if any(profile != profiles[0] for profile in profiles):
@@ -182,9 +175,8 @@ class Replayer(Node):
                 self._log.error(f'cannot be played any further: {error}')
             code = 2
         if self.context.ok():
-            late = f', {self._playback.late} of them late' if self._playback.late else ''
-            self._terminal.tell(f'played {self._playback.sent} messages on '
-                                f'{len(self._senders)} topics{late}')
+            self._terminal.tell(f'played {self._playback.sent} messages on {len(self._senders)} '
+                                f'topics, {self._playback.late} of them late')
             self.finished.set_result(code)
 
     def _messages(self) -> Iterator[Message]:
@@ -260,11 +252,7 @@ def open_log(path: Path, partial: bool) -> LogReader:
 
 
 def message_class(type_name: str) -> type:
-    """
-    Return the class of a message type that a log names.
-
-    Raises LookupError unless it is one of an installed ROS package; nothing else is imported.
-    """
+    """Return a message class of an installed ROS package.  Raises LookupError for all else."""
     match = TYPE_NAME.fullmatch(type_name)
     if match is None:
         raise LookupError(f'{type_name!r} is not the name of a message type')

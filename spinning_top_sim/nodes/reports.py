@@ -32,11 +32,7 @@ class MotionReport:
         self._regime = ''
 
     def diagnostics(self, stamp: Time, name: str, max_error: float) -> DiagnosticArray:
-        """
-        Return the message for /diagnostics; its level is that of the worst problem.
-
-        max_error : largest orientation error that is no problem; 0: it is not computed [rad]
-        """
+        """Return the message for /diagnostics; without a `max_error` no error is computed."""
         simulation, loop, session = self._simulation, self._loop, self._session
         error = simulation.orientation_error if max_error else math.nan
         problems = [(DiagnosticStatus.OK, 'paused' if loop.paused else 'running')]
@@ -114,11 +110,7 @@ class MotionReport:
 
 
 class Terminal:
-    """
-    Shows a line that overwrites itself on a terminal, and whole lines elsewhere.
-
-    A terminal without a width is one that a launch reads line by line.
-    """
+    """Shows a line that overwrites itself, and whole ones where a launch or a file reads them."""
 
     def __init__(self) -> None:
         self._columns = os.get_terminal_size(1).columns if sys.stdout.isatty() else 0

@@ -95,10 +95,10 @@ class StreamPublishers:
 
 class Simulator(Node):
     """
-    The node; docs/interface.md has its topics, services and parameters.
+    The node.  Raises ValueError for a bad parameter.
 
     One thread ticks, the executor's does everything else; both hold the lock while they use the
-    simulation.  `finished` completes after `duration`.  Raises ValueError for a bad parameter.
+    simulation.  `finished` completes after `duration`.
     """
 
     def __init__(self, argv: Sequence[str] = ()) -> None:

@@ -18,9 +18,8 @@ from spinning_top_sim.streams.schedule import NEVER_NS
 EPOCH_GRID_NS = 10_000_000
 # How often subscribers are counted; a new one waits at most this long.
 SUBSCRIBERS_PERIOD_NS = 50_000_000
-# The look-ahead is computed in pieces that fill this share of the time between two ticks, so that
-# the next tick finds the processor free.  It begins this many ticks, or this much time, before it
-# is needed.
+# The look-ahead is computed in pieces that fill this share of the time between two ticks.  It
+# begins this many ticks, or this much time, before it is needed.
 BUSY_SHARE = 0.35
 TICKS_AHEAD, AHEAD_NS = 24, 50_000_000
 # One tick works at most this long before services and signals get their turn; so does one step.
@@ -231,8 +230,8 @@ class TickLoop:
         """
         Go back to the start state of these parameters, and out of a failure; a pause remains.
 
-        t = 0 is stamped with this date, or later, so that stamps never go back.  Raises ValueError
-        or IntegrationError if no motion begins there; the present one goes on then.
+        t = 0 has this date or, as stamps never go back, a later one.  Raises ValueError or
+        IntegrationError if no motion begins there; the present one goes on then.
         """
         simulation, sent_ns = self._simulation, self._simulation.now_ns
         epoch_ns = next_epoch(max(simulation.epoch_ns + sent_ns + 1, date_ns))
