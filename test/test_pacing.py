@@ -94,6 +94,21 @@ def test_idle_work_begins_a_moment_after_the_tick_that_asks_for_it(monkeypatch):
     assert run.idled == pytest.approx([2.25 + run.thread.NAP, 4.25 + run.thread.NAP])
 
 
+def test_the_thread_tells_of_errors_and_goes_on(monkeypatch):
+    class Failing(Run):
+        def _tick(self):
+            wants = super()._tick()
+            if len(self.seen) in (2, 3):
+                raise ZeroDivisionError(len(self.seen))
+            return wants
+
+    told = []
+    monkeypatch.setattr(pytest, 'fail', lambda error: told.append(str(error)))
+    run = Failing(monkeypatch, 5)
+    assert told == ['2', '3']
+    assert len(run.seen) == 5
+
+
 def test_a_far_deadline_is_waited_for_in_pieces(monkeypatch):
     run = Run(monkeypatch, 2, at={0: lambda run: setattr(run, 'period', 1.0)})
     assert max(run.time.naps) <= run.thread.LONGEST_SLEEP
