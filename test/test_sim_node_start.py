@@ -113,6 +113,8 @@ def test_what_waits_for_a_reset_or_a_recording_is_said_when_it_is_set(peer, node
     assert peer.set_together(node, record__max_loss=1.0).successful
     wait_for('a line', lambda: 'record.max_loss: a change takes effect at the next start of a '
              'recording' in node.err)
+    assert peer.set_together(node, top__mass=2.5, imu__lever_arm=[0.0, 0.0, 1.0]).successful
+    wait_for('a line', lambda: ': imu.lever_arm: a change takes' in node.err)
     assert 'pose.rate' not in node.err
 
 

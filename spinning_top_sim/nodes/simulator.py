@@ -294,7 +294,8 @@ class Simulator(Node):
                     self._set_status_period(values['status_period'])
                 self._loop.set_pace(values)
         for effect in (Effect.RESET, Effect.RECORDING):
-            names = [name for name in rest if parameters.BY_NAME[name].effect is effect]
+            names = [name for name in rest if parameters.BY_NAME[name].effect is effect
+                     and values[name] != self._values[name]]
             if names:
                 self._log.info(f'{", ".join(names)}: {effect.value}')
         self._values = values
