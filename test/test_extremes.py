@@ -109,9 +109,8 @@ def test_a_node_starts_with_extreme_parameters_or_refuses_them_in_one_line(peer,
     given = {name: str(value).lower() if isinstance(value, bool) else value
              for name, value in without_end(parameter_sets(seed)).items()}
     with SimNode(tmp_path, {'status_period': 1.0} | given) as node:
-        wait_for('a service or the end', lambda: not node.alive or node.name in {
-            f'{space.rstrip("/")}/{name}' for name, space
-            in peer.node.get_node_names_and_namespaces()})
+        wait_for('a service or the end', lambda: not node.alive or node.topic('~/record') in {
+            name for name, _ in peer.node.get_service_names_and_types()})
         if node.alive:
             assert peer.switch(node, 'set_pause', True) is not None
             assert node.end() == 0, node.err
