@@ -76,19 +76,20 @@ def play(messages, rate=1.0, plan=None, cost_ns=0, **options):
     fake = FakeTime()
     sent = []
 
-    def send(index, _):
-        sent.append((index, fake.now_ns - 77))
+    def send(data):
+        sent.append((int(data), fake.now_ns - 77))
         fake.now_ns += cost_ns
 
-    player = Playback(EPOCH_NS, send, source=fake.now, sleep=fake.sleep, **options)
+    player = Playback(EPOCH_NS, source=fake.now, sleep=fake.sleep, **options)
     player.set_rate(rate)
     fake.at_rest = {77 + at: (lambda act=act: act(player)) for at, act in (plan or {}).items()}
-    player.run(messages)
+    player.run((at_ns, send, data) for at_ns, _, data in messages)
     return sent, player, fake
 
 
-def messages_at(*offsets):
-    return [(EPOCH_NS + offset, index, b'') for index, offset in enumerate(offsets)]
+def messages_at(*offsets, send=None):
+    return [(EPOCH_NS + offset, send, str(index).encode())
+            for index, offset in enumerate(offsets)]
 
 
 @pytest.mark.parametrize('rate', [0.1, 1.0, 3.0, 10.0])
@@ -149,14 +150,14 @@ def test_a_pause_from_another_thread_waits_for_the_message_that_is_being_sent():
     """Nothing is sent after `pause` has returned, though the playback never rests here."""
     sending, go_on = threading.Event(), threading.Event()
 
-    def send(index, _):
-        if index == 3:
+    def send(data):
+        if data == b'3':
             sending.set()
             assert go_on.wait(PATIENCE_S)
 
-    player = Playback(EPOCH_NS, send)
-    playing = threading.Thread(target=player.run, args=(messages_at(*range(10_000)),),
-                               daemon=True)
+    player = Playback(EPOCH_NS)
+    playing = threading.Thread(target=player.run, daemon=True, args=(
+        messages_at(*range(10_000), send=send),))
     playing.start()
     assert sending.wait(PATIENCE_S)
     pausing = threading.Thread(target=player.pause, args=(True,), daemon=True)

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 
-Message = tuple[int, int, bytes]    # time [ns], which publisher, CDR
+Message = tuple[int, Callable[[bytes], object], bytes]      # time [ns], what sends it, CDR
 
 # Between the last message of a round and the first of the next.
 ROUND_GAP_NS = 10_000_000
@@ -130,8 +130,8 @@ def rounds(read: Callable[[], Iterable[Message]], span_ns: int, loop: bool) -> I
     shift = 0
     while True:
         at_ns = None
-        for at_ns, index, data in read():
-            yield at_ns + shift, index, data
+        for at_ns, send, data in read():
+            yield at_ns + shift, send, data
         if at_ns is None or not loop:
             return
         shift += span_ns + ROUND_GAP_NS
@@ -187,14 +187,13 @@ class Playback:
     Sends messages at their times, late ones at once, by a clock with pauses and a rate.
 
     begin_ns : time at which the clock starts [ns]
-    send : takes the index of a publisher, and CDR
     source, sleep : returns steady time [ns]; waits at most so many seconds (None: until woken)
     """
 
-    def __init__(self, begin_ns: int, send: Callable[[int, bytes], None], *, paused: bool = False,
+    def __init__(self, begin_ns: int, *, paused: bool = False,
                  source: Callable[[], int] = time.monotonic_ns,
                  sleep: Callable[[float | None], object] | None = None) -> None:
-        self._send, self._source = send, source
+        self._source = source
         self._clock = SimulatedClock(source, 1.0)
         self._clock.set(begin_ns, running=False)
         self._sent_until = begin_ns         # all messages before this time are sent
@@ -207,12 +206,12 @@ class Playback:
 
     def run(self, messages: Iterable[Message]) -> None:
         """Play messages in the order of their times, to the end or until stopped."""
-        for at_ns, index, data in messages:
+        for at_ns, send, data in messages:
             if not self.sent:           # reading the first message may have taken a while
                 with self._lock:
                     self._clock.set(self._sent_until, not self.paused)
             self._sent_until = at_ns
-            if not self._send_when_due(at_ns, index, data):
+            if not self._send_when_due(at_ns, send, data):
                 return
 
     def now(self) -> int:
@@ -239,7 +238,7 @@ class Playback:
             self._stopped = True
         self._wake.set()
 
-    def _send_when_due(self, at_ns: int, index: int, data: bytes) -> bool:
+    def _send_when_due(self, at_ns: int, send: Callable[[bytes], object], data: bytes) -> bool:
         """Send a message when its time has come; return False when stopped before."""
         while True:
             with self._lock:
@@ -248,7 +247,7 @@ class Playback:
                 due = self._clock.when(at_ns)
                 left = None if due is None else due - self._source()
                 if left is not None and left <= 0:
-                    self._send(index, data)
+                    send(data)
                     self.sent += 1
                     self.late += left < -LATE_NS
                     return True

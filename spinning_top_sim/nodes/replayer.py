@@ -69,17 +69,17 @@ class Replayer(Node):
             raise ValueError(f'--start {options.start:g}: the log lasts {self._length_s:.3f} s')
         self._outputs = self._open_publishers()     # by channel
         self._senders = set(self._outputs.values())
-        self._playback = Playback(
-            self._begin_ns, lambda channel_id, data: self._outputs[channel_id].publish(data),
-            paused=options.start_paused)
+        self._playback = Playback(self._begin_ns, paused=options.start_paused)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self.declare_parameter('rate', 1.0, ParameterDescriptor(
             description='recorded over real time; a change takes effect at once',
             additional_constraints=f'a number in [{SLOWEST:g}, {FASTEST:g}]', dynamic_typing=True))
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         if options.clock:
-            self._clock_publisher = self.create_publisher(ClockMessage, '/clock', 10)
-            self.create_timer(1.0 / max(options.clock, SLOWEST), self._publish_clock, clock=steady)
+            clock = self.create_publisher(ClockMessage, '/clock', 10)
+            self._senders.add(clock)
+            self.create_timer(1.0 / max(options.clock, SLOWEST), lambda: clock.publish(
+                ClockMessage(clock=Time(nanoseconds=self._playback.now()).to_msg())), clock=steady)
         self.create_timer(1.0, self._show_status, clock=steady)
         self.create_service(SetBool, '~/set_pause', self._on_pause)
         self._stopping = threading.Event()
@@ -175,8 +175,9 @@ class Replayer(Node):
                 self._log.error(f'cannot be played any further: {error}')
             code = 2
         if self.context.ok():
-            self._terminal.tell(f'played {self._playback.sent} messages on {len(self._senders)} '
-                                f'topics, {self._playback.late} of them late')
+            self._terminal.tell(
+                f'played {self._playback.sent} messages on {len(set(self._outputs.values()))} '
+                f'topics, {self._playback.late} of them late')
             self.finished.set_result(code)
 
     def _messages(self) -> Iterator[Message]:
@@ -191,7 +192,7 @@ class Replayer(Node):
                 raise ValueError(f'the index of {self._reader.path} does not fit its messages: '
                                  '`recover` makes a log with a right one')
             if message.channel_id in self._outputs:
-                yield at_ns, message.channel_id, message.data
+                yield at_ns, self._outputs[message.channel_id].publish, message.data
 
     def _tell_damage(self) -> bool:
         """Return whether messages are missing unexpectedly; say so once."""
@@ -204,15 +205,10 @@ class Replayer(Node):
     def _wait_to_begin(self) -> None:
         """Wait for subscribers and the delay."""
         begin = time.monotonic() + self._options.delay
-        publishers = [*self._senders, *([self._clock_publisher] if self._options.clock else [])]
         while not self._stopping.wait(LOOK_S) and (time.monotonic() < begin or sum(
-                publisher.get_subscription_count() for publisher in publishers
+                publisher.get_subscription_count() for publisher in self._senders
                 ) < self._options.wait_for_subscribers):
             pass
-
-    def _publish_clock(self) -> None:
-        now = Time(nanoseconds=self._playback.now())
-        self._clock_publisher.publish(ClockMessage(clock=now.to_msg()))
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._playback.pause(request.data)
