@@ -1,127 +1,155 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Values that no arithmetic holds are refused where they are given; all others run."""
+"""Extreme parameters and commands: a node lives on, or refuses them in one clear line."""
 
-import math
-from collections import Counter
+import time
+from types import SimpleNamespace
 
 import pytest
-from helpers import short_lives
-from helpers.simulations import MILLISECOND, SECOND, record, simulate, stream
+from helpers.extremes import actions, commands, parameter_sets
 
+from spinning_top_sim.nodes.tick_loop import TickLoop
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.pipeline import Simulation
-from spinning_top_sim.streams.schedule import LAST_STAMP_NS
-from spinning_top_sim.tools.simulate import main
 
-HUGE, TINY = 1e300, 1e-300
-REFUSED = [
-    ('status_period', 1e10), ('status_period', TINY), ('duration', HUGE), ('duration', TINY),
-    *((f'{name}.rate', TINY) for name, *_ in parameters.STREAM_DEFAULTS),
-    ('tick_rate', TINY), ('time_scale', TINY), ('max_error', HUGE),
-    *((f'imu.{kind}_{name}', value) for kind in ('gyroscope', 'accelerometer')
-      for name in ('noise_density', 'random_walk', 'turn_on_bias', 'range', 'resolution')
-      for value in (HUGE, 1e200, TINY)),
-    ('imu.lever_arm', (0.0, HUGE, 0.0)), ('imu.rpy', (0.0, 0.0, -HUGE)),
-    ('top.mass', HUGE), ('top.com_distance', -HUGE), ('top.lambda1', HUGE),
-    ('top.lambda3', 1e200), ('top.gravity', HUGE), ('initial.theta_dot', 1e18),
-    ('initial.phi', HUGE), ('initial.psi', -1e18), ('record.min_free_bytes', 2 ** 63),
-    ('seed', 10 ** 400), ('step.count', -10 ** 400)]
+TICK_NS = 5_000_000
+REFUSED = ValueError, IntegrationError
 
 
-@pytest.mark.parametrize(('name', 'value'), REFUSED)
-def test_what_no_arithmetic_holds_is_refused_by_the_table(name, value):
-    """With name, value, and what is allowed."""
-    with pytest.raises(ValueError, match='must be') as refusal:
-        parameters.checked({name: value})
-    assert str(refusal.value).startswith(f'{name} = {value!r}: must be ')
+class Run:
+    """A loop on a clock of its own, which records what is enabled and goes on as the node does."""
+
+    def __init__(self, values):
+        self.values, self.now_ns, self.sent = values, 77, 0
+        self.simulation = Simulation(values)
+        recording = SimpleNamespace(
+            has_room=lambda: True, wait_for_room=lambda: None, write_command=lambda *_: None,
+            write_event=lambda event, *_, **details: journal.event(event, 0, 0, **details))
+        self.loop = TickLoop(
+            self.simulation, values, recording, update_subscribers=lambda: None,
+            tell=lambda *_: None, source=lambda: self.now_ns,
+            steady=lambda: self.now_ns + time.monotonic_ns())
+        self.simulation.log_to(self.count, [
+            stream for stream in self.simulation.streams
+            if journal.is_enabled(stream.parameter, values)])
+        self.loop.start()
+
+    def count(self, *_):
+        self.sent += 1
+
+    def try_(self, act, *arguments):
+        """Do something; what is refused changes nothing, and any other error stops the motion."""
+        try:
+            act(*arguments)
+        except REFUSED as error:
+            assert str(error).strip()
+        except Exception as error:
+            self.loop.fail(str(error))
+
+    def tick(self):
+        self.now_ns += TICK_NS
+        if self.loop.tick():
+            self.loop.idle()
+
+    def ticks(self, count=8):
+        for _ in range(count):
+            self.try_(self.tick)
 
 
-@pytest.mark.parametrize(('given', 'named'), [
-    ({'spin.l3': 1e20}, '1e+20'), ({'spin.l3': 1e17, 'spin.lz': 1e16}, '1e+17'),
-    ({'spin.lz': -1e18}, '-1e+18'), ({'spin.l3': HUGE}, '1e+300'),
-    ({'initial.theta_dot': 1e12}, '1000000000000.0'),
-    ({'top.lambda1': TINY}, 'lambda1=1e-300'), ({'top.lambda3': 5e-324}, 'lambda3=5e-324')])
-@pytest.mark.parametrize('method', ['exact', 'rk45'])
-def test_what_turns_too_fast_is_refused_at_the_start_at_a_reset_and_by_simulate(
-        given, named, method, tmp_path, capsys):
-    values = parameters.checked({**given, 'solver.method': method})
-    running = simulate(solver__method=method)
-    for refuse in (lambda: Simulation(values), lambda: running.restart(values)):
-        with pytest.raises(ValueError, match='no motion from') as refusal:
-            refuse()
-        assert named in str(refusal.value)
-    assert running.advance(SECOND)
-    log = tmp_path / 'run.mcap'
-    arguments = [part for name, value in values.items() if name in (*given, 'solver.method')
-                 for part in ('-p', f'{name}:={value}')]
-    assert main(['-o', str(log), '--duration', '1', '--quiet', *arguments]) == 1
-    assert 'no motion from' in capsys.readouterr().err
-    assert not log.exists()
+def run_of(values):
+    """Return a run, or None where one is refused."""
+    try:
+        return Run(parameters.checked(values))
+    except (*REFUSED, ArithmeticError) as error:
+        assert str(error).strip() and '\n' not in str(error)
+        return None
 
 
-def test_a_closed_form_that_ends_stops_the_motion_there():
-    simulation = simulate(solver__method='exact', spin__l3=3e6, spin__lz=1e6)
-    limit_ns = simulation.segment.solver.ns_limit
-    assert 10 ** 17 < limit_ns < LAST_STAMP_NS - simulation.epoch_ns
-    assert simulation.advance(limit_ns)
-    with pytest.raises(IntegrationError, match=r'2\^52 turns'):
-        simulation.advance(limit_ns + SECOND)
-    simulation.command(1.0, 0.5)
-    assert simulation.advance(limit_ns + SECOND)
+@pytest.mark.parametrize('first', range(0, 30, 10))
+def test_whatever_is_set_and_commanded_a_reset_to_the_default_revives(first):
+    for seed in range(first, first + 10):
+        given = {name: value for name, value in parameter_sets(seed).items()
+                 if name not in ('duration', 'start_paused')}
+        run = run_of(given) or run_of({})
+        run.ticks()
+        for data in commands(seed):
+            if len(data) == 2:
+                run.try_(run.loop.command, *data)
+            run.ticks()
+        values = parameters.checked({})
+        run.loop.reset(values, 0)
+        assert run.loop.failure is None, seed
+        sent = run.sent
+        run.simulation.log_to(run.count, run.simulation.streams[:1])
+        for _ in range(4):
+            run.tick()
+        assert run.loop.now_ns == 4 * TICK_NS, seed
+        assert run.sent == sent + 3, seed
 
 
-# -------------------------------------------------------------------------------------- stamps
+# ------------------------------------------------------------------------------------- real nodes
 
-def near_the_end(**values):
-    """Return a simulation that begins a second before the last stamp."""
-    simulation = simulate(**values)
-    simulation.epoch_ns = LAST_STAMP_NS - SECOND + 1
-    return simulation
+@pytest.fixture(scope='module')
+def peer():
+    pytest.importorskip('rclpy')
+    from helpers.node_harness import Peer
 
-
-@pytest.mark.parametrize('ahead', [False, True])
-@pytest.mark.parametrize('method', ['exact', 'rk45'])
-def test_stamps_end_with_their_seconds_and_not_before(method, ahead):
-    simulation = near_the_end(solver__method=method)
-    taken, published = record(simulation, 'pose'), []
-    stream(simulation, 'pose').publish = published.append
-    with pytest.raises(IntegrationError, match=r'must be from 0 to 2147483648 s, in January 2038'):
-        for tick in range(300):
-            if not simulation.send_ready(5 * tick * MILLISECOND):
-                simulation.advance(5 * tick * MILLISECOND)
-            if ahead:
-                simulation.prepare(5 * (tick + 1) * MILLISECOND)
-    assert [t_ns for _, t_ns, _ in taken] == [10 * k * MILLISECOND for k in range(100)]
-    seconds = [int.from_bytes(data[4:8], 'little', signed=True) for data in published]
-    assert set(seconds) == {2 ** 31 - 1} and len(published) == 100
+    with Peer() as peer:
+        yield peer
 
 
-def test_a_run_offline_whose_stamps_would_end_is_refused_before(tmp_path, capsys):
-    simulation = near_the_end()
-    simulation.log_to(None, simulation.streams)
-    with pytest.raises(IntegrationError, match='2038'):
-        simulation.advance_in_blocks(2 * SECOND, lambda *block: None)
-    for epoch_ns in (LAST_STAMP_NS - 5, -1, 2 ** 70):
-        with pytest.raises(ValueError, match='must be from 0 to 2147483648 s'):
-            Simulation(parameters.checked({'duration': 1.0}), epoch_ns)
-    for epoch in ('2147483647.5', '-3', '1e300', 'nan'):
-        log = tmp_path / 'run.mcap'
-        assert main(['-o', str(log), '--duration', '1', '--quiet', '--epoch', epoch]) == 1
-        assert 'must be from 0 to 2147483648 s' in capsys.readouterr().err
-        assert not log.exists()
+def without_end(values):
+    return {name: value for name, value in values.items() if name != 'duration'}
 
 
-# ----------------------------------------------------------------------------- anything allowed
+@pytest.mark.parametrize('seed', range(8))
+def test_a_node_starts_with_extreme_parameters_or_refuses_them_in_one_line(peer, tmp_path, seed):
+    from helpers.node_harness import SimNode, wait_for
 
-def test_every_combination_that_the_ranges_allow_runs_or_is_refused():
-    found = Counter(short_lives.live(seed) for seed in range(100))
-    assert found.keys() <= {'ran', 'refused', 'stopped'}
-    assert found['ran'] > 40 and found['refused'] > 5
+    given = {name: str(value).lower() if isinstance(value, bool) else value
+             for name, value in without_end(parameter_sets(seed)).items()}
+    with SimNode(tmp_path, {'status_period': 1.0} | given) as node:
+        wait_for('a service or the end', lambda: not node.alive or node.topic('~/record') in {
+            name for name, _ in peer.node.get_service_names_and_types()})
+        if node.alive:
+            assert peer.switch(node, 'set_pause', True) is not None
+            assert node.end() == 0, node.err
+        else:
+            assert node.wait() == 2, node.err
+            assert node.err.count('sim_node: cannot start: ') == 1
+    assert 'Traceback' not in node.out + node.err
 
 
-def test_numbers_of_any_size_are_among_them():
-    sizes = [abs(value) for seed in range(300) for name, value in short_lives.values(seed).items()
-             if name == 'spin.l3' and value]
-    assert min(sizes) < 1e-100 and max(sizes) > 1e100
-    assert all(map(math.isfinite, sizes))
+def test_a_node_survives_extreme_parameters_commands_and_resets(peer, tmp_path):
+    from geometry_msgs.msg import PoseStamped
+    from helpers.node_harness import Diagnostics, SimNode
+    from rclpy.parameter import Parameter
+
+    defaults = {name: list(value) if isinstance(value, tuple) else value
+                for name, value in parameters.defaults().items()
+                if parameters.BY_NAME[name].effect is not parameters.Effect.START
+                and not name.startswith('spin.')}
+    with SimNode(tmp_path, {'status_period': 0.5}) as node:
+        peer.introduce(node, Diagnostics(peer))
+        for seed in range(20):
+            for kind, data in actions(seed):
+                if kind == 'set':
+                    for name, value in without_end(data).items():
+                        peer.set_each(node, **{name: Parameter(name, value=value)
+                                               .to_parameter_msg()})
+                elif kind == 'command':
+                    peer.send_command(node, *data)
+                elif kind == 'pause':
+                    peer.switch(node, 'set_pause', data)
+                elif kind == 'wait':
+                    time.sleep(data)
+                else:
+                    peer.trigger(node, kind)
+            assert node.alive, (seed, node.err)
+        assert all(result.successful for result in peer.set_each(node, **defaults))
+        assert peer.trigger(node, 'reset').success
+        assert peer.switch(node, 'set_pause', False).success
+        pose = peer.listen(node.topic('pose'), PoseStamped)
+        pose.wait_more(50)
+        assert node.end() == 0, node.err
+        peer.stop_listening(pose)

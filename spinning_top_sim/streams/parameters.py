@@ -24,10 +24,10 @@ Value = Any
 class Effect(enum.Enum):
     """When a changed value is used."""
 
-    NOW = 'at once'
-    RESET = 'at the next ~/reset'
-    RECORDING = 'at the next start of a recording'
-    START = 'fixed when the node starts'
+    NOW = 'a change takes effect at once'
+    RESET = 'a change takes effect at the next ~/reset'
+    RECORDING = 'a change takes effect at the next start of a recording'
+    START = 'cannot be changed while the node runs'
 
 
 @dataclass(frozen=True)
@@ -60,10 +60,18 @@ class Parameter:
     @property
     def description(self) -> str:
         """Return text, unit, range and effect as one line."""
-        unit = f' [{self.unit}]' if self.unit else ''
         allowed = f'; {self.allowed}' if self.choices or self._bounds() else ''
+        return self._describe(allowed)
+
+    @property
+    def summary(self) -> str:
+        """Return the description without what is allowed."""
+        return self._describe('')
+
+    def _describe(self, allowed: str) -> str:
+        unit = f' [{self.unit}]' if self.unit else ''
         unset = '; unset: L3 cos(theta0), the cusp' if self.default is None else ''
-        return f'{self.text}{unit}{allowed}{unset}; a change takes effect {self.effect.value}'
+        return f'{self.text}{unit}{allowed}{unset}; {self.effect.value}'
 
     def _bounds(self) -> str:
         bounds = (('0 or >=', self.smallest) if self.smallest else ('>=', self.minimum),
