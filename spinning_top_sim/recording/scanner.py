@@ -35,6 +35,8 @@ from spinning_top_sim.recording.records import (
     DamagedError,
     TooLargeError,
     break_up,
+    check_declared,
+    check_size,
     name_of,
     open_chunk,
     parse,
@@ -167,6 +169,7 @@ class Scanner:
         opcode, end = self._source.head(offset, self._limit)
         if self._places.get(offset, opcode) != opcode or end > self._next_place(offset):
             raise DamagedError('the summary tells of another record there')
+        check_size(end - offset - HEAD.size, self._source.max_bytes)
         if opcode == Opcode.ATTACHMENT:
             return self._scan_attachment(offset, end)
         if opcode > Opcode.DATA_END:
@@ -238,8 +241,16 @@ class Scanner:
 
     def _declare(self, offset: int, record: Schema | Channel) -> Schema | Channel:
         """Make a schema or channel known, and return what is right about it."""
-        known = (self.schemas.setdefault(record.id, record) if isinstance(record, Schema)
-                 else self.channels.setdefault(record.id, record))
+        known: Schema | Channel | None = (
+            self.schemas if isinstance(record, Schema) else self.channels).get(record.id)
+        if known is None:
+            self._summary.declared_bytes += len(record_bytes(record))
+            check_declared(self._summary.declared_bytes)
+            if isinstance(record, Schema):
+                self.schemas[record.id] = record
+            else:
+                self.channels[record.id] = record
+            return record
         if known != record:
             self._defects.append(
                 f'the {type(record).__name__.lower()} {record.id} at byte {offset} is not what '

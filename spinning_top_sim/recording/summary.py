@@ -33,7 +33,7 @@ from spinning_top_sim.recording.records import (
     HEAD,
     DamagedError,
     StrictStream,
-    TooLargeError,
+    check_size,
     parse,
 )
 
@@ -109,9 +109,7 @@ class McapSource:
 
     def raw(self, offset: int, end: int) -> bytes:
         """Return the bytes of a record.  Raises TooLargeError."""
-        length = end - offset - HEAD.size
-        if length > self.max_bytes:
-            raise TooLargeError(length, self.max_bytes)
+        check_size(end - offset - HEAD.size, self.max_bytes)
         return self.read(offset, end - offset)
 
     def record(self, offset: int, limit: int) -> McapRecord:
@@ -146,6 +144,7 @@ class Summary:
     # beginning.
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
+    declared_bytes: int = 0     # by scans, and of the metadata of the last one
     statistics: Statistics | None = None
     chunks: dict[int, ChunkIndex] = field(default_factory=dict)  # by offset
     metadata: list[MetadataIndex] = field(default_factory=list)
@@ -209,8 +208,7 @@ def read_summary(source: McapSource) -> Summary:
     try:
         if not MAGIC_SIZE <= start <= footer_offset:
             raise DamagedError('the footer leads to no summary')
-        if size > source.max_bytes:
-            raise DamagedError(f'the summary is not read: {TooLargeError(size, source.max_bytes)}')
+        check_size(size, source.max_bytes)
         if footer.summary_crc not in (0, source.crc(start, magic_offset - 4)):
             raise DamagedError('the checksum of the summary is wrong')
         return _read_section(source, start, footer_offset)
