@@ -10,6 +10,8 @@ import io
 import json
 import os
 import random
+import re
+import shutil
 import signal
 import struct
 import subprocess
@@ -670,7 +672,12 @@ def test_what_is_handed_over_is_on_the_disk_within_max_loss(tmp_path, monkeypatc
             advance(timeout)
 
     class Thread:
-        start = join = is_alive = lambda *_, **__: None
+        """The thread that records is this one, and what it starts is done at once."""
+
+        join = is_alive = lambda *_: None
+
+        def __init__(self, target, args=(), **_):
+            self.start = (lambda: target(*args)) if args else (lambda: None)
 
     def advance(duration):
         nonlocal now
@@ -692,7 +699,7 @@ def test_what_is_handed_over_is_on_the_disk_within_max_loss(tmp_path, monkeypatc
 
     monkeypatch.setattr(writer, 'time', SimpleNamespace(monotonic=lambda: now))
     monkeypatch.setattr(writer, 'threading', SimpleNamespace(
-        Event=Event, Thread=lambda **_: Thread(), TIMEOUT_MAX=threading.TIMEOUT_MAX))
+        Event=Event, Thread=Thread, TIMEOUT_MAX=threading.TIMEOUT_MAX))
     recorder = McapRecorder.open(
         tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=max_loss, min_free_bytes=0)
     monkeypatch.setattr(os, 'fsync', fsync)
@@ -701,6 +708,61 @@ def test_what_is_handed_over_is_on_the_disk_within_max_loss(tmp_path, monkeypatc
     assert (summary.error, summary.lost) == (None, 0)
     assert summary.flushes > 30
     assert len(waits) > 1900 and 0.9 * max_loss / 2 < max(waits) <= max_loss
+
+
+@pytest.fixture
+def slow_disk(monkeypatch):
+    """Have every fsync wait from now on until the event is set."""
+    disk_is_back, fsync = threading.Event(), os.fsync
+    monkeypatch.setattr(os, 'fsync', lambda fd: (disk_is_back.wait(PATIENCE_S), fsync(fd)))
+    return disk_is_back
+
+
+def test_recording_goes_on_while_the_disk_is_slow_and_says_what_may_be_lost(tmp_path, slow_disk):
+    path = tmp_path / 'run.mcap'
+    slow_disk.set()
+    with McapRecorder.open(path, TOPICS, METADATA, max_loss=0.05, min_free_bytes=0) as recorder:
+        assert (recorder.warning, recorder.possible_loss) == (None, 0.0)
+        slow_disk.clear()
+        for number in range(3):
+            recorder.write(0, number, pose_cdr(number))
+            eventually(lambda n=number: numbers_in(path) == list(range(n + 1)))
+        eventually(lambda: recorder.warning)
+        assert recorder.possible_loss > 0.05
+        assert re.fullmatch(rf'the disk of {path} is slow: a power loss would take the last '
+                            r'\d+\.\d s, more than max_loss = 0\.05 s', recorder.warning)
+        assert recorder.state == 'recording'
+        slow_disk.set()
+        eventually(lambda: recorder.possible_loss == 0.0)
+        assert recorder.warning is None
+    assert numbers_in(path) == [0, 1, 2]
+
+
+def test_a_sync_that_hangs_does_not_hang_the_end(tmp_path, slow_disk):
+    slow_disk.set()
+    recorder = McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02,
+                                 min_free_bytes=0)
+    slow_disk.clear()
+    recorder.write(0, 1, pose_cdr(1))
+    eventually(lambda: recorder.warning)
+    assert 'could not be closed within 0.05 s' in (recorder.close(timeout=0.05).error or '')
+    slow_disk.set()
+    assert recorder.close(timeout=PATIENCE_S).indexed
+
+
+@pytest.mark.parametrize('what', ['file', 'folder'])
+@pytest.mark.parametrize('when', ['recording', 'closing'])
+def test_a_log_that_is_deleted_is_an_error(tmp_path, what, when):
+    path = tmp_path / 'logs' / 'run.mcap'
+    path.parent.mkdir()
+    recorder = McapRecorder.open(path, TOPICS, METADATA, min_free_bytes=0,
+                                 max_loss=0.02 if when == 'recording' else 60.0)
+    recorder.write(0, 1, pose_cdr(1))
+    path.unlink() if what == 'file' else shutil.rmtree(path.parent)
+    if when == 'recording':
+        eventually(lambda: recorder.state == 'failed')
+    assert recorder.close().error == f'recording to {path} stopped: the file was deleted'
+    assert recorder.state == 'failed'
 
 
 def test_a_kill_takes_nothing_that_was_in_the_file(tmp_path):

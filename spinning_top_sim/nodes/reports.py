@@ -44,6 +44,8 @@ class MotionReport:
         if error > max_error > 0.0:
             problems.append((DiagnosticStatus.WARN, f'orientation error {error:.3g} rad: more '
                                                     f'than max_error = {max_error:g} rad'))
+        if self._session.warning:
+            problems.append((DiagnosticStatus.WARN, f'recording: {self._session.warning}'))
         if self._session.error:
             problems.append((DiagnosticStatus.ERROR, f'recording: {self._session.error}'))
         if loop.failure:

@@ -290,6 +290,9 @@ class Simulator(Node):
         reason = self._session.check()
         if reason:
             self.get_logger().error(f'recording stopped: {reason}; the simulation goes on')
+        if self._session.warning:
+            self.get_logger().warning(
+                f'recording: {self._session.warning}', throttle_duration_sec=10.0)
         if self._report.overloaded:
             self.get_logger().warning(
                 'this machine cannot keep up with these rates: live topics skip samples, or the '

@@ -218,6 +218,11 @@ class McapWriter:
         os.fsync(self._file.fileno())
         self.synced_size = size
 
+    @property
+    def is_deleted(self) -> bool:
+        """Whether the file has no name any more."""
+        return os.fstat(self._file.fileno()).st_nlink == 0
+
     def free_bytes(self) -> int:
         """Return how much of the disk is free for this user [bytes]."""
         disk = os.fstatvfs(self._file.fileno())

@@ -29,6 +29,7 @@ from spinning_top_sim.recording.records import (
     ChunkContents,
     DamagedError,
     break_up,
+    check_declared,
     open_chunk,
 )
 from spinning_top_sim.recording.rosbag2 import Qos, qos_profiles
@@ -184,6 +185,7 @@ class LogReader:
                ) -> Iterator[LogMessage]:
         """Yield messages of spans in order; a span is read when its time comes."""
         spans = sorted(spans, key=attrgetter('offset'))
+        self._held_bytes = 0
         streams = [self._stream(span, channels) for span in spans]
         for message in heapq.merge(*streams, key=attrgetter('log_time')):
             if message.channel_id >= 0 and message.log_time in times:
@@ -193,12 +195,17 @@ class LogReader:
         """Yield what stands for the time at which a span begins, then its messages in order."""
         yield LogMessage('', span.start_ns, 0, 0, b'', -1)
         contents = self._read(span)
+        plain = contents.plain
+        self._held_bytes += len(plain)
+        if self._held_bytes > 2 * self.source.max_bytes:
+            raise LogError(f'cannot read {self.path}: the messages of several chunks overlap in '
+                           f'time, and these have more than {2 * self.source.max_bytes} bytes')
         for channel_id in contents.entries.keys() - channels:
             del contents.entries[channel_id]
-        plain = contents.plain
         for channel_id, sequence, log_time, publish_time, begin, end in contents.sorted_messages():
             yield LogMessage(channels[channel_id], log_time, publish_time, sequence,
                              bytes(plain[begin:end]), channel_id)
+        self._held_bytes -= len(plain)
 
     def scan(self) -> Scanner:
         """Begin a scan of all usable records in file order, with what former ones know."""
@@ -210,8 +217,11 @@ class LogReader:
         if not self._summary.is_complete:
             return self._survey[0]
         metadata = {}
+        metadata_bytes = 0
         for index in self._summary.metadata:
             try:
+                metadata_bytes += index.length
+                check_declared(metadata_bytes)
                 record = self.source.record(index.offset, self._summary.data_limit)
             except DamagedError:
                 continue

@@ -89,6 +89,7 @@ class Scanner:
         self._place_offsets = sorted(self._places)
         self._finder = RecordFinder(source, self._limit)
 
+        self._metadata_bytes = 0
         self._losses: list[Loss] = []
         self._defects: list[str] = []
         self._crc = zlib.crc32(MCAP0_MAGIC)     # over the records as they should be
@@ -197,6 +198,9 @@ class Scanner:
         scanned = ScannedRecord(opcode, offset, end, record, raw)
         if isinstance(record, Chunk):
             return self._scan_chunk(scanned, record)
+        if isinstance(record, Metadata):
+            self._metadata_bytes += len(raw)
+            check_declared(self._metadata_bytes)
         if isinstance(record, Schema | Channel):
             known = self._declare(offset, record)
             if known != record:

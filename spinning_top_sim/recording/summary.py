@@ -33,6 +33,7 @@ from spinning_top_sim.recording.records import (
     HEAD,
     DamagedError,
     StrictStream,
+    check_declared,
     check_size,
     parse,
 )
@@ -144,7 +145,7 @@ class Summary:
     # beginning.
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    declared_bytes: int = 0     # by scans, and of the metadata of the last one
+    declared_bytes: int = 0     # of schemas and channels
     statistics: Statistics | None = None
     chunks: dict[int, ChunkIndex] = field(default_factory=dict)  # by offset
     metadata: list[MetadataIndex] = field(default_factory=list)
@@ -219,10 +220,14 @@ def read_summary(source: McapSource) -> Summary:
 def _read_section(source: McapSource, start: int, end: int) -> Summary:
     """Return the summary between two offsets; raises DamagedError if it does not fit the file."""
     found: dict[type, list[Any]] = defaultdict(list)
+    declared_bytes = 0
     offset = start
     while offset < end:
         try:
             opcode, record_end = source.head(offset, end)
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                declared_bytes += record_end - offset
+                check_declared(declared_bytes)
             if opcode <= Opcode.DATA_END:
                 record, _ = parse(source.raw(offset, record_end))
                 found[type(record)].append(record)
@@ -230,7 +235,8 @@ def _read_section(source: McapSource, start: int, end: int) -> Summary:
             raise DamagedError(f'the summary is damaged: {damage}') from None
         offset = record_end
     summary = Summary(
-        start, closed=True, schemas={schema.id: schema for schema in found[Schema]},
+        start, closed=True, declared_bytes=declared_bytes,
+        schemas={schema.id: schema for schema in found[Schema]},
         channels={channel.id: channel for channel in found[Channel]},
         statistics=next(reversed(found[Statistics]), None),
         chunks={index.chunk_start_offset: index for index in found[ChunkIndex]},
