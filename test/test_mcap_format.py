@@ -13,11 +13,13 @@ import subprocess
 import sys
 import tracemalloc
 import zlib
+from collections import Counter
 from pathlib import Path
 
 import lz4.frame  # type: ignore[import-untyped]
 import pytest
 import zstandard
+from helpers.mutations import mutate
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import (
@@ -345,6 +347,24 @@ def test_mutations_crash_nothing(tmp_path, kind, monkeypatch):
             output.unlink()
 
 
+@pytest.mark.parametrize('kind', [*STRANGERS, 'ours'])
+def test_mutated_logs_are_read_and_recovered(tmp_path, kind, monkeypatch):
+    """Also with right checksums, and inside of chunks; `make stress` does thousands."""
+    monkeypatch.setattr(os, 'fsync', lambda descriptor: None)
+    path, output = tmp_path / 'a.mcap', tmp_path / 'whole.mcap'
+    write_log(path) if kind == 'ours' else write_stranger(path, STRANGERS[kind], count=40)
+    content = path.read_bytes()
+    for seed in range(12):
+        path.write_bytes(mutate(content, seed))
+        code, _, err = run(path, '-o', output)
+        assert (code == 1) == err.startswith('recover: '), (seed, err)
+        if code != 1:
+            assert Counter(seen_by_us(output)) == Counter(seen_by_us(path)), seed
+            with LogReader(output) as reader:
+                assert reader.damage.lossless, seed
+            output.unlink()
+
+
 # Bounded memory and time
 
 @pytest.mark.parametrize(('stated_size', 'report'), [
@@ -421,6 +441,94 @@ def test_the_search_behind_damage_takes_linear_time(tmp_path, monkeypatch):
     # A true chunk behind a few of them is still found.
     path.write_bytes(MCAP0_MAGIC + HEADER + RAW_CHANNEL + b'\x00' + content[:3 * head] + last)
     assert seen_by_us(path) == [('/a', 5, b'x')]
+
+
+CEILING_MB = 1000       # of the process: about three times max_bytes, and the interpreter
+
+
+def peak_of(path: Path, call: str) -> tuple[int, str]:
+    """Run a call in a process of its own; return its peak memory [MB] and what it prints."""
+    done = subprocess.run(
+        [sys.executable, '-c',
+         'import resource\n'
+         'from spinning_top_sim.recording.reader import LogReader\n'
+         'from spinning_top_sim.recording.errors import LogError\n'
+         'from spinning_top_sim.tools.recover import main\n'
+         f'path = {str(path)!r}\n{call}\n'
+         'print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10)'],
+        env=os.environ | {'PYTHONPATH': str(ROOT)}, capture_output=True, text=True, timeout=300,
+        check=True)
+    *printed, peak = done.stdout.splitlines()
+    return int(peak), '\n'.join(printed)
+
+
+READ = """
+with LogReader(path) as reader:
+    try:
+        print(sum(1 for _ in reader.messages()))
+    except LogError as error:
+        print(error)
+    print(*reader.damage.lines(), sep='\\n')
+"""
+
+
+def zstd_chunk(plain: bytes, end: int = 5) -> bytes:
+    return chunk_of(plain, 5, end, 'zstd', zstandard.compress(plain))
+
+
+def tiny_messages() -> bytes:
+    return zstd_chunk(message(5, b'') * 1_000_000)
+
+
+def long_names() -> bytes:
+    return b''.join(zstd_chunk(b''.join(
+        record_bytes(Channel(id=number, topic='/' + 'x' * 15_000_000, message_encoding='x',
+                             metadata={}, schema_id=0))
+        for number in numbers) + message(5, b'')) for numbers in ((2,), (3, 4), (5,), (6,)))
+
+
+def many_keys() -> bytes:
+    metadata = {str(number): '' for number in range(1_500_000)}
+    return zstd_chunk(record_bytes(Channel(
+        id=2, topic='/b', message_encoding='x', metadata=metadata, schema_id=0)))
+
+
+def overlapping() -> bytes:
+    return zstd_chunk(message(5, b'') + message(6, bytes(200_000_000)) + message(9, b''), 9) * 6
+
+
+@pytest.mark.parametrize(('bomb', 'report'), [
+    (tiny_messages, '1000000'), (long_names, 'refused: chunk'), (many_keys, 'refused: chunk'),
+    (overlapping, 'overlap in time')])
+def test_memory_has_a_ceiling(tmp_path, bomb, report):
+    """Small files that unpack to much; what is refused for its size is called that."""
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(closed(HEADER, RAW_CHANNEL, bomb()))
+    assert path.stat().st_size < 3_000_000
+    peak, printed = peak_of(path, READ)
+    assert report in printed
+    assert 'lost' not in printed
+    assert peak < CEILING_MB
+    peak, _ = peak_of(path, f'main([path, "-o", {str(tmp_path / "b.mcap")!r}])')
+    assert peak < CEILING_MB
+
+
+@pytest.mark.parametrize('kind', [
+    Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.SCHEMA, 0x90])
+def test_a_record_of_many_gigabytes_is_not_read(tmp_path, kind):
+    """It is a hole in the file: to read it, or to copy it, would take minutes and the disk."""
+    path, size = tmp_path / 'a.mcap', 100 << 30
+    start = MCAP0_MAGIC + HEADER + RAW_CHANNEL + chunk_of(message(4, b'a'), 4, 4)
+    end = closed(chunk_of(message(6, b'c'), 6, 6))[len(MCAP0_MAGIC):]
+    with path.open('wb') as file:
+        file.write(start + struct.pack('<BQ', kind, size))
+        file.seek(size, os.SEEK_CUR)
+        file.write(end)
+    output = recover(path, SOME_LOST)
+    assert [data for _, _, data in seen_by_us(output)] == [b'a', b'c']
+    with LogReader(path) as reader:
+        (loss,) = reader.damage.losses
+        assert (loss.refused, loss.bytes) == (True, 9 + size)
 
 
 # The output

@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import heapq
 import os
+import struct
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from operator import attrgetter
@@ -25,6 +26,7 @@ from spinning_top_sim.recording.chunks import time_span
 from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.records import (
+    HEAD,
     MAX_BYTES,
     ChunkContents,
     DamagedError,
@@ -42,6 +44,7 @@ from spinning_top_sim.recording.summary import (
 )
 from spinning_top_sim.recording.writer import OUR_LIBRARY
 
+_CHUNK_HEAD = struct.Struct('<BQQQ')    # opcode, length, earliest and latest log time
 _RUN_BYTES = 1 << 20  # of messages outside of chunks that are read at a time
 
 
@@ -213,8 +216,9 @@ class LogReader:
 
     @functools.cached_property
     def _index(self) -> _Index:
-        """What the summary indexes, if that is all, else what a scan found."""
-        if not self._summary.is_complete:
+        """What the summary indexes, if that is all and right, else what a scan found."""
+        if not (self._summary.is_complete
+                and all(map(self._leads_to_chunk, self._summary.chunks))):
             return self._survey[0]
         metadata = {}
         metadata_bytes = 0
@@ -231,6 +235,14 @@ class LogReader:
                        chunk.message_end_time) for offset, chunk in self._summary.chunks.items()
                  if indexed_messages(chunk)]
         return sorted(spans), metadata
+
+    def _leads_to_chunk(self, offset: int) -> bool:
+        """Return whether the chunk there is the one that the summary tells of."""
+        index = self._summary.chunks[offset]
+        head = _CHUNK_HEAD.pack(
+            Opcode.CHUNK, (index.chunk_length - HEAD.size) % (1 << 64),
+            index.message_start_time, index.message_end_time)
+        return self.source.read(offset, len(head)) == head
 
     @functools.cached_property
     def _survey(self) -> tuple[_Index, Damage]:

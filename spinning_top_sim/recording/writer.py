@@ -144,8 +144,8 @@ class McapRecorder:
         """What to tell the user while the disk is too slow for `max_loss`."""
         loss = self.possible_loss
         return None if loss <= self._max_loss else (
-            f'the disk of {self.path} is slow: a power loss would take the last {loss:.1f} s, more '
-            f'than max_loss = {self._max_loss:g} s')
+            f'the disk of {self.path} is slow: a power loss would take the last {loss:.1f} s, '
+            f'more than max_loss = {self._max_loss:g} s')
 
     @property
     def counters(self) -> RecordingSummary:
