@@ -21,7 +21,7 @@ import pytest
 import zstandard
 from helpers.mutations import mutate
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
+from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import (
     Attachment,
     Channel,
@@ -304,6 +304,25 @@ def test_a_channel_without_its_schema_is_not_written(tmp_path):
     with open(output, 'rb') as file:
         assert [channel.topic for channel in make_reader(file).get_summary().channels.values()
                 ] == ['/raw']
+
+
+@pytest.mark.parametrize('wrong', [
+    Channel(id=1, topic='/a', message_encoding='json', metadata={}, schema_id=9),
+    Channel(id=1, topic='/b', message_encoding='json', metadata={}, schema_id=1),
+    Channel(id=3, topic='/c', message_encoding='json', metadata={}, schema_id=9),
+    Schema(id=1, name='other', encoding='jsonschema', data=b'')])
+def test_a_chunk_with_wrong_declarations_is_not_copied(tmp_path, wrong):
+    """A reader that goes from the beginning to the end would believe the last one."""
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(closed(HEADER, SCHEMA, CHANNEL, chunk_of(
+        message(4, b'1'), 4, 4), chunk_of(record_bytes(wrong) + message(5, b'2'))))
+    output = recover(path)
+    with open(output, 'rb') as file:
+        read = [(schema.name, channel.topic, message.data) for schema, channel, message
+                in NonSeekingReader(file, validate_crcs=True).iter_messages()]
+    assert read == [('thing', '/a', b'1'), ('thing', '/a', b'2')]
+    with LogReader(output) as reader:
+        assert reader.damage.lines() == []
 
 
 def test_a_channel_that_stands_behind_its_messages_is_enough(tmp_path):

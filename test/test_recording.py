@@ -47,7 +47,7 @@ from spinning_top_sim.recording.chunks import CHUNK_BYTES, PlainChunk, compresso
 from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import DefinitionNotFoundError, RecordingError
 from spinning_top_sim.recording.mcap_writer import McapWriter
-from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic
+from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic, qos_profiles
 from spinning_top_sim.recording.writer import COMPRESSIONS, McapRecorder, create_file
 
 ROOT = Path(__file__).parents[1]
@@ -276,6 +276,39 @@ def test_offered_qos_is_written_as_yaml_cpp_writes_it(tmp_path):
             sec: 9223372036
             nsec: 854775807
           avoid_ros_namespace_conventions: false""")
+
+
+def parsed_qos(text):
+    return qos_profiles(ChannelRecord(1, '/a', 'cdr', {'offered_qos_profiles': text}, 1))
+
+
+@pytest.mark.parametrize('text', [
+    '[{depth: 7, reliability: best_effort, deadline: {sec: 1, nsec: 2}}]',
+    '# what it offers\n- depth: 7   # last ones\n  reliability: 2\n  deadline: {sec: 1, nsec: 2}',
+    '- {"depth": 7, "reliability": 2, "histroy": 3, deadline: {"sec": 1, "nsec": 2}}',
+])
+def test_offered_qos_is_read_in_any_style_of_yaml(text):
+    assert parsed_qos(text) == (
+        dict(DEFAULT_QOS) | {'depth': 7, 'reliability': 2, 'deadline': {'sec': 1, 'nsec': 2}},)
+
+
+@pytest.mark.parametrize('value', [
+    '1.5', '[1]', '{}', 'true', '"7"', '~', '.nan', 'keep_some', str(1 << 63), '-' + '9' * 20])
+def test_a_policy_that_is_not_understood_is_the_default(value):
+    keys = ('history', 'depth', 'reliability', 'deadline')
+    text = '- ' + '\n  '.join(f'{key}: {value}' for key in keys)
+    assert parsed_qos(text) == (DEFAULT_QOS,)
+
+
+@pytest.mark.parametrize('text', [
+    '', '7', '{}', '- 7', '[', '- depth: ' + '9' * 5000, '[' * 30_000, '!!int ""', '!!timestamp x',
+    '- {a: &a [1], <<: *a}', '\x00', 'x' * 10_000_000, '? {} : 1', '- ? []\n  : 1', '"\\ud800"',
+    'a: &a {b: 1}\n' + ''.join(
+        f'{name}: &{name} {{<<: [{", ".join([f"*{former}"] * 20)}]}}\n'
+        for former, name in zip('abcdefgh', 'bcdefghi', strict=True)),
+])
+def test_what_is_no_list_of_profiles_offers_none(text):
+    assert parsed_qos(text) == ()
 
 
 @pytest.mark.parametrize('count', [0, 1, 1001])

@@ -73,7 +73,7 @@ class ChunkContents:
     entries: dict[int, array[int]] = field(default_factory=dict)    # of the message indexes
     declared: list[Schema | Channel] = field(default_factory=list)
     in_time_order: bool = True
-    complete: bool = True   # no entries were left out, whose channel is unknown
+    right: bool = True      # as a whole: all channels are known, and what they are elsewhere
 
     def messages(self) -> Iterator[StoredMessage]:
         """Yield the messages in the order of the file."""

@@ -214,8 +214,9 @@ class Scanner:
 
     def _scan_chunk(self, scanned: ScannedRecord, chunk: Chunk) -> ScannedRecord:
         contents = open_chunk(chunk, self._source.max_bytes)
-        for record in contents.declared:
-            self._declare(scanned.offset, record)
+        declared = [self._declare(scanned.offset, record) for record in contents.declared]
+        contents.right = declared == contents.declared and all(
+            self._summary.knows(record.id) for record in declared if isinstance(record, Channel))
         times = time_span(contents.entries)
         if contents.entries and times != (chunk.message_start_time, chunk.message_end_time):
             self._defects.append(f'the chunk at byte {scanned.offset} has wrong times in its head')
@@ -279,7 +280,7 @@ class Scanner:
                     self._next_sequence[number] = message.sequence + 1
         for number in unknown:
             del contents.entries[number]
-            contents.complete = False
+            contents.right = False
         for number, entries in contents.entries.items():
             self._found[number] += len(entries) // 2
         if contents.entries:
