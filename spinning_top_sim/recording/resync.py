@@ -43,7 +43,9 @@ class RecordFinder:
     def __init__(self, source: McapSource, limit: int) -> None:
         self._source = source
         self._limit = limit
-        self._effort = _MAX_EFFORT * source.size    # so that the time is linear in the size
+        # Bytes of candidates to be read and to be uncompressed, so that the time is limited.
+        self._effort = _MAX_EFFORT * source.size
+        self._unpacking = _MAX_EFFORT * (source.size + source.max_bytes)
 
     def is_record(self, offset: int) -> bool:
         """Return whether a record of a known kind begins there, or the data section ends."""
@@ -94,6 +96,9 @@ class RecordFinder:
             raise DamagedError('the file has candidates everywhere')
         record, _ = parse(self._source.raw(offset, end))
         if isinstance(record, Chunk):
+            self._unpacking -= record.uncompressed_size
+            if self._unpacking < 0:
+                raise DamagedError('the file has candidates everywhere')
             contents = open_chunk(record, self._source.max_bytes)
             if not contents.entries and not contents.declared:
                 raise DamagedError('it is empty')       # zeros in data look like that
