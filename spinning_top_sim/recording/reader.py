@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Chunk, Header, Metadata
+from mcap.records import Chunk, Header, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording.chunks import time_span
@@ -129,16 +129,14 @@ class LogReader:
     def topics(self) -> tuple[LogTopic, ...]:
         """The channels of the log, in the order of their ids."""
         self._index     # noqa: B018 - makes the channels known
-        found = []
-        for number, channel in sorted(self._summary.channels.items()):
-            schema = self._summary.schemas.get(channel.schema_id)
-            found.append(LogTopic(
-                name=channel.topic, type_name=schema.name if schema else '',
-                schema=schema.data.decode(errors='replace') if schema else '',
-                schema_encoding=schema.encoding if schema else '',
-                encoding=channel.message_encoding, qos=qos_profiles(channel),
-                metadata=channel.metadata, channel_id=number))
-        return tuple(found)
+        schemas = {0: Schema(id=0, data=b'', encoding='', name=''), **self._summary.schemas}
+        return tuple(LogTopic(
+            name=channel.topic, type_name=schema.name,
+            schema=schema.data.decode(errors='replace'), schema_encoding=schema.encoding,
+            encoding=channel.message_encoding, qos=qos_profiles(channel),
+            metadata=channel.metadata, channel_id=number)
+            for number, channel in sorted(self._summary.channels.items())
+            for schema in [schemas.get(channel.schema_id, schemas[0])])
 
     @property
     def metadata(self) -> dict[str, dict[str, str]]:

@@ -303,7 +303,14 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
 
     Raises ValueError for an argument out of range, RecordingError naming path or type.
     """
-    _check_arguments(topics, metadata, compression, min_free_bytes)
+    names = [topic.name for topic in topics]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f'topic {name!r} is listed twice: once is allowed')
+    if compression not in COMPRESSIONS:
+        raise ValueError(f'compression = {compression!r}: must be one of {COMPRESSIONS}')
+    if min_free_bytes < 0:
+        raise ValueError(f'min_free_bytes = {min_free_bytes!r}: must be >= 0')
     definitions = {
         name: find_definition(name) for name in dict.fromkeys(topic.type_name for topic in topics)}
     try:
@@ -336,22 +343,6 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
     except (OSError, ValueError) as error:
         raise RecordingError(f'cannot record to {path}: {_reason(error)}') from error
     return file
-
-
-def _check_arguments(topics: Sequence[RecordedTopic], metadata: Mapping[str, str],
-                     compression: str, min_free_bytes: int) -> None:
-    """Raise ValueError for what no log can be created with."""
-    names = [topic.name for topic in topics]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f'topic {name!r} is listed twice: once is allowed')
-    for item in metadata.items():
-        if not all(isinstance(text, str) for text in item):
-            raise ValueError(f'metadata {item!r}: key and value must be str')
-    if compression not in COMPRESSIONS:
-        raise ValueError(f'compression = {compression!r}: must be one of {COMPRESSIONS}')
-    if min_free_bytes < 0:
-        raise ValueError(f'min_free_bytes = {min_free_bytes!r}: must be >= 0')
 
 
 def _check_disk(file: McapWriter, min_free_bytes: int) -> None:
