@@ -930,7 +930,7 @@ def test_a_failing_disk_stops_the_recording(tmp_path, monkeypatch):
 def test_a_disk_that_runs_short_stops_the_recording_in_good_order(tmp_path, monkeypatch):
     recorder = McapRecorder.open(
         tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02, min_free_bytes=1)
-    monkeypatch.setattr(McapWriter, 'free_bytes', lambda self: 0)
+    monkeypatch.setattr(os, 'fstatvfs', lambda fd: SimpleNamespace(f_bavail=0, f_frsize=4096))
     recorder.write(0, 7, pose_cdr(7))
     eventually(lambda: recorder.state == 'failed')
     assert recorder.error == (

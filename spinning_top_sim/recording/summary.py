@@ -208,13 +208,13 @@ def read_summary(source: McapSource) -> Summary:
         return Summary(footer_offset, closed=True)
     try:
         if not MAGIC_SIZE <= start <= footer_offset:
-            raise DamagedError('the footer leads to no summary')
+            raise DamagedError('the footer does not lead to it')
         check_size(size, source.max_bytes)
         if footer.summary_crc not in (0, source.crc(start, magic_offset - 4)):
-            raise DamagedError('the checksum of the summary is wrong')
+            raise DamagedError('its checksum is wrong')
         return _read_section(source, start, footer_offset)
     except DamagedError as damage:
-        return Summary(source.size, closed=True, problem=str(damage))
+        return Summary(source.size, closed=True, problem=f'the summary is not used: {damage}')
 
 
 def _read_section(source: McapSource, start: int, end: int) -> Summary:
@@ -223,16 +223,13 @@ def _read_section(source: McapSource, start: int, end: int) -> Summary:
     declared_bytes = 0
     offset = start
     while offset < end:
-        try:
-            opcode, record_end = source.head(offset, end)
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                declared_bytes += record_end - offset
-                check_declared(declared_bytes)
-            if opcode <= Opcode.DATA_END:
-                record, _ = parse(source.raw(offset, record_end))
-                found[type(record)].append(record)
-        except DamagedError as damage:
-            raise DamagedError(f'the summary is damaged: {damage}') from None
+        opcode, record_end = source.head(offset, end)
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            declared_bytes += record_end - offset
+            check_declared(declared_bytes)
+        if opcode <= Opcode.DATA_END:
+            record, _ = parse(source.raw(offset, record_end))
+            found[type(record)].append(record)
         offset = record_end
     summary = Summary(
         start, closed=True, declared_bytes=declared_bytes,
@@ -243,9 +240,7 @@ def _read_section(source: McapSource, start: int, end: int) -> Summary:
         metadata=found[MetadataIndex], attachments=found[AttachmentIndex])
     if any(index.chunk_start_offset + index.chunk_length > start
            for index in summary.chunks.values()):
-        raise DamagedError(
-            'the summary is damaged: it places a chunk outside of the data section')
+        raise DamagedError('it places a chunk outside of the data section')
     if summary.statistics is not None and summary.chunks and not summary.indexes_all_chunks:
-        raise DamagedError('the summary is damaged: its statistics and its indexes count '
-                           'different numbers of chunks')
+        raise DamagedError('its statistics and its indexes count different numbers of chunks')
     return summary

@@ -246,7 +246,7 @@ class McapRecorder:
                     self._syncing.join()
                 if self._sync_error is not None:
                     raise self._sync_error
-                _check_disk(self._file, self._min_free_bytes)
+                self._file.check_disk(self._min_free_bytes)
                 if closing:
                     self._file.finish()
                     self._indexed = True
@@ -317,7 +317,7 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
         header = Header(profile='ros2', library=OUR_LIBRARY + version('spinning_top_sim'))
         file = McapWriter(path, header=record_bytes(header), compression=compression)
         with file.discarded_on_failure():
-            _check_disk(file, min_free_bytes)
+            file.check_disk(min_free_bytes)
             file.write(Metadata(METADATA_NAME, dict(metadata)))
             schema_ids = {}
             for number, (name, definition) in enumerate(definitions.items(), start=1):
@@ -343,16 +343,6 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
     except (OSError, ValueError) as error:
         raise RecordingError(f'cannot record to {path}: {_reason(error)}') from error
     return file
-
-
-def _check_disk(file: McapWriter, min_free_bytes: int) -> None:
-    """Raise OSError if the disk has too little left, or the file was deleted."""
-    if file.is_deleted:
-        raise OSError('the file was deleted')
-    free = file.free_bytes()
-    if free < min_free_bytes:
-        raise OSError(f'{free} bytes are free on the disk, fewer than min_free_bytes = '
-                      f'{min_free_bytes}')
 
 
 def _reason(error: Exception) -> str:
