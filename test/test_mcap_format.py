@@ -19,7 +19,7 @@ from pathlib import Path
 import lz4.frame  # type: ignore[import-untyped]
 import pytest
 import zstandard
-from helpers.mutations import mutate
+from helpers.mutations import mutate, repair
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import (
@@ -42,6 +42,7 @@ from test_recover import (
     ROOT,
     SOME_LOST,
     STRANGERS,
+    TOPICS,
     metadata_of,
     records_of,
     run,
@@ -54,6 +55,7 @@ from test_recover import (
 from spinning_top_sim.recording.mcap_writer import record_bytes
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.summary import McapSource
+from spinning_top_sim.recording.writer import create_file
 
 HEADER = record_bytes(Header(profile='', library='a stranger'))
 SCHEMA = record_bytes(Schema(id=1, name='thing', encoding='jsonschema', data=b'{}'))
@@ -192,7 +194,40 @@ def test_a_chunk_that_is_indexed_twice_is_read_once(tmp_path, monkeypatch):
         assert seen_by_us(path) == [('/a', 5, b'x')]
 
 
+@pytest.mark.parametrize('has_summary', [True, False])
+@pytest.mark.parametrize('stamps', [(0, 7), (5, 7), (0,), ()])
+def test_a_message_at_time_0_belongs_to_the_span(tmp_path, stamps, has_summary):
+    path = tmp_path / 'a.mcap'
+    file = create_file(path, TOPICS, {}, compression='none')
+    for stamp in stamps:
+        file.append(0, stamp, b'')
+        file.write_chunk()
+    file.finish()
+    if not has_summary:
+        path.write_bytes(path.read_bytes()[:-50])
+    with LogReader(path) as reader:
+        assert reader.whole == has_summary
+        assert reader.span == (min(stamps, default=0), max(stamps, default=0))
+        assert [message.log_time for message in reader.messages()] == list(stamps)
+
+
 # Damage
+
+@pytest.mark.parametrize('place', range(4))
+@pytest.mark.parametrize('wrong', [0, 1, 1021, 1 << 63, (1 << 64) - 1])
+def test_a_chunk_index_that_lies_costs_nothing(tmp_path, place, wrong):
+    """Its times, its place, or its length; the checksum of the summary is right."""
+    path = tmp_path / 'a.mcap'
+    messages = write_stranger(path, {})
+    content = bytearray(path.read_bytes())
+    indexes = [start for opcode, start, _ in records_of(content) if opcode == Opcode.CHUNK_INDEX]
+    for number, index in enumerate(indexes[1:]):
+        struct.pack_into('<Q', content, index + 9 + 8 * place, abs(wrong - number))
+    repair(content)
+    path.write_bytes(content)
+    assert seen_by_us(path) == messages
+    assert seen_by_mcap(recover(path)) == messages
+
 
 def test_an_index_with_more_entries_than_its_chunk_is_only_a_defect(tmp_path):
     path = tmp_path / 'a.mcap'

@@ -45,6 +45,7 @@ from spinning_top_sim.recording.summary import (
 from spinning_top_sim.recording.writer import OUR_LIBRARY
 
 _CHUNK_HEAD = struct.Struct('<BQQQ')    # opcode, length, earliest and latest log time
+_STREAM_BYTES = 1 << 12     # that an open chunk costs besides its content, about
 _RUN_BYTES = 1 << 20  # of messages outside of chunks that are read at a time
 
 
@@ -197,7 +198,8 @@ class LogReader:
         yield LogMessage('', span.start_ns, 0, 0, b'', -1)
         contents = self._read(span)
         plain = contents.plain
-        self._held_bytes += len(plain)
+        held_bytes = len(plain) + _STREAM_BYTES
+        self._held_bytes += held_bytes
         if self._held_bytes > 2 * self.source.max_bytes:
             raise LogError(f'cannot read {self.path}: the messages of several chunks overlap in '
                            f'time, and these have more than {2 * self.source.max_bytes} bytes')
@@ -206,7 +208,7 @@ class LogReader:
         for channel_id, sequence, log_time, publish_time, begin, end in contents.sorted_messages():
             yield LogMessage(channels[channel_id], log_time, publish_time, sequence,
                              bytes(plain[begin:end]), channel_id)
-        self._held_bytes -= len(plain)
+        self._held_bytes -= held_bytes
 
     def scan(self) -> Scanner:
         """Begin a scan of all usable records in file order, with what former ones know."""

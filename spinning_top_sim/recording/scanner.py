@@ -21,6 +21,7 @@ from array import array
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, DataEnd, Header, McapRecord, Metadata, Schema
@@ -85,7 +86,13 @@ class Scanner:
         self._all_in_chunks = ours or summary.indexes_all_messages
         self._limit = summary.data_limit
         self._has_limit = summary.closed and not summary.problem    # else that of the file
-        self._places = summary.places
+        self._places: dict[int, int] = {}       # opcodes of indexed records by offset
+        for offset, opcode, length in summary.places:
+            # Where neither kind nor length is right, the index is wrong and not the record.
+            head = source.read(offset, HEAD.size)
+            if head[:1] == bytes([opcode]) or head[1:] == HEAD.pack(
+                    opcode, (length - HEAD.size) % (1 << 64))[1:]:
+                self._places[offset] = opcode
         self._place_offsets = sorted(self._places)
         self._finder = RecordFinder(source, self._limit)
 
@@ -195,17 +202,16 @@ class Scanner:
         if (isinstance(record, DataEnd) or (isinstance(record, Header) and offset != MAGIC_SIZE)
                 or (opcode in _SUMMARY_KINDS and (self._has_limit or extra))):
             raise DamagedError('it has no place there')
-        scanned = ScannedRecord(opcode, offset, end, record, raw)
         if isinstance(record, Chunk):
-            return self._scan_chunk(scanned, record)
+            return self._scan_chunk(ScannedRecord(opcode, offset, end, record, raw), record)
         if isinstance(record, Metadata):
             self._metadata_bytes += len(raw)
             check_declared(self._metadata_bytes)
-        if isinstance(record, Schema | Channel):
+        elif isinstance(record, Schema | Channel):
             known = self._declare(offset, record)
             if known != record:
-                return replace(scanned, record=known, raw=record_bytes(known))
-        return scanned
+                record, raw = known, record_bytes(known)
+        return ScannedRecord(opcode, offset, end, record, raw)
 
     def _check_extra(self, extra: int, end: int) -> None:
         # Nothing but what follows proves that bytes behind the known fields belong to the record.
@@ -246,21 +252,16 @@ class Scanner:
 
     def _declare(self, offset: int, record: Schema | Channel) -> Schema | Channel:
         """Make a schema or channel known, and return what is right about it."""
-        known: Schema | Channel | None = (
-            self.schemas if isinstance(record, Schema) else self.channels).get(record.id)
-        if known is None:
+        known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
+        if record.id not in known:
             self._summary.declared_bytes += len(record_bytes(record))
             check_declared(self._summary.declared_bytes)
-            if isinstance(record, Schema):
-                self.schemas[record.id] = record
-            else:
-                self.channels[record.id] = record
-            return record
-        if known != record:
+        right: Schema | Channel = known.setdefault(record.id, record)
+        if right != record:
             self._defects.append(
                 f'the {type(record).__name__.lower()} {record.id} at byte {offset} is not what '
                 'the file says elsewhere')
-        return known
+        return right
 
     def _count(self, offset: int, contents: ChunkContents) -> None:
         """Count messages, and leave out those of unknown channels."""

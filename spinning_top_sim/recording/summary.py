@@ -178,11 +178,13 @@ class Summary:
             and all(map(self.knows, self.channels)))
 
     @property
-    def places(self) -> dict[int, int]:
-        """Opcodes of the indexed records by offset."""
-        return {**dict.fromkeys(self.chunks, int(Opcode.CHUNK)),
-                **{index.offset: int(Opcode.METADATA) for index in self.metadata},
-                **{index.offset: int(Opcode.ATTACHMENT) for index in self.attachments}}
+    def places(self) -> list[tuple[int, int, int]]:
+        """Offsets of the indexed records, with their opcodes and lengths."""
+        return [
+            *((index.chunk_start_offset, Opcode.CHUNK, index.chunk_length)
+              for index in self.chunks.values()),
+            *((index.offset, Opcode.METADATA, index.length) for index in self.metadata),
+            *((index.offset, Opcode.ATTACHMENT, index.length) for index in self.attachments)]
 
 
 def indexed_messages(index: ChunkIndex) -> int:
