@@ -194,8 +194,19 @@ def test_a_chunk_that_is_indexed_twice_is_read_once(tmp_path, monkeypatch):
         assert seen_by_us(path) == [('/a', 5, b'x')]
 
 
+def test_a_channel_that_only_the_summary_calls_otherwise_costs_nothing(tmp_path):
+    path = tmp_path / 'a.mcap'
+    messages = write_stranger(path, {})
+    content = bytearray(path.read_bytes())
+    *_, channel = (start for opcode, start, _ in records_of(content) if opcode == Opcode.CHANNEL)
+    content[channel + 9] += 7
+    repair(content)
+    path.write_bytes(content)
+    assert seen_by_us(path) == messages
+
+
 @pytest.mark.parametrize('has_summary', [True, False])
-@pytest.mark.parametrize('stamps', [(0, 7), (5, 7), (0,), ()])
+@pytest.mark.parametrize('stamps', [(0, 7), (5, 7), (0,), (0, 0), (7, 10 ** 18), ()])
 def test_a_message_at_time_0_belongs_to_the_span(tmp_path, stamps, has_summary):
     path = tmp_path / 'a.mcap'
     file = create_file(path, TOPICS, {}, compression='none')
@@ -209,6 +220,16 @@ def test_a_message_at_time_0_belongs_to_the_span(tmp_path, stamps, has_summary):
         assert reader.whole == has_summary
         assert reader.span == (min(stamps, default=0), max(stamps, default=0))
         assert [message.log_time for message in reader.messages()] == list(stamps)
+
+
+def test_beside_dates_a_time_of_0_is_none(tmp_path):
+    """As of messages that came before the clock of a simulation."""
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(closed(HEADER, RAW_CHANNEL, chunk_of(message(0, b'a'), 0, 0),
+                            chunk_of(message(10 ** 18, b'b'), 10 ** 18, 10 ** 18)))
+    with LogReader(path) as reader:
+        assert reader.span == (10 ** 18, 10 ** 18)
+        assert [message.data for message in reader.messages()] == [b'a', b'b']
 
 
 # Damage

@@ -45,6 +45,7 @@ from spinning_top_sim.recording.summary import (
 from spinning_top_sim.recording.writer import OUR_LIBRARY
 
 _CHUNK_HEAD = struct.Struct('<BQQQ')    # opcode, length, earliest and latest log time
+_FIRST_DATE = 10 ** 17       # [ns], in 1973
 _STREAM_BYTES = 1 << 12     # that an open chunk costs besides its content, about
 _RUN_BYTES = 1 << 20  # of messages outside of chunks that are read at a time
 
@@ -151,8 +152,15 @@ class LogReader:
 
     @property
     def span(self) -> tuple[int, int]:
-        """The earliest and the latest log time [ns]; both 0 without messages."""
+        """
+        The earliest and the latest log time [ns]; both 0 without messages.
+
+        Beside dates, a time of 0 does not count: it says that there was no clock yet.
+        """
         spans, _ = self._index
+        dated = [span for span in spans if span.end_ns]
+        if dated and dated[0].start_ns > _FIRST_DATE:
+            spans = dated
         return (min((span.start_ns for span in spans), default=0),
                 max((span.end_ns for span in spans), default=0))
 

@@ -175,7 +175,8 @@ class Summary:
             self.statistics is not None and self.indexes_all_messages
             and len(self.metadata) == self.statistics.metadata_count
             and len(self.channels) == self.statistics.channel_count
-            and all(map(self.knows, self.channels)))
+            and all(map(self.knows, set(self.channels).union(
+                *(index.message_index_offsets for index in self.chunks.values())))))
 
     @property
     def places(self) -> list[tuple[int, int, int]]:
