@@ -11,6 +11,7 @@ from mcap.records import Chunk
 from spinning_top_sim.recording.chunks import MESSAGE_FIELDS
 from spinning_top_sim.recording.records import (
     HEAD,
+    MAX_DECLARED,
     DamagedError,
     TooLargeError,
     open_chunk,
@@ -27,7 +28,6 @@ _NAME_OFFSETS: dict[int, int] = {
 
 _LOOK_BYTES = 64                # of the content, enough for a chunk's fields before its data
 _MAX_NAME = 1 << 12
-_MAX_DECLARATION = 1 << 24
 _MAX_EXTRA = 1 << 10
 _BLOCK = 1 << 16                # searched at a time
 _MAX_EFFORT = 4                 # bytes of candidates read, as a multiple of the file's size
@@ -112,4 +112,4 @@ def _looks_right(opcode: int, length: int, start: bytes) -> bool:
         data_start = name_start + name_size + 8
         data_size = int.from_bytes(start[data_start - 8:data_start], 'little')
         return 0 <= length - data_start - data_size <= _MAX_EXTRA
-    return 0 < name_size < _MAX_NAME and length <= _MAX_DECLARATION
+    return 0 < name_size < _MAX_NAME and length <= MAX_DECLARED
