@@ -52,6 +52,7 @@ from test_recover import (
     write_stranger,
 )
 
+from spinning_top_sim.recording import resync
 from spinning_top_sim.recording.mcap_writer import record_bytes
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.summary import McapSource
@@ -604,6 +605,23 @@ def test_a_record_of_many_gigabytes_is_not_read(tmp_path, kind):
     with LogReader(path) as reader:
         (loss,) = reader.damage.losses
         assert (loss.refused, loss.bytes) == (True, 9 + size)
+
+
+def test_the_search_behind_damage_unpacks_a_limited_amount(tmp_path, monkeypatch):
+    """Chunks that are small and unpack to much, each with a wrong checksum."""
+    unpacked = []
+    ordinary = resync.open_chunk
+    monkeypatch.setattr(resync, 'open_chunk', lambda chunk, max_bytes: (
+        unpacked.append(chunk.uncompressed_size), ordinary(chunk, max_bytes))[1])
+    plain = bytearray(zstd_chunk(message(5, bytes(1_000_000))))
+    plain[9 + 24] ^= 1
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(MCAP0_MAGIC + HEADER + b'\x00' + bytes(plain) * 300)
+    max_bytes = 2_000_000
+    with LogReader(path, max_bytes) as reader:
+        assert reader.damage.lost_bytes == path.stat().st_size - len(MCAP0_MAGIC + HEADER)
+    assert 1 < len(unpacked)
+    assert sum(unpacked) < 5 * (path.stat().st_size + max_bytes)
 
 
 # The output
