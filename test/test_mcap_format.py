@@ -620,7 +620,7 @@ def test_the_search_behind_damage_unpacks_a_limited_amount(tmp_path, monkeypatch
     max_bytes = 2_000_000
     with LogReader(path, max_bytes) as reader:
         assert reader.damage.lost_bytes == path.stat().st_size - len(MCAP0_MAGIC + HEADER)
-    assert 1 < len(unpacked)
+    assert len(unpacked) > 1
     assert sum(unpacked) < 5 * (path.stat().st_size + max_bytes)
 
 
