@@ -13,13 +13,15 @@ import subprocess
 import sys
 import tracemalloc
 import zlib
+from collections import Counter
 from pathlib import Path
 
 import lz4.frame  # type: ignore[import-untyped]
 import pytest
 import zstandard
+from helpers.mutations import mutate, repair
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
+from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import (
     Attachment,
     Channel,
@@ -40,6 +42,7 @@ from test_recover import (
     ROOT,
     SOME_LOST,
     STRANGERS,
+    TOPICS,
     metadata_of,
     records_of,
     run,
@@ -49,9 +52,11 @@ from test_recover import (
     write_stranger,
 )
 
+from spinning_top_sim.recording import resync
 from spinning_top_sim.recording.mcap_writer import record_bytes
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.summary import McapSource
+from spinning_top_sim.recording.writer import create_file
 
 HEADER = record_bytes(Header(profile='', library='a stranger'))
 SCHEMA = record_bytes(Schema(id=1, name='thing', encoding='jsonschema', data=b'{}'))
@@ -190,7 +195,61 @@ def test_a_chunk_that_is_indexed_twice_is_read_once(tmp_path, monkeypatch):
         assert seen_by_us(path) == [('/a', 5, b'x')]
 
 
+def test_a_channel_that_only_the_summary_calls_otherwise_costs_nothing(tmp_path):
+    path = tmp_path / 'a.mcap'
+    messages = write_stranger(path, {})
+    content = bytearray(path.read_bytes())
+    *_, channel = (start for opcode, start, _ in records_of(content) if opcode == Opcode.CHANNEL)
+    content[channel + 9] += 7
+    repair(content)
+    path.write_bytes(content)
+    assert seen_by_us(path) == messages
+
+
+@pytest.mark.parametrize('has_summary', [True, False])
+@pytest.mark.parametrize('stamps', [(0, 7), (5, 7), (0,), (0, 0), (7, 10 ** 18), ()])
+def test_a_message_at_time_0_belongs_to_the_span(tmp_path, stamps, has_summary):
+    path = tmp_path / 'a.mcap'
+    file = create_file(path, TOPICS, {}, compression='none')
+    for stamp in stamps:
+        file.append(0, stamp, b'')
+        file.write_chunk()
+    file.finish()
+    if not has_summary:
+        path.write_bytes(path.read_bytes()[:-50])
+    with LogReader(path) as reader:
+        assert reader.whole == has_summary
+        assert reader.span == (min(stamps, default=0), max(stamps, default=0))
+        assert [message.log_time for message in reader.messages()] == list(stamps)
+
+
+def test_beside_dates_a_time_of_0_is_none(tmp_path):
+    """As of messages that came before the clock of a simulation."""
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(closed(HEADER, RAW_CHANNEL, chunk_of(message(0, b'a'), 0, 0),
+                            chunk_of(message(10 ** 18, b'b'), 10 ** 18, 10 ** 18)))
+    with LogReader(path) as reader:
+        assert reader.span == (10 ** 18, 10 ** 18)
+        assert [message.data for message in reader.messages()] == [b'a', b'b']
+
+
 # Damage
+
+@pytest.mark.parametrize('place', range(4))
+@pytest.mark.parametrize('wrong', [0, 1, 1021, 1 << 63, (1 << 64) - 1])
+def test_a_chunk_index_that_lies_costs_nothing(tmp_path, place, wrong):
+    """Its times, its place, or its length; the checksum of the summary is right."""
+    path = tmp_path / 'a.mcap'
+    messages = write_stranger(path, {})
+    content = bytearray(path.read_bytes())
+    indexes = [start for opcode, start, _ in records_of(content) if opcode == Opcode.CHUNK_INDEX]
+    for number, index in enumerate(indexes[1:]):
+        struct.pack_into('<Q', content, index + 9 + 8 * place, abs(wrong - number))
+    repair(content)
+    path.write_bytes(content)
+    assert seen_by_us(path) == messages
+    assert seen_by_mcap(recover(path)) == messages
+
 
 def test_an_index_with_more_entries_than_its_chunk_is_only_a_defect(tmp_path):
     path = tmp_path / 'a.mcap'
@@ -304,6 +363,25 @@ def test_a_channel_without_its_schema_is_not_written(tmp_path):
                 ] == ['/raw']
 
 
+@pytest.mark.parametrize('wrong', [
+    Channel(id=1, topic='/a', message_encoding='json', metadata={}, schema_id=9),
+    Channel(id=1, topic='/b', message_encoding='json', metadata={}, schema_id=1),
+    Channel(id=3, topic='/c', message_encoding='json', metadata={}, schema_id=9),
+    Schema(id=1, name='other', encoding='jsonschema', data=b'')])
+def test_a_chunk_with_wrong_declarations_is_not_copied(tmp_path, wrong):
+    """A reader that goes from the beginning to the end would believe the last one."""
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(closed(HEADER, SCHEMA, CHANNEL, chunk_of(
+        message(4, b'1'), 4, 4), chunk_of(record_bytes(wrong) + message(5, b'2'))))
+    output = recover(path)
+    with open(output, 'rb') as file:
+        read = [(schema.name, channel.topic, message.data) for schema, channel, message
+                in NonSeekingReader(file, validate_crcs=True).iter_messages()]
+    assert read == [('thing', '/a', b'1'), ('thing', '/a', b'2')]
+    with LogReader(output) as reader:
+        assert reader.damage.lines() == []
+
+
 def test_a_channel_that_stands_behind_its_messages_is_enough(tmp_path):
     """As when the first one is damaged, and so is the summary that repeats it."""
     path = tmp_path / 'a.mcap'
@@ -342,6 +420,24 @@ def test_mutations_crash_nothing(tmp_path, kind, monkeypatch):
         assert (code == 1) == err.startswith('recover: '), (seed, err)
         if code != 1:
             seen_by_mcap(output)
+            output.unlink()
+
+
+@pytest.mark.parametrize('kind', [*STRANGERS, 'ours'])
+def test_mutated_logs_are_read_and_recovered(tmp_path, kind, monkeypatch):
+    """Also with right checksums, and inside of chunks; `make stress` does thousands."""
+    monkeypatch.setattr(os, 'fsync', lambda descriptor: None)
+    path, output = tmp_path / 'a.mcap', tmp_path / 'whole.mcap'
+    write_log(path) if kind == 'ours' else write_stranger(path, STRANGERS[kind], count=40)
+    content = path.read_bytes()
+    for seed in range(12):
+        path.write_bytes(mutate(content, seed))
+        code, _, err = run(path, '-o', output)
+        assert (code == 1) == err.startswith('recover: '), (seed, err)
+        if code != 1:
+            assert Counter(seen_by_us(output)) == Counter(seen_by_us(path)), seed
+            with LogReader(output) as reader:
+                assert reader.damage.lossless, seed
             output.unlink()
 
 
@@ -421,6 +517,111 @@ def test_the_search_behind_damage_takes_linear_time(tmp_path, monkeypatch):
     # A true chunk behind a few of them is still found.
     path.write_bytes(MCAP0_MAGIC + HEADER + RAW_CHANNEL + b'\x00' + content[:3 * head] + last)
     assert seen_by_us(path) == [('/a', 5, b'x')]
+
+
+CEILING_MB = 1000       # of the process: about three times max_bytes, and the interpreter
+
+
+def peak_of(path: Path, call: str) -> tuple[int, str]:
+    """Run a call in a process of its own; return its peak memory [MB] and what it prints."""
+    done = subprocess.run(
+        [sys.executable, '-c',
+         'import resource\n'
+         'from spinning_top_sim.recording.reader import LogReader\n'
+         'from spinning_top_sim.recording.errors import LogError\n'
+         'from spinning_top_sim.tools.recover import main\n'
+         f'path = {str(path)!r}\n{call}\n'
+         'print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10)'],
+        env=os.environ | {'PYTHONPATH': str(ROOT)}, capture_output=True, text=True, timeout=300,
+        check=True)
+    *printed, peak = done.stdout.splitlines()
+    return int(peak), '\n'.join(printed)
+
+
+READ = """
+with LogReader(path) as reader:
+    try:
+        print(sum(1 for _ in reader.messages()))
+    except LogError as error:
+        print(error)
+    print(*reader.damage.lines(), sep='\\n')
+"""
+
+
+def zstd_chunk(plain: bytes, end: int = 5) -> bytes:
+    return chunk_of(plain, 5, end, 'zstd', zstandard.compress(plain))
+
+
+def tiny_messages() -> bytes:
+    return zstd_chunk(message(5, b'') * 1_000_000)
+
+
+def long_names() -> bytes:
+    return b''.join(zstd_chunk(b''.join(
+        record_bytes(Channel(id=number, topic='/' + 'x' * 15_000_000, message_encoding='x',
+                             metadata={}, schema_id=0))
+        for number in numbers) + message(5, b'')) for numbers in ((2,), (3, 4), (5,), (6,)))
+
+
+def many_keys() -> bytes:
+    metadata = {str(number): '' for number in range(1_500_000)}
+    return zstd_chunk(record_bytes(Channel(
+        id=2, topic='/b', message_encoding='x', metadata=metadata, schema_id=0)))
+
+
+def overlapping() -> bytes:
+    return zstd_chunk(message(5, b'') + message(6, bytes(200_000_000)) + message(9, b''), 9) * 6
+
+
+@pytest.mark.parametrize(('bomb', 'report'), [
+    (tiny_messages, '1000000'), (long_names, 'refused: chunk'), (many_keys, 'refused: chunk'),
+    (overlapping, 'overlap in time')])
+def test_memory_has_a_ceiling(tmp_path, bomb, report):
+    """Small files that unpack to much; what is refused for its size is called that."""
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(closed(HEADER, RAW_CHANNEL, bomb()))
+    assert path.stat().st_size < 3_000_000
+    peak, printed = peak_of(path, READ)
+    assert report in printed
+    assert 'lost' not in printed
+    assert peak < CEILING_MB
+    peak, _ = peak_of(path, f'main([path, "-o", {str(tmp_path / "b.mcap")!r}])')
+    assert peak < CEILING_MB
+
+
+@pytest.mark.parametrize('kind', [
+    Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.SCHEMA, 0x90])
+def test_a_record_of_many_gigabytes_is_not_read(tmp_path, kind):
+    """It is a hole in the file: to read it, or to copy it, would take minutes and the disk."""
+    path, size = tmp_path / 'a.mcap', 100 << 30
+    start = MCAP0_MAGIC + HEADER + RAW_CHANNEL + chunk_of(message(4, b'a'), 4, 4)
+    end = closed(chunk_of(message(6, b'c'), 6, 6))[len(MCAP0_MAGIC):]
+    with path.open('wb') as file:
+        file.write(start + struct.pack('<BQ', kind, size))
+        file.seek(size, os.SEEK_CUR)
+        file.write(end)
+    output = recover(path, SOME_LOST)
+    assert [data for _, _, data in seen_by_us(output)] == [b'a', b'c']
+    with LogReader(path) as reader:
+        (loss,) = reader.damage.losses
+        assert (loss.refused, loss.bytes) == (True, 9 + size)
+
+
+def test_the_search_behind_damage_unpacks_a_limited_amount(tmp_path, monkeypatch):
+    """Chunks that are small and unpack to much, each with a wrong checksum."""
+    unpacked = []
+    ordinary = resync.open_chunk
+    monkeypatch.setattr(resync, 'open_chunk', lambda chunk, max_bytes: (
+        unpacked.append(chunk.uncompressed_size), ordinary(chunk, max_bytes))[1])
+    plain = bytearray(zstd_chunk(message(5, bytes(1_000_000))))
+    plain[9 + 24] ^= 1
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(MCAP0_MAGIC + HEADER + b'\x00' + bytes(plain) * 300)
+    max_bytes = 2_000_000
+    with LogReader(path, max_bytes) as reader:
+        assert reader.damage.lost_bytes == path.stat().st_size - len(MCAP0_MAGIC + HEADER)
+    assert len(unpacked) > 1
+    assert sum(unpacked) < 5 * (path.stat().st_size + max_bytes)
 
 
 # The output

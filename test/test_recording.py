@@ -10,6 +10,8 @@ import io
 import json
 import os
 import random
+import re
+import shutil
 import signal
 import struct
 import subprocess
@@ -45,7 +47,7 @@ from spinning_top_sim.recording.chunks import CHUNK_BYTES, PlainChunk, compresso
 from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import DefinitionNotFoundError, RecordingError
 from spinning_top_sim.recording.mcap_writer import McapWriter
-from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic
+from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic, qos_profiles
 from spinning_top_sim.recording.writer import COMPRESSIONS, McapRecorder, create_file
 
 ROOT = Path(__file__).parents[1]
@@ -276,6 +278,39 @@ def test_offered_qos_is_written_as_yaml_cpp_writes_it(tmp_path):
           avoid_ros_namespace_conventions: false""")
 
 
+def parsed_qos(text):
+    return qos_profiles(ChannelRecord(1, '/a', 'cdr', {'offered_qos_profiles': text}, 1))
+
+
+@pytest.mark.parametrize('text', [
+    '[{depth: 7, reliability: best_effort, deadline: {sec: 1, nsec: 2}}]',
+    '# what it offers\n- depth: 7   # last ones\n  reliability: 2\n  deadline: {sec: 1, nsec: 2}',
+    '- {"depth": 7, "reliability": 2, "histroy": 3, deadline: {"sec": 1, "nsec": 2}}',
+])
+def test_offered_qos_is_read_in_any_style_of_yaml(text):
+    assert parsed_qos(text) == (
+        dict(DEFAULT_QOS) | {'depth': 7, 'reliability': 2, 'deadline': {'sec': 1, 'nsec': 2}},)
+
+
+@pytest.mark.parametrize('value', [
+    '1.5', '[1]', '{}', 'true', '"7"', '~', '.nan', 'keep_some', str(1 << 63), '-' + '9' * 20])
+def test_a_policy_that_is_not_understood_is_the_default(value):
+    keys = ('history', 'depth', 'reliability', 'deadline')
+    text = '- ' + '\n  '.join(f'{key}: {value}' for key in keys)
+    assert parsed_qos(text) == (DEFAULT_QOS,)
+
+
+@pytest.mark.parametrize('text', [
+    '', '7', '{}', '- 7', '[', '- depth: ' + '9' * 5000, '[' * 30_000, '!!int ""', '!!timestamp x',
+    '- {a: &a [1], <<: *a}', '\x00', 'x' * 10_000_000, '? {} : 1', '- ? []\n  : 1', '"\\ud800"',
+    'a: &a {b: 1}\n' + ''.join(
+        f'{name}: &{name} {{<<: [{", ".join([f"*{former}"] * 20)}]}}\n'
+        for former, name in zip('abcdefgh', 'bcdefghi', strict=True)),
+])
+def test_what_is_no_list_of_profiles_offers_none(text):
+    assert parsed_qos(text) == ()
+
+
 @pytest.mark.parametrize('count', [0, 1, 1001])
 def test_bag_metadata_agrees_with_the_messages(tmp_path, monkeypatch, count):
     monkeypatch.delenv('ROS_DISTRO', raising=False)
@@ -482,11 +517,9 @@ def test_arguments_out_of_range_are_named(tmp_path, argument, value):
     assert not list(tmp_path.iterdir())
 
 
-def test_topics_twice_and_bad_metadata_are_refused(tmp_path):
+def test_topics_twice_are_refused(tmp_path):
     with pytest.raises(ValueError, match="'/top/pose' is listed twice"):
         McapRecorder.open(tmp_path / 'run.mcap', [TOPICS[0], TOPICS[0]], {})
-    with pytest.raises(ValueError, match=r"\('seed', 7\)"):
-        McapRecorder.open(tmp_path / 'run.mcap', TOPICS, {'seed': 7})  # type: ignore[dict-item]
 
 
 # Running and ending
@@ -670,7 +703,12 @@ def test_what_is_handed_over_is_on_the_disk_within_max_loss(tmp_path, monkeypatc
             advance(timeout)
 
     class Thread:
-        start = join = is_alive = lambda *_, **__: None
+        """The thread that records is this one, and what it starts is done at once."""
+
+        join = is_alive = lambda *_: None
+
+        def __init__(self, target, args=(), **_):
+            self.start = (lambda: target(*args)) if args else (lambda: None)
 
     def advance(duration):
         nonlocal now
@@ -692,7 +730,7 @@ def test_what_is_handed_over_is_on_the_disk_within_max_loss(tmp_path, monkeypatc
 
     monkeypatch.setattr(writer, 'time', SimpleNamespace(monotonic=lambda: now))
     monkeypatch.setattr(writer, 'threading', SimpleNamespace(
-        Event=Event, Thread=lambda **_: Thread(), TIMEOUT_MAX=threading.TIMEOUT_MAX))
+        Event=Event, Thread=Thread, TIMEOUT_MAX=threading.TIMEOUT_MAX))
     recorder = McapRecorder.open(
         tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=max_loss, min_free_bytes=0)
     monkeypatch.setattr(os, 'fsync', fsync)
@@ -701,6 +739,61 @@ def test_what_is_handed_over_is_on_the_disk_within_max_loss(tmp_path, monkeypatc
     assert (summary.error, summary.lost) == (None, 0)
     assert summary.flushes > 30
     assert len(waits) > 1900 and 0.9 * max_loss / 2 < max(waits) <= max_loss
+
+
+@pytest.fixture
+def slow_disk(monkeypatch):
+    """Have every fsync wait from now on until the event is set."""
+    disk_is_back, fsync = threading.Event(), os.fsync
+    monkeypatch.setattr(os, 'fsync', lambda fd: (disk_is_back.wait(PATIENCE_S), fsync(fd)))
+    return disk_is_back
+
+
+def test_recording_goes_on_while_the_disk_is_slow_and_says_what_may_be_lost(tmp_path, slow_disk):
+    path = tmp_path / 'run.mcap'
+    slow_disk.set()
+    with McapRecorder.open(path, TOPICS, METADATA, max_loss=0.05, min_free_bytes=0) as recorder:
+        assert (recorder.warning, recorder.possible_loss) == (None, 0.0)
+        slow_disk.clear()
+        for number in range(3):
+            recorder.write(0, number, pose_cdr(number))
+            eventually(lambda n=number: numbers_in(path) == list(range(n + 1)))
+        eventually(lambda: recorder.warning)
+        assert recorder.possible_loss > 0.05
+        assert re.fullmatch(rf'the disk of {path} is slow: a power loss would take the last '
+                            r'\d+\.\d s, more than max_loss = 0\.05 s', recorder.warning)
+        assert recorder.state == 'recording'
+        slow_disk.set()
+        eventually(lambda: recorder.possible_loss == 0.0)
+        assert recorder.warning is None
+    assert numbers_in(path) == [0, 1, 2]
+
+
+def test_a_sync_that_hangs_does_not_hang_the_end(tmp_path, slow_disk):
+    slow_disk.set()
+    recorder = McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02,
+                                 min_free_bytes=0)
+    slow_disk.clear()
+    recorder.write(0, 1, pose_cdr(1))
+    eventually(lambda: recorder.warning)
+    assert 'could not be closed within 0.05 s' in (recorder.close(timeout=0.05).error or '')
+    slow_disk.set()
+    assert recorder.close(timeout=PATIENCE_S).indexed
+
+
+@pytest.mark.parametrize('what', ['file', 'folder'])
+@pytest.mark.parametrize('when', ['recording', 'closing'])
+def test_a_log_that_is_deleted_is_an_error(tmp_path, what, when):
+    path = tmp_path / 'logs' / 'run.mcap'
+    path.parent.mkdir()
+    recorder = McapRecorder.open(path, TOPICS, METADATA, min_free_bytes=0,
+                                 max_loss=0.02 if when == 'recording' else 60.0)
+    recorder.write(0, 1, pose_cdr(1))
+    path.unlink() if what == 'file' else shutil.rmtree(path.parent)
+    if when == 'recording':
+        eventually(lambda: recorder.state == 'failed')
+    assert recorder.close().error == f'recording to {path} stopped: the file was deleted'
+    assert recorder.state == 'failed'
 
 
 def test_a_kill_takes_nothing_that_was_in_the_file(tmp_path):
@@ -837,7 +930,7 @@ def test_a_failing_disk_stops_the_recording(tmp_path, monkeypatch):
 def test_a_disk_that_runs_short_stops_the_recording_in_good_order(tmp_path, monkeypatch):
     recorder = McapRecorder.open(
         tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02, min_free_bytes=1)
-    monkeypatch.setattr(McapWriter, 'free_bytes', lambda self: 0)
+    monkeypatch.setattr(os, 'fstatvfs', lambda fd: SimpleNamespace(f_bavail=0, f_frsize=4096))
     recorder.write(0, 7, pose_cdr(7))
     eventually(lambda: recorder.state == 'failed')
     assert recorder.error == (

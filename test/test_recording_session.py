@@ -2,6 +2,7 @@
 """The recording of a running simulation: opening beside the ticks, names, failures."""
 
 import json
+import os
 import threading
 import time
 from types import SimpleNamespace
@@ -10,7 +11,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from helpers.node_harness import PATIENCE_S
+from helpers.node_harness import PATIENCE_S, wait_for
 from helpers.node_logs import events_in, log_of
 
 from spinning_top_sim.nodes.pacing import FairLock
@@ -177,6 +178,23 @@ def test_a_second_start_and_a_second_stop_do_nothing(tmp_path):
     recorded.simulation.advance(SECOND)
     assert recorded.session.stop().startswith(str(tmp_path / 'one.mcap'))
     assert recorded.session.stop() is None
+
+
+def test_a_disk_that_is_too_slow_is_told_with_what_may_be_lost(tmp_path, monkeypatch):
+    recorded = Recorded(tmp_path, record__max_loss=0.02)
+    assert recorded.session.warning is None
+    recorded.start()
+    disk_is_back, fsync = threading.Event(), os.fsync
+    monkeypatch.setattr(os, 'fsync', lambda fd: (disk_is_back.wait(PATIENCE_S), fsync(fd)))
+    recorded.simulation.advance(SECOND)
+    wait_for('the warning', lambda: recorded.session.warning)
+    assert 'max_loss = 0.02 s' in recorded.session.warning
+    numbers = recorded.session.numbers()
+    assert numbers['recorder'] == 'recording'
+    assert float(numbers['possible loss [s]']) > 0.02
+    disk_is_back.set()
+    log, _ = recorded.stop()
+    assert len(log['/ns/pose']) == 101
 
 
 def test_a_recording_that_fails_is_closed_and_says_why(tmp_path):

@@ -535,7 +535,9 @@ def test_an_index_that_does_not_fit_the_messages_is_an_error(tmp_path, start_ns)
     summary, = struct.unpack_from('<Q', content, len(content) - 28)
     while content[summary] != Opcode.CHUNK_INDEX:
         summary += 9 + struct.unpack_from('<Q', content, summary + 1)[0]
-    struct.pack_into('<QQ', content, summary + 9, start_ns, start_ns)
+    chunk, = struct.unpack_from('<Q', content, summary + 9 + 16)
+    for record in (chunk, summary):
+        struct.pack_into('<QQ', content, record + 9, start_ns, start_ns)
     struct.pack_into('<I', content, len(content) - 12, 0)       # no checksum of the summary
     path.write_bytes(content)
     with Replay(tmp_path, path) as node:

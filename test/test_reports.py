@@ -31,8 +31,8 @@ def reported():
     """A report of a paused simulation that stands at 1.25 s, and what it is about."""
     values = parameters.checked({'start_paused': True})
     simulation = Simulation(values)
-    session = SimpleNamespace(error=None, size='', numbers=lambda: {'recorder': 'off'},
-                              has_room=lambda: True,
+    session = SimpleNamespace(error=None, warning=None, size='',
+                              numbers=lambda: {'recorder': 'off'}, has_room=lambda: True,
                               write_command=print, write_event=lambda *_, **__: None)
     loop = TickLoop(simulation, values, session, update_subscribers=lambda: None, tell=print)
     loop.start()
@@ -77,9 +77,13 @@ def test_the_worst_problem_is_the_level_and_the_message(reported):
     level, message, numbers = status_of(reported)
     assert (level, message) == (1, 'this machine cannot keep up')
     assert numbers['clock slip [s]'] == '1.500'
+    reported.loop.slipped_ns = 0
+    reported.session.warning = 'the disk is slow'
+    assert status_of(reported)[:2] == (1, 'recording: the disk is slow')
+    reported.loop.slipped_ns = 1
     reported.session.error = 'disk full'
     assert status_of(reported)[:2] == (2, 'recording: disk full')
-    reported.session.error = None
+    reported.session.error = reported.session.warning = None
     reported.loop.fail('at a pole')
     assert status_of(reported)[:2] == (2, 'at a pole')
     reported.loop.slipped_ns = 0

@@ -109,6 +109,12 @@ class RecordingSession:
         self.stop(recorder.error)
         return recorder.error
 
+    @property
+    def warning(self) -> str | None:
+        """What to tell the user while the disk does not keep `record.max_loss`."""
+        recorder = self._recorder
+        return None if recorder is None else recorder.warning
+
     def write_command(self, l3: float, lz: float) -> None:
         """Record a command applied now, both as a message and as an event."""
         self.write_event('command', l3=l3, lz=lz)
@@ -152,7 +158,8 @@ class RecordingSession:
         return {'recorder': recorder.state, 'recorded file': recorder.path,
                 'recorded messages': counters.messages, 'recorded bytes': counters.bytes,
                 'queued messages': counters.queued,
-                'longest flush [s]': f'{counters.longest_flush:.3f}'}
+                'longest flush [s]': f'{counters.longest_flush:.3f}',
+                'possible loss [s]': f'{recorder.possible_loss:.3f}'}
 
 
 def _open_log(topics: Sequence[Topic], run: Run) -> McapRecorder:

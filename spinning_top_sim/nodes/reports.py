@@ -43,6 +43,8 @@ class MotionReport:
         if error > max_error > 0.0:
             problems.append((DiagnosticStatus.WARN, f'orientation error {error:.3g} rad: more '
                                                     f'than max_error = {max_error:g} rad'))
+        if session.warning:
+            problems.append((DiagnosticStatus.WARN, f'recording: {session.warning}'))
         if session.error:
             problems.append((DiagnosticStatus.ERROR, f'recording: {session.error}'))
         if loop.failure:

@@ -347,6 +347,9 @@ class Simulator(Node):
         reason = self._session.check()
         if reason:
             self._log.error(f'recording stopped: {reason}; the simulation goes on')
+        if self._session.warning:
+            self._log.warning(
+                f'recording: {self._session.warning}', throttle_duration_sec=10.0)
         names = self.get_node_names_and_namespaces()
         if names.count((self.get_name(), self.get_namespace())) > 1:
             self._log.warning(

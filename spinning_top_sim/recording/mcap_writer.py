@@ -218,10 +218,16 @@ class McapWriter:
         os.fsync(self._file.fileno())
         self.synced_size = size
 
-    def free_bytes(self) -> int:
-        """Return how much of the disk is free for this user [bytes]."""
-        disk = os.fstatvfs(self._file.fileno())
-        return disk.f_bavail * disk.f_frsize
+    def check_disk(self, min_free_bytes: int) -> None:
+        """Raise OSError if the disk has too little left, or the file was deleted."""
+        descriptor = self._file.fileno()
+        if os.fstat(descriptor).st_nlink == 0:
+            raise OSError('the file was deleted')
+        disk = os.fstatvfs(descriptor)
+        free = disk.f_bavail * disk.f_frsize
+        if free < min_free_bytes:
+            raise OSError(f'{free} bytes are free on the disk, fewer than min_free_bytes = '
+                          f'{min_free_bytes}')
 
     def finish(self, *, bag: bool = True, file_name: str = '', former_bag: str = '') -> None:
         """

@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import heapq
 import os
+import struct
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from operator import attrgetter
@@ -18,17 +19,19 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Chunk, Header, Metadata
+from mcap.records import Chunk, Header, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording.chunks import time_span
 from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.records import (
+    HEAD,
     MAX_BYTES,
     ChunkContents,
     DamagedError,
     break_up,
+    check_declared,
     open_chunk,
 )
 from spinning_top_sim.recording.rosbag2 import Qos, qos_profiles
@@ -41,6 +44,9 @@ from spinning_top_sim.recording.summary import (
 )
 from spinning_top_sim.recording.writer import OUR_LIBRARY
 
+_CHUNK_HEAD = struct.Struct('<BQQQ')    # opcode, length, earliest and latest log time
+_FIRST_DATE = 10 ** 17       # [ns], in 1973
+_STREAM_BYTES = 1 << 12     # that an open chunk costs besides its content, about
 _RUN_BYTES = 1 << 20  # of messages outside of chunks that are read at a time
 
 
@@ -125,16 +131,14 @@ class LogReader:
     def topics(self) -> tuple[LogTopic, ...]:
         """The channels of the log, in the order of their ids."""
         self._index     # noqa: B018 - makes the channels known
-        found = []
-        for number, channel in sorted(self._summary.channels.items()):
-            schema = self._summary.schemas.get(channel.schema_id)
-            found.append(LogTopic(
-                name=channel.topic, type_name=schema.name if schema else '',
-                schema=schema.data.decode(errors='replace') if schema else '',
-                schema_encoding=schema.encoding if schema else '',
-                encoding=channel.message_encoding, qos=qos_profiles(channel),
-                metadata=channel.metadata, channel_id=number))
-        return tuple(found)
+        schemas = {0: Schema(id=0, data=b'', encoding='', name=''), **self._summary.schemas}
+        return tuple(LogTopic(
+            name=channel.topic, type_name=schema.name,
+            schema=schema.data.decode(errors='replace'), schema_encoding=schema.encoding,
+            encoding=channel.message_encoding, qos=qos_profiles(channel),
+            metadata=channel.metadata, channel_id=number)
+            for number, channel in sorted(self._summary.channels.items())
+            for schema in [schemas.get(channel.schema_id, schemas[0])])
 
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
@@ -148,8 +152,15 @@ class LogReader:
 
     @property
     def span(self) -> tuple[int, int]:
-        """The earliest and the latest log time [ns]; both 0 without messages."""
+        """
+        The earliest and the latest log time [ns]; both 0 without messages.
+
+        Beside dates, a time of 0 does not count: it says that there was no clock yet.
+        """
         spans, _ = self._index
+        dated = [span for span in spans if span.end_ns]
+        if dated and dated[0].start_ns > _FIRST_DATE:
+            spans = dated
         return (min((span.start_ns for span in spans), default=0),
                 max((span.end_ns for span in spans), default=0))
 
@@ -184,6 +195,7 @@ class LogReader:
                ) -> Iterator[LogMessage]:
         """Yield messages of spans in order; a span is read when its time comes."""
         spans = sorted(spans, key=attrgetter('offset'))
+        self._held_bytes = 0
         streams = [self._stream(span, channels) for span in spans]
         for message in heapq.merge(*streams, key=attrgetter('log_time')):
             if message.channel_id >= 0 and message.log_time in times:
@@ -193,12 +205,18 @@ class LogReader:
         """Yield what stands for the time at which a span begins, then its messages in order."""
         yield LogMessage('', span.start_ns, 0, 0, b'', -1)
         contents = self._read(span)
+        plain = contents.plain
+        held_bytes = len(plain) + _STREAM_BYTES
+        self._held_bytes += held_bytes
+        if self._held_bytes > 2 * self.source.max_bytes:
+            raise LogError(f'cannot read {self.path}: the messages of several chunks overlap in '
+                           f'time, and these have more than {2 * self.source.max_bytes} bytes')
         for channel_id in contents.entries.keys() - channels:
             del contents.entries[channel_id]
-        plain = contents.plain
         for channel_id, sequence, log_time, publish_time, begin, end in contents.sorted_messages():
             yield LogMessage(channels[channel_id], log_time, publish_time, sequence,
                              bytes(plain[begin:end]), channel_id)
+        self._held_bytes -= held_bytes
 
     def scan(self) -> Scanner:
         """Begin a scan of all usable records in file order, with what former ones know."""
@@ -206,12 +224,16 @@ class LogReader:
 
     @functools.cached_property
     def _index(self) -> _Index:
-        """What the summary indexes, if that is all, else what a scan found."""
-        if not self._summary.is_complete:
+        """What the summary indexes, if that is all and right, else what a scan found."""
+        if not (self._summary.is_complete
+                and all(map(self._leads_to_chunk, self._summary.chunks))):
             return self._survey[0]
         metadata = {}
+        metadata_bytes = 0
         for index in self._summary.metadata:
             try:
+                metadata_bytes += index.length
+                check_declared(metadata_bytes)
                 record = self.source.record(index.offset, self._summary.data_limit)
             except DamagedError:
                 continue
@@ -221,6 +243,14 @@ class LogReader:
                        chunk.message_end_time) for offset, chunk in self._summary.chunks.items()
                  if indexed_messages(chunk)]
         return sorted(spans), metadata
+
+    def _leads_to_chunk(self, offset: int) -> bool:
+        """Return whether the chunk there is the one that the summary tells of."""
+        index = self._summary.chunks[offset]
+        head = _CHUNK_HEAD.pack(
+            Opcode.CHUNK, (index.chunk_length - HEAD.size) % (1 << 64),
+            index.message_start_time, index.message_end_time)
+        return self.source.read(offset, len(head)) == head
 
     @functools.cached_property
     def _survey(self) -> tuple[_Index, Damage]:

@@ -31,6 +31,7 @@ from spinning_top_sim.recording.chunks import ENTRY_SIZE, INDEX_HEAD, MESSAGE, M
 from spinning_top_sim.recording.mcap_writer import record_bytes
 
 MAX_BYTES = 256 << 20               # of one record or one uncompressed chunk in memory
+MAX_DECLARED = 16 << 20             # of schemas, channels or metadata, which take ten times that
 HEAD = struct.Struct('<BQ')         # of every record: opcode, length of what follows
 
 _BLOCK = 1 << 20    # bytes decompressed at a time
@@ -47,9 +48,6 @@ class DamagedError(Exception):
 
 class TooLargeError(DamagedError):
     """A record may be right but is larger than what is read into memory."""
-
-    def __init__(self, size: int, max_bytes: int) -> None:
-        super().__init__(f'its {size} bytes are more than max_bytes = {max_bytes}')
 
 
 class StoredMessage(NamedTuple):
@@ -75,7 +73,7 @@ class ChunkContents:
     entries: dict[int, array[int]] = field(default_factory=dict)    # of the message indexes
     declared: list[Schema | Channel] = field(default_factory=list)
     in_time_order: bool = True
-    complete: bool = True   # no entries were left out, whose channel is unknown
+    right: bool = True      # as a whole: all channels are known, and what they are elsewhere
 
     def messages(self) -> Iterator[StoredMessage]:
         """Yield the messages in the order of the file."""
@@ -114,6 +112,19 @@ class StrictStream(ReadDataStream):
         return data
 
 
+def check_size(size: int, max_bytes: int) -> None:
+    """Raise TooLargeError if a record or a chunk is not read into memory."""
+    if size > max_bytes:
+        raise TooLargeError(f'its {size} bytes are more than max_bytes = {max_bytes}')
+
+
+def check_declared(size: int) -> None:
+    """Raise TooLargeError for too many bytes of schemas, channels and metadata."""
+    if size > MAX_DECLARED:
+        raise TooLargeError(f'{size} bytes of schemas, channels or metadata are more than '
+                            f'the {MAX_DECLARED} that are read')
+
+
 def name_of(opcode: int) -> str:
     """Return what a kind of record is called in reports."""
     try:
@@ -131,6 +142,8 @@ def parse(raw: bytes) -> tuple[McapRecord, int]:
     record_class = _CLASSES.get(raw[0])
     if record_class is None:
         raise DamagedError('there is no such kind of record')
+    if record_class is not Chunk:
+        check_declared(len(raw))
     stream = StrictStream(raw)
     try:
         record: McapRecord = record_class.read(stream)  # type: ignore[attr-defined]
@@ -172,7 +185,7 @@ def break_up(plain: bytes | bytearray) -> ChunkContents:
     """Return the messages and declarations among records that stand one after the other."""
     contents = ChunkContents(plain)
     entries = contents.entries
-    last_time = 0
+    last_time = declared_bytes = 0
     size = len(plain)
     offset = 0
     while offset < size:
@@ -195,6 +208,8 @@ def break_up(plain: bytes | bytearray) -> ChunkContents:
                 contents.in_time_order = False
             last_time = log_time
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            declared_bytes += length
+            check_declared(declared_bytes)
             record, _ = parse(bytes(plain[offset:end]))
             assert isinstance(record, Schema | Channel)
             contents.declared.append(record)
@@ -205,8 +220,7 @@ def break_up(plain: bytes | bytearray) -> ChunkContents:
 def _decompress(chunk: Chunk, max_bytes: int) -> bytes | bytearray:
     """Return the uncompressed bytes of all frames, never more than the chunk states."""
     size = chunk.uncompressed_size
-    if size > max_bytes:
-        raise TooLargeError(size, max_bytes)
+    check_size(size, max_bytes)
     stream: BinaryIO
     if chunk.compression == '':
         stream = BytesIO(chunk.data)

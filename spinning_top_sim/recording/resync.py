@@ -11,6 +11,7 @@ from mcap.records import Chunk
 from spinning_top_sim.recording.chunks import MESSAGE_FIELDS
 from spinning_top_sim.recording.records import (
     HEAD,
+    MAX_DECLARED,
     DamagedError,
     TooLargeError,
     open_chunk,
@@ -27,7 +28,6 @@ _NAME_OFFSETS: dict[int, int] = {
 
 _LOOK_BYTES = 64                # of the content, enough for a chunk's fields before its data
 _MAX_NAME = 1 << 12
-_MAX_DECLARATION = 1 << 24
 _MAX_EXTRA = 1 << 10
 _BLOCK = 1 << 16                # searched at a time
 _MAX_EFFORT = 4                 # bytes of candidates read, as a multiple of the file's size
@@ -43,7 +43,9 @@ class RecordFinder:
     def __init__(self, source: McapSource, limit: int) -> None:
         self._source = source
         self._limit = limit
-        self._effort = _MAX_EFFORT * source.size    # so that the time is linear in the size
+        # Bytes of candidates to be read and to be uncompressed, so that the time is limited.
+        self._effort = _MAX_EFFORT * source.size
+        self._unpacking = _MAX_EFFORT * (source.size + source.max_bytes)
 
     def is_record(self, offset: int) -> bool:
         """Return whether a record of a known kind begins there, or the data section ends."""
@@ -94,6 +96,9 @@ class RecordFinder:
             raise DamagedError('the file has candidates everywhere')
         record, _ = parse(self._source.raw(offset, end))
         if isinstance(record, Chunk):
+            self._unpacking -= record.uncompressed_size
+            if self._unpacking < 0:
+                raise DamagedError('the file has candidates everywhere')
             contents = open_chunk(record, self._source.max_bytes)
             if not contents.entries and not contents.declared:
                 raise DamagedError('it is empty')       # zeros in data look like that
@@ -107,4 +112,4 @@ def _looks_right(opcode: int, length: int, start: bytes) -> bool:
         data_start = name_start + name_size + 8
         data_size = int.from_bytes(start[data_start - 8:data_start], 'little')
         return 0 <= length - data_start - data_size <= _MAX_EXTRA
-    return 0 < name_size < _MAX_NAME and length <= _MAX_DECLARATION
+    return 0 < name_size < _MAX_NAME and length <= MAX_DECLARED

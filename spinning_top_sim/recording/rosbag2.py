@@ -24,6 +24,7 @@ Qos = Mapping[str, Any]
 BAG_METADATA = 'rosbag2'  # name of the metadata record
 
 _METADATA_VERSION = 9  # of rosbag2_storage::BagMetadata in jazzy
+_MAX_QOS_TEXT = 1 << 16
 _NEVER = {'sec': 9223372036, 'nsec': 854775807}  # RMW_DURATION_INFINITE
 
 # What a reliable publisher with a queue of ten offers, rmw's enum values.
@@ -72,9 +73,12 @@ def qos_profiles(channel: Channel) -> tuple[Qos, ...]:
     A policy that is missing or not understood is as in DEFAULT_QOS; a text that is no list of
     profiles has none.
     """
+    text = channel.metadata.get('offered_qos_profiles', '')
+    if len(text) > _MAX_QOS_TEXT or '<<' in text:   # merged keys may grow exponentially
+        return ()
     try:
-        profiles = yaml.safe_load(channel.metadata.get('offered_qos_profiles', ''))
-    except (yaml.YAMLError, ValueError, TypeError, OverflowError, RecursionError):
+        profiles = yaml.safe_load(text)
+    except Exception:   # PyYAML raises many kinds for what it does not understand
         return ()
     if not isinstance(profiles, list) or not all(isinstance(one, dict) for one in profiles):
         return ()

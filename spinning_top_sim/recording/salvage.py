@@ -134,7 +134,7 @@ class _Copy:
     def _put_messages(self, scanned: ScannedRecord, contents: ChunkContents) -> None:
         for channel_id in contents.entries:
             self._declare(self._scanner.channels[channel_id])
-        if isinstance(scanned.record, Chunk) and contents.complete:
+        if isinstance(scanned.record, Chunk) and contents.right:
             self._writer.write_chunk()  # what came before stays before
             self._writer.copy_chunk(scanned.record, contents.entries, scanned.raw)
             return

@@ -21,6 +21,7 @@ from array import array
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, DataEnd, Header, McapRecord, Metadata, Schema
@@ -35,6 +36,8 @@ from spinning_top_sim.recording.records import (
     DamagedError,
     TooLargeError,
     break_up,
+    check_declared,
+    check_size,
     name_of,
     open_chunk,
     parse,
@@ -83,10 +86,17 @@ class Scanner:
         self._all_in_chunks = ours or summary.indexes_all_messages
         self._limit = summary.data_limit
         self._has_limit = summary.closed and not summary.problem    # else that of the file
-        self._places = summary.places
+        self._places: dict[int, int] = {}       # opcodes of indexed records by offset
+        for offset, opcode, length in summary.places:
+            # Where neither kind nor length is right, the index is wrong and not the record.
+            head = source.read(offset, HEAD.size)
+            if head[:1] == bytes([opcode]) or head[1:] == HEAD.pack(
+                    opcode, (length - HEAD.size) % (1 << 64))[1:]:
+                self._places[offset] = opcode
         self._place_offsets = sorted(self._places)
         self._finder = RecordFinder(source, self._limit)
 
+        self._metadata_bytes = 0
         self._losses: list[Loss] = []
         self._defects: list[str] = []
         self._crc = zlib.crc32(MCAP0_MAGIC)     # over the records as they should be
@@ -167,6 +177,7 @@ class Scanner:
         opcode, end = self._source.head(offset, self._limit)
         if self._places.get(offset, opcode) != opcode or end > self._next_place(offset):
             raise DamagedError('the summary tells of another record there')
+        check_size(end - offset - HEAD.size, self._source.max_bytes)
         if opcode == Opcode.ATTACHMENT:
             return self._scan_attachment(offset, end)
         if opcode > Opcode.DATA_END:
@@ -191,14 +202,16 @@ class Scanner:
         if (isinstance(record, DataEnd) or (isinstance(record, Header) and offset != MAGIC_SIZE)
                 or (opcode in _SUMMARY_KINDS and (self._has_limit or extra))):
             raise DamagedError('it has no place there')
-        scanned = ScannedRecord(opcode, offset, end, record, raw)
         if isinstance(record, Chunk):
-            return self._scan_chunk(scanned, record)
-        if isinstance(record, Schema | Channel):
+            return self._scan_chunk(ScannedRecord(opcode, offset, end, record, raw), record)
+        if isinstance(record, Metadata):
+            self._metadata_bytes += len(raw)
+            check_declared(self._metadata_bytes)
+        elif isinstance(record, Schema | Channel):
             known = self._declare(offset, record)
             if known != record:
-                return replace(scanned, record=known, raw=record_bytes(known))
-        return scanned
+                record, raw = known, record_bytes(known)
+        return ScannedRecord(opcode, offset, end, record, raw)
 
     def _check_extra(self, extra: int, end: int) -> None:
         # Nothing but what follows proves that bytes behind the known fields belong to the record.
@@ -207,8 +220,9 @@ class Scanner:
 
     def _scan_chunk(self, scanned: ScannedRecord, chunk: Chunk) -> ScannedRecord:
         contents = open_chunk(chunk, self._source.max_bytes)
-        for record in contents.declared:
-            self._declare(scanned.offset, record)
+        declared = [self._declare(scanned.offset, record) for record in contents.declared]
+        contents.right = declared == contents.declared and all(
+            self._summary.knows(record.id) for record in declared if isinstance(record, Channel))
         times = time_span(contents.entries)
         if contents.entries and times != (chunk.message_start_time, chunk.message_end_time):
             self._defects.append(f'the chunk at byte {scanned.offset} has wrong times in its head')
@@ -238,13 +252,16 @@ class Scanner:
 
     def _declare(self, offset: int, record: Schema | Channel) -> Schema | Channel:
         """Make a schema or channel known, and return what is right about it."""
-        known = (self.schemas.setdefault(record.id, record) if isinstance(record, Schema)
-                 else self.channels.setdefault(record.id, record))
-        if known != record:
+        known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
+        if record.id not in known:
+            self._summary.declared_bytes += len(record_bytes(record))
+            check_declared(self._summary.declared_bytes)
+        right: Schema | Channel = known.setdefault(record.id, record)
+        if right != record:
             self._defects.append(
                 f'the {type(record).__name__.lower()} {record.id} at byte {offset} is not what '
                 'the file says elsewhere')
-        return known
+        return right
 
     def _count(self, offset: int, contents: ChunkContents) -> None:
         """Count messages, and leave out those of unknown channels."""
@@ -264,7 +281,7 @@ class Scanner:
                     self._next_sequence[number] = message.sequence + 1
         for number in unknown:
             del contents.entries[number]
-            contents.complete = False
+            contents.right = False
         for number, entries in contents.entries.items():
             self._found[number] += len(entries) // 2
         if contents.entries:

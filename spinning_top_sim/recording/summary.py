@@ -33,7 +33,8 @@ from spinning_top_sim.recording.records import (
     HEAD,
     DamagedError,
     StrictStream,
-    TooLargeError,
+    check_declared,
+    check_size,
     parse,
 )
 
@@ -109,9 +110,7 @@ class McapSource:
 
     def raw(self, offset: int, end: int) -> bytes:
         """Return the bytes of a record.  Raises TooLargeError."""
-        length = end - offset - HEAD.size
-        if length > self.max_bytes:
-            raise TooLargeError(length, self.max_bytes)
+        check_size(end - offset - HEAD.size, self.max_bytes)
         return self.read(offset, end - offset)
 
     def record(self, offset: int, limit: int) -> McapRecord:
@@ -146,6 +145,7 @@ class Summary:
     # beginning.
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
+    declared_bytes: int = 0     # of schemas and channels
     statistics: Statistics | None = None
     chunks: dict[int, ChunkIndex] = field(default_factory=dict)  # by offset
     metadata: list[MetadataIndex] = field(default_factory=list)
@@ -175,14 +175,17 @@ class Summary:
             self.statistics is not None and self.indexes_all_messages
             and len(self.metadata) == self.statistics.metadata_count
             and len(self.channels) == self.statistics.channel_count
-            and all(map(self.knows, self.channels)))
+            and all(map(self.knows, set(self.channels).union(
+                *(index.message_index_offsets for index in self.chunks.values())))))
 
     @property
-    def places(self) -> dict[int, int]:
-        """Opcodes of the indexed records by offset."""
-        return {**dict.fromkeys(self.chunks, int(Opcode.CHUNK)),
-                **{index.offset: int(Opcode.METADATA) for index in self.metadata},
-                **{index.offset: int(Opcode.ATTACHMENT) for index in self.attachments}}
+    def places(self) -> list[tuple[int, int, int]]:
+        """Offsets of the indexed records, with their opcodes and lengths."""
+        return [
+            *((index.chunk_start_offset, Opcode.CHUNK, index.chunk_length)
+              for index in self.chunks.values()),
+            *((index.offset, Opcode.METADATA, index.length) for index in self.metadata),
+            *((index.offset, Opcode.ATTACHMENT, index.length) for index in self.attachments)]
 
 
 def indexed_messages(index: ChunkIndex) -> int:
@@ -208,40 +211,39 @@ def read_summary(source: McapSource) -> Summary:
         return Summary(footer_offset, closed=True)
     try:
         if not MAGIC_SIZE <= start <= footer_offset:
-            raise DamagedError('the footer leads to no summary')
-        if size > source.max_bytes:
-            raise DamagedError(f'the summary is not read: {TooLargeError(size, source.max_bytes)}')
+            raise DamagedError('the footer does not lead to it')
+        check_size(size, source.max_bytes)
         if footer.summary_crc not in (0, source.crc(start, magic_offset - 4)):
-            raise DamagedError('the checksum of the summary is wrong')
+            raise DamagedError('its checksum is wrong')
         return _read_section(source, start, footer_offset)
     except DamagedError as damage:
-        return Summary(source.size, closed=True, problem=str(damage))
+        return Summary(source.size, closed=True, problem=f'the summary is not used: {damage}')
 
 
 def _read_section(source: McapSource, start: int, end: int) -> Summary:
     """Return the summary between two offsets; raises DamagedError if it does not fit the file."""
     found: dict[type, list[Any]] = defaultdict(list)
+    declared_bytes = 0
     offset = start
     while offset < end:
-        try:
-            opcode, record_end = source.head(offset, end)
-            if opcode <= Opcode.DATA_END:
-                record, _ = parse(source.raw(offset, record_end))
-                found[type(record)].append(record)
-        except DamagedError as damage:
-            raise DamagedError(f'the summary is damaged: {damage}') from None
+        opcode, record_end = source.head(offset, end)
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            declared_bytes += record_end - offset
+            check_declared(declared_bytes)
+        if opcode <= Opcode.DATA_END:
+            record, _ = parse(source.raw(offset, record_end))
+            found[type(record)].append(record)
         offset = record_end
     summary = Summary(
-        start, closed=True, schemas={schema.id: schema for schema in found[Schema]},
+        start, closed=True, declared_bytes=declared_bytes,
+        schemas={schema.id: schema for schema in found[Schema]},
         channels={channel.id: channel for channel in found[Channel]},
         statistics=next(reversed(found[Statistics]), None),
         chunks={index.chunk_start_offset: index for index in found[ChunkIndex]},
         metadata=found[MetadataIndex], attachments=found[AttachmentIndex])
     if any(index.chunk_start_offset + index.chunk_length > start
            for index in summary.chunks.values()):
-        raise DamagedError(
-            'the summary is damaged: it places a chunk outside of the data section')
+        raise DamagedError('it places a chunk outside of the data section')
     if summary.statistics is not None and summary.chunks and not summary.indexes_all_chunks:
-        raise DamagedError('the summary is damaged: its statistics and its indexes count '
-                           'different numbers of chunks')
+        raise DamagedError('its statistics and its indexes count different numbers of chunks')
     return summary

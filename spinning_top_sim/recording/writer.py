@@ -3,7 +3,8 @@
 Recording while the simulation runs: bounded loss, bounded memory, and no waiting for a disk.
 
 The simulation's thread only appends to a queue.  One other thread makes chunks, compresses and
-writes them, and brings them to the disk at least every half `max_loss`.
+writes them, at least every half `max_loss`, so that a SIGKILL takes no more.  A third brings them
+to the disk meanwhile; `possible_loss` tells what a power loss would take.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ class McapRecorder:
         self.error: str | None = None
         self._names = [topic.name for topic in topics]
         self._file = file
-        self._flush_interval = max_loss / 2.0
+        self._max_loss = max_loss
         self._min_free_bytes = min_free_bytes
 
         # Appending to a deque and taking from its other end need no lock between threads.
@@ -91,6 +92,9 @@ class McapRecorder:
         self._indexed = False
         self._flushes = 0
         self._longest_flush = 0.0
+        self._on_disk = time.monotonic(), 0     # what came by this time; bytes out of the queue
+        self._sync_error: Exception | None = None
+        self._syncing: threading.Thread | None = None
         self._wake = threading.Event()
         self._taken = threading.Event()
         # A daemon, so that a forgotten recording cannot hold up the end of the interpreter; the
@@ -126,6 +130,22 @@ class McapRecorder:
         began with room may be written to its end.
         """
         return self._bytes_in - self._bytes_out < QUEUE_BYTES
+
+    @property
+    def possible_loss(self) -> float:
+        """Wall time whose messages a power loss would take now, but for one tick [s]."""
+        since, bytes_on_disk = self._on_disk
+        if self.state != 'recording' or self._bytes_in == bytes_on_disk:
+            return 0.0
+        return time.monotonic() - since
+
+    @property
+    def warning(self) -> str | None:
+        """What to tell the user while the disk is too slow for `max_loss`."""
+        loss = self.possible_loss
+        return None if loss <= self._max_loss else (
+            f'the disk of {self.path} is slow: a power loss would take the last {loss:.1f} s, '
+            f'more than max_loss = {self._max_loss:g} s')
 
     @property
     def counters(self) -> RecordingSummary:
@@ -176,13 +196,13 @@ class McapRecorder:
         May be called again.  Where the disk does not finish within `timeout` [s], the summary's
         `error` says so and the file goes on being closed in the background.
         """
+        atexit.unregister(self.close)
         self._accepting = False
         self._wake.set()
         self._thread.join(timeout)
         if self._thread.is_alive():
             late = f'{self.path} could not be closed within {timeout:g} s'
             return replace(self.counters, error=self.error or late)
-        atexit.unregister(self.close)
         return self.counters
 
     def __enter__(self) -> Self:
@@ -205,26 +225,58 @@ class McapRecorder:
             self.state = 'failed'
             # Cutting off the truncated chunk may have freed enough space for the summary.
             with contextlib.suppress(Exception):
+                if self._syncing is not None:
+                    self._syncing.join()
                 self._file.finish()
                 self._indexed = True
 
     def _record(self) -> None:
         """Write what is queued, flush in time, finish when asked to."""
-        next_flush = time.monotonic() + self._flush_interval
+        interval = self._max_loss / 2.0
+        next_flush = time.monotonic() + interval
         while True:
             self._wake.clear()
             closing = not self._accepting  # read before the queue: once set, nothing more comes
+            now = time.monotonic()
             self._write_queued()
-            if closing:
+            if closing or now >= next_flush:
+                next_flush = now + interval
                 self._file.write_chunk()
-                self._file.finish()
-                self._indexed = True
-                return
-            start = time.monotonic()
-            if start >= next_flush:
-                next_flush = start + self._flush_interval
-                self._flush(start)
+                if closing and self._syncing is not None:
+                    self._syncing.join()
+                if self._sync_error is not None:
+                    raise self._sync_error
+                self._file.check_disk(self._min_free_bytes)
+                if closing:
+                    self._file.finish()
+                    self._indexed = True
+                    return
+                self._begin_sync(now)
             self._wake.wait(max(0.0, next_flush - time.monotonic()))
+
+    def _begin_sync(self, now: float) -> None:
+        """Bring what is in the file to the disk, in a thread that may hang as the disk does."""
+        if self._syncing is not None and self._syncing.is_alive():
+            return
+        written = now, self._bytes_out
+        if self._file.size == self._file.synced_size:
+            self._on_disk = written
+            return
+        self._syncing = threading.Thread(
+            target=self._sync, args=(written,), name='recorder sync', daemon=True)
+        self._syncing.start()
+
+    def _sync(self, written: tuple[float, int]) -> None:
+        start = time.monotonic()
+        try:
+            self._file.sync()
+        except Exception as error:
+            self._sync_error = error
+            self._wake.set()
+            return
+        self._on_disk = written
+        self._flushes += 1
+        self._longest_flush = max(self._longest_flush, time.monotonic() - start)
 
     def _write_queued(self) -> None:
         """Take what is in the queue now and put it into chunks; write those that are full."""
@@ -236,15 +288,6 @@ class McapRecorder:
             self._bytes_out += size + _ENTRY_BYTES * len(messages)
         if self.room:
             self._taken.set()
-
-    def _flush(self, start: float) -> None:
-        """Close the chunk and bring it to the disk; mind the space left."""
-        self._file.write_chunk()
-        if self._file.size != self._file.synced_size:
-            self._file.sync()
-            self._flushes += 1
-            self._longest_flush = max(self._longest_flush, time.monotonic() - start)
-            _check_space(self._file, self._min_free_bytes)
 
 
 def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[str, str], *,
@@ -260,14 +303,21 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
 
     Raises ValueError for an argument out of range, RecordingError naming path or type.
     """
-    _check_arguments(topics, metadata, compression, min_free_bytes)
+    names = [topic.name for topic in topics]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f'topic {name!r} is listed twice: once is allowed')
+    if compression not in COMPRESSIONS:
+        raise ValueError(f'compression = {compression!r}: must be one of {COMPRESSIONS}')
+    if min_free_bytes < 0:
+        raise ValueError(f'min_free_bytes = {min_free_bytes!r}: must be >= 0')
     definitions = {
         name: find_definition(name) for name in dict.fromkeys(topic.type_name for topic in topics)}
     try:
         header = Header(profile='ros2', library=OUR_LIBRARY + version('spinning_top_sim'))
         file = McapWriter(path, header=record_bytes(header), compression=compression)
         with file.discarded_on_failure():
-            _check_space(file, min_free_bytes)
+            file.check_disk(min_free_bytes)
             file.write(Metadata(METADATA_NAME, dict(metadata)))
             schema_ids = {}
             for number, (name, definition) in enumerate(definitions.items(), start=1):
@@ -293,30 +343,6 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
     except (OSError, ValueError) as error:
         raise RecordingError(f'cannot record to {path}: {_reason(error)}') from error
     return file
-
-
-def _check_arguments(topics: Sequence[RecordedTopic], metadata: Mapping[str, str],
-                     compression: str, min_free_bytes: int) -> None:
-    """Raise ValueError for what no log can be created with."""
-    names = [topic.name for topic in topics]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f'topic {name!r} is listed twice: once is allowed')
-    for item in metadata.items():
-        if not all(isinstance(text, str) for text in item):
-            raise ValueError(f'metadata {item!r}: key and value must be str')
-    if compression not in COMPRESSIONS:
-        raise ValueError(f'compression = {compression!r}: must be one of {COMPRESSIONS}')
-    if min_free_bytes < 0:
-        raise ValueError(f'min_free_bytes = {min_free_bytes!r}: must be >= 0')
-
-
-def _check_space(file: McapWriter, min_free_bytes: int) -> None:
-    """Raise OSError if the disk has too little left."""
-    free = file.free_bytes()
-    if free < min_free_bytes:
-        raise OSError(f'{free} bytes are free on the disk, fewer than min_free_bytes = '
-                      f'{min_free_bytes}')
 
 
 def _reason(error: Exception) -> str:
