@@ -46,9 +46,15 @@ def exit_code(parser: argparse.ArgumentParser, argv: Sequence[str] | None,
         return INTERRUPTED
 
 
+def printable(text: str) -> str:
+    """Return a text with escapes for what would act on a terminal, or cannot be encoded."""
+    return ''.join(character if character.isprintable() else
+                   character.encode('unicode_escape').decode() for character in text)
+
+
 def print_line(text: str, file: TextIO | None = None) -> None:
-    """Print a line, by default to the standard output, whatever bytes a file name holds."""
-    print(text.encode(errors='backslashreplace').decode(), file=file or sys.stdout)
+    """Print a line, by default to the standard output, whatever a name in it holds."""
+    print(printable(text), file=file or sys.stdout)
 
 
 @contextlib.contextmanager
@@ -72,7 +78,7 @@ class Table:
 
     def lines(self, width: int) -> Iterator[str]:
         """Yield the lines; where they are too wide, the first column has lines of its own."""
-        cells = [self.head, *self.rows]
+        cells = [[*map(printable, row)] for row in (self.head, *self.rows)]
         first, *widths = (max(map(len, column)) for column in zip(*cells, strict=True))
         stacked = first + sum(widths) + len(GAP) * (len(widths) + 1) > width
         yield from ('', self.title)

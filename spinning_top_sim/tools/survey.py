@@ -26,7 +26,7 @@ from spinning_top_sim.streams.segment import Segment
 from spinning_top_sim.streams.topics import Stream
 from spinning_top_sim.tools import analysis, recorded_run
 from spinning_top_sim.tools.analysis import Attitudes, Measured, Reals
-from spinning_top_sim.tools.recorded_run import RunDescription
+from spinning_top_sim.tools.recorded_run import LATEST_NS, ODD, RunDescription, reason_of
 
 BLOCK = 16384               # messages of all topics analysed together
 MOST_POINTS = 20_000        # of a series that is kept for a picture
@@ -144,6 +144,11 @@ class Survey:
 
 def survey(reader: LogReader) -> Survey:
     """Return the findings about a log.  Raises LogError."""
+    with np.errstate(all='ignore'):         # odd numbers are found, too
+        return _survey(reader)
+
+
+def _survey(reader: LogReader) -> Survey:
     damage = reader.damage
     found = Survey(damage, reader.whole and not damage.truncated and damage.lossless,
                    damage.end_ns, {topic.name: TopicReport(topic.type_name)
@@ -160,7 +165,7 @@ def survey(reader: LogReader) -> Survey:
     while block := sorted(itertools.islice(messages, BLOCK), key=attrgetter('topic')):
         for topic, group in itertools.groupby(block, attrgetter('topic')):
             samples = list(group)
-            blocks_ns[topic].append(np.array([sample.log_time for sample in samples]))
+            blocks_ns[topic].append(_stamps(samples))
             if sections and topic in sections[0].streams:
                 for number, part in itertools.groupby(
                         samples, lambda sample: bisect_left(ends_ns, sample.log_time)):
@@ -197,8 +202,8 @@ def _find_sections(found: Survey, run: RunDescription) -> list[Section]:
                 found.motions.append(_motion(run, simulation, streams, event.name, begin_ns))
             sections.append(Section(found.motions[-1], begin_ns, begin_ns, simulation.epoch_ns,
                                     streams, Imu(simulation.values)))
-    except recorded_run.DepartureError as error:
-        found.notes.append(f'the run cannot be followed beyond here: {error}')
+    except (recorded_run.DepartureError, *ODD) as error:
+        found.notes.append(f'the run cannot be followed beyond here: {reason_of(error)}')
     return sections
 
 
@@ -213,12 +218,16 @@ def _motion(run: RunDescription, simulation: Simulation, streams: Mapping[str, S
                   simulation.segment, exact, source)
 
 
+def _stamps(samples: Sequence[LogMessage]) -> Stamps:
+    return np.array([min(sample.log_time, LATEST_NS) for sample in samples], np.int64)
+
+
 def _analyse(found: Survey, section: Section, topic: str, samples: list[LogMessage]) -> None:
     """Analyse consecutive samples of a stream within a section."""
     stream, motion, segment = section.streams[topic], section.motion, section.motion.segment
     fitting = [sample for sample in samples if len(sample.data) == len(stream.template)]
     found.topics[topic].odd_size += len(samples) - len(fitting)
-    stamps_ns = np.array([sample.log_time for sample in fitting], np.int64)
+    stamps_ns = _stamps(fitting)
     fields = stream.template.decode(b''.join(sample.data for sample in fitting))
     if stream.topic in IMU_TOPICS:
         time = (stamps_ns - found.motions[0].begin_ns) / NANOSECONDS
@@ -238,7 +247,8 @@ def _analyse(found: Survey, section: Section, topic: str, samples: list[LogMessa
             series.add(data.stamps_ns, (value - start) / (abs(start) or 1.0))
     exact = segment.reference.solution
     if exact is not None:
-        truth = exact.states(data.stamps_ns - motion.origin_ns).rows_quaternion
+        times_ns = np.clip(data.stamps_ns - motion.origin_ns, -exact.ns_limit, exact.ns_limit)
+        truth = exact.states(times_ns).rows_quaternion
         found.errors.setdefault(topic, Series()).add(
             data.stamps_ns, angle_between(data.quaternion, truth))
 
@@ -275,6 +285,10 @@ def _measure(found: Survey, motion: Motion) -> None:
     data = analysis.longest_run(samples) if samples else None
     if data is None or len(data.stamps_ns) < 2:
         return
-    motion.measured = analysis.measure(data)
-    motion.regime = analysis.measured_regime(motion.segment.solver.top, data)
-    found.shown = found.shown or (motion, data.first(found.shown_s))
+    try:
+        motion.measured = analysis.measure(data)
+        motion.regime = analysis.measured_regime(motion.segment.solver.top, data)
+    except ODD as error:
+        found.notes.append(f'{motion.source} cannot be measured: {reason_of(error)}')
+    else:
+        found.shown = found.shown or (motion, data.first(found.shown_s))
