@@ -97,7 +97,8 @@ def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
     given: dict[str, object] = {}
     for path in arguments.params:
         given.update(read_scene(path))
-    given.update(parse_assignment(text) for text in arguments.param)
+    for text in arguments.param:
+        given.update(parse_assignment(text))
     given.update((name, value) for name, value in vars(arguments).items()
                  if name in ('seed', 'duration') and value is not None)
     values = parameters.checked(given)
