@@ -168,6 +168,8 @@ def _open_log(topics: Sequence[Topic], run: Run) -> McapRecorder:
     values, metadata = run[-1], provenance(*run)
     recorded = [RecordedTopic(*topic) for topic in topics]
     path = Path(values['record.uri']).expanduser().absolute()
+    if values['record.uri'].endswith('/'):
+        path.mkdir(parents=True, exist_ok=True)
     named = values['record.uri'] and not path.is_dir()
     paths = itertools.repeat(path) if named else _dated(path)
     while True:

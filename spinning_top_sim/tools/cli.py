@@ -12,8 +12,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TextIO
 
-from tqdm import tqdm
-
 OK = 0
 FAILED = 1
 INTERRUPTED = 130
@@ -61,8 +59,23 @@ def print_line(text: str, file: TextIO | None = None) -> None:
 def progress(what: str, total: float, unit: str, *, quiet: bool = False,
              ) -> Iterator[Callable[[float], None]]:
     """Show a bar on a terminal, nothing elsewhere; yield what takes the amount done so far."""
-    # None: no bar where there is no terminal.
-    with tqdm(total=total, unit=unit, desc=what, disable=quiet or not total > 0.0 or None,
+    if quiet or not total > 0.0 or not sys.stderr.isatty():
+        yield lambda done: None
+        return
+    try:
+        from tqdm import tqdm  # noqa: PLC0415 - a system may lack it
+    except ImportError:
+        shown = -1
+
+        def show(done: float) -> None:
+            nonlocal shown
+            shown, before = int(100.0 * min(done / total, 1.0)), shown
+            if shown != before:
+                print(f'\r{what} {shown} %', end='', file=sys.stderr, flush=True)
+        yield show
+        print(file=sys.stderr)
+        return
+    with tqdm(total=total, unit=unit, desc=what,
               bar_format='{desc} {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} {unit} '
                          '[{elapsed}<{remaining}]') as bar:
         yield lambda done: bar.update(min(done, total) - bar.n)

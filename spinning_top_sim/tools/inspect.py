@@ -83,10 +83,13 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> bool:
             raise ValueError('nothing to draw: no attitude of a top in this log')
         from spinning_top_sim.tools import plots  # noqa: PLC0415
 
+        shown = {}
         if arguments.plot is not None:
-            plots.draw_page(found, arguments.plot, arguments.log.name)
+            shown[arguments.plot] = plots.draw_page(found, arguments.plot, arguments.log.name)
         if arguments.animate is not None:
-            plots.animate(found, arguments.animate)
+            shown[arguments.animate] = plots.animate(found, arguments.animate)
+        for path, what in shown.items():
+            print_line(f'{path}: {what}', sys.stderr if arguments.json else None)
         return True
     except ImportError as error:
         print_line("inspect: pictures need matplotlib: pip install 'spinning_top_sim[plot]', or "

@@ -32,13 +32,14 @@ if TYPE_CHECKING:
 
 # In ROS a stamp of 0 means "no time".
 DEFAULT_EPOCH = 1.0
+MOST_SECONDS = 2.0 ** 31 - 1.0      # in a stamp
 FORMATS = ('mcap', 'csv', 'parquet')
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
     return exit_code(_parser(), argv, _run,
-                     (ValueError, RecordingError, IntegrationError, OSError))
+                     (ValueError, ArithmeticError, RecordingError, IntegrationError, OSError))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -75,6 +76,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(arguments: argparse.Namespace) -> int:
     values = _parameters(arguments)
+    if not 0.0 <= arguments.epoch <= MOST_SECONDS - values['duration']:
+        raise ValueError(f'--epoch {arguments.epoch:g}: stamps must be from 0 to 2^31 s')
     stops = parse_stops(arguments.command, round(values['duration'] * NANOSECONDS))
     output: Path = arguments.output
     file_format = arguments.format or output.suffix[1:]
