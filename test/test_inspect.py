@@ -24,6 +24,7 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.tools import analysis, cli, inspect, recover, simulate
+from spinning_top_sim.tools.recorded_run import read_run_description
 from spinning_top_sim.tools.survey import Series, survey
 
 RUN_S = 20
@@ -687,6 +688,18 @@ def test_a_log_that_ends_at_a_reset_or_a_start_verifies(tmp_path, capsys, when):
     code, content = as_json(capsys, path, '--verify')
     assert content['verify']['identical'] and code == 0, content['verify']
     assert all(topic['missing'] in (0, None) for topic in content['topics'].values())
+
+
+def test_the_journal_is_read_without_the_chunks_that_have_none_of_it(tmp_path, monkeypatch):
+    path = log_of(tmp_path / 'run.mcap', '--duration', 30, '--command', '14:1.7:1.4')
+    with open(path, 'rb') as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    with LogReader(path) as reader:
+        read, plain = [], reader._read
+        monkeypatch.setattr(reader, '_read', lambda span: (read.append(span), plain(span))[1])
+        run = read_run_description(reader)
+        assert [event.name for event in run.events] == ['start', 'command']
+        assert len(read) <= 4 < len(chunks)
 
 
 def test_names_do_not_act_on_the_terminal(tmp_path, capsys):

@@ -172,6 +172,8 @@ class LogReader:
             if (start is not None and span.end_ns < start) or (
                     end is not None and span.start_ns >= end):
                 continue
+            if names is not None and self._is_without(span, channels):
+                continue
             pending.sort()
             ready = bisect.bisect_left(pending, span.start_ns, key=itemgetter(0))
             yield from map(itemgetter(3), pending[:ready])
@@ -186,6 +188,12 @@ class LogReader:
                         contents.plain[begin:stop], channel)))
         pending.sort()
         yield from map(itemgetter(3), pending)
+
+    def _is_without(self, span: _Span, channels: Mapping[int, str]) -> bool:
+        """Whether a chunk has message indexes by the summary, and none of these channels."""
+        index = self._summary.chunks.get(span.offset)
+        return bool(index and index.message_index_offsets
+                    and index.message_index_offsets.keys().isdisjoint(channels))
 
     def scan(self) -> Scanner:
         """Begin a scan of all usable records in file order, with what former ones know."""
