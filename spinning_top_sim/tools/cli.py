@@ -20,10 +20,13 @@ TEXT_WIDTH = 118            # without a terminal
 GAP = '  '                  # before each column of a table
 
 
-def exit_code(parser: argparse.ArgumentParser, argv: Sequence[str] | None,
-              command: Callable[[argparse.Namespace], int],
-              errors: tuple[type[Exception], ...]) -> int:
+def run(name: str, help_text: str | None, argv: Sequence[str] | None,
+        add_arguments: Callable[[argparse.ArgumentParser], object],
+        command: Callable[[argparse.Namespace], int], errors: tuple[type[Exception], ...]) -> int:
     """Run a command; return its code, FAILED after one of `errors`, INTERRUPTED after Ctrl-C."""
+    parser = argparse.ArgumentParser(prog=name, description=help_text,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_arguments(parser)
     arguments = parser.parse_args(argv)
     try:
         code = command(arguments)
@@ -37,10 +40,10 @@ def exit_code(parser: argparse.ArgumentParser, argv: Sequence[str] | None,
         what = str(error)
         if isinstance(error, OSError) and error.filename is not None:
             what = f'{error.filename}: {error.strerror}'
-        print_line(f'{parser.prog}: {what}', sys.stderr)
+        print_line(f'{name}: {what}', sys.stderr)
         return FAILED
     except KeyboardInterrupt:
-        print_line(f'{parser.prog}: interrupted', sys.stderr)
+        print_line(f'{name}: interrupted', sys.stderr)
         return INTERRUPTED
 
 

@@ -84,12 +84,9 @@ def smooth_tip(data: Attitudes) -> tuple[Reals, Complexes, Reals]:
     return at * data.period, interpolate(data.tip, at), interpolate(data.height, at)
 
 
-def draw_page(found: Survey, path: Path, name: str) -> str:
+def draw_page(found: Survey, path: Path) -> str:
     """
     Draw a page of figures about a log with samples of attitudes; return what it shows.
-
-    path : picture to write; its extension is the format
-    name : of the log, for the title
 
     Raises OSError or ValueError where the picture cannot be written or the format is unknown.
     """
@@ -103,7 +100,7 @@ def draw_page(found: Survey, path: Path, name: str) -> str:
         figure = Figure(figsize=(11.0, 2.4 * rows + 0.6), layout='constrained')
         grid = figure.add_gridspec(rows, 2, height_ratios=[1.1, 1.1, 1.0, 1.0][:rows])
         regime = motion.regime or (motion.exact.name if motion.exact else '')
-        figure.suptitle(f'{name}: {regime}', fontsize=14)
+        figure.suptitle(f'{found.path.name}: {regime}', fontsize=14)
         _tip_panel(figure.add_subplot(grid[0:2, 0]), data, period or 0.0)
         tilt = figure.add_subplot(grid[0, 1])
         time, _, height = smooth_tip(data)
@@ -189,11 +186,7 @@ def _plot_series(axes: Axes, found: Survey, series: Series, **style: Any) -> Non
 
 
 def animate(found: Survey, path: Path) -> str:
-    """
-    Draw the turning top as a GIF: axis, disc with a mark, trace; return what it shows.
-
-    Raises OSError or ValueError where the picture cannot be written.
-    """
+    """Draw the turning top as a GIF: axis, disc with a mark, trace; else as `draw_page`."""
     assert found.shown is not None
     _, data = found.shown
     frames = max(2, int(min(LONGEST_S, float(data.time[-1])) * FRAMES_PER_S))

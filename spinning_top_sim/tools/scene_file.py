@@ -7,7 +7,6 @@ import difflib
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -22,7 +21,7 @@ ROS_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_servi
 class _Loader(yaml.SafeLoader):
     """Finds the types of plain scalars as rcl does: 1e5 is a double, 1_000 and ~ are strings."""
 
-    def compose_node(self, *place: Any) -> yaml.Node | None:
+    def compose_node(self, *place: object) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError('rcl supports no aliases')
         return super().compose_node(*place)

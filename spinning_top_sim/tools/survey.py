@@ -10,6 +10,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,6 +116,7 @@ class Section:
 class Survey:
     """All findings about a log."""
 
+    path: Path                            # of the log
     damage: Damage
     whole: bool                           # the log was closed, and nothing is lost
     end_ns: int                           # log time up to which samples were recorded [ns]
@@ -141,15 +143,11 @@ class Survey:
         return max(SHOWN_S, SHOWN_NUTATIONS * ((exact and exact.nutation_period) or 0.0))
 
 
+@np.errstate(all='ignore')                  # odd numbers are findings, too
 def survey(reader: LogReader) -> Survey:
     """Return the findings about a log.  Raises LogError."""
-    with np.errstate(all='ignore'):         # odd numbers are found, too
-        return _survey(reader)
-
-
-def _survey(reader: LogReader) -> Survey:
     damage = reader.damage
-    found = Survey(damage, reader.whole and not damage.truncated and damage.lossless,
+    found = Survey(reader.path, damage, reader.whole and not damage.truncated and damage.lossless,
                    damage.end_ns, {topic.name: TopicReport(topic.type_name)
                                    for topic in reader.topics})
     sections: list[Section] = []
