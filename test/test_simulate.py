@@ -350,9 +350,9 @@ def test_progress_is_shown_without_tqdm_too(monkeypatch):
             return True
 
     monkeypatch.setitem(sys.modules, 'tqdm', None)
-    for stream, quiet, shown in ((Terminal(), False, ['', 'verified 0 %', 'verified 50 %',
-                                                      'verified 100 %\n']),
-                                 (Terminal(), True, ['']), (io.StringIO(), False, [''])):
+    told = ['', 'verified   0%', 'verified  50%', 'verified  50%', 'verified 100%\n']
+    for stream, quiet, shown in ((Terminal(), False, told), (Terminal(), True, ['']),
+                                 (io.StringIO(), False, [''])):
         monkeypatch.setattr(sys, 'stderr', stream)
         with cli.progress('verified', 20.0, 's', quiet=quiet) as show:
             for done in (0.0, 10.0, 10.0001, 25.0):

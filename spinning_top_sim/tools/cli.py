@@ -68,14 +68,8 @@ def progress(what: str, total: float, unit: str, *, quiet: bool = False,
     try:
         from tqdm import tqdm  # noqa: PLC0415 - a system may lack it
     except ImportError:
-        shown = -1
-
-        def show(done: float) -> None:
-            nonlocal shown
-            shown, before = int(100.0 * min(done / total, 1.0)), shown
-            if shown != before:
-                print(f'\r{what} {shown} %', end='', file=sys.stderr, flush=True)
-        yield show
+        yield lambda done: print(f'\r{what} {min(done / total, 1.0):4.0%}', end='',
+                                 file=sys.stderr, flush=True)
         print(file=sys.stderr)
         return
     with tqdm(total=total, unit=unit, desc=what,

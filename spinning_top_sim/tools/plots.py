@@ -85,11 +85,7 @@ def smooth_tip(data: Attitudes) -> tuple[Reals, Complexes, Reals]:
 
 
 def draw_page(found: Survey, path: Path) -> str:
-    """
-    Draw a page of figures about a log with samples of attitudes; return what it shows.
-
-    Raises OSError or ValueError where the picture cannot be written or the format is unknown.
-    """
+    """Draw a page about a log with samples of attitudes (`found.shown`); return what it shows."""
     assert found.shown is not None
     motion, data = found.shown
     assert motion.measured is not None

@@ -119,15 +119,12 @@ def reason_of(error: Exception) -> str:
 
 
 def _topics(topics: Sequence[LogTopic], now: Mapping[str, Any]) -> dict[str, str]:
-    """
-    Return the topic in the log of each stream and of the parts of the journal.
-
-    A log as it was written has them in a known order, whatever they were remapped to.  In a log
-    that was put together anew they are known by the ends of their names.
-    """
+    """Return the topic in the log of each stream and of the parts of the journal."""
     every = all_streams(now)
     recorded = [*((stream.topic, stream.type_name)
                   for stream in journal.recorded_streams(every, now)), *journal.TOPICS]
+    # As the log was written they have this order, whatever they were remapped to.  In a log that
+    # was put together anew they are known by the ends of their names.
     if [topic.type_name for topic in topics] == [type_name for _, type_name in recorded]:
         return {name: topic.name for topic, (name, _) in zip(topics, recorded, strict=True)}
     known = [*((stream.topic, stream.type_name) for stream in every), *journal.TOPICS]

@@ -60,11 +60,7 @@ def read_scene(path: str | Path) -> dict[str, object]:
 
 
 def parse_assignment(text: str) -> dict[str, object]:
-    """
-    Return the value of NAME:=VALUE, read as YAML, by its name; nothing for a parameter of ROS.
-
-    Raises ValueError.
-    """
+    """Return the value of NAME:=VALUE, read as YAML, by its name; nothing for one of ROS."""
     name, separator, value = text.partition(':=')
     if not separator:
         raise ValueError(f'{text!r}: must be NAME:=VALUE')
@@ -88,11 +84,7 @@ def _flatten(section: Mapping[object, object], prefix: str = '') -> Iterator[tup
 
 
 def _known(values: Mapping[str, object], source: str) -> dict[str, object]:
-    """
-    Return the values without those of parameters of ROS.
-
-    Raises ValueError for a name that is unknown and a value that no ROS parameter has.
-    """
+    """Return the values but for those of ROS.  Raises ValueError for others than ours."""
     known = {name: value for name, value in values.items()
              if name.split('.')[0] not in ROS_PARAMETERS}
     for name, value in known.items():

@@ -124,15 +124,13 @@ class Survey:
     run: RunDescription | None = None     # None for a log that this package did not record
     foreign_reason: str = ''              # why not
     motions: list[Motion] = field(default_factory=list)
-    # By topic, of energy, l3 and lz: relative to their values at the beginning of the motion,
-    # absolute where these are 0.
+    # By topic, of energy, l3 and lz: relative to the beginning of the motion, if that is not 0.
     drifts: dict[str, dict[str, Series]] = field(default_factory=dict)
     # By topic: angle between the attitude and the exact solution [rad].
     errors: dict[str, Series] = field(default_factory=dict)
     # The first motion with samples, and its samples shown in pictures.
     shown: tuple[Motion, Attitudes] | None = None
-    # By topic of the IMU, in the same time: (n, 7) time since the first motion began [s],
-    # angular velocity [rad/s], specific force [m/s^2].
+    # By topic: (n, 7) time [s], angular velocity [rad/s], specific force [m/s^2].
     readings: dict[str, list[Reals]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
