@@ -527,6 +527,19 @@ def test_a_table_breaks_no_cell_however_narrow(width, stacked):
         assert [line.split() for line in lines] == cells
 
 
+def test_a_terminal_of_80_columns_holds_every_line_and_whole_names(stepped, capsys, monkeypatch):
+    monkeypatch.setenv('COLUMNS', '80')
+    out = told(capsys, stepped, '--verify')[1]
+    assert max(map(len, out.splitlines()[1:])) <= 80
+    for name in ('visualization_msgs/msg/MarkerArray', 'sensor_msgs/msg/JointState',
+                 '/a/b/ground_truth/imu_bias', '/a/b/spinning_top/invariants'):
+        assert f'{name} ' in out or f'{name}\n' in out
+    for tool in (inspect, recover, simulate):
+        with pytest.raises(SystemExit):
+            tool.main(['--help'])
+        assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
+
+
 def test_json_is_strict_and_documented(columns, capsys):
     _, out, _ = told(capsys, columns, '--json', '--verify')
     content = json.loads(out, parse_constant=pytest.fail)

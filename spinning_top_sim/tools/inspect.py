@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Show what is in a log: topics, gaps, the motions measured from the data beside the exact ones,
-drifts, errors.  Reads damaged logs too.
+Show what is in a log: topics, gaps, the motions measured from the data beside
+the exact ones, drifts, errors.  Reads damaged logs too.
 
 exit codes:
   0    no fault was found
-  1    the file cannot be read or is damaged, --verify found a difference or could not
-       compute the run, or a picture could not be drawn
+  1    the file cannot be read or is damaged, --verify found a difference or
+       could not compute the run, or a picture could not be drawn
   2    wrong arguments
   130  interrupted
 The keys of --json are in docs/inspect.md.

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Write everything that is whole in a truncated or damaged MCAP log into a new log that every
-reader takes: chunks as they are, index and summary made anew.  The old file is only read.
+Write everything that is whole in a truncated or damaged MCAP log into a new
+log that every reader takes: chunks as they are, index and summary made anew.
+The old file is only read.
 
 exit codes:
   0    everything was kept (index and summary do not count)
-  1    nothing was written: no whole message in it, no MCAP file, not readable, or the
-       output exists
+  1    nothing was written: no whole message in it, no MCAP file, not readable,
+       or the output exists
   2    wrong arguments
   3    some was lost: what and how much is printed
   130  interrupted: nothing was written

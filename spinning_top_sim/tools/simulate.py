@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Simulate the heavy symmetric top offline, as the node does, into a log (MCAP) or a table of the
-true states (CSV, Parquet).
+Simulate the heavy symmetric top offline, as the node does, into a log (MCAP)
+or a table of the true states (CSV, Parquet).
 
 exit codes:
   0    done
