@@ -71,7 +71,9 @@ def _nodes(context: LaunchContext) -> list:
     values = {}
     for path in files:
         values.update(read_scene(path))
-    asked = dict(map(parse_assignment, shlex.split(given['set'])))
+    asked = {}
+    for text in shlex.split(given['set']):
+        asked.update(parse_assignment(text))
     values = parameters.checked({**values, **asked})
     prefix = given['frame_prefix']
     if prefix == 'auto':
