@@ -59,18 +59,23 @@ help:
 	@echo
 	@echo 'PYTHON=$(PYTHON)  interpreter, 3.11 or newer;  VENV=$(VENV)  virtual environment'
 
+# A name, or the path of a parameter file.
+SCENE_FILE = $(or $(wildcard $(filter %.yaml,$(SCENE))),config/$(SCENE).yaml)
+
+# One installs at a time: a second `make run` waits here, and finds everything installed.
 run: export ROS_DOMAIN_ID := $(RUN_DOMAIN_ID)
-run: check-scene $(VENV)/.deps-plot $(VENV)/.package
+run: check-scene
+	@flock Makefile $(MAKE) --no-print-directory '$(VENV)/.deps-plot' '$(VENV)/.package'
 	@mkdir -p '$(LOGS)'
 	@echo 'Scene $(SCENE), recording into $(LOGS)/, until Ctrl-C. To listen from another terminal of'
 	@echo 'this machine:  export ROS_DOMAIN_ID=$(RUN_DOMAIN_ID)' \
 	    'ROS_AUTOMATIC_DISCOVERY_RANGE=$(ROS_AUTOMATIC_DISCOVERY_RANGE)'
-	@exec '$(VENV)/bin/sim_node' --ros-args --params-file 'config/$(SCENE).yaml' \
+	@exec '$(VENV)/bin/sim_node' --ros-args --params-file '$(SCENE_FILE)' \
 	    -p record.enabled:=true -p 'record.uri:=$(LOGS)/' $(ARGS)
 
 check-scene:
-	@test -f 'config/$(SCENE).yaml' || { \
-	    echo 'There is no scene "$(SCENE)" (config/$(SCENE).yaml). There are: $(SCENES)' >&2; exit 2; }
+	@test -f '$(SCENE_FILE)' || { \
+	    echo 'There is no scene "$(SCENE)" ($(SCENE_FILE)). There are: $(SCENES)' >&2; exit 2; }
 
 dependencies: $(VENV)/.deps-test $(VENV)/.package
 

@@ -111,8 +111,7 @@ def simulate(values: dict[str, float], hours: float) -> tuple[np.ndarray, np.nda
     """Return readings and biases of a run, (n, 6): rates [rad/s], specific force [m/s²]."""
     simulation = Simulation(parameters.checked({**HANGING, **values}))
     found: dict[str, list[np.ndarray]] = {'imu/data_raw': [], 'ground_truth/imu_bias': []}
-    simulation.log_to(lambda *messages: None,
-                      [stream for stream in simulation.streams if stream.topic in found])
+    simulation.log_to(None, [stream for stream in simulation.streams if stream.topic in found])
 
     def take(stream, stamps_ns, rows):
         _, rates, force = stream.template.decode(rows.tobytes())

@@ -72,7 +72,7 @@ class Bare(Node):
             if bounds and isinstance(value, float):
                 descriptor.floating_point_range = [FloatingPointRange(
                     from_value=float(bounds[0]), to_value=float(bounds[1]))]
-            elif bounds:
+            elif bounds and isinstance(value, int):
                 descriptor.integer_range = [IntegerRange(from_value=bounds[0],
                                                          to_value=bounds[1])]
             if not self.has_parameter(name):

@@ -42,9 +42,12 @@ def parameter_file(path: Path) -> None:
     rows = []
     for parameter in parameters.TABLE:
         value = parameter.default
+        lowest = parameter.minimum if parameter.above is None else parameter.above
+        largest = sys.float_info.max if parameter.is_double else 2 ** 62
         bounds = None
-        if type(parameter.default) in (int, float, type(None)):
-            bounds = [0.0 if parameter.or_zero else parameter.minimum, parameter.maximum]
+        if lowest is not None or parameter.maximum is not None:
+            bounds = [-largest if lowest is None else lowest,
+                      largest if parameter.maximum is None else parameter.maximum]
         rows.append([parameter.name, 1.0 if value is None else value, parameter.description,
                      bounds])
     path.write_text(json.dumps(rows))

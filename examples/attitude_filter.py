@@ -16,6 +16,7 @@ end of --settle on.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import itertools
 import json
 import math
@@ -396,7 +397,11 @@ def main(argv: list[str] | None = None) -> int:
     """Compare; return 0, 1 where nothing could be compared, 2 for what could not be started."""
     argv = sys.argv if argv is None else argv
     own = argv[1:argv.index('--ros-args')] if '--ros-args' in argv else argv[1:]
-    arguments = _parser().parse_args(own)
+    parser = _parser()
+    arguments = parser.parse_args(own)
+    if arguments.log is None and 0.0 < arguments.duration <= arguments.settle:
+        parser.error(f'--duration {arguments.duration:g} must be more than --settle '
+                     f'{arguments.settle:g}: errors count from then on')
     if arguments.log is None:
         return executable.run('attitude_filter', argv, lambda _: lambda: make_node(arguments))
     from spinning_top_sim.recording.errors import LogError
@@ -428,10 +433,10 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _not_negative(text: str) -> float:
-    value = float(text)
-    if not (math.isfinite(value) and value >= 0.0):
-        raise argparse.ArgumentTypeError(f'{text}: must be a finite number >= 0')
-    return value
+    with contextlib.suppress(ValueError):
+        if 0.0 <= float(text) < math.inf:
+            return float(text)
+    raise argparse.ArgumentTypeError(f'{text}: must be a finite number >= 0')
 
 
 if __name__ == '__main__':

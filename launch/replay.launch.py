@@ -58,7 +58,7 @@ def _nodes(context: LaunchContext) -> list:
         options.append('--clock' if given['clock'].lower() == 'true'
                        else f'--clock={given["clock"]}')
     node = Node(package='spinning_top_sim', executable='replay_node', output='screen',
-                emulate_tty=True, arguments=[given['file'], *options],
+                arguments=[given['file'], *options],
                 on_exit=Shutdown(reason='it has ended'))
     actions = [node]
     if not (on['tf'] or on['rviz']):
@@ -74,7 +74,7 @@ def _nodes(context: LaunchContext) -> list:
         actions += launch_helpers.state_publisher(
             SHARE, run.now, namespace, run.topics['joint_states'], clocked)
     if on['rviz']:
-        actions.append(launch_helpers.rviz(SHARE, run.now['world_frame'], namespace, clocked))
+        actions += launch_helpers.rviz(SHARE, run.now['world_frame'], namespace, clocked)
     return actions
 
 

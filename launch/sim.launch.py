@@ -6,6 +6,7 @@ Simulate a scene, with TF and optionally RViz.
   ros2 launch spinning_top_sim sim.launch.py namespace:=left set:='spin.l3:=2.0 seed:=7'
 """
 
+import json
 import shlex
 from pathlib import Path
 
@@ -68,13 +69,11 @@ def _nodes(context: LaunchContext) -> list:
     on = {name: given[name] == 'true' for name in ('use_sim_time', 'tf', 'rviz', 'markers')}
     namespace = given['namespace'].strip('/')
     files = [_scene_file(given['scene']), *filter(None, [given['params_file']])]
-    values = {}
-    for path in files:
-        values.update(read_scene(path))
-    asked = {}
-    for text in shlex.split(given['set']):
-        asked.update(parse_assignment(text))
-    values = parameters.checked({**values, **asked})
+    scene, *second = map(read_scene, files)
+    asked = dict(map(parse_assignment, shlex.split(given['set'])))
+    for values in second:
+        asked = {**values, **asked}
+    values = parameters.checked({**scene, **asked})
     prefix = given['frame_prefix']
     if prefix == 'auto':
         prefix = f'{namespace}/' if namespace else ''
@@ -85,22 +84,25 @@ def _nodes(context: LaunchContext) -> list:
         asked['record.enabled'] = True
         if given['record'] != 'true':
             asked['record.uri'] = given['record']
-    values = parameters.checked({**values, **asked})
+    values = parameters.checked({**scene, **asked})
 
+    # As `-p` too: that wins also over an integer in a file, which hides a double of a later one.
     node = Node(package='spinning_top_sim', executable='sim_node', namespace=namespace,
-                output='screen', emulate_tty=True, sigterm_timeout='15',
+                output='screen', sigterm_timeout='15',
                 on_exit=Shutdown(reason='it has ended'), parameters=[*map(str, files), {
                     **{name: list(value) if isinstance(value, tuple) else value
                        for name, value in asked.items()},
-                    'use_sim_time': on['use_sim_time']}])
+                    'use_sim_time': on['use_sim_time']}],
+                ros_arguments=[word for name in asked for word in (
+                    '-p', f'{name}:={json.dumps(values[name])}')])
     actions = [node]
     if on['tf']:
         actions += launch_helpers.state_publisher(
             SHARE, values, namespace, resolve_topic('joint_states', namespace),
             on['use_sim_time'])
     if on['rviz']:
-        actions.append(launch_helpers.rviz(SHARE, values['world_frame'], namespace,
-                                           on['use_sim_time']))
+        actions += launch_helpers.rviz(SHARE, values['world_frame'], namespace,
+                                       on['use_sim_time'])
     return actions
 
 

@@ -185,3 +185,13 @@ def test_live_it_ends_by_sigint_and_tells(example, tmp_path):
         assert node.end(signal.SIGINT) == 0
     assert 'heading drift' in node.out
     assert 'Traceback' not in node.err
+
+
+@pytest.mark.parametrize(('arguments', 'says'), [
+    (['--duration', '10'], '--duration 10 must be more than --settle 15'),
+    (['--duration', '3', '--settle', '3'], '--duration 3 must be more than --settle 3'),
+    (['--settle', 'x'], 'x: must be a finite number >= 0')])
+def test_what_would_compare_nothing_is_refused_before_it_runs(example, capsys, arguments, says):
+    with pytest.raises(SystemExit, match='2'):
+        example.main(['attitude_filter', *arguments])
+    assert says in capsys.readouterr().err

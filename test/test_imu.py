@@ -326,7 +326,34 @@ def test_readings_saturate_and_are_rounded():
     assert found.tolist() == [[1.0, -4.0, 4.0, 1.1, -20.0, 20.0],
                               [0.0, 0.25, 4.0, 2.0, 2.0, -2.0]]
     assert not np.signbit(found[1, 0]), 'no reading is -0'
+    assert not np.signbit(read(sensor, range(1), tuple((np.array([-1e-9]),) * 3
+                                                       for _ in range(2)))[0][0, 0])
     assert sensor.rate_variance == pytest.approx(0.25 ** 2 / 12.0)
+
+
+@pytest.mark.parametrize(('limit', 'step'), [
+    (4.0, 0.3), (34.9066, 1.06423e-3), (0.3, 0.1), (156.906, 4.78840e-3), (1.0, 3.0), (7.0, 7.0),
+    (1e12, 1e-12), (1e-12, 1e12)])
+def test_no_reading_is_beyond_the_range_or_off_the_grid_of_the_resolution(limit, step):
+    sensor = Sensor(parameters.checked({
+        'imu.gyroscope_range': limit, 'imu.gyroscope_resolution': step,
+        'imu.accelerometer_range': limit}), PERIOD_NS)
+    values = limit * np.array([-3.0, -1.0, -0.999, 0.999, 1.0, 1.001, 1e6])
+    times = range(0, len(values) * PERIOD_NS, PERIOD_NS)
+    found, _ = read(sensor, times, 2 * ((values, values, values),))
+    assert np.abs(found).max() <= limit
+    codes = found[:, :3] / step
+    assert np.abs(codes - np.rint(codes)).max() <= 1e-9 * max(1.0, np.abs(codes).max())
+    # No more than a step is lost, and both ends are alike.
+    assert found[-1, 0] >= limit - step - 1e-15 * limit and found[0, 0] == -found[-1, 0]
+    assert found[-1, 3] == limit and np.array_equal(found[2:4, 3], values[2:4])
+
+
+@pytest.mark.parametrize('kind', ['gyroscope', 'accelerometer'])
+@pytest.mark.parametrize('step', [1e-310, 5e-324, 1e-13, -0.1, math.nan])
+def test_a_resolution_that_doubles_cannot_divide_by_is_refused(kind, step):
+    with pytest.raises(ValueError, match=rf'imu\.{kind}_resolution = {step!r}: must be'):
+        parameters.checked({f'imu.{kind}_resolution': step})
 
 
 def test_equal_seeds_give_equal_bytes_in_any_company():

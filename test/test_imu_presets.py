@@ -4,11 +4,13 @@
 import json
 import math
 
+import numpy as np
 import pytest
 from helpers.reference import ROOT, scene_parameters
 
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.imu import Sensor
 from spinning_top_sim.tools.scene_file import read_scene
 from spinning_top_sim.tools.simulate import main as simulate
 
@@ -34,16 +36,26 @@ def walk_of(stability, density):
     return math.sqrt(3.0) * stability ** 2 / (2.0 * density)
 
 
+def in_16_bits(nominal, resolution):
+    """Return the largest reading within a range: codes of 16 bits end at 32767."""
+    return min(nominal, 32767 * resolution)
+
+
 ADIS_RATE, ADIS_FORCE = 0.34 * DEG / 60.0, 0.037 / 60.0
 # Of gyroscope and accelerometer: noise density, walk, turn-on bias, range, resolution.
 DATA_SHEETS = {
     'perfect': (5 * (0.0,), 5 * (0.0,)),
-    'bmi088': ((one_sided(0.014 * DEG), 0.0, 1.0 * DEG, 2000.0 * DEG, DEG / 16.384),
+    'bmi088': ((one_sided(0.014 * DEG), 0.0, 1.0 * DEG,
+                in_16_bits(2000.0 * DEG, DEG / 16.384), DEG / 16.384),
                (one_sided(190e-6 * G), 0.0, 0.020 * G, 6.0 * G, G / 5460.0)),
-    'icm_42688_p': ((one_sided(0.0028 * DEG), 0.0, 0.5 * DEG, 2000.0 * DEG, DEG / 16.4),
-                    (one_sided(70e-6 * G), 0.0, 0.020 * G, 16.0 * G, G / 2048.0)),
-    'icm_20948': ((one_sided(0.015 * DEG), 0.0, 5.0 * DEG, 2000.0 * DEG, DEG / 16.4),
-                  (one_sided(230e-6 * G), 0.0, 0.025 * G, 16.0 * G, G / 2048.0)),
+    'icm_42688_p': ((one_sided(0.0028 * DEG), 0.0, 0.5 * DEG,
+                     in_16_bits(2000.0 * DEG, DEG / 16.4), DEG / 16.4),
+                    (one_sided(70e-6 * G), 0.0, 0.020 * G,
+                     in_16_bits(16.0 * G, G / 2048.0), G / 2048.0)),
+    'icm_20948': ((one_sided(0.015 * DEG), 0.0, 5.0 * DEG,
+                   in_16_bits(2000.0 * DEG, DEG / 16.4), DEG / 16.4),
+                  (one_sided(230e-6 * G), 0.0, 0.025 * G,
+                   in_16_bits(16.0 * G, G / 2048.0), G / 2048.0)),
     'adis16470': ((ADIS_RATE, walk_of(8.0 * DEG / 3600.0, ADIS_RATE), 0.2 * DEG, 2000.0 * DEG,
                    0.1 * DEG),
                   (ADIS_FORCE, walk_of(13e-6 * G, ADIS_FORCE), 0.004 * G, 40.0 * G, 1.25e-3 * G)),
@@ -74,6 +86,20 @@ def test_the_derived_walk_puts_the_minimum_where_the_data_sheet_has_it():
     lowest = min(math.sqrt(9.0 / tau + walk ** 2 * tau / 3.0)
                  for tau in (0.001 * k for k in range(1, 10_000)))
     assert lowest == pytest.approx(8.0, rel=1e-6)
+
+
+@pytest.mark.parametrize('path', PRESETS, ids=lambda path: path.stem)
+def test_a_preset_reads_no_more_than_its_range_and_its_16_bits(path):
+    values = parameters.checked(read_scene(path))
+    device = Sensor(values, 1_000_000)
+    times = range(0, 100_000_000, 1_000_000)
+    for sign in (1.0, -1.0):
+        rates, force = device.read(((sign * 1e4,) * 3, (sign * 1e4,) * 3), times)
+        for kind, axes in (('gyroscope', rates), ('accelerometer', force)):
+            *_, limit, step = sensor(values, kind)
+            assert all(np.abs(axis).max() <= (limit or math.inf) for axis in axes)
+            if step:
+                assert all(19_990 < abs(np.rint(axis / step)).max() <= 32_767 for axis in axes)
 
 
 def test_simulate_takes_a_preset_on_top_of_a_scene(tmp_path):

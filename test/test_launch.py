@@ -21,7 +21,7 @@ from helpers.reference import ROOT, SCENES
 from spinning_top_sim import nodes
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import simulate
-from spinning_top_sim.tools.scene_file import read_scene
+from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
 
 pytest.importorskip('ament_index_python')
 pytest.importorskip('xacro')
@@ -204,17 +204,10 @@ def test_without_the_means_there_is_a_line_and_no_tf(installed, monkeypatch, mis
         monkeypatch.setitem(sys.modules, 'xacro', None)
     run = started('sim')
     assert set(run.nodes) == {'spinning_top_sim/sim_node'}
-    assert run.said == [f'no TF: the package {missing} is not installed']
+    (warning,) = run.said
+    assert warning.startswith('WARNING: no TF: ')
+    assert f'sudo apt install ros-$ROS_DISTRO-{missing.replace("_", "-")}' in warning
     assert started('sim', tf='false').said == []
-
-
-def test_without_rviz_nothing_is_started_for_it(installed):
-    installed.discard('rviz2')
-    with pytest.raises(LookupError, match='rviz2'):
-        started('sim', rviz='true')
-
-
-# ---------------------------------------------------------------------------------- replay.launch
 
 
 @pytest.fixture
@@ -224,6 +217,36 @@ def log(tmp_path):
                           '-p', 'body_frame:=a/b/wheel', '-p', 'imu.lever_arm:=[0.1,0.2,0.3]',
                           ]) == 0
     return path
+
+
+def test_without_rviz_a_warning_names_the_package_and_all_else_starts(installed, log):
+    installed.discard('rviz2')
+    for run in (started('sim', rviz='true'), started('replay', file=str(log), rviz='true')):
+        (warning,) = run.said
+        assert warning.startswith('WARNING: no RViz: ')
+        assert 'sudo apt install ros-$ROS_DISTRO-rviz2' in warning
+        assert f'{RSP}/{RSP}' in run.nodes and len(run.nodes) == 2
+
+
+def test_nodes_write_whole_lines_for_the_launch(installed, log):
+    for run in (started('sim'), started('replay', file=str(log))):
+        assert not any(getattr(node, 'emulate_tty', False) for node in run.nodes.values())
+
+
+def test_overrides_win_over_integers_in_files(installed, tmp_path):
+    """Between parameter files rcl takes an integer, wherever it stands, and drops a double."""
+    for name, value in (('scene', '2'), ('second', '2.5')):
+        (tmp_path / f'{name}.yaml').write_text(
+            f'/**:\n  ros__parameters:\n    spin.l3: {value}\n    top.mass: {value}\n')
+    run = started('sim', scene=str(tmp_path / 'scene.yaml'), set='spin.l3:=1.5 record.uri:="a b"',
+                  params_file=str(tmp_path / 'second.yaml'))
+    words = run.nodes['spinning_top_sim/sim_node'].ros_arguments
+    assert words[::2] == len(words[1::2]) * ['-p']
+    given = dict(map(parse_assignment, words[1::2]))
+    assert (given['spin.l3'], given['top.mass'], given['record.uri']) == (1.5, 2.5, 'a b')
+
+
+# ---------------------------------------------------------------------------------- replay.launch
 
 
 def options_of(node):

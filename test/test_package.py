@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The package as colcon, pip and `ros2 run` see it: manifest, versions, executables, files."""
 
+import fcntl
 import inspect
 import os
 import re
@@ -225,6 +226,34 @@ def test_make_run_installs_what_the_tools_draw_with():
     plan = subprocess.run(['make', '--dry-run', '--always-make', 'run'], cwd=ROOT, check=True,
                           capture_output=True, text=True, timeout=60).stdout
     assert "'.[build,plot]'" in plan and "'.[build,ros]'" in plan
+
+
+@pytest.mark.parametrize(('scene', 'file'), [
+    ('wavy', 'config/wavy.yaml'), ('config/wavy.yaml', 'config/wavy.yaml'),
+    (str(ROOT / 'config/wavy.yaml'), str(ROOT / 'config/wavy.yaml'))])
+def test_make_run_takes_a_scene_by_name_or_path(scene, file):
+    plan = subprocess.run(['make', '--dry-run', 'run', f'SCENE={scene}'], cwd=ROOT, check=True,
+                          capture_output=True, text=True, timeout=60).stdout
+    assert f"--params-file '{file}'" in plan
+
+
+def test_make_run_names_the_scenes_where_there_is_none_of_a_name():
+    for scene in ('nothing', 'config/nothing.yaml'):
+        made = subprocess.run(['make', 'run', f'SCENE={scene}'], cwd=ROOT, check=False,
+                              capture_output=True, text=True, timeout=60)
+        assert made.returncode == 2
+        assert f'There is no scene "{scene}"' in made.stderr and 'looping' in made.stderr
+
+
+def test_a_second_make_run_waits_while_the_first_installs():
+    with (ROOT / 'Makefile').open() as makefile:
+        fcntl.flock(makefile, fcntl.LOCK_EX)
+        second = subprocess.Popen(['make', '--dry-run', 'run'], cwd=ROOT, text=True,
+                                  stdout=subprocess.PIPE)
+        with pytest.raises(subprocess.TimeoutExpired):
+            second.communicate(timeout=1.0)
+    assert 'sim_node' in second.communicate(timeout=60)[0]
+    assert second.returncode == 0
 
 
 def test_every_source_says_its_license():

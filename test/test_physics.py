@@ -294,6 +294,33 @@ def test_ends_of_a_range_show_no_rounding_dust():
     assert 0.0 < abs(description.precession_min) < 1e-12
 
 
+@pytest.mark.parametrize('theta_dot', [1e-2, 1e-4, 1e-6, 1e-8, 1e-10])
+@pytest.mark.parametrize('theta', [0.02, 0.5, 2.5, 3.1415])
+def test_a_range_shows_two_ends_or_the_tilt_rests(theta, theta_dot):
+    top = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
+    # Steady precession, touched: lambda1 cos(theta) Omega^2 - L3 Omega + P = 0.
+    l3, cosine = 2.0, math.cos(theta)
+    rate = 2.0 * top.gravity_torque / (l3 + math.sqrt(
+        l3 * l3 - 4.0 * top.lambda1 * cosine * top.gravity_torque))
+    lz = top.lambda1 * rate * math.sin(theta) ** 2 + l3 * cosine
+    description = ExactSolution(
+        top, State(theta=theta, theta_dot=theta_dot, l3=l3, lz=lz)).describe()
+    rests = description.name in ('steady precession', 'sleeping', 'hanging')
+    assert rests == (description.nutation_period is None) == (' every ' not in str(description))
+    assert not rests or theta_dot < 1e-5
+    if not rests:
+        low, high = str(description).split('from ')[1].split(' deg')[0].split(' to ')
+        assert float(low) < float(high)
+
+
+def test_a_start_beside_the_top_is_described():
+    top = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
+    for theta in (1e-100, 1e-170, 1e-200):
+        description = ExactSolution(top, State(theta=theta, l3=2.0, lz=2.0)).describe()
+        assert description.name == 'sleeping' and description.theta_min == theta
+        assert ' every ' not in str(description)
+
+
 def test_swing_contains_every_reference_tilt():
     """Two roots that nearly meet are known to the square root of a rounding only."""
     for case in CASES.values():

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the node says about itself, without a node."""
 
+import io
 import math
+import os
 from types import SimpleNamespace
 
 import pytest
@@ -29,10 +31,10 @@ def reported():
     """A report of a paused simulation that stands at 1.25 s, and what it is about."""
     values = parameters.checked({'start_paused': True})
     simulation = Simulation(values)
-    session = SimpleNamespace(error=None, size=None, numbers=lambda: {'recorder': 'off'},
+    session = SimpleNamespace(error=None, size='', numbers=lambda: {'recorder': 'off'},
                               has_room=lambda: True,
                               write_command=print, write_event=lambda *_, **__: None)
-    loop = TickLoop(simulation, values, session, update_subscribers=lambda: None, error=print)
+    loop = TickLoop(simulation, values, session, update_subscribers=lambda: None, tell=print)
     loop.start()
     loop.step(1, 1.25)
     return SimpleNamespace(report=MotionReport(simulation, loop, session), loop=loop,
@@ -93,11 +95,68 @@ def test_the_status_line_and_what_is_told_of_a_new_motion(reported):
     assert 'cusp' in told
     assert reported.report.new_motion() is None
     line = reported.report.status_line()
-    assert line.startswith('t      1.25 s paused | ') and line.endswith(' 0 msgs')
-    assert 'L3 1.6 Lz 1.386' in line
+    assert line.startswith('t      1.25 s paused | ') and 'x' not in line.split()
+    assert 'L3 1.6 Lz 1.386' in line and 'no subscribers yet' in line
+    status_of(reported)
     reported.session.size = '1.2 MB'
     reported.loop.command(2.0, 1.0)
     assert reported.report.new_motion() is not None
-    assert reported.report.status_line().endswith(' | log 1.2 MB')
+    assert ' | log 1.2 MB | ' in reported.report.status_line()
+    reported.simulation.streams[0].sent = 12
+    assert ' | 12 messages | ' in reported.report.status_line()
+    reported.loop.waits_for_clock = True
+    assert ' waiting for /clock | ' in reported.report.status_line()
+    assert status_of(reported)[:2] == (1, 'waiting for /clock')
     reported.loop.fail('at a pole')
     assert ' FAILED | ' in reported.report.status_line()
+
+
+class Screen(io.StringIO):
+    """A standard output that is a terminal, or none."""
+
+    def __init__(self, columns):
+        super().__init__()
+        self.columns = columns
+
+    def isatty(self):
+        return self.columns is not None
+
+
+@pytest.fixture
+def screen(monkeypatch):
+    """Return a terminal of so many columns (None: no terminal), and what is shown."""
+    def of(columns):
+        out = Screen(columns)
+        monkeypatch.setattr(reports.sys, 'stdout', out)
+        monkeypatch.setattr(reports.os, 'get_terminal_size', lambda *_: os.terminal_size(
+            (out.columns, 24)))
+        return reports.Terminal(), out
+    return of
+
+
+def test_the_status_line_fits_the_terminal_also_when_that_becomes_narrower(screen):
+    terminal, out = screen(20)
+    terminal.show('123456 | 123456 | 123456')
+    terminal.show('123456 | 12345678901 | 1')
+    out.columns = 5
+    terminal.show('123456 | 123456 | 123456')
+    assert out.getvalue().split('\r\x1b[K') == ['', '123456 | 123456', '123456', '1234']
+
+
+def test_nothing_stands_behind_the_status_line(screen):
+    terminal, out = screen(80)
+    terminal.show('one | two')
+    terminal.end()
+    terminal.end()
+    terminal.show('three')
+    terminal.tell('done')
+    assert out.getvalue() == '\r\x1b[Kone | two\n\r\x1b[Kthree\ndone\n'
+
+
+@pytest.mark.parametrize('columns', [None, 0])
+def test_without_a_terminal_or_under_launch_lines_are_whole(screen, columns):
+    terminal, out = screen(columns)
+    terminal.show('a | ' * 50 + 'z')
+    terminal.show('b')
+    terminal.end()
+    assert out.getvalue() == 'a | ' * 50 + 'z\nb\n'

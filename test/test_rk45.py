@@ -557,6 +557,7 @@ EXTREMES = {
     'thin, spinning': of_size(1e-8, 1e-310, 1e-309, theta=math.pi, theta_dot=-1e-150, l3=-1e-310,
                               lz=1e-310),
     'thick': of_size(1e150, 1e-150, -1e-143, theta=1e-8, theta_dot=-1e3, l3=-1e20, lz=-1e20),
+    'turned far': of_size(1.0, 0.5, 4.9, theta=0.6, l3=2.0, lz=1.0, phi=1.7e308, psi=1.7e308),
     'light': of_size(1e-8, 1e-8, 1e-20, theta=0.4, theta_dot=3.0, l3=1e-9, lz=1e-10),
     'heavy': of_size(1e8, 2e8, 1e8, theta=3.1, theta_dot=0.3, l3=1e6, lz=-1e6),
 }

@@ -2,6 +2,7 @@
 """How the node ends, what it does not do while nobody listens, and how it bears overload."""
 
 import json
+import os
 import signal
 import subprocess
 import time
@@ -13,7 +14,7 @@ import pytest
 pytest.importorskip('rclpy')
 
 from geometry_msgs.msg import PoseStamped
-from helpers.node_harness import Diagnostics, SimNode, wait_for
+from helpers.node_harness import PATIENCE_S, Diagnostics, SimNode, wait_for
 from helpers.node_logs import (
     KINDS,
     PERIODS_NS,
@@ -161,7 +162,7 @@ def test_the_default_scene_imports_just_what_it_uses(finished):
             if name.startswith('spinning_top_sim.') and name.count('.') == 2}
     assert {name for name in ours if name.startswith(('nodes.', 'recording.', 'tools.'))} == {
         'nodes.executable', 'nodes.pacing', 'nodes.recording_session', 'nodes.reports',
-        'nodes.ros_parameters', 'nodes.simulator', 'nodes.stream_publishers', 'nodes.tick_loop',
+        'nodes.ros_parameters', 'nodes.simulator', 'nodes.tick_loop',
         'recording.errors'}
     messages = {name.split('.')[0] for name in modules if name.endswith('_msgs')}
     assert messages <= {
@@ -199,9 +200,11 @@ def test_however_it_is_ended_the_log_is_whole(peer, tmp_path, case):
 def test_a_signal_while_it_starts_ends_it_quietly(tmp_path, number):
     """From 0.15 s (python is there) on to where it runs."""
     seen = set()
-    for delay in (0.15, 0.25, 0.35, 0.5, 0.7, 0.9):
+    for delay in (0.15, 0.25, 0.35, 0.5, 0.7, 0.9, PATIENCE_S):
         with SimNode(tmp_path / str(delay), {'record.enabled': True}) as node:
-            time.sleep(delay)
+            end = time.monotonic() + delay
+            while time.monotonic() < end and 'recording to' not in node.err:
+                time.sleep(0.01)
             code = node.end(number)
         seen.add(code)
         allowed = {0, 130} if number == signal.SIGINT else {0, -signal.SIGTERM}
@@ -428,6 +431,27 @@ def test_an_error_that_nobody_expects_stops_the_motion_loudly_until_a_reset(
     status = diagnostics.wait_for(node, 'the recording that ended',
                                   lambda s: 'recording: unexpected' in s.message)
     assert status.level == b'\x02'
+
+
+HUNG_DISK = """
+import os, runpy, time
+ordinary = os.fsync
+os.fsync = lambda file: time.sleep(1000.0) if os.path.exists('hung') else ordinary(file)
+runpy.run_module('spinning_top_sim.nodes.sim_node', run_name='__main__')
+"""
+
+
+def test_with_a_hung_disk_the_node_ends_all_the_same(peer, tmp_path):
+    with SimNode(tmp_path, {**QUIET, 'record.enabled': True, 'record.max_loss': 0.1},
+                 program=('-c', HUNG_DISK)) as node:
+        pose = peer.listen(node.topic('pose'), PoseStamped).wait(50)
+        (node.folder / 'hung').touch()
+        pose.wait_more(100)                 # the motion goes on meanwhile
+        os.killpg(node.process.pid, signal.SIGINT)
+        assert node.wait(60.0) == 0, node.err
+        peer.stop_listening(pose)
+    assert 'could not be closed within' in node.out
+    assert TRACEBACK not in node.err
 
 
 SMALL_FILES = """

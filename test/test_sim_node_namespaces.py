@@ -141,14 +141,19 @@ def test_parameters_are_described(peer, pair):
     for descriptor, parameter in zip(found, parameters.TABLE, strict=True):
         assert parameter.text in descriptor.description
         assert f'[{parameter.unit}]' in descriptor.description or not parameter.unit
-        assert descriptor.additional_constraints.startswith('must be ')
+        assert parameter.effect.value in descriptor.description
+        assert 'must' not in descriptor.description, 'what is allowed is a constraint'
         assert descriptor.read_only == (parameter.effect is parameters.Effect.START)
+        bounded = [bound for bound in (parameter.minimum, parameter.above, parameter.maximum)
+                   if bound is not None]
         ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
-        assert len(ranges) == (type(parameter.default) in (int, float, type(None)))
+        assert len(ranges) == (len(bounded) == 2), parameter.name
         for limits in ranges:
-            lowest = 0.0 if parameter.or_zero else parameter.minimum
-            assert (limits.from_value, limits.to_value) == (lowest, parameter.maximum)
+            assert [limits.from_value, limits.to_value] == bounded, parameter.name
+        said = descriptor.additional_constraints
+        assert said == (parameter.allowed if not ranges else f'must be > {parameter.above:g}'
+                        if parameter.above is not None else '')
     described = {d.name: d for d in found}
-    assert described['top.mass'].description.startswith('Mass of the top [kg]; must be a number')
     assert described['solver.method'].additional_constraints == 'must be one of rk45, exact'
     assert 'cusp' in described['spin.lz'].description
+    assert not described['pacing'].description.count('change takes effect')

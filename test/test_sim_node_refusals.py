@@ -121,6 +121,9 @@ STARTS_REFUSED = {
     'no parameters': (['--params-file', 'list.yaml'], ('list.yaml',)),
     'use_sim_time': (['-p', 'use_sim_time:=perhaps'], ('use_sim_time', 'perhaps')),
     'no stream': (['-p', 'record.streams:=[poise]'], ('record.streams', 'poise')),
+    'too many digits': (['-p', f'seed:={400 * "7"}'], ('seed', '7777', 'an integer')),
+    'too many digits for a double': (['-p', f'spin.l3:={400 * "7"}'], ('spin.l3', 'a number')),
+    'too many digits in a file': (['--params-file', 'digits.yaml'], ('top.mass', 'a number')),
     'bad remapping': (['-r', 'pose:='], ('pose:=',)),
     'bad qos': (['-p', 'qos_overrides./pose.publisher.reliability:=often'], ('often',)),
 }
@@ -132,6 +135,8 @@ def test_what_cannot_be_started_is_said_in_one_line_with_exit_code_2(tmp_path, c
     node = SimNode(tmp_path, namespace='/', arguments=arguments)
     (node.folder / 'bad.yaml').write_text('a: [1, 2\n  : {{{\n')
     (node.folder / 'list.yaml').write_text('- 1\n- 2\n')
+    (node.folder / 'digits.yaml').write_text(
+        f'/**:\n  ros__parameters:\n    top.mass: {400 * "7"}\n')
     with node:
         code = node.wait()
     assert code == 2, (code, node.err)

@@ -46,7 +46,7 @@ class Run:
                 has_room=room, write_command=lambda *_: self.told.append('command'),
                 write_event=lambda event, sent_ns, **_: self.told.append((event, sent_ns))),
             update_subscribers=lambda: self.told.append('subscribers'),
-            error=self.told.append, source=self.clock, steady=self.clock)
+            tell=lambda text, _: self.told.append(text), source=self.clock, steady=self.clock)
 
     @property
     def pose(self):
@@ -182,6 +182,43 @@ def test_a_step_that_takes_too_long_says_what_is_left(monkeypatch):
         run.loop.step(1, 10.0)
 
 
+LAST_S = 2 ** 31 - 86_400
+
+
+def test_stamps_end_before_their_seconds_do_and_a_reset_says_why_not():
+    run = started()
+    run.simulation.epoch_ns = (LAST_S - 1) * SECOND
+    run.ticks(250)
+    assert run.loop.failure == tick_loop.TOO_LATE
+    assert SECOND - 2 * TICK_NS < run.simulation.now_ns < 2 * SECOND
+    with pytest.raises(ValueError, match='2038'):
+        run.loop.reset(run.values, 0)
+    assert run.loop.failure == tick_loop.TOO_LATE
+
+
+def test_a_fast_clock_comes_no_further_than_the_last_stamp():
+    run = started(time_scale=1e6, pose__rate=1e-3, solver__method='exact')
+    run.simulation.epoch_ns = (LAST_S - 100_000) * SECOND
+    run.ticks(100)
+    assert run.loop.failure == tick_loop.TOO_LATE
+    assert max(run.stamps) < 2 ** 31 * SECOND
+
+
+def test_a_step_ends_at_the_last_stamp():
+    run = started(start_paused=True)
+    run.simulation.epoch_ns = (LAST_S - 1) * SECOND
+    run.loop.step(1, 0.5)
+    with pytest.raises(RuntimeError, match='2038'):
+        run.loop.step(1, 0.75)
+    assert max(run.stamps) <= LAST_S * SECOND
+
+
+@pytest.mark.parametrize('date_ns', [2 ** 31 * SECOND, 2 ** 62])
+def test_a_date_that_no_stamp_can_have_is_refused(date_ns):
+    with pytest.raises(ValueError, match='2038'):
+        tick_loop.next_epoch(date_ns)
+
+
 def test_started_paused_nothing_moves():
     run = started(start_paused=True).ticks(5)
     assert run.stamps == [] and run.loop.now_ns == 0
@@ -256,6 +293,18 @@ def test_a_time_scale_holds_from_its_moment_on():
     assert run.loop.grid == pytest.approx(((BEGIN_NS + 4 * TICK_NS - 2e6) / 1e9, 0.005), abs=0.0)
     run.tick()
     assert run.loop.now_ns == 4 * TICK_NS + 10 * TICK_NS
+
+
+@pytest.mark.parametrize('time_scale', [1.0, 3.0])
+def test_a_clock_that_steps_back_is_told_and_time_goes_on_from_where_it_is(time_scale):
+    run = started(time_scale=time_scale).ticks(9)
+    now_ns = run.loop.now_ns
+    run.tick(after_ns=-30 * SECOND)
+    assert run.loop.now_ns == now_ns
+    run.ticks(6)
+    assert run.loop.now_ns == now_ns + 6 * time_scale * TICK_NS
+    assert sum('/clock stepped back by 30 s' in told for told in run.told) == 1
+    assert run.stamps == grid(run.loop.now_ns)
 
 
 def test_a_reset_begins_again_at_a_later_stamp_and_a_pause_remains():

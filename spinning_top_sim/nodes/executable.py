@@ -13,6 +13,7 @@ from os import _exit
 from typing import TYPE_CHECKING, Protocol, cast
 
 if TYPE_CHECKING:
+    from rclpy.executors import Executor
     from rclpy.node import Node
     from rclpy.publisher import Publisher
     from rclpy.task import Future
@@ -34,10 +35,9 @@ class RunnableNode(Protocol):
 def run(name: str, argv: list[str],
         prepare: Callable[[list[str]], Callable[[], RunnableNode] | None]) -> int:
     """
-    Run a node; return 0 after an ordinary end, 2 if it cannot be started.
+    Run a node; return 0 after an ordinary end, 2 if it cannot be started, and say why.
 
-    `prepare` takes the arguments.  It returns a function that makes the node, or None if there is
-    nothing to run.  What either raises is shown in one line.
+    prepare : takes the arguments; returns what makes the node, or None if there is nothing to run
     """
     # Nothing is open yet, and a KeyboardInterrupt in the midst of imports is easily lost.
     _handle(signal.SIGINT, lambda *_: _exit(130))
@@ -56,13 +56,19 @@ def run(name: str, argv: list[str],
         rclpy.init(args=argv)
     except Exception as error:
         return _cannot_start(name, error)
-    node = None
+    node, started = None, False
     try:
         node = make_node()
-        return _spin(node, interrupts)
+        executor = _executor(node)
+        node.start()
+        started = True
+        # Without a timeout, the EventsExecutor of Jazzy hangs.
+        while rclpy.ok() and not interrupts and not node.finished.done():
+            executor.spin_once(SPIN_S)
+        return (node.finished.result() or 0) if node.finished.done() else 0
     except Exception as error:
         # A call that the end of the context interrupts may raise anything.
-        if rclpy.ok() and node is not None:
+        if rclpy.ok() and started:
             raise
         return _cannot_start(name, error) if rclpy.ok() else 0
     finally:
@@ -86,17 +92,23 @@ def _ignore_signals() -> None:
 
 
 def _cannot_start(name: str, error: Exception) -> int:
-    """Say why in one line, without the places in the sources of rcl; return the exit code."""
-    text = ' '.join(re.sub(r',\s*at \S+:\d+', '', str(error)).split())
+    """Say why in one line; return the exit code."""
     kind = type(error).__name__
     expected = isinstance(error, ValueError | RuntimeError | OSError) or kind.startswith('Invalid')
-    print(f'{name}: cannot start: {text if expected else f"{kind}: {text}"}', file=sys.stderr)
+    print(f'{name}: cannot start: {"" if expected else f"{kind}: "}{one_line(error)}',
+          file=sys.stderr)
     return 2
 
 
-def _spin(node: RunnableNode, interrupts: list[int]) -> int:
-    """Spin a node until it has finished, or a signal ends it; return the exit code."""
-    import rclpy  # noqa: PLC0415
+def one_line(text: object) -> str:
+    """Return a text as one line: no control characters, no places in the sources of rcl."""
+    line = ' '.join(re.sub(r',\s*at \S+:\d+', '', str(text)).split())
+    line = ''.join(char if char.isprintable() else ascii(char)[1:-1] for char in line)
+    return line if len(line) <= 600 else f'{line[:300]} ... {line[-300:]}'
+
+
+def _executor(node: RunnableNode) -> Executor:
+    """Return an executor that has the node, with little for the garbage collector to do."""
     try:
         # It takes least processor time.
         from rclpy.experimental import EventsExecutor as Executor  # noqa: PLC0415
@@ -107,14 +119,8 @@ def _spin(node: RunnableNode, interrupts: list[int]) -> int:
     node.finished.add_done_callback(lambda _: executor.wake())
     gc.collect()
     gc.freeze()             # no full collection goes through what is there from the start
-    # A full collection waits until there is a quarter more than the one before has found.
-    # This one finds nothing, so the cyclic garbage of service calls does not pile up.
-    gc.collect()
-    node.start()
-    # Without a timeout, the EventsExecutor of Jazzy hangs.
-    while rclpy.ok() and not interrupts and not node.finished.done():
-        executor.spin_once(SPIN_S)
-    return (node.finished.result() or 0) if node.finished.done() else 0
+    gc.collect()            # finds nothing, so that the next full one comes soon
+    return executor
 
 
 def wait_for_all_acked(publishers: Iterable[Publisher], seconds: float,

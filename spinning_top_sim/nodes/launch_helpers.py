@@ -23,17 +23,12 @@ HIGHEST_PUBLISH_FREQUENCY = 1000.0
 
 def state_publisher(share: Path, values: Mapping[str, Any], namespace: str, joint_states: str,
                     use_sim_time: bool) -> list[Action]:
-    """
-    Return robot_state_publisher, or a line that says why there is no TF.
-
-    `joint_states` is the full name of the topic.  Raises ValueError if the frames are impossible.
-    """
+    """Return robot_state_publisher, or a warning.  Raises ValueError for impossible frames."""
     try:
         get_package_prefix(STATE_PUBLISHER)
         description = robot_description(values, share / 'urdf')
     except (PackageNotFoundError, ImportError) as error:
-        missing = 'xacro' if isinstance(error, ImportError) else STATE_PUBLISHER
-        return [LogInfo(msg=f'no TF: the package {missing} is not installed')]
+        return _missing('TF', 'xacro' if isinstance(error, ImportError) else STATE_PUBLISHER)
     warning = inertia_warning(values)
     return [*([LogInfo(msg=f'WARNING: {warning}')] if warning else []), Node(
         package=STATE_PUBLISHER, executable=STATE_PUBLISHER, namespace=namespace,
@@ -43,12 +38,20 @@ def state_publisher(share: Path, values: Mapping[str, Any], namespace: str, join
             'use_sim_time': use_sim_time}])]
 
 
-def rviz(share: Path, world_frame: str, namespace: str, use_sim_time: bool) -> Node:
-    """Return RViz with the topics of a namespace.  Raises LookupError if it is not installed."""
-    get_package_prefix('rviz2')     # before anything is started
-    return Node(
+def rviz(share: Path, world_frame: str, namespace: str, use_sim_time: bool) -> list[Action]:
+    """Return RViz with the topics of a namespace, or a warning that it is not installed."""
+    try:
+        get_package_prefix('rviz2')
+    except PackageNotFoundError:
+        return _missing('RViz', 'rviz2')
+    return [Node(
         package='rviz2', executable='rviz2', namespace=namespace,
         arguments=['-d', str(share / 'rviz/spinning_top.rviz'), '-f', world_frame],
         remappings=[(f'/{topic}', resolve_topic(topic, namespace))
                     for topic in ('markers', 'robot_description')],
-        parameters=[{'use_sim_time': use_sim_time}])
+        parameters=[{'use_sim_time': use_sim_time}])]
+
+
+def _missing(what: str, package: str) -> list[Action]:
+    return [LogInfo(msg=f'WARNING: no {what}: the package {package} is not installed; '
+                        f'sudo apt install ros-$ROS_DISTRO-{package.replace("_", "-")}')]

@@ -1,11 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clocks, a fair lock, and the thread that calls a function at absolute deadlines."""
+"""When ticks and recorded messages are due, without ROS: clocks, a fair lock, threads."""
 
 from __future__ import annotations
 
+import contextlib
+import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+
+Message = tuple[int, Callable[[bytes], object], bytes]      # time [ns], what sends it, CDR
+
+# Between the last message of a round and the first of the next.
+ROUND_GAP_NS = 10_000_000
+# A message sent later than this is counted.
+LATE_NS = 10_000_000
+# Read ahead.
+BATCH_BYTES, BATCH_MESSAGES, BATCHES = 256_000, 512, 16
 
 
 class SimulatedClock:
@@ -39,33 +50,13 @@ class SimulatedClock:
 
     def when(self, simulated_ns: int) -> int | None:
         """Return the source's time of a simulated time [ns]; None while the clock stands."""
-        if self._from_source is None:
-            return None
-        return self._from_source + round((simulated_ns - self._from_simulated) / self._scale)
-
-
-class MonotonicClock:
-    """Follows a clock without its steps back, as of a log in a loop, and tells of these [ns]."""
-
-    def __init__(self, source: Callable[[], int], tell: Callable[[int], object]) -> None:
-        self._source, self._tell = source, tell
-        self._newest_ns = self._stepped_back_ns = 0
-
-    def __call__(self) -> int:
-        back_ns, self._newest_ns = self._newest_ns, self._source()
-        back_ns -= self._newest_ns
-        if back_ns > 0:
-            self._stepped_back_ns += back_ns
-            self._tell(back_ns)
-        return self._newest_ns + self._stepped_back_ns
+        begin = self._from_source       # read once: other threads may stop the clock
+        return None if begin is None else (
+            begin + round((simulated_ns - self._from_simulated) / self._scale))
 
 
 class FairLock:
-    """
-    A lock that threads get in turn.
-
-    An ordinary one stays with a thread that takes it again and again, as an overloaded tick does.
-    """
+    """A lock in turn: an ordinary one stays with a thread that takes it again and again."""
 
     def __init__(self) -> None:
         self._lock, self._next = threading.Lock(), threading.Lock()
@@ -82,10 +73,11 @@ class DeadlineThread(threading.Thread):
     """
     Calls `tick` at absolute deadlines until it is stopped, and `idle` behind it where it asks so.
 
-    A late tick comes at once, deadlines that have passed are skipped, and their grid stays.  A
-    sleeping thread costs less processor time than an rclpy timer (`benchmark/wake_up.py`).
+    A late tick comes at once, and deadlines that have passed are skipped.  It costs less processor
+    time than an rclpy timer (`benchmark/wake_up.py`).
 
     grid : returns a deadline on the monotonic clock and the time between two [s]
+    failed : takes any error of these; the thread goes on
     """
 
     LONGEST_SLEEP = 0.05    # [s], so that `stop` is quick
@@ -95,30 +87,172 @@ class DeadlineThread(threading.Thread):
     SHORTEST_NAP = 1e-4
 
     def __init__(self, tick: Callable[[], object], idle: Callable[[], object],
-                 grid: Callable[[], tuple[float, float]]) -> None:
+                 grid: Callable[[], tuple[float, float]],
+                 failed: Callable[[Exception], object]) -> None:
         super().__init__(name='simulation', daemon=True)
-        self._tick, self._idle, self._grid = tick, idle, grid
+        self._tick, self._idle, self._grid, self._failed = tick, idle, grid, failed
         self._stopped = False
+        self._newest = 0                # number of the deadline of the newest tick
+        self._newest_grid: tuple[float, float] | None = None
 
     def run(self) -> None:
-        grid: tuple[float, float] | None = None
-        newest = 0              # number of the deadline of the newest tick
         while not self._stopped:
-            before, grid = grid, self._grid()
-            origin, period = grid
-            passed = int((time.monotonic() - origin) // period)
-            newest = max(passed, newest + 1) if grid == before else passed + 1
-            deadline = origin + newest * period
-            while (left := deadline - time.monotonic()) > 0.0 and not self._stopped:
-                time.sleep(min(left, self.LONGEST_SLEEP))
-            if not self._stopped and self._tick():
-                nap = min(self.NAP * period, self.LONGEST_SLEEP)
-                if nap >= self.SHORTEST_NAP:
-                    time.sleep(nap)
-                self._idle()
+            try:
+                self._wait_and_tick()
+            except Exception as error:
+                self._failed(error)
+                time.sleep(self.LONGEST_SLEEP)
+
+    def _wait_and_tick(self) -> None:
+        before, self._newest_grid = self._newest_grid, self._grid()
+        origin, period = self._newest_grid
+        passed = int((time.monotonic() - origin) // period)
+        self._newest = (max(passed, self._newest + 1) if self._newest_grid == before
+                        else passed + 1)
+        deadline = origin + self._newest * period
+        while (left := deadline - time.monotonic()) > 0.0 and not self._stopped:
+            time.sleep(min(left, self.LONGEST_SLEEP))
+        if not self._stopped and self._tick():
+            nap = min(self.NAP * period, self.LONGEST_SLEEP)
+            if nap >= self.SHORTEST_NAP:
+                time.sleep(nap)
+            self._idle()
 
     def stop(self) -> None:
         """Ask the thread to end, and wait for it."""
         self._stopped = True
         if self.is_alive():
             self.join(5.0)
+
+
+def rounds(read: Callable[[], Iterable[Message]], span_ns: int, loop: bool) -> Iterator[Message]:
+    """Yield the messages of a round, `span_ns` long, or those of round after round."""
+    shift = 0
+    while True:
+        at_ns = None
+        for at_ns, send, data in read():
+            yield at_ns + shift, send, data
+        if at_ns is None or not loop:
+            return
+        shift += span_ns + ROUND_GAP_NS
+
+
+class ReadAhead:
+    """Iterates over messages that a thread reads ahead, a bounded number; its error comes last."""
+
+    def __init__(self, messages: Iterable[Message]) -> None:
+        # Behind the batches comes the error, or None.
+        self._batches: queue.Queue[list[Message] | Exception | None] = queue.Queue(BATCHES)
+        self._stopped = False
+        self._thread = threading.Thread(target=self._read, args=(messages,), name='read ahead',
+                                        daemon=True)
+        self._thread.start()
+
+    def __iter__(self) -> Iterator[Message]:
+        while isinstance(batch := self._batches.get(), list):
+            yield from batch
+        if batch is not None:
+            raise batch
+
+    def stop(self) -> None:
+        """End both the reading and the iterating."""
+        self._stopped = True
+        # The thread that reads may wait for room, and the one that iterates for a batch.
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._batches.get_nowait()
+        self._batches.put(None)
+        self._thread.join(1.0)
+
+    def _read(self, messages: Iterable[Message]) -> None:
+        batch: list[Message] = []
+        end, size = None, 0
+        try:
+            for message in messages:
+                if self._stopped:
+                    return
+                batch.append(message)
+                size += len(message[2])
+                if size >= BATCH_BYTES or len(batch) >= BATCH_MESSAGES:
+                    self._batches.put(batch)
+                    batch, size = [], 0
+        except Exception as error:
+            end = error
+        self._batches.put(batch)
+        self._batches.put(end)
+
+
+class Playback:
+    """
+    Sends messages at their times, late ones at once, by a clock with pauses and a rate.
+
+    begin_ns : time at which the clock starts [ns]
+    source, sleep : returns steady time [ns]; waits at most so many seconds (None: until woken)
+    """
+
+    def __init__(self, begin_ns: int, *, paused: bool = False,
+                 source: Callable[[], int] = time.monotonic_ns,
+                 sleep: Callable[[float | None], object] | None = None) -> None:
+        self._source = source
+        self._clock = SimulatedClock(source, 1.0)
+        self._clock.set(begin_ns, running=False)
+        self._sent_until = begin_ns         # all messages before this time are sent
+        self._stopped = False
+        self._wake = threading.Event()
+        self._sleep = sleep or self._sleep_until_woken
+        self._lock = FairLock()             # the clock, and sending
+        self.paused = paused
+        self.sent = self.late = 0
+
+    def run(self, messages: Iterable[Message]) -> None:
+        """Play messages in the order of their times, to the end or until stopped."""
+        for at_ns, send, data in messages:
+            if not self.sent:           # reading the first message may have taken a while
+                with self._lock:
+                    self._clock.set(self._sent_until, not self.paused)
+            self._sent_until = at_ns
+            if not self._send_when_due(at_ns, send, data):
+                return
+
+    def now(self) -> int:
+        """Return the time up to which all messages are sent [ns]."""
+        with self._lock:
+            return min(self._clock.now(), self._sent_until)
+
+    def pause(self, paused: bool) -> None:
+        """Pause, or go on without catching up; once paused, no message is sent any more."""
+        with self._lock:
+            self.paused = paused
+            self._clock.set(self._clock.now(), not paused)
+        self._wake.set()
+
+    def set_rate(self, rate: float) -> None:
+        """Go on at another rate."""
+        with self._lock:
+            self._clock.set_scale(rate)
+        self._wake.set()
+
+    def stop(self) -> None:
+        """Make `run` return, soon."""
+        with self._lock:
+            self._stopped = True
+        self._wake.set()
+
+    def _send_when_due(self, at_ns: int, send: Callable[[bytes], object], data: bytes) -> bool:
+        """Send a message when its time has come; return False when stopped before."""
+        while True:
+            with self._lock:
+                if self._stopped:
+                    return False
+                due = self._clock.when(at_ns)
+                left = None if due is None else due - self._source()
+                if left is not None and left <= 0:
+                    send(data)
+                    self.sent += 1
+                    self.late += left < -LATE_NS
+                    return True
+            self._sleep(None if left is None else left / 1e9)
+
+    def _sleep_until_woken(self, seconds: float | None) -> None:
+        self._wake.wait(None if seconds is None else min(seconds, threading.TIMEOUT_MAX))
+        self._wake.clear()

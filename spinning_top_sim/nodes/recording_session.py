@@ -24,7 +24,7 @@ MOST_PENDING = 20_000
 
 # Full name, type, and offered QoS.
 Topic = tuple[str, str, dict[str, int]]
-# What `provenance` takes; the present parameters come last.
+# What `provenance` takes.
 Run = tuple[Mapping[str, Any], int, int, tuple[tuple[int, float, float], ...], Mapping[str, Any]]
 
 
@@ -39,6 +39,7 @@ class RecordingSession:
     def __init__(self, simulation: Simulation, lock: FairLock,
                  topics: Callable[[Sequence[Stream]], list[Topic]]) -> None:
         self.error: str | None = None       # why the newest one stopped early or could not start
+        self.path = Path()                  # of the newest one
         self._simulation, self._lock, self._topics = simulation, lock, topics
         self._recorder: McapRecorder | None = None
         self._pending: list[Messages] = []      # while a log is being opened
@@ -77,7 +78,7 @@ class RecordingSession:
             with self._lock:
                 for messages in self._pending:
                     recorder.write_all(*messages)
-                self._recorder, self.error = recorder, None
+                self._recorder, self.path, self.error = recorder, recorder.path, None
                 self._feed(recorder.write_all, streams)
         return f'recording to {recorder.path}'
 

@@ -30,8 +30,8 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes import reports
-from spinning_top_sim.nodes.executable import wait_for_all_acked
-from spinning_top_sim.nodes.playback import ROUND_GAP_NS, Message, Playback, ReadAhead, rounds
+from spinning_top_sim.nodes.executable import one_line, wait_for_all_acked
+from spinning_top_sim.nodes.pacing import ROUND_GAP_NS, Message, Playback, ReadAhead, rounds
 from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import DefinitionNotFoundError, LogError
 from spinning_top_sim.recording.reader import LogReader, LogTopic
@@ -53,17 +53,13 @@ SWITCH_INTERVAL_S = 0.0005
 
 
 class Replayer(Node):
-    """
-    The node: plays a log once it is started.  Raises ValueError if nothing of it can be played.
-
-    options : those of `replay_node`
-    """
+    """The node: plays a log once it is started.  Raises ValueError if nothing can be played."""
 
     def __init__(self, log: LogReader, options: argparse.Namespace) -> None:
         given = [] if options.rate is None else [Parameter('rate', value=options.rate)]
         super().__init__('replay', parameter_overrides=given)
         self.finished: Future = Future()    # completes with the exit code when all is played
-        self._log, self._options = log, options
+        self._reader, self._options = log, options
         self._terminal = reports.Terminal()
         self._log_begin_ns, self._end_ns = log.span
         self._begin_ns = self._log_begin_ns + round(options.start * NANOSECONDS)
@@ -73,41 +69,45 @@ class Replayer(Node):
             raise ValueError(f'--start {options.start:g}: the log lasts {self._length_s:.3f} s')
         self._outputs = self._open_publishers()     # by channel
         self._senders = set(self._outputs.values())
-        self._playback = Playback(
-            self._begin_ns, lambda channel_id, data: self._outputs[channel_id].publish(data),
-            paused=options.start_paused)
+        self._playback = Playback(self._begin_ns, paused=options.start_paused)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self.declare_parameter('rate', 1.0, ParameterDescriptor(
             description='recorded over real time; a change takes effect at once',
             additional_constraints=f'a number in [{SLOWEST:g}, {FASTEST:g}]', dynamic_typing=True))
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         if options.clock:
-            self._clock_publisher = self.create_publisher(ClockMessage, '/clock', 10)
-            self.create_timer(1.0 / max(options.clock, SLOWEST), self._publish_clock, clock=steady)
+            clock = self.create_publisher(ClockMessage, '/clock', 10)
+            self._senders.add(clock)
+            self.create_timer(1.0 / max(options.clock, SLOWEST), lambda: clock.publish(
+                ClockMessage(clock=Time(nanoseconds=self._playback.now()).to_msg())), clock=steady)
         self.create_timer(1.0, self._show_status, clock=steady)
         self.create_service(SetBool, '~/set_pause', self._on_pause)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._play, name='playback', daemon=True)
         self._ahead = ReadAhead(rounds(self._messages, self._span_ns, options.loop))
 
+    @property
+    def _log(self) -> Any:
+        """The logger; what it says does not stand behind the status line."""
+        self._terminal.end()
+        return self.get_logger()
+
     def _open_publishers(self) -> dict[int, Publisher]:
         """Return the publishers by channel; warn of the topics that cannot be played."""
-        there = {channel.name for channel in self._log.topics}
+        there = {channel.name for channel in self._reader.topics}
         wanted = set(self._options.topics) or there
         for name in sorted(wanted - there):
-            self.get_logger().warning(f'the log has no topic {name}')
+            self._log.warning(f'the log has no topic {name}')
         channels: dict[tuple[str, str], list[LogTopic]] = defaultdict(list)
-        for channel in self._log.topics:
+        for channel in self._reader.topics:
             if channel.name in wanted:
                 channels[channel.name, channel.type_name].append(channel)
-        outputs = {}
+        outputs: dict[int, Publisher] = {}
         for (name, _), alike in channels.items():
             try:
-                publisher = self._publisher(alike)
+                outputs |= dict.fromkeys([one.channel_id for one in alike], self._publisher(alike))
             except Exception as error:      # whatever a log may ask for: the others are played
-                self.get_logger().warning(f'{name} is not played: {error}')
-            else:
-                outputs.update({channel.channel_id: publisher for channel in alike})
+                self._log.warning(one_line(f'{name} is not played: {error}'))
         if wanted and not outputs and not self._options.clock:
             raise ValueError('none of the topics can be played; the log has '
                              f'{", ".join(sorted(there)) or "none at all"}')
@@ -121,19 +121,18 @@ class Replayer(Node):
         if topic.encoding != 'cdr':
             raise LookupError(f'its messages are encoded as {topic.encoding!r}, not as CDR')
         kind = message_class(topic.type_name)
-        recorded_hash = topic.metadata.get('topic_type_hash')
+        type_hash = topic.metadata.get('topic_type_hash')
         with contextlib.suppress(DefinitionNotFoundError):
-            if recorded_hash and recorded_hash != find_definition(topic.type_name).type_hash:
-                self.get_logger().warning(
-                    f'{topic.name} was recorded with another {topic.type_name} than is installed: '
-                    'subscribers may misread it')
+            if type_hash and type_hash != find_definition(topic.type_name).type_hash:
+                self._log.warning(f'{topic.name} was recorded with another {topic.type_name} than '
+                                  'is installed: subscribers may misread it')
         profiles = [profile for channel in channels for profile in channel.qos] or [DEFAULT_QOS]
         try:
             if any(profile != profiles[0] for profile in profiles):
                 raise ValueError('its publishers had different ones')
             qos = qos_profile(profiles[0])
         except ValueError as error:
-            self.get_logger().warning(f'{topic.name} is published with default QoS, not with the '
+            self._log.warning(f'{topic.name} is published with default QoS, not with the '
                                       f'recorded one: {error}')
             qos = qos_profile(DEFAULT_QOS)
         return self.create_publisher(
@@ -160,7 +159,7 @@ class Replayer(Node):
         self._ahead.stop()
         if self._thread.is_alive():
             self._thread.join(1.0)
-        self._log.close()
+        self._reader.close()
         self._terminal.end()
 
     def _play(self) -> None:
@@ -173,48 +172,43 @@ class Replayer(Node):
             code = 2 if self._tell_damage() else 0
         except Exception as error:
             if self.context.ok():           # publishing fails once the context is down
-                self.get_logger().error(f'cannot be played any further: {error}')
+                self._log.error(f'cannot be played any further: {error}')
             code = 2
         if self.context.ok():
-            late = f', {self._playback.late} of them late' if self._playback.late else ''
-            self._terminal.tell(f'played {self._playback.sent} messages on '
-                                f'{len(self._senders)} topics{late}')
+            self._terminal.tell(
+                f'played {self._playback.sent} messages on {len(set(self._outputs.values()))} '
+                f'topics, {self._playback.late} of them late')
             self.finished.set_result(code)
 
     def _messages(self) -> Iterator[Message]:
         """Yield the messages of a round."""
-        names = {channel.name for channel in self._log.topics
+        names = {channel.name for channel in self._reader.topics
                  if channel.channel_id in self._outputs}
         # A reader that is told where to start takes the index's word for it.
         start = self._begin_ns if self._options.start else None
-        for message in self._log.messages(names, start):
+        for message in self._reader.messages(names, start):
             at_ns = message.log_time or self._begin_ns      # 0: recorded before there was a time
             if not self._log_begin_ns <= at_ns <= self._end_ns:
-                raise ValueError(f'the index of {self._log.path} does not fit its messages: '
+                raise ValueError(f'the index of {self._reader.path} does not fit its messages: '
                                  '`recover` makes a log with a right one')
             if message.channel_id in self._outputs:
-                yield at_ns, message.channel_id, message.data
+                yield at_ns, self._outputs[message.channel_id].publish, message.data
 
     def _tell_damage(self) -> bool:
         """Return whether messages are missing unexpectedly; say so once."""
-        damaged = self._log.left_out > 0 and not self._options.partial
+        damaged = self._reader.left_out > 0 and not self._options.partial
         if damaged:
-            self.get_logger().error(f'{self._log.path} is damaged inside, and messages are left '
+            self._log.error(f'{self._reader.path} is damaged inside, and messages are left '
                                     'out: `recover` tells which', once=True)
         return damaged
 
     def _wait_to_begin(self) -> None:
         """Wait for subscribers and the delay."""
         begin = time.monotonic() + self._options.delay
-        publishers = [*self._senders, *([self._clock_publisher] if self._options.clock else [])]
         while not self._stopping.wait(LOOK_S) and (time.monotonic() < begin or sum(
-                publisher.get_subscription_count() for publisher in publishers
+                publisher.get_subscription_count() for publisher in self._senders
                 ) < self._options.wait_for_subscribers):
             pass
-
-    def _publish_clock(self) -> None:
-        now = Time(nanoseconds=self._playback.now())
-        self._clock_publisher.publish(ClockMessage(clock=now.to_msg()))
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._playback.pause(request.data)
@@ -254,11 +248,7 @@ def open_log(path: Path, partial: bool) -> LogReader:
 
 
 def message_class(type_name: str) -> type:
-    """
-    Return the class of a message type that a log names.
-
-    Raises LookupError unless it is one of an installed ROS package; nothing else is imported.
-    """
+    """Return a message class of an installed ROS package.  Raises LookupError for all else."""
     match = TYPE_NAME.fullmatch(type_name)
     if match is None:
         raise LookupError(f'{type_name!r} is not the name of a message type')
@@ -267,7 +257,9 @@ def message_class(type_name: str) -> type:
                 sys.prefix]
     if any(Path(prefix, AMENT_INDEX, package).is_file() for prefix in prefixes):
         with contextlib.suppress(ImportError, AttributeError):
-            return getattr(importlib.import_module(f'{package}.msg'), name)
+            kind = getattr(importlib.import_module(f'{package}.msg'), name)
+            if hasattr(kind, 'get_fields_and_field_types'):
+                return kind
     raise LookupError(f'{type_name} is not installed')
 
 

@@ -26,20 +26,18 @@ class MotionReport:
 
     def __init__(self, simulation: Simulation, loop: TickLoop, session: RecordingSession) -> None:
         self._simulation, self._loop, self._session = simulation, loop, session
-        self._speed = 0.0                       # simulated over real time, at the last reading
+        self._speed = math.nan                  # simulated over real time, at the last reading
         self._read_at, self._read_ns = time.monotonic(), 0
         self._described: object = None          # the motion that `_regime` names
         self._regime = ''
 
     def diagnostics(self, stamp: Time, name: str, max_error: float) -> DiagnosticArray:
-        """
-        Return the message for /diagnostics; its level is that of the worst problem.
-
-        max_error : largest orientation error that is no problem; 0: it is not computed [rad]
-        """
+        """Return the message for /diagnostics; without a `max_error` no error is computed."""
         simulation, loop, session = self._simulation, self._loop, self._session
         error = simulation.orientation_error if max_error else math.nan
         problems = [(DiagnosticStatus.OK, 'paused' if loop.paused else 'running')]
+        if loop.waits_for_clock:
+            problems.append((DiagnosticStatus.WARN, 'waiting for /clock'))
         if self.overloaded:
             problems.append((DiagnosticStatus.WARN, 'this machine cannot keep up'))
         if error > max_error > 0.0:
@@ -99,26 +97,35 @@ class MotionReport:
     def status_line(self) -> str:
         """Return the line for the terminal, with the angle in degrees."""
         simulation, loop, size = self._simulation, self._loop, self._session.size
-        theta = math.degrees(float(simulation.state().theta[0]))
-        flag = ' FAILED' if loop.failure else ' paused' if loop.paused else ''
-        log = f' | log {size}' if size else ''
-        return (f't {loop.now_ns / NANOSECONDS:9.2f} s{flag} | {self._regime} | '
-                f'theta {theta:6.2f} deg | L3 {simulation.l3:.4g} Lz {simulation.lz:.4g} | '
-                f'x{self._speed:.2f} | dE/E {simulation.energy_drift:+.0e} | '
-                f"{self._total('sent')} msgs{log}")
+        theta, sent = math.degrees(float(simulation.state().theta[0])), self._total('sent')
+        flag = (' FAILED' if loop.failure else ' waiting for /clock' if loop.waits_for_clock
+                else ' paused' if loop.paused else '')
+        # The most important first: a terminal shows as many as fit.
+        return ' | '.join([
+            f't {loop.now_ns / NANOSECONDS:9.2f} s{flag}', self._regime, f'theta {theta:6.2f} deg',
+            *([] if math.isnan(self._speed) else [f'x{self._speed:.2f}']),
+            *([f'log {size}'] if size else []),
+            f'L3 {simulation.l3:.4g} Lz {simulation.lz:.4g}', f'{sent} messages' if sent
+            else 'no subscribers yet', f'dE/E {simulation.energy_drift:+.0e}'])
 
 
 class Terminal:
-    """Shows a line that overwrites itself on a terminal, and lines one by one elsewhere."""
+    """Shows a line that overwrites itself, and whole ones where a launch or a file reads them."""
 
     def __init__(self) -> None:
-        self._overwrites = sys.stdout.isatty()
+        self._columns = os.get_terminal_size(1).columns if sys.stdout.isatty() else 0
         self._open = False              # the cursor stands behind a line
 
     def show(self, line: str) -> None:
-        """Show the newest line."""
-        self._write(f'\r\x1b[K{line}' if self._overwrites else f'{line}\n')
-        self._open = self._overwrites
+        """Show the newest line, on a terminal as many of its parts as fit."""
+        if self._columns:
+            self._columns = os.get_terminal_size(1).columns
+            while len(line) >= self._columns > 0 and ' | ' in line:
+                line = line.rpartition(' | ')[0]
+            self._write(f'\r\x1b[K{line[:max(self._columns - 1, 1)]}')
+            self._open = True
+        else:
+            self._write(f'{line}\n')
 
     def tell(self, line: str) -> None:
         """Show a line that stays."""

@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import array
+import contextlib
 import difflib
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -19,22 +22,35 @@ SPIN = ('spin.l3', 'spin.lz')
 OF_RCLPY = ('use_sim_time', 'start_type_description_service')
 
 
-def _descriptor(parameter: Parameter) -> ParameterDescriptor:
+def overrides(argv: Sequence[str]) -> list[str]:
     """
-    Return what `ros2 param describe` shows.
+    Return the `-p NAME:=VALUE` of a command line, as arguments for the node alone.
 
-    Typing is dynamic because an integer is accepted for a double; `Parameter.check` decides.
+    There they win.  Among those of the process, rcl drops a double that overrides an integer.
     """
+    return ['--ros-args', *(word for flag, rule in pairwise(argv) if flag in {'-p', '--param'}
+                            for word in (flag, rule))]
+
+
+def _descriptor(parameter: Parameter) -> ParameterDescriptor:
+    """Return what `ros2 param describe` shows; dynamic types, as `Parameter.check` decides."""
     result = ParameterDescriptor(
-        name=parameter.name, description=parameter.description, dynamic_typing=True,
-        read_only=parameter.effect is Effect.START,
-        additional_constraints=parameter.allowed)
-    bounds = {'from_value': 0.0 if parameter.or_zero else parameter.minimum,
-              'to_value': parameter.maximum}
-    if parameter.is_double:
-        result.floating_point_range = [FloatingPointRange(**bounds)]
-    elif type(parameter.default) is int:
-        result.integer_range = [IntegerRange(**bounds)]
+        name=parameter.name, description=parameter.summary, dynamic_typing=True,
+        read_only=parameter.effect is Effect.START)
+    lowest = parameter.minimum if parameter.above is None else parameter.above
+    if lowest is None or parameter.maximum is None:
+        result.additional_constraints = parameter.allowed
+        return result
+    if parameter.above is not None:
+        result.additional_constraints = f'must be > {parameter.above:g}'
+    elif parameter.smallest is not None:
+        result.additional_constraints = f'must be 0 or >= {parameter.smallest:g}'
+    if isinstance(parameter.default, int):
+        result.integer_range = [IntegerRange(
+            from_value=int(lowest), to_value=int(parameter.maximum))]
+    else:               # a list of numbers has the range of each
+        result.floating_point_range = [FloatingPointRange(
+            from_value=float(lowest), to_value=float(parameter.maximum))]
     return result
 
 
@@ -53,7 +69,7 @@ def declare(node: Node) -> dict[str, Any]:
         if name in OF_RCLPY:
             continue
         if name in parameters.BY_NAME:
-            given[name] = value
+            given[name] = list(value) if isinstance(value, array.array) else value
         elif not name.startswith('qos_overrides.'):
             near = difflib.get_close_matches(name, parameters.BY_NAME, 1)
             hint = f'; did you mean {near[0]}?' if near else ''
@@ -70,10 +86,27 @@ def declare(node: Node) -> dict[str, Any]:
 
 
 def with_doubles(given: Sequence[RosParameter]) -> list[RosParameter]:
-    """Make doubles of integers where the table has doubles, before rclpy looks at ranges."""
-    return [RosParameter(p.name, RosParameter.Type.DOUBLE, float(p.value))
-            if p.type_ is RosParameter.Type.INTEGER and p.name in parameters.BY_NAME
-            and parameters.BY_NAME[p.name].is_double else p for p in given]
+    """
+    Make doubles where the table has doubles: of integers, and of texts that are numbers.
+
+    It is called before rclpy looks at ranges.  `ros2 param` takes 1e-9 for a text, as YAML 1.1.
+    """
+    result = []
+    for one in given:
+        row, value = parameters.BY_NAME.get(one.name), one.value
+        if row is not None and row.is_double:
+            value = _as_double(value)
+        elif row is not None and isinstance(value, list | array.array):
+            of_doubles = isinstance(row.default, tuple) and isinstance(row.default[0], float)
+            value = [_as_double(item) if of_doubles else item for item in value]
+        result.append(one if value is one.value else RosParameter(one.name, value=value))
+    return result
+
+
+def _as_double(value: object) -> object:
+    with contextlib.suppress(ValueError):
+        return float(value) if type(value) in {int, str} else value     # type: ignore[arg-type]
+    return value
 
 
 def changed(values: Mapping[str, Any], changes: Mapping[str, Any],

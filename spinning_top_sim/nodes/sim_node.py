@@ -12,7 +12,7 @@ from spinning_top_sim.nodes import executable
 if TYPE_CHECKING:
     from spinning_top_sim.nodes.simulator import Simulator
 
-USAGE = """usage: sim_node [--help] [--ros-args -p NAME:=VALUE --params-file FILE ...]
+USAGE = """usage: sim_node [--help] [--version] [--ros-args -p NAME:=VALUE --params-file FILE ...]
 
 Simulate the heavy symmetric top in real time, in namespace and with parameters as usual:
 
@@ -20,8 +20,12 @@ Simulate the heavy symmetric top in real time, in namespace and with parameters 
   ros2 run spinning_top_sim sim_node --ros-args --params-file config/looping.yaml
   ros2 run spinning_top_sim sim_node --ros-args -p spin.l3:=2.0 -p record.enabled:=true
 
-Parameters (a change by `ros2 param set` takes effect as said there):
-"""
+Subscribes to:
+  ~/commands (std_msgs/Float64MultiArray: [L3, Lz] in kg m^2/s); ~ is /spinning_top
+Services:
+  ~/set_pause, ~/record (std_srvs/SetBool); ~/step, ~/reset (std_srvs/Trigger)
+Publishes, where enabled:
+  /diagnostics (diagnostic_msgs/DiagnosticArray), always"""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -30,17 +34,34 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _prepare(argv: list[str]) -> Callable[[], Simulator] | None:
-    if not {'--help', '-h'}.intersection(argv[1:]):
-        from spinning_top_sim.nodes.simulator import Simulator  # noqa: PLC0415
-        return Simulator
     from spinning_top_sim.streams import parameters  # noqa: PLC0415
-    print(USAGE)
-    for parameter in parameters.TABLE:
-        default = parameter.default
-        shown = list(default) if isinstance(default, tuple) else default
-        print(f'  {parameter.name}  (default {"unset" if shown is None else shown})\n'
-              f'      {parameter.description}')
-    return None
+
+    if {'--help', '-h'}.intersection(argv[1:]):
+        print(USAGE)
+        for *_, text in parameters.STREAM_DEFAULTS:
+            print(f'  {text}')
+        print('Parameters:')
+        for parameter in parameters.TABLE:
+            default = parameter.default
+            shown = list(default) if isinstance(default, tuple) else default
+            print(f'  {parameter.name}  (default {"unset" if shown is None else shown})\n'
+                  f'      {parameter.description}')
+        return None
+    if '--version' in argv[1:]:
+        from spinning_top_sim.recording.provenance import version  # noqa: PLC0415
+        print(f'sim_node {version("spinning_top_sim")}')
+        return None
+    from rclpy.utilities import remove_ros_args  # noqa: PLC0415
+
+    try:
+        stray = ' '.join(remove_ros_args(argv)[1:])
+    except RuntimeError as error:       # rcl does not know what stands behind --ros-args
+        stray = executable.one_line(error)
+    if stray:
+        raise ValueError(f'{stray!r} is not expected here; the form is: sim_node --ros-args '
+                         '-p NAME:=VALUE --params-file FILE')
+    from spinning_top_sim.nodes.simulator import Simulator  # noqa: PLC0415
+    return lambda: Simulator(argv)
 
 
 if __name__ == '__main__':

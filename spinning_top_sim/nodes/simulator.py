@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -15,6 +16,9 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.task import Future
 from rclpy.timer import Timer
 from std_msgs.msg import Float64MultiArray
@@ -22,35 +26,86 @@ from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes import reports, ros_parameters
 from spinning_top_sim.nodes.executable import wait_for_all_acked
-from spinning_top_sim.nodes.pacing import DeadlineThread, FairLock, MonotonicClock
-from spinning_top_sim.nodes.recording_session import RecordingSession
+from spinning_top_sim.nodes.pacing import DeadlineThread, FairLock
+from spinning_top_sim.nodes.recording_session import RecordingSession, Topic
 from spinning_top_sim.nodes.ros_parameters import SPIN
-from spinning_top_sim.nodes.stream_publishers import StreamPublishers
 from spinning_top_sim.nodes.tick_loop import TickLoop, next_epoch
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.parameters import Effect
 from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.stream import Stream
 
 # Threads let go of the interpreter this soon when a tick is due; Python's default is 5 ms.
 SWITCH_INTERVAL_S = 1e-4
 # How often the first message of a followed /clock is looked for.
 CLOCK_PERIOD_S = 0.02
+# A /clock that stands for longer is said to have stopped.
+CLOCK_PATIENCE_S = 2.0
 # At the end of `duration` all subscribers together are waited for at most this long.
 ACKNOWLEDGED_S = 1.0
+RECORDED_POLICIES = ('history', 'depth', 'reliability', 'durability', 'liveliness')
+
+
+class StreamPublishers:
+    """Has a publisher for each enabled stream."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self.by_topic: dict[str, Publisher] = {}
+
+    def create(self, message_class: type, topic: str) -> Publisher:
+        """Create a reliable publisher whose QoS can be overridden by parameters."""
+        return self._node.create_publisher(
+            message_class, topic, QoSProfile(depth=10),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+
+    def open(self, streams: Sequence[Stream], values: Mapping[str, Any]) -> None:
+        """Create the publishers of enabled streams; destroy those of others."""
+        for stream in streams:
+            enabled = journal.is_enabled(stream.parameter, values)
+            there = stream.topic in self.by_topic
+            if enabled and not there:
+                package, _, name = stream.type_name.split('/')
+                message_class = getattr(importlib.import_module(f'{package}.msg'), name)
+                self.by_topic[stream.topic] = self.create(message_class, stream.topic)
+            elif there and not enabled:
+                stream.publish = None
+                self._node.destroy_publisher(self.by_topic.pop(stream.topic))
+
+    def update_subscribers(self, streams: Sequence[Stream]) -> None:
+        """Let a stream publish if anybody subscribes to it; without that, it computes nothing."""
+        for stream in streams:
+            publisher = self.by_topic.get(stream.topic)
+            if publisher is not None:
+                heard = publisher.get_subscription_count() > 0
+                stream.publish = publisher.publish if heard else None
+
+    def topics_to_record(self, streams: Sequence[Stream]) -> list[Topic]:
+        """Return the topics of these streams, and behind them those of the journal."""
+        topics: list[Topic] = []
+        for stream in streams:
+            publisher = self.by_topic[stream.topic]
+            topics.append((publisher.topic_name, stream.type_name, {
+                name: int(getattr(publisher.qos_profile, name)) for name in RECORDED_POLICIES}))
+        return [*topics, *((self._node.resolve_topic_name(name), type_name, {})
+                           for name, type_name in journal.TOPICS)]
 
 
 class Simulator(Node):
     """
-    The node; docs/interface.md has its topics, services and parameters.
+    The node.  Raises ValueError for a bad parameter.
 
     One thread ticks, the executor's does everything else; both hold the lock while they use the
-    simulation.  `finished` completes after `duration`.  Raises ValueError for a bad parameter.
+    simulation.  `finished` completes after `duration`.
     """
 
-    def __init__(self) -> None:
-        super().__init__('spinning_top', automatically_declare_parameters_from_overrides=True)
+    def __init__(self, argv: Sequence[str] = ()) -> None:
+        super().__init__('spinning_top', cli_args=ros_parameters.overrides(argv),
+                         automatically_declare_parameters_from_overrides=True)
         self.finished: Future = Future()
+        self._terminal = reports.Terminal()
         values = ros_parameters.declare(self)
         simulation = self._simulation = Simulation(values)
         # A reset goes back to this; an unset spin.lz is the cusp of the tilt that there is then.
@@ -63,21 +118,16 @@ class Simulator(Node):
         self._follows = (self.get_parameter('use_sim_time').value
                          and not journal.is_enabled('clock', values))
         self._date = self.get_clock() if self._follows else Clock(clock_type=ClockType.SYSTEM_TIME)
-        logger = self.get_logger()
-        followed = MonotonicClock(self._date_ns, lambda back_ns: logger.warning(
-            f'/clock stepped back by {back_ns / NANOSECONDS:g} s: the motion and its stamps go on '
-            'from where they are'))
+        self._clock_seen = 0, time.monotonic()      # newest date [ns], and when it was new [s]
         self._lock = FairLock()
         self._outputs = StreamPublishers(self)
         self._session = RecordingSession(simulation, self._lock, self._outputs.topics_to_record)
         self._loop = TickLoop(
-            simulation, values, self._session, error=logger.error,
+            simulation, values, self._session, tell=self._tell,
             update_subscribers=lambda: self._outputs.update_subscribers(simulation.streams),
-            source=followed if self._follows else time.monotonic_ns)
-        self._pacer = DeadlineThread(self._guarded(self._tick), self._guarded(self._idle),
-                                     lambda: self._loop.grid)
+            source=self._date_ns if self._follows else time.monotonic_ns)
+        self._pacer = DeadlineThread(self._tick, self._idle, lambda: self._loop.grid, self._fail)
         self._report = reports.MotionReport(simulation, self._loop, self._session)
-        self._terminal = reports.Terminal()
         self._outputs.open(simulation.streams, values)
         self._diagnostics = self._outputs.create(DiagnosticArray, '/diagnostics')
         self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
@@ -89,15 +139,31 @@ class Simulator(Node):
         self._status_timer: Timer | None = None
         self._set_status_period(values['status_period'])
         if not simulation.top.is_realizable:
-            logger.warning(
+            self._log.warning(
                 f'top.lambda3 = {simulation.top.lambda3!r} kg m^2: no rigid body has more than '
                 f'2 (lambda1 - M R^2) = {2.0 * simulation.top.lambda1_at_com:g}; simulated all '
                 'the same')
 
+    @property
+    def _log(self) -> Any:
+        """The logger; what it says does not stand behind the status line."""
+        self._terminal.end()
+        return self.get_logger()
+
+    def _tell(self, text: str, failed: bool) -> None:
+        if failed:
+            self._log.error(text)
+        else:
+            self._log.warning(text)
+
     def _steady_timer(self, period: float, callback: Callable[[], object]) -> Timer:
-        """Create a timer that neither a step of the date nor /clock can hold up."""
-        return self.create_timer(period, self._guarded(callback),
-                                 clock=Clock(clock_type=ClockType.STEADY_TIME))
+        """Create a timer that no clock can hold up; unexpected errors stop the motion."""
+        def call() -> None:
+            try:
+                callback()
+            except Exception as error:
+                self._fail(error)
+        return self.create_timer(period, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _set_status_period(self, period: float) -> None:
         if self._status_timer is not None:
@@ -129,10 +195,22 @@ class Simulator(Node):
         self._pacer.start()
         if open_log is not None:
             try:
-                open_log()
+                self._log.info(open_log())
             except RecordingError as error:
                 self._session.error = str(error)
-                self.get_logger().error(f'not recording: {error}')
+                self._log.error(f'not recording: {error}')
+
+    def _watch_clock(self) -> None:
+        """Say that the /clock that is followed has stopped, or not begun, and that it goes on."""
+        date_ns, now = self._date_ns(), time.monotonic()
+        if date_ns != self._clock_seen[0]:
+            self._clock_seen = date_ns, now
+        waits = self._follows and (date_ns == 0 or now > self._clock_seen[1] + CLOCK_PATIENCE_S)
+        if waits and not self._loop.waits_for_clock:
+            self._log.warning('waiting for /clock (use_sim_time is set)')
+        elif self._loop.waits_for_clock and not waits:
+            self._log.info('/clock goes on')
+        self._loop.waits_for_clock = waits
 
     def stop(self) -> None:
         """End the motion and close the recording; safe whatever state the context is in."""
@@ -141,6 +219,8 @@ class Simulator(Node):
         summary = self._session.stop()
         if summary:
             self._terminal.tell(summary)
+            if self._session.path.exists():
+                self._terminal.tell(f'next: inspect {self._session.path} --plot top.png')
 
     def _tick(self) -> bool:
         with self._lock:
@@ -154,21 +234,11 @@ class Simulator(Node):
         with self._lock:
             self._loop.idle()
 
-    def _guarded(self, callback: Callable) -> Callable:
-        """Return a callback whose unexpected errors stop the motion, not the node or a thread."""
-        def call(*arguments: object) -> object:
-            try:
-                return callback(*arguments)
-            except Exception as error:
-                self._fail(error)
-                return None
-        return call
-
     def _fail(self, error: Exception) -> None:
         """Stop the motion after an unexpected error, and close the log while it is whole."""
         if not self.context.ok():       # publishing fails once the context is down
             return
-        self.get_logger().error(traceback.format_exc())
+        self._log.error(traceback.format_exc())
         reason = f'unexpected {type(error).__name__}: {error}'
         with self._lock:
             self._loop.fail(reason)
@@ -193,10 +263,14 @@ class Simulator(Node):
             self._loop.rejected_commands += 1
             reason = f'data has {len(message.data)} values: must be [L3, Lz]'
         if reason:
-            self.get_logger().warning(f'~/commands: refused: {reason}')
+            self._log.warning(f'~/commands: refused: {reason}')
 
     def _on_set_parameters(self, given: list[Parameter]) -> SetParametersResult:
         """Apply all changes together or none."""
+        for p in given:
+            if p.name == 'use_sim_time' and p.value != self.get_parameter(p.name).value:
+                return SetParametersResult(successful=False, reason=(
+                    f'{p.name} = {p.value!r}: cannot be changed while the node runs'))
         changes = {p.name: p.value for p in given if p.name in parameters.BY_NAME}
         if self._resetting or not changes:
             return SetParametersResult(successful=True)
@@ -219,6 +293,11 @@ class Simulator(Node):
                 if 'status_period' in rest:
                     self._set_status_period(values['status_period'])
                 self._loop.set_pace(values)
+        for effect in (Effect.RESET, Effect.RECORDING):
+            names = [name for name in rest if parameters.BY_NAME[name].effect is effect
+                     and values[name] != self._values[name]]
+            if names:
+                self._log.info(f'{", ".join(names)}: {effect.value}')
         self._values = values
 
     def _serve(self, act: Callable[[Any], str], request: object, response: Any) -> object:
@@ -227,7 +306,7 @@ class Simulator(Node):
 
     def _check_started(self) -> None:
         if not self._loop.started:
-            raise RuntimeError('waiting for the first /clock (use_sim_time is set)')
+            raise RuntimeError(self._loop.failure or 'waiting for /clock (use_sim_time is set)')
 
     def _set_pause(self, request: SetBool.Request) -> str:
         with self._lock:
@@ -264,11 +343,17 @@ class Simulator(Node):
 
     def _publish_diagnostics(self) -> None:
         """Look at the recording, and publish /diagnostics."""
+        self._watch_clock()
         reason = self._session.check()
         if reason:
-            self.get_logger().error(f'recording stopped: {reason}; the simulation goes on')
+            self._log.error(f'recording stopped: {reason}; the simulation goes on')
+        names = self.get_node_names_and_namespaces()
+        if names.count((self.get_name(), self.get_namespace())) > 1:
+            self._log.warning(
+                f'there is another node {self.get_fully_qualified_name()}: give one of them a '
+                'namespace, with --ros-args -r __ns:=/NAME', once=True)
         if self._report.overloaded:
-            self.get_logger().warning(
+            self._log.warning(
                 'this machine cannot keep up with these rates: live topics skip samples, or the '
                 'clock slips; a recording stays complete, and /diagnostics counts', once=True)
         if self._values['max_error'] > 0.0:
@@ -285,5 +370,5 @@ class Simulator(Node):
         with self._lock:
             motion, line = self._report.new_motion(), self._report.status_line()
         if motion:
-            self._terminal.tell(motion)
+            self._log.info(motion)
         self._terminal.show(line)

@@ -18,9 +18,8 @@ from spinning_top_sim.streams.schedule import NEVER_NS
 EPOCH_GRID_NS = 10_000_000
 # How often subscribers are counted; a new one waits at most this long.
 SUBSCRIBERS_PERIOD_NS = 50_000_000
-# The look-ahead is computed in pieces that fill this share of the time between two ticks, so that
-# the next tick finds the processor free.  It begins this many ticks, or this much time, before it
-# is needed.
+# The look-ahead is computed in pieces that fill this share of the time between two ticks.  It
+# begins this many ticks, or this much time, before it is needed.
 BUSY_SHARE = 0.35
 TICKS_AHEAD, AHEAD_NS = 24, 50_000_000
 # One tick works at most this long before services and signals get their turn; so does one step.
@@ -30,10 +29,15 @@ STEP_BUDGET_NS = 2_000_000_000
 LATEST_NS = 500_000_000
 # A simulation further behind than this lets its clock slip: its real-time factor falls below 1.
 LONGEST_LAG_NS = 1_000_000_000
+# A day before the seconds of a stamp, an int32, end: no look-ahead goes that far.
+LAST_STAMP_NS = (2 ** 31 - 86_400) * NANOSECONDS
+TOO_LATE = 'stamps cannot be later than 2038-01-18: the stamps of ROS messages end'
 
 
 def next_epoch(date_ns: int) -> int:
-    """Return the first stamp from this date on [ns] that t = 0 may have."""
+    """Return the first stamp from this date on [ns] that t = 0 may have.  Raises ValueError."""
+    if date_ns > LAST_STAMP_NS:
+        raise ValueError(TOO_LATE)
     return -(-date_ns // EPOCH_GRID_NS) * EPOCH_GRID_NS
 
 
@@ -46,23 +50,24 @@ class TickLoop:
 
     recording : where it has no room, nothing is sent
     update_subscribers : sets `publish` of each stream that has subscribers
-    error : takes a text for the log
+    tell : takes a text for the log, and whether the motion has failed
     source : returns the time that simulated time follows [ns]
     steady : returns steady time [ns]; decides which ticks are late and how long one may work
     """
 
     def __init__(self, simulation: Simulation, values: Mapping[str, Any],
-                 recording: RecordingSession, *, update_subscribers: Callable[[], object],
-                 error: Callable[[str], object], source: Callable[[], int] = time.monotonic_ns,
+                 recording: RecordingSession, *, tell: Callable[[str, bool], object],
+                 update_subscribers: Callable[[], object],
+                 source: Callable[[], int] = time.monotonic_ns,
                  steady: Callable[[], int] = time.monotonic_ns) -> None:
         self.late_ticks = self.skipped_ticks = self.slipped_ns = 0      # since the start
         self.commands = self.rejected_commands = 0
         self.started = self.ended = False       # `ended`: all samples of `duration` are sent
         self.paused: bool = values['start_paused']
         self.failure: str | None = None         # why the motion stands still until `reset`
-        self.grid = 0.0, 0.0                    # a time for a tick on the steady clock, period [s]
+        self.waits_for_clock = False            # whether the source has stopped, or not begun
         self._simulation, self._recording = simulation, recording
-        self._update_subscribers, self._error = update_subscribers, error
+        self._update_subscribers, self._tell = update_subscribers, tell
         self._steady, self._is_steady = steady, source is steady
         self._clock = SimulatedClock(source, values['time_scale'])
         self._subscribers_due_ns = 0            # on the steady clock
@@ -92,13 +97,12 @@ class TickLoop:
         self._fast_until_ns, self._late_from_ns = -1, NEVER_NS
         self._clock.set(self.now_ns, running=self.started and not (
             self.ended or self.paused or self.failure))
-        self._align()
 
-    def _align(self) -> None:
-        """Have ticks just after samples are due."""
+    @property
+    def grid(self) -> tuple[float, float]:
+        """Steady time of a tick, just after samples are due, and from tick to tick [s]."""
         origin_ns = self._clock.when(0) if self._is_steady else None
-        self.grid = (self.grid[0] if origin_ns is None else origin_ns / NANOSECONDS,
-                     self._tick_period_ns / NANOSECONDS)
+        return (origin_ns or 0) / NANOSECONDS, self._tick_period_ns / NANOSECONDS
 
     def tick(self) -> bool:
         """Send what is due; return whether `idle` has something to do before the next tick."""
@@ -106,7 +110,7 @@ class TickLoop:
         self._late_from_ns = steady_ns + self._late_after_ns
         due_ns = self._clock.now()
         # The fast path touches little memory: after a rest, little of it is in the caches.
-        if (due_ns < self._fast_until_ns and steady_ns <= late_from_ns
+        if (self._simulation.now_ns <= due_ns < self._fast_until_ns and steady_ns <= late_from_ns
                 and self._simulation.send_ready(due_ns)):
             return self._computing
         if not self._clock.running:
@@ -147,10 +151,20 @@ class TickLoop:
     def _advance(self) -> int:
         """Send what is due, or what one tick has time for; return the simulated time due [ns]."""
         simulation, has_room = self._simulation, self._recording.has_room
-        target_ns = min(self._clock.now(), self._duration_ns)
+        due_ns = self._clock.now()
+        target_ns = min(due_ns, self._duration_ns)
         if not self._clock.running:
             return target_ns
+        if due_ns < simulation.now_ns:          # as where a log is played in a loop
+            back_s = (simulation.now_ns - due_ns) / self._time_scale / NANOSECONDS
+            self._tell(f'/clock stepped back by {back_s:g} s: the motion and its stamps go on '
+                       'from where they are', False)
+            self._sync_clock()
+            return simulation.now_ns
         publish_from_ns = target_ns - int(LATEST_NS * self._time_scale)
+        if simulation.epoch_ns + target_ns > LAST_STAMP_NS:
+            self.fail(TOO_LATE)
+            return target_ns
         stop_at_ns = self._steady() + TICK_BUDGET_NS
         try:
             arrived = has_room() and simulation.advance(
@@ -182,6 +196,7 @@ class TickLoop:
             raise RuntimeError('running: ~/step works while paused (~/set_pause true)')
         self._update_subscribers()
         target_ns = self.now_ns + round(count * dt * NANOSECONDS)
+        last_ns = LAST_STAMP_NS - self._simulation.epoch_ns
         stop_at_ns = self._steady() + STEP_BUDGET_NS
 
         def give_way() -> bool:
@@ -190,12 +205,14 @@ class TickLoop:
             return self._steady() > stop_at_ns
 
         try:
-            self._simulation.advance(target_ns, give_way=give_way)
+            self._simulation.advance(min(target_ns, last_ns), give_way=give_way)
         except IntegrationError as error:
             self.fail(str(error))
         self._sync_clock()
         if self.failure:
             raise RuntimeError(self.failure)
+        if self.now_ns == last_ns:
+            raise RuntimeError(TOO_LATE)
         if self.now_ns < target_ns:
             raise RuntimeError(f'{self.time_text}: this takes too long, '
                                f'{(target_ns - self.now_ns) / NANOSECONDS:.9g} s are left')
@@ -213,13 +230,15 @@ class TickLoop:
         """
         Go back to the start state of these parameters, and out of a failure; a pause remains.
 
-        t = 0 is stamped with this date, or later, so that stamps never go back.  Raises ValueError
-        or IntegrationError if no motion begins there; the present one goes on then.
+        t = 0 has this date or, as stamps never go back, a later one.  Raises ValueError or
+        IntegrationError if no motion begins there; the present one goes on then.
         """
         simulation, sent_ns = self._simulation, self._simulation.now_ns
+        epoch_ns = next_epoch(max(simulation.epoch_ns + sent_ns + 1, date_ns))
         simulation.restart(values)
-        simulation.epoch_ns = next_epoch(max(simulation.epoch_ns + sent_ns + 1, date_ns))
+        simulation.epoch_ns = epoch_ns
         self.failure = None
+        self.set_pace(values)           # which a failed change has left half done
         self._sync_clock()
         self._recording.write_event('reset', sent_ns, epoch_ns=simulation.epoch_ns,
                                     parameters=values)
@@ -228,7 +247,7 @@ class TickLoop:
         """Hold the motion until `reset`."""
         self.failure = reason
         self._sync_clock()
-        self._error(f'{reason}; the motion stands still until ~/reset')
+        self._tell(f'{reason}; the motion stands still until ~/reset', True)
 
     def set_pace(self, values: Mapping[str, Any]) -> None:
         """Take over tick_rate, time_scale and duration."""
@@ -240,4 +259,3 @@ class TickLoop:
             1.5 * self._tick_period_ns, min(TICKS_AHEAD * self._tick_period_ns, AHEAD_NS)))
         self._late_from_ns, self._fast_until_ns = NEVER_NS, -1
         self._clock.set_scale(self._time_scale)
-        self._align()

@@ -60,9 +60,11 @@ class Description:
 
 
 def _span(low: float, high: float) -> str:
-    """Return both ends of a range in words; one that is 0 but for rounding is 0."""
+    """Return both ends of a range in words, apart; one that is 0 but for rounding is 0."""
     dust = COINCIDE * min(max(abs(low), abs(high)), 1e300)
-    return ' to '.join(f'{0.0 if abs(x) <= dust else x:.4g}' for x in (low, high))
+    ends = [0.0 if abs(x) <= dust else x for x in (low, high)]
+    digits = next((n for n in range(4, 14) if len({f'{x:.{n}g}' for x in ends}) == 2), 4)
+    return ' to '.join(f'{x:.{digits}g}' for x in ends)
 
 
 # Relative distance below which two roots, or a root and Lz/L3, are said to coincide.

@@ -83,6 +83,8 @@ class Rotations:
         second.  A uniform grid that divides the second needs the latter once: it takes half the
         time of `cosines_and_sines`, and a value depends on its own time only.
         """
+        if self._short_ns < 1.0:        # a second has more turns than a double counts
+            return self.cosines_and_sines(Times.from_ns(ns))
         if isinstance(ns, range) and NANOSECONDS % ns.step == 0 and ns.step >= SHORTEST_STEP_NS:
             return self._on_grid(ns)
         times = np.asarray(ns, dtype=np.int64)

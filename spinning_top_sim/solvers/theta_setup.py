@@ -217,9 +217,6 @@ def _resting(given: _Given) -> ThetaMotion:
         m=ZERO, m1=ONE, theta_bounds=(theta, theta))
 
 
-# ------------------------------------------------------------------------- the roots of the cubic
-
-
 class _Roots(NamedTuple):
     """The roots y1 <= 0 <= y2 <= y3 of u'^2 in y = u - u0, and distances that do not cancel."""
 
@@ -312,9 +309,6 @@ def _check_roots(roots: _Roots, a0: Decimal, a1: Decimal, a2: Decimal) -> None:
                           (-a0, (y1 * y2 * y3,))):
         if abs(sum(terms) - wanted) > SAME * sum(map(abs, terms)):
             raise _RootsTooCloseError
-
-
-# --------------------------------------------------------------- from the roots to theta functions
 
 
 class _Poles(NamedTuple):

@@ -106,8 +106,8 @@ class TransportEquations(Equations):
             2.0 * sine * cosine * (self.l3 - lambda1 * phi_dot
                                    * (cosine * cosine - sine * sine)),
             lambda1 * start.theta_dot)
-        return (cosine * cmath.rect(1.0, 0.5 * (start.phi + start.psi)),
-                sine * cmath.rect(1.0, 0.5 * (start.phi - start.psi)),
+        return (cosine * cmath.rect(1.0, 0.5 * start.phi + 0.5 * start.psi),
+                sine * cmath.rect(1.0, 0.5 * start.phi - 0.5 * start.psi),
                 0.5j * momentum / lambda1)
 
     def derivative(self, alpha: complex, beta: complex, m: complex) -> Vector:

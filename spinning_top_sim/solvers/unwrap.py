@@ -105,9 +105,9 @@ class PhaseUnwrapper:
     def __init__(self, start: State, uniform_rate: float) -> None:
         half = 0.5 * start.theta
         self.of_alpha = Phase(start.lz + start.l3, math.copysign(1.0, math.cos(half)),
-                              0.5 * (start.phi + start.psi))
+                              0.5 * start.phi + 0.5 * start.psi)
         self.of_beta = Phase(start.lz - start.l3, math.copysign(1.0, math.sin(half)),
-                             0.5 * (start.phi - start.psi))
+                             0.5 * start.phi - 0.5 * start.psi)
         self._uniform_rate = uniform_rate
         self.begins = np.array([[self.of_alpha.start], [self.of_beta.start], [half]])
 

@@ -96,9 +96,11 @@ class Sensor:
         self._walk = six('random_walk') * math.sqrt(WALK_STEP_NS * 1e-9)
         # + 0.0: no bias is -0, and below no reading.
         self._turn_on = six('turn_on_bias') * _normal(self._seed, TURN_ON, 0, 1).T + 0.0
-        self._range, self._resolution = six('range'), six('resolution')
+        self._resolution = six('resolution')
+        self._limit = [_largest_reading(*pair) for pair in zip(
+            six('range')[:, 0].tolist(), self._resolution[:, 0].tolist(), strict=True)]
         self._is_perfect = not any(map(np.any, (
-            self._white, self._walk, self._turn_on, self._range, self._resolution)))
+            self._white, self._walk, self._turn_on, six('range'), self._resolution)))
         variances = self._white ** 2 + self._resolution ** 2 / 12.0
         self.rate_variance, self.force_variance = variances[[0, 3], 0].tolist()
         self._newest: tuple[range, Rows, Rows] = range(0), NO_ERRORS, NO_ERRORS
@@ -112,13 +114,13 @@ class Sensor:
         if self._is_perfect:
             return exact
         rows = []
-        for value, white, bias, (limit,), (step,) in zip(
-                itertools.chain(*exact), *self._errors(times), self._range, self._resolution,
+        for value, white, bias, limit, (step,) in zip(
+                itertools.chain(*exact), *self._errors(times), self._limit, self._resolution,
                 strict=True):
             reading = value + white + bias
-            if limit:
-                reading = np.clip(reading, -limit, limit)
-            rows.append((np.rint(reading / step) + 0.0) * step if step else reading)
+            if step:
+                reading = (np.rint(reading / step) + 0.0) * step
+            rows.append(np.clip(reading, -limit, limit))
         return tuple(rows[:3]), tuple(rows[3:])
 
     def bias(self, times: range) -> tuple[Vector, Vector]:
@@ -139,6 +141,16 @@ class Sensor:
                     partial(_walk, self._seed), t_ns // WALK_STEP_NS)
             self._newest = times, white, bias
         return self._newest[1:]
+
+
+def _largest_reading(limit: float, step: float) -> float:
+    """Return the largest multiple of the resolution within the range; 0 is no limit."""
+    if not limit:
+        return math.inf
+    if not step:
+        return limit
+    count = math.floor(limit / step)
+    return (count if count * step <= limit else count - 1) * step
 
 
 def _rows(block: Callable[[int], Rows], numbers: NDArray[np.int64]) -> Rows:

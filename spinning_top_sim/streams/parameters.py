@@ -24,10 +24,10 @@ Value = Any
 class Effect(enum.Enum):
     """When a changed value is used."""
 
-    NOW = 'at once'
-    RESET = 'at the next ~/reset'
-    RECORDING = 'at the next start of a recording'
-    START = 'fixed when the node starts'
+    NOW = 'a change takes effect at once'
+    RESET = 'a change takes effect at the next ~/reset'
+    RECORDING = 'a change takes effect at the next start of a recording'
+    START = 'cannot be changed while the node runs'
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,8 @@ class Parameter:
     One parameter.  Its type is that of the default; None is a double that may be left unset.
 
     minimum, maximum : of a number, or of each number in a list
-    or_zero : 0 is allowed too
+    above : exclusive lower bound
+    smallest : of what is not 0
     choices : allowed strings
     """
 
@@ -44,9 +45,10 @@ class Parameter:
     default: Value
     text: str
     unit: str = ''
-    minimum: float = -math.inf
-    maximum: float = math.inf
-    or_zero: bool = False
+    minimum: float | None = None
+    maximum: float | None = None
+    above: float | None = None
+    smallest: float | None = None
     choices: tuple[str, ...] = ()
     effect: Effect = Effect.NOW
 
@@ -58,10 +60,23 @@ class Parameter:
     @property
     def description(self) -> str:
         """Return text, unit, range and effect as one line."""
+        allowed = f'; {self.allowed}' if self.choices or self._bounds() else ''
+        return self._describe(allowed)
+
+    @property
+    def summary(self) -> str:
+        """Return the description without what is allowed."""
+        return self._describe('')
+
+    def _describe(self, allowed: str) -> str:
         unit = f' [{self.unit}]' if self.unit else ''
-        allowed = f'; {self.allowed}' if self.choices or self.maximum < math.inf else ''
         unset = '; unset: L3 cos(theta0), the cusp' if self.default is None else ''
-        return f'{self.text}{unit}{allowed}{unset}; a change takes effect {self.effect.value}'
+        return f'{self.text}{unit}{allowed}{unset}; {self.effect.value}'
+
+    def _bounds(self) -> str:
+        bounds = (('0 or >=', self.smallest) if self.smallest else ('>=', self.minimum),
+                  ('>', self.above), ('<=', self.maximum))
+        return ' and '.join(f'{sign} {bound:g}' for sign, bound in bounds if bound is not None)
 
     @property
     def allowed(self) -> str:
@@ -73,15 +88,13 @@ class Parameter:
         if isinstance(self.default, tuple):
             kind = ('a list of strings' if isinstance(self.default[0], str)
                     else f'a list of {len(self.default)} numbers')
-        zero = '0 or ' if self.or_zero else ''
-        bounds = (f' from {self.minimum:g} to {self.maximum:g}' if self.maximum < math.inf else '')
-        return f'must be {zero}{kind}{bounds}'
+        return f'must be {kind} {self._bounds()}'.rstrip()
 
     def check(self, value: Value) -> Value:
         """Return the value in its own type.  Raises ValueError with name, value, allowed."""
         if value is None and self.default is None:
             return None
-        with contextlib.suppress(TypeError):
+        with contextlib.suppress(TypeError, OverflowError):
             if self._is_allowed(value):
                 if isinstance(self.default, tuple):
                     return tuple(type(self.default[0])(item) for item in value)
@@ -102,7 +115,10 @@ class Parameter:
 
     def _is_in_range(self, number: Value) -> bool:
         return (isinstance(number, int | float) and not isinstance(number, bool)
-                and (self.minimum <= number <= self.maximum or (self.or_zero and number == 0)))
+                and math.isfinite(number) and (self.above is None or number > self.above)
+                and (self.minimum is None or number >= self.minimum)
+                and (self.maximum is None or number <= self.maximum)
+                and not (self.smallest and 0 < number < self.smallest))
 
 
 # name, default rate [Hz], on by default, what it is
@@ -121,7 +137,7 @@ LOWEST_RATE, HIGHEST_RATE = 1e-6, 10_000.0
 
 
 # Values of physics up to here have squares and products that doubles hold.
-LARGEST, SMALLEST = 1e30, 1e-30
+LARGEST = 1e30
 # The longest time of anything [s], three years.
 LONGEST = 1e8
 
@@ -136,7 +152,7 @@ def _axes(kind: str, unit: str) -> list[Parameter]:
     """Return the error model of three axes; names and units of the first two are kalibr's."""
     walk = {'rad/s': 'rad/s^2', 'm/s^2': 'm/s^3'}[unit]
     return [
-        Parameter(f'imu.{kind}_{name}', 0.0, text, unit_text, 1e-12, 1e12, or_zero=True,
+        Parameter(f'imu.{kind}_{name}', 0.0, text, unit_text, 0.0, 1e12, smallest=1e-12,
                   effect=Effect.RESET)
         for name, text, unit_text in (
             ('noise_density', f'White noise of the {kind}, 0 = none', f'{unit}/sqrt(Hz)'),
@@ -152,9 +168,9 @@ TABLE: tuple[Parameter, ...] = (
     Parameter('top.com_distance', 0.15, 'From the pivot to the centre of mass along the axis, '
               'signed', 'm', -LARGEST, LARGEST, effect=Effect.RESET),
     Parameter('top.lambda1', 0.123, 'Moment of inertia across the axis, about the pivot',
-              'kg m^2', SMALLEST, LARGEST, effect=Effect.RESET),
-    Parameter('top.lambda3', 0.15, 'Moment of inertia along the axis', 'kg m^2', SMALLEST,
-              LARGEST, effect=Effect.RESET),
+              'kg m^2', above=0.0, maximum=LARGEST, effect=Effect.RESET),
+    Parameter('top.lambda3', 0.15, 'Moment of inertia along the axis', 'kg m^2', above=0.0,
+              maximum=LARGEST, effect=Effect.RESET),
     Parameter('top.gravity', 9.80665, 'Gravity, downwards positive', 'm/s^2', -LARGEST, LARGEST,
               effect=Effect.RESET),
     Parameter('initial.theta', math.radians(30.0), 'Tilt at the start', 'rad', 0.0, math.pi,
@@ -165,10 +181,11 @@ TABLE: tuple[Parameter, ...] = (
               effect=Effect.RESET),
     Parameter('initial.psi', 0.0, 'Spin angle at the start', 'rad', -1e12, 1e12,
               effect=Effect.RESET),
+    # These two without a range: the motion decides what is too fast.
     Parameter('spin.l3', 1.6, 'Angular momentum along the axis; a change is a command',
-              'kg m^2/s', -LARGEST, LARGEST),
+              'kg m^2/s'),
     Parameter('spin.lz', None, 'Angular momentum along the vertical; a change is a command',
-              'kg m^2/s', -LARGEST, LARGEST),
+              'kg m^2/s'),
     Parameter('solver.method', 'rk45', 'Dormand-Prince steps or the closed form',
               choices=METHODS, effect=Effect.RESET),
     Parameter('solver.equations', 'transport', "rk45: regular form, or the paper's to the letter",
@@ -203,8 +220,8 @@ TABLE: tuple[Parameter, ...] = (
               's', 0.0, 3600.0, effect=Effect.RESET),
     Parameter('markers.trace_points', 200, 'Points of the trace, evenly spaced in time', '', 1,
               10_000, effect=Effect.RESET),
-    Parameter('duration', 0.0, 'End after this much simulated time, 0 = never', 's', 1e-9,
-              LONGEST, or_zero=True),
+    Parameter('duration', 0.0, 'End after this much simulated time, 0 = never', 's', 0.0,
+              LONGEST, smallest=1e-9),
     Parameter('record.enabled', False, 'Record from the start', effect=Effect.START),
     Parameter('record.uri', '', 'File or folder of a recording; empty: '
               'spinning_top_<date>_<time>.mcap here', effect=Effect.RECORDING),
@@ -218,8 +235,8 @@ TABLE: tuple[Parameter, ...] = (
               'bytes', 0, 2 ** 62, effect=Effect.RECORDING),
     Parameter('step.count', 1, 'Steps of one ~/step', '', 1, 1_000_000),
     Parameter('step.dt', 0.01, 'Simulated time of one step', 's', 1e-6, 1e3),
-    Parameter('status_period', 1.0, 'Of the status line on the terminal, 0 = none', 's', 0.01,
-              LONGEST, or_zero=True),
+    Parameter('status_period', 1.0, 'Of the status line on the terminal, 0 = none', 's', 0.0,
+              LONGEST, smallest=0.01),
 )
 BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in TABLE}
 

@@ -20,20 +20,19 @@ from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.solvers.exact import MOST_TURNS, ExactSolution
 from spinning_top_sim.solvers.propagator import propagate
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.schedule import Instant, Schedule
-from spinning_top_sim.streams.segment import Segment
+from spinning_top_sim.streams.schedule import Instant, Schedule, check_stamp
+from spinning_top_sim.streams.segment import SHORTEST_RUN_NS, Segment
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import all_streams
 
 # Steps that the first nanosecond may take; of a block offline: interpolants stay in the cache.
 FIRST_STEPS, OFFLINE_STEPS = 500, 2000
-# A motion whose exact solution ends before three years is refused when it begins.
-SHORTEST_RUN_NS = 10 ** 17
-
+# Turns a second whose phases doubles hold for the shortest run.
+MOST_RATE = MOST_TURNS / SHORTEST_RUN_NS * NANOSECONDS
 # Takes the samples of an instant for a log: numbers of their streams there, stamp [ns], messages,
 # size of these together [bytes].
 Log = Callable[[Sequence[int], int, Sequence[bytes], int], object]
@@ -75,6 +74,8 @@ class Simulation:
 
     def _load(self, values: Mapping[str, Any], epoch_ns: int) -> None:
         # All that may be refused, before anything changes.
+        for stamp_ns in (epoch_ns, epoch_ns + round(values['duration'] * NANOSECONDS)):
+            check_stamp(stamp_ns, ValueError)
         top, start = parameters.top_of(values), parameters.start_state(values)
         segment = _segment(top, start, 0, values)
         streams = all_streams(values)
@@ -250,6 +251,7 @@ class Simulation:
         """
         segment = self.segment
         self._schedule.invalidate()
+        check_stamp(self.epoch_ns + target_ns)
         while self.now_ns < target_ns and not give_way():
             try:
                 segment.reach(target_ns, OFFLINE_STEPS)
@@ -305,16 +307,17 @@ def _segment(top: Top, start: State, start_ns: int, values: Mapping[str, Any]) -
         solver = propagate(top, start, method=values['solver.method'],
                            equations=values['solver.equations'], rtol=values['solver.rtol'],
                            atol=values['solver.atol'])
-        segment = Segment(solver, start, start_ns)
+        with np.errstate(over='ignore', invalid='ignore'):
+            segment = Segment(solver, start, start_ns)
         if not math.isfinite(segment.energy):
             raise ValueError(f'the energy would be {segment.energy!r} J')
         if not segment.reach(start_ns + 1, FIRST_STEPS):
             raise ValueError(f'it turns too fast: over {FIRST_STEPS} steps a nanosecond')
-        if isinstance(solver, ExactSolution) and solver.ns_limit < SHORTEST_RUN_NS:
-            raise ValueError(f'it turns too fast: after {solver.time_limit:.3g} s, not '
-                             f'{SHORTEST_RUN_NS / NANOSECONDS:g} s, a phase reaches 2^52 turns')
+        if ((isinstance(solver, ExactSolution) and solver.ns_limit < SHORTEST_RUN_NS)
+                or abs(start.l3) / top.lambda3 > math.tau * MOST_RATE):
+            raise ValueError(f'it turns too fast: at most {MOST_RATE:.2g} turns a second')
     except (ArithmeticError, RuntimeError, ValueError) as error:
         raise ValueError(f'no motion from theta = {start.theta!r} rad, theta_dot = '
                          f'{start.theta_dot!r} rad/s with l3 = {start.l3!r}, lz = {start.lz!r} '
-                         f'kg m^2/s: {error}') from error
+                         f'kg m^2/s, for {top}: {error}') from error
     return segment

@@ -25,11 +25,20 @@ LONGEST_BLOCK_NS = 300_000_000
 # Integration steps between two looks at the time, and how many such pieces make a block.
 STEPS_IN_A_PIECE, MOST_PIECES = 4, 64
 NEVER_NS = 2 ** 63 - 1
+# Seconds of a stamp are an int32: they end in January 2038.
+LAST_STAMP_NS = 2 ** 31 * NANOSECONDS - 1
 # Offline, a block becomes a chunk of a log.  Twice as many bytes take no less time, and are
 # compressed worse (28 MB of 546 000 messages become 36 MB).
 OFFLINE_BYTES = 1 << 20
 # A longer block would show no progress, and an interrupted run would lose it.
 LONGEST_OFFLINE_NS = 100 * NANOSECONDS
+
+
+def check_stamp(stamp_ns: int, error: type[Exception] = IntegrationError) -> None:
+    """Raise an error for a stamp [ns] that no message can hold."""
+    if not 0 <= stamp_ns <= LAST_STAMP_NS:
+        raise error(f'the stamp {stamp_ns / NANOSECONDS:.12g} s: must be from 0 to '
+                    f'{LAST_STAMP_NS / NANOSECONDS:.0f} s, in January 2038')
 
 
 class Delivery:
@@ -128,10 +137,11 @@ class Schedule:
         """
         Finish the block under way, or if there is none compute one up to `until_ns` at most.
 
-        Raises IntegrationError if the equations do not go on from `now_ns`.
+        Raises IntegrationError if the equations, or stamps, do not go on from `now_ns`.
         """
         if self._work is None:
             self.update(now_ns)
+            check_stamp(self.epoch_ns + min(self.computed_ns, until_ns))
             self._work = self._pieces(now_ns, until_ns)
         self._go_on(None)
 
@@ -151,7 +161,8 @@ class Schedule:
     def _pieces(self, now_ns: int, until_ns: int) -> Iterator[None]:
         """Compute a block, as far as the steps allow, in pieces of some 0.1 to 0.3 ms."""
         segment = self._segment
-        until_ns = min(until_ns, self.computed_ns + (LARGEST_BLOCK - 1) * self._shortest_ns)
+        until_ns = min(until_ns, self.computed_ns + (LARGEST_BLOCK - 1) * self._shortest_ns,
+                       LAST_STAMP_NS - self.epoch_ns)
         segment.release(now_ns)
         try:
             for _ in range(MOST_PIECES):

@@ -12,8 +12,12 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State
+from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.propagator import Propagator
+
+# A motion whose exact solution ends before three years is refused when it begins.
+SHORTEST_RUN_NS = 10 ** 17
 
 Axis = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
@@ -30,23 +34,27 @@ class Segment:
 
     def __init__(self, solver: Propagator, start: State, start_ns: int) -> None:
         self.solver, self.start, self.start_ns = solver, start, start_ns
-        self.reached_ns = start_ns + solver.latest_ns
+        # Steps go on for ever, the closed form does not.
+        self._solver_end_ns = (solver.ns_limit if isinstance(solver, ExactSolution)
+                               else 2 ** 63 - 1)
+        self.reached_ns = start_ns + min(solver.latest_ns, self._solver_end_ns)
         first = solver.states(range(1))
         self.energy, self.l3, self.lz = float(first.energy[0]), start.l3, start.lz
 
     @cached_property
     def exact(self) -> ExactSolution | None:
         """
-        The exact solution of the same motion; None for a motion whose constants it cannot hold.
+        The exact solution of the same motion; None for a motion that it cannot hold for so long.
 
         Its set-up takes milliseconds, and may be done in another thread than the simulation's.
         """
         if isinstance(self.solver, ExactSolution):
             return self.solver
         try:
-            return ExactSolution(self.solver.top, self.start)
+            exact = ExactSolution(self.solver.top, self.start)
         except ValueError:
             return None
+        return exact if exact.ns_limit >= SHORTEST_RUN_NS else None
 
     def reach(self, t_ns: int, max_steps: int) -> bool:
         """
@@ -55,9 +63,13 @@ class Segment:
         Raises IntegrationError if the equations cannot go on; `reached_ns` has where they stop.
         """
         try:
-            return self.solver.reach(t_ns - self.start_ns, max_steps)
+            arrived = self.solver.reach(t_ns - self.start_ns, max_steps)
         finally:
-            self.reached_ns = self.start_ns + self.solver.latest_ns
+            self.reached_ns = self.start_ns + min(self.solver.latest_ns, self._solver_end_ns)
+        if t_ns > self.start_ns + self._solver_end_ns:
+            raise IntegrationError(f'the closed form ends at t = {self.reached_ns / 10 ** 9:.9g} '
+                                   's, where a phase of the motion reaches 2^52 turns')
+        return arrived
 
     def release(self, before_ns: int) -> None:
         """Forget the steps that only states before this simulated time [ns] need."""

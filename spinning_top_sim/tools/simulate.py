@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
 # In ROS a stamp of 0 means "no time".
 DEFAULT_EPOCH = 1.0
-MOST_SECONDS = 2.0 ** 31 - 1.0      # in a stamp
 FORMATS = ('mcap', 'csv', 'parquet')
 
 
@@ -75,8 +74,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     values = _parameters(arguments)
-    if not 0.0 <= arguments.epoch <= MOST_SECONDS - values['duration']:
-        raise ValueError(f'--epoch {arguments.epoch:g}: stamps must be from 0 to 2^31 s')
+    if not 0.0 <= arguments.epoch <= 2.0 ** 31:
+        raise ValueError(f'--epoch {arguments.epoch!r}: must be from 0 to {2 ** 31} s')
     stops = parse_stops(arguments.command, round(values['duration'] * NANOSECONDS))
     output: Path = arguments.output
     file_format = arguments.format or output.suffix[1:]

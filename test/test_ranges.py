@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Values that no arithmetic holds are refused where they are given; all others run."""
+
+import math
+from collections import Counter
+
+import pytest
+from helpers import short_lives
+from helpers.simulations import MILLISECOND, SECOND, record, simulate, stream
+
+from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.schedule import LAST_STAMP_NS
+from spinning_top_sim.tools.simulate import main
+
+HUGE, TINY = 1e300, 1e-300
+REFUSED = [
+    ('status_period', 1e10), ('status_period', TINY), ('duration', HUGE), ('duration', TINY),
+    *((f'{name}.rate', TINY) for name, *_ in parameters.STREAM_DEFAULTS),
+    ('tick_rate', TINY), ('time_scale', TINY), ('max_error', HUGE),
+    *((f'imu.{kind}_{name}', value) for kind in ('gyroscope', 'accelerometer')
+      for name in ('noise_density', 'random_walk', 'turn_on_bias', 'range', 'resolution')
+      for value in (HUGE, 1e200, TINY)),
+    ('imu.lever_arm', (0.0, HUGE, 0.0)), ('imu.rpy', (0.0, 0.0, -HUGE)),
+    ('top.mass', HUGE), ('top.com_distance', -HUGE), ('top.lambda1', HUGE),
+    ('top.lambda3', 1e200), ('top.gravity', HUGE), ('initial.theta_dot', 1e18),
+    ('initial.phi', HUGE), ('initial.psi', -1e18), ('record.min_free_bytes', 2 ** 63),
+    ('seed', 10 ** 400), ('step.count', -10 ** 400)]
+
+
+@pytest.mark.parametrize(('name', 'value'), REFUSED)
+def test_what_no_arithmetic_holds_is_refused_by_the_table(name, value):
+    """With name, value, and what is allowed."""
+    with pytest.raises(ValueError, match='must be') as refusal:
+        parameters.checked({name: value})
+    assert str(refusal.value).startswith(f'{name} = {value!r}: must be ')
+
+
+@pytest.mark.parametrize(('given', 'named'), [
+    ({'spin.l3': 1e20}, '1e+20'), ({'spin.l3': 1e17, 'spin.lz': 1e16}, '1e+17'),
+    ({'spin.lz': -1e18}, '-1e+18'), ({'spin.l3': HUGE}, '1e+300'),
+    ({'initial.theta_dot': 1e12}, '1000000000000.0'),
+    ({'top.lambda1': TINY}, 'lambda1=1e-300'), ({'top.lambda3': 5e-324}, 'lambda3=5e-324')])
+@pytest.mark.parametrize('method', ['exact', 'rk45'])
+def test_what_turns_too_fast_is_refused_at_the_start_at_a_reset_and_by_simulate(
+        given, named, method, tmp_path, capsys):
+    values = parameters.checked({**given, 'solver.method': method})
+    running = simulate(solver__method=method)
+    for refuse in (lambda: Simulation(values), lambda: running.restart(values)):
+        with pytest.raises(ValueError, match='no motion from') as refusal:
+            refuse()
+        assert named in str(refusal.value)
+    assert running.advance(SECOND)
+    log = tmp_path / 'run.mcap'
+    arguments = [part for name, value in values.items() if name in (*given, 'solver.method')
+                 for part in ('-p', f'{name}:={value}')]
+    assert main(['-o', str(log), '--duration', '1', '--quiet', *arguments]) == 1
+    assert 'no motion from' in capsys.readouterr().err
+    assert not log.exists()
+
+
+def test_a_closed_form_that_ends_stops_the_motion_there():
+    simulation = simulate(solver__method='exact', spin__l3=3e6, spin__lz=1e6)
+    limit_ns = simulation.segment.solver.ns_limit
+    assert 10 ** 17 < limit_ns < LAST_STAMP_NS - simulation.epoch_ns
+    assert simulation.advance(limit_ns)
+    with pytest.raises(IntegrationError, match=r'2\^52 turns'):
+        simulation.advance(limit_ns + SECOND)
+    simulation.command(1.0, 0.5)
+    assert simulation.advance(limit_ns + SECOND)
+
+
+# -------------------------------------------------------------------------------------- stamps
+
+def near_the_end(**values):
+    """Return a simulation that begins a second before the last stamp."""
+    simulation = simulate(**values)
+    simulation.epoch_ns = LAST_STAMP_NS - SECOND + 1
+    return simulation
+
+
+@pytest.mark.parametrize('ahead', [False, True])
+@pytest.mark.parametrize('method', ['exact', 'rk45'])
+def test_stamps_end_with_their_seconds_and_not_before(method, ahead):
+    simulation = near_the_end(solver__method=method)
+    taken, published = record(simulation, 'pose'), []
+    stream(simulation, 'pose').publish = published.append
+    with pytest.raises(IntegrationError, match=r'must be from 0 to 2147483648 s, in January 2038'):
+        for tick in range(300):
+            if not simulation.send_ready(5 * tick * MILLISECOND):
+                simulation.advance(5 * tick * MILLISECOND)
+            if ahead:
+                simulation.prepare(5 * (tick + 1) * MILLISECOND)
+    assert [t_ns for _, t_ns, _ in taken] == [10 * k * MILLISECOND for k in range(100)]
+    seconds = [int.from_bytes(data[4:8], 'little', signed=True) for data in published]
+    assert set(seconds) == {2 ** 31 - 1} and len(published) == 100
+
+
+def test_a_run_offline_whose_stamps_would_end_is_refused_before(tmp_path, capsys):
+    simulation = near_the_end()
+    simulation.log_to(None, simulation.streams)
+    with pytest.raises(IntegrationError, match='2038'):
+        simulation.advance_in_blocks(2 * SECOND, lambda *block: None)
+    for epoch_ns in (LAST_STAMP_NS - 5, -1, 2 ** 70):
+        with pytest.raises(ValueError, match='must be from 0 to 2147483648 s'):
+            Simulation(parameters.checked({'duration': 1.0}), epoch_ns)
+    for epoch in ('2147483647.5', '-3', '1e300', 'nan'):
+        log = tmp_path / 'run.mcap'
+        assert main(['-o', str(log), '--duration', '1', '--quiet', '--epoch', epoch]) == 1
+        assert 'must be from 0 to 2147483648 s' in capsys.readouterr().err
+        assert not log.exists()
+
+
+# ----------------------------------------------------------------------------- anything allowed
+
+def test_every_combination_that_the_ranges_allow_runs_or_is_refused():
+    found = Counter(short_lives.live(seed) for seed in range(100))
+    assert found.keys() <= {'ran', 'refused', 'stopped'}
+    assert found['ran'] > 40 and found['refused'] > 5
+
+
+def test_numbers_of_any_size_are_among_them():
+    sizes = [abs(value) for seed in range(300) for name, value in short_lives.values(seed).items()
+             if name == 'spin.l3' and value]
+    assert min(sizes) < 1e-100 and max(sizes) > 1e100
+    assert all(map(math.isfinite, sizes))
