@@ -71,9 +71,7 @@ def _nodes(context: LaunchContext) -> list:
     values = {}
     for path in files:
         values.update(read_scene(path))
-    asked = {}
-    for text in shlex.split(given['set']):
-        asked.update(parse_assignment(text))
+    asked = dict(map(parse_assignment, shlex.split(given['set'])))
     values = parameters.checked({**values, **asked})
     prefix = given['frame_prefix']
     if prefix == 'auto':
