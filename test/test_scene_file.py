@@ -46,7 +46,7 @@ def test_values_have_the_types_that_rcl_finds(tmp_path):
     path = scene(tmp_path / 'p.yaml', **{f'p{k}': text for k, text in enumerate(VALUES)})
     with ros_node(path) as node:
         theirs = [node.get_parameter(f'p{k}').value for k in range(len(VALUES))]
-    ours = [parse_assignment(f'spin.l3:={text}')['spin.l3'] for text in VALUES]
+    ours = [parse_assignment(f'spin.l3:={text}')[1] for text in VALUES]
     assert list(zip(VALUES, map(repr, ours), strict=True)) == list(
         zip(VALUES, map(repr, theirs), strict=True))
 

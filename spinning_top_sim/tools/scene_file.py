@@ -59,12 +59,14 @@ def read_scene(path: str | Path) -> dict[str, object]:
     return _known(values, str(path))
 
 
-def parse_assignment(text: str) -> dict[str, object]:
-    """Return the value of NAME:=VALUE, read as YAML, by its name; nothing for one of ROS."""
-    name, separator, value = text.partition(':=')
+def parse_assignment(text: str) -> tuple[str, object]:
+    """Return name and value of NAME:=VALUE, the value read as YAML.  Raises ValueError."""
+    name, separator, yaml_text = text.partition(':=')
     if not separator:
         raise ValueError(f'{text!r}: must be NAME:=VALUE')
-    return _known({name: _parse_yaml(value, text)}, text)
+    value = _parse_yaml(yaml_text, text)
+    _known({name: value}, text)
+    return name, value
 
 
 def _parse_yaml(text: str | bytes, source: str) -> object:
@@ -83,10 +85,14 @@ def _flatten(section: Mapping[object, object], prefix: str = '') -> Iterator[tup
             yield f'{prefix}{name}', value
 
 
+def is_of_ros(name: str) -> bool:
+    """Whether rclpy takes a parameter of this name."""
+    return name.split('.')[0] in ROS_PARAMETERS
+
+
 def _known(values: Mapping[str, object], source: str) -> dict[str, object]:
     """Return the values but for those of ROS.  Raises ValueError for others than ours."""
-    known = {name: value for name, value in values.items()
-             if name.split('.')[0] not in ROS_PARAMETERS}
+    known = {name: value for name, value in values.items() if not is_of_ros(name)}
     for name, value in known.items():
         if name not in parameters.BY_NAME:
             near = difflib.get_close_matches(name, parameters.BY_NAME, 1)

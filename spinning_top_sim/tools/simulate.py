@@ -33,7 +33,7 @@ from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.streams.schedule import offline_block_ns, offline_targets
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools import cli
-from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
+from spinning_top_sim.tools.scene_file import is_of_ros, parse_assignment, read_scene
 from spinning_top_sim.tools.table import Stop, write_table
 
 if TYPE_CHECKING:
@@ -98,8 +98,8 @@ def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
     given: dict[str, object] = {}
     for path in arguments.params:
         given.update(read_scene(path))
-    for text in arguments.param:
-        given.update(parse_assignment(text))
+    given.update((name, value) for name, value in map(parse_assignment, arguments.param)
+                 if not is_of_ros(name))
     given.update((name, value) for name, value in vars(arguments).items()
                  if name in ('seed', 'duration') and value is not None)
     values = parameters.checked(given)
