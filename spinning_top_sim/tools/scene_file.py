@@ -87,7 +87,7 @@ def _flatten(section: Mapping[object, object], prefix: str = '') -> Iterator[tup
 
 def is_of_ros(name: str) -> bool:
     """Whether rclpy takes a parameter of this name."""
-    return name.split('.')[0] in ROS_PARAMETERS
+    return name.partition('.')[0] in ROS_PARAMETERS
 
 
 def _known(values: Mapping[str, object], source: str) -> dict[str, object]:
