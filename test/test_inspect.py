@@ -5,7 +5,9 @@
 What is measured is compared with the closed form, which test_exact.py holds against 30 digits.
 """
 
+import itertools
 import json
+import math
 import re
 import struct
 import subprocess
@@ -13,13 +15,16 @@ import sys
 
 import numpy as np
 import pytest
+from helpers.odd_logs import odd_log
 from helpers.reference import ROOT, SCENES, scene_parameters
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.streams import parameters
-from spinning_top_sim.tools import analysis, cli, inspect, simulate
+from spinning_top_sim.streams import journal, parameters
+from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.tools import analysis, cli, inspect, recover, simulate
+from spinning_top_sim.tools.recorded_run import read_run_description
 from spinning_top_sim.tools.survey import Series, survey
 
 RUN_S = 20
@@ -76,14 +81,23 @@ def surveyed(path):
         return survey(reader)
 
 
-def rewritten(source, target, change=lambda topic, number, data: data):
-    """Copy a log with checksums that are right; `change` has each message, None drops it."""
+def rewritten(source, target, change=lambda topic, number, data: data, metadata=None,
+              stamp=lambda topic, number, stamp_ns, copy=0: stamp_ns):
+    """
+    Copy a log with checksums that are right.
+
+    change : takes topic, number in it and data of a message; returns other data, None to drop it,
+        or a list of data
+    metadata : what is another in the metadata of the run
+    stamp : takes topic, number and log time [ns], and the place in the list; returns the log time
+    """
     numbers = {}
     with open(source, 'rb') as old, open(target, 'wb') as new:
         reader, writer = make_reader(old), Writer(new)
         writer.start('ros2')
         for record in reader.iter_metadata():
-            writer.add_metadata(record.name, record.metadata)
+            ours = metadata if record.name == 'spinning_top_sim' else None
+            writer.add_metadata(record.name, {**record.metadata, **(ours or {})})
         summary = reader.get_summary()
         schemas = {number: writer.register_schema(schema.name, schema.encoding, schema.data)
                    for number, schema in summary.schemas.items()}
@@ -91,11 +105,13 @@ def rewritten(source, target, change=lambda topic, number, data: data):
             channel.topic, channel.message_encoding, schemas[channel.schema_id],
             channel.metadata) for number, channel in summary.channels.items()}
         for _, channel, message in reader.iter_messages():
-            number = numbers[channel.topic] = numbers.get(channel.topic, -1) + 1
-            data = change(channel.topic, number, message.data)
-            if data is not None:
-                writer.add_message(channels[channel.id], message.log_time, data,
-                                   message.publish_time)
+            topic = channel.topic
+            number = numbers[topic] = numbers.get(topic, -1) + 1
+            data = change(topic, number, message.data)
+            for copy, one in enumerate(data if isinstance(data, list) else [data]):
+                if one is not None:
+                    at_ns = stamp(topic, number, message.log_time, *filter(None, [copy]))
+                    writer.add_message(channels[channel.id], at_ns, one, at_ns)
         writer.finish()
     return target
 
@@ -511,6 +527,19 @@ def test_a_table_breaks_no_cell_however_narrow(width, stacked):
         assert [line.split() for line in lines] == cells
 
 
+def test_a_terminal_of_80_columns_holds_every_line_and_whole_names(stepped, capsys, monkeypatch):
+    monkeypatch.setenv('COLUMNS', '80')
+    out = told(capsys, stepped, '--verify')[1]
+    assert max(map(len, out.splitlines()[1:])) <= 80
+    for name in ('visualization_msgs/msg/MarkerArray', 'sensor_msgs/msg/JointState',
+                 '/a/b/ground_truth/imu_bias', '/a/b/spinning_top/invariants'):
+        assert f'{name} ' in out or f'{name}\n' in out
+    for tool in (inspect, recover, simulate):
+        with pytest.raises(SystemExit):
+            tool.main(['--help'])
+        assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
+
+
 def test_json_is_strict_and_documented(columns, capsys):
     _, out, _ = told(capsys, columns, '--json', '--verify')
     content = json.loads(out, parse_constant=pytest.fail)
@@ -574,6 +603,155 @@ def test_says_what_it_cannot_tell(tmp_path, capsys, streams):
     assert ('no topic with an attitude' in out) == (streams != ['pose'])
 
 
+@pytest.mark.parametrize('seed', range(50))
+def test_odd_logs_end_in_words(tmp_path, capsys, seed):
+    path = odd_log(tmp_path / 'odd.mcap', seed)
+    code, out, err = told(capsys, path, '--verify')
+    assert code in (0, 1) and out.startswith(f'{path}: ')
+    assert (out + err).replace('\n', '').isprintable()
+    code, content = as_json(capsys, path)
+    assert code in (0, 1) and content['file'] == str(path)
+
+
+@pytest.mark.parametrize(('key', 'text'), [
+    *itertools.product(
+        ('parameters', 'parameters_now', 'history', 'epoch_ns', 'begun_ns'),
+        ('', '[]', '[' * 100_000, '"\\ud800"', '9' * 5000, str(2 ** 63), 'NaN')),
+    ('history', '[[0, 1, NaN]]'), ('history', '[[5, 1.0, 1.0], [4, 1.0, 1.0]]'),
+    ('history', '[[1e300, 1.0, 1.0]]'), ('epoch_ns', '-1'), ('begun_ns', str(10 ** 18)),
+    ('parameters', '{"spin.l3": {}}'), ('parameters', '{"world_frame": "\\ud800"}'),
+    ('parameters', '{"top.lambda1": 1e-320}')])
+def test_odd_metadata_end_in_words(stepped, tmp_path, capsys, key, text):
+    path = rewritten(stepped, tmp_path / 'odd.mcap', metadata={key: text})
+    code, out, _ = told(capsys, path, '--verify')
+    assert code in (0, 1) and '/a/b/pose' in out
+    assert 'cannot be used' in out or 'motion 1' in out or 'cannot be followed' in out
+
+
+@pytest.mark.parametrize('event', [
+    {'event': 'command', 'l3': math.nan, 'lz': 1.0}, {'event': 'command', 'l3': [], 'lz': None},
+    {'event': 'command', 'sent_ns': 2 ** 63, 'l3': 1.0, 'lz': 1.0},
+    {'event': 'command', 'sent_ns': 0.5, 'l3': 1.0, 'lz': 1.0}, {'event': 'parameters', 'x': 1},
+    {'event': 'parameters', 'pose.rate': '\ud800'}, {'event': 'reset'}, {'event': []},
+    {'event': 'reset', 'parameters': {}, 'epoch_ns': 10 ** 18},
+    {'event': 'reset', 'parameters': [], 'epoch_ns': 3_500_000_000}])
+def test_an_odd_entry_of_the_journal_is_told(stepped, tmp_path, capsys, event):
+    """It is left out: the run is followed to its end all the same."""
+    data = journal.event(**{'name': event['event'], 't_ns': 0, 'sent_ns': 2_500_000_000, **{
+        name: value for name, value in event.items() if name != 'event'}})
+    path = rewritten(stepped, tmp_path / 'odd.mcap', lambda topic, number, old: (
+        [old, data] if topic.endswith('/events') and number == 3 else old))
+    code, out, _ = told(capsys, path, '--verify')
+    assert code == 1
+    assert 'journal, entry at 3.003100000 s: ' in out or 'cannot be followed beyond' in out
+    assert 'motion 4' in out
+
+
+def test_a_run_that_no_log_of_its_size_holds_is_not_computed(stepped, tmp_path, capsys):
+    """A stamp of the year 2100: neither 10^10 samples nor 10^10 steps."""
+    path = rewritten(stepped, tmp_path / 'late.mcap', lambda topic, number, data: data,
+                     stamp=lambda topic, number, stamp_ns: (
+                         4 * 10 ** 18 if (topic, number) == ('/a/b/pose', 300) else stamp_ns))
+    code, out, _ = told(capsys, path, '--verify')
+    assert code == 1 and 'lacks most samples of this run' in out
+    path = rewritten(
+        stepped, tmp_path / 'far.mcap', lambda topic, number, data: (
+            data.replace(b'"sent_ns": 2003100000', b'"sent_ns": 3999999999000000000').replace(
+                b'"t_ns": 2003100000', b'"t_ns": 3999999999000000000')
+            if topic.endswith('/events') else data),
+        stamp=lambda topic, number, stamp_ns: (
+            4 * 10 ** 18 if (topic.endswith('/events') and number == 3) else stamp_ns))
+    code, out, _ = told(capsys, path)
+    assert 'journal, entry at 4000000000.000000000 s' in out or 'integration steps' in out
+
+
+def test_changes_without_effect_cost_next_to_nothing(stepped, tmp_path, capsys, monkeypatch):
+    """No block of samples ends at a change of parameters that acts on no sample."""
+    calls = []
+    advance = Simulation.advance_in_blocks
+    monkeypatch.setattr(Simulation, 'advance_in_blocks', lambda self, *arguments: (
+        calls.append(arguments[0]), advance(self, *arguments)))
+    assert verified(capsys, stepped)['identical']
+    before = len(calls)
+    entries = [journal.event('parameters', t, t, status_period=float(t % 7), tick_rate=50.0)
+               for t in range(2_100_000_000, 2_200_000_000, 100_000)]
+    path = rewritten(
+        stepped, tmp_path / 'run.mcap', lambda topic, number, data: (
+            [data, *entries] if topic.endswith('/events') and number == 3 else data),
+        stamp=lambda topic, number, stamp_ns, copy=0: stamp_ns + (copy and 200_000_000))
+    calls.clear()
+    assert verified(capsys, path)['identical']
+    assert len(calls) == before
+
+
+@pytest.mark.parametrize('when', [0, 1])
+def test_a_log_that_ends_at_a_reset_or_a_start_verifies(tmp_path, capsys, when):
+    """Before the first sample of the motion; nothing is missing."""
+    values = parameters.checked({})
+    path = log_of(tmp_path / 'run.mcap', '--duration', 1)
+    end = journal.event('reset', 0, 1_000_000_000, epoch_ns=2_100_000_000, parameters=values)
+    if when:
+        path = rewritten(path, tmp_path / 'reset.mcap', lambda topic, number, data: (
+            [data, end] if topic.endswith('/events') else data),
+            stamp=lambda topic, number, stamp_ns, copy=0: (
+                2_100_000_000 if copy else stamp_ns))
+    else:
+        path = rewritten(path, tmp_path / 'start.mcap', lambda topic, number, data: (
+            data if topic.endswith('/events') else None))
+    code, content = as_json(capsys, path, '--verify')
+    assert content['verify']['identical'] and code == 0, content['verify']
+    assert all(topic['missing'] in (0, None) for topic in content['topics'].values())
+
+
+def test_the_journal_is_read_without_the_chunks_that_have_none_of_it(tmp_path, monkeypatch):
+    path = log_of(tmp_path / 'run.mcap', '--duration', 30, '--command', '14:1.7:1.4')
+    with open(path, 'rb') as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    with LogReader(path) as reader:
+        read, plain = [], reader._read
+        monkeypatch.setattr(reader, '_read', lambda span: (read.append(span), plain(span))[1])
+        run = read_run_description(reader)
+        assert [event.name for event in run.events] == ['start', 'command']
+        assert len(read) <= 4 < len(chunks)
+
+
+def test_names_do_not_act_on_the_terminal(tmp_path, capsys):
+    path = tmp_path / 'evil.mcap'
+    with open(path, 'wb') as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema('a/\x1b]0;b\x07', 'ros2msg', b'')
+        channel = writer.register_channel('/\x1b[2J\u202e\x9b\nline', 'cdr', schema)
+        writer.add_message(channel, 1, b'', 1)
+        writer.finish()
+    out = told(capsys, path)[1]
+    assert out.replace('\n', '').isprintable()
+    assert '/\\x1b[2J\\u202e\\x9b\\nline' in out and 'a/\\x1b]0;b\\x07' in out
+
+
+def test_an_incomplete_log_is_told_in_the_same_words_before_and_after_recover(
+        columns, tmp_path, capsys):
+    torn, whole = tmp_path / 'torn.mcap', tmp_path / 'whole.mcap'
+    data = bytearray(columns.read_bytes())
+    with open(columns, 'rb') as file:
+        chunk = make_reader(file).get_summary().chunk_indexes[1]
+    middle = chunk.chunk_start_offset + chunk.chunk_length // 2
+    data[middle:middle + 99] = bytes(99)
+    torn.write_bytes(data)
+    assert recover.main([str(torn), '-o', str(whole)]) == 3
+    capsys.readouterr()
+    texts = []
+    for path in (torn, whole):
+        code, out, _ = told(capsys, path, '--verify')
+        assert code == 1
+        texts.append([line for line in out.splitlines() if line.startswith('verify: ')])
+        verdict = verified(capsys, path)
+        assert verdict['missing'] and not (verdict['different'] or verdict['unexpected'])
+    assert texts[0] == texts[1]
+    assert re.match(r'verify: incomplete, \d+ messages missing; the other \d+ are identical',
+                    texts[0][0])
+
+
 # ---------------------------------------------------------------------------------- pictures
 
 
@@ -609,7 +787,11 @@ def test_pictures_are_drawn(stepped, tmp_path, capsys):
     pytest.importorskip('matplotlib')
     image = pytest.importorskip('PIL.Image')
     page, film = tmp_path / 'page.png', tmp_path / 'top.gif'
-    assert told(capsys, stepped, '--plot', page, '--animate', film)[0] == 0
+    code, out, _ = told(capsys, stepped, '--plot', page, '--animate', film)
+    assert code == 0
+    assert out.endswith(
+        f'{page}: motion from 0.01 to 1 s of 3 s in the log; drifts and errors of all of it\n'
+        f'{film}: motion from 0.01 to 0.96 s of 3 s in the log\n')
     pixels = np.asarray(image.open(page).convert('L'))
     assert min(pixels.shape) > 700 and 0.02 < np.mean(pixels < 250) < 0.5
     frames = image.open(film)

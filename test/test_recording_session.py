@@ -54,6 +54,15 @@ class Recorded:
         return log_of(self.session.stop().split(': ')[0])
 
 
+@pytest.mark.parametrize('uri', ['new/', 'new/er.mcap/'])
+def test_a_name_with_a_slash_is_a_folder(tmp_path, uri):
+    recorded = Recorded(f'{tmp_path}/{uri}')
+    recorded.start()
+    recorded.stop()
+    log, = (tmp_path / uri).iterdir()
+    assert log.suffix == '.mcap'
+
+
 @pytest.fixture
 def slow_disk(monkeypatch):
     """Have a log opened no sooner than `go_on` is set; `opening` says that it is at it."""

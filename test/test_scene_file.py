@@ -13,7 +13,7 @@ VALUES = ['1e-9', '1e5', '-1E+5', '1.5', '.5', '5.', '+5', '-3', '010', '08', '0
           '1:30', '~', 'null', 't', 'y', 'No', 'on', 'True', 'tRUE', '.inf', 'nan', '.NaN',
           '-.nan', '2020-01-01', '0b11', '1e', 'e5', '""', '"1"', "'true'", '!!str 5', 'a b',
           '[1, 2, 3]', '[1.0, 2e3]', '[a, b]', '["1", a]', '[true, false]']
-REFUSED = ['[1, 2.0]', '[1e3, 2]', '[0.5, a]', '[true, "n"]', '', '[1', '{']
+REFUSED = ['[1, 2.0]', '[1e3, 2]', '[0.5, a]', '[true, "n"]', '', '[1', '{', '&a [*a]', '*b']
 
 
 @contextlib.contextmanager
@@ -84,6 +84,29 @@ def test_the_last_section_of_the_node_decides(tmp_path, sections):
                             for k, name in enumerate(sections)))
     with ros_node(path) as node:
         assert read_scene(path) == {'world_frame': node.get_parameter('world_frame').value}
+
+
+@pytest.mark.parametrize('section', ['use_sim_time: false', '{}', '{qos_overrides: {/a: 1}}'])
+def test_a_file_may_have_parameters_of_ros_only(tmp_path, section):
+    path = tmp_path / 'p.yaml'
+    path.write_text(f'/**:\n  ros__parameters:\n    {section}\n')
+    with ros_node(path):
+        assert read_scene(path) == {}
+    assert main(['-o', str(tmp_path / 'run.mcap'), '--params', str(path), '--duration', '1',
+                 '-p', 'use_sim_time:=true', '-p', 'qos_overrides./a.b:=1', '--quiet']) == 0
+
+
+def test_a_deep_file_is_refused(tmp_path):
+    path = scene(tmp_path / 'p.yaml', **{'spin.l3': '[' * 10_000})
+    with pytest.raises(ValueError, match=r'p\.yaml'):
+        read_scene(path)
+
+
+@pytest.mark.parametrize('name', ['1', '1.5', 'true', '[a]', '<<', '""', '? {a: b}\n   '])
+def test_a_name_that_is_no_text_is_refused(tmp_path, name):
+    path = scene(tmp_path / 'p.yaml', **{name: '1.5'})
+    with pytest.raises(ValueError, match=r'p\.yaml'):
+        read_scene(path)
 
 
 def test_an_unknown_name_is_refused_with_a_likely_one(tmp_path, capsys):

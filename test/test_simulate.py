@@ -191,6 +191,10 @@ def events_of(log):
     (['--duration', '0'], 'duration = 0.0 s'), ([], 'duration = 0.0 s'),
     (['--duration', '1', '-p', 'top.lambda1:=-1'], 'top.lambda1 = -1'),
     (['--duration', '1', '-p', 'spin.l3=2'], "'spin.l3=2'"),
+    (['--duration', '1', '--epoch', 'nan'], '--epoch nan'),
+    (['--duration', '1', '--epoch=-3'], '--epoch -3'),
+    (['--duration', '10', '--epoch', '2147483640'], '2038'),
+    (['--duration', '1e300'], 'must be'), (['--duration', '3e9'], 'must be'),
     (['--duration', '1', '--params', '/nowhere.yaml'], '/nowhere.yaml'),
     (['--duration', '1', '--command', '1:2'], '--command 1:2'),
     (['--duration', '1', '--command=-1:2:2'], '--command -1:2:2'),
@@ -208,6 +212,9 @@ def events_of(log):
      'simulate: /nowhere/run.csv: No such file or directory\n'),
     (['--duration', '1', '-o', '/proc/run.csv'],
      'simulate: /proc/run.csv: No such file or directory\n'),
+    (['--duration', '1', '-o', '/proc/self/fd/run.mcap'],
+     'simulate: cannot record to /proc/self/fd/run.mcap: no files can be made in /proc/self/fd\n'),
+    (['--duration', '1', '-o', '/dev/null', '--format', 'mcap'], '/dev/null'),
 ])
 def test_what_cannot_be_simulated_is_told_in_a_line(tmp_path, capsys, arguments, message):
     assert main(['-o', str(tmp_path / 'run.mcap'), '--quiet', *arguments]) == 1
@@ -228,7 +235,7 @@ def test_a_params_file_that_is_no_yaml_or_of_another_node(tmp_path, capsys):
         assert message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize('name', ['run', 'run.bag', 'run.mcap.zst', 'run.CSV'])
+@pytest.mark.parametrize('name', ['run', 'run.bag', 'run.mcap.zst', 'run.CSV', '.mcap', 'run.'])
 def test_an_unknown_extension_is_refused(tmp_path, capsys, name):
     assert main(['-o', str(tmp_path / name), '--duration', '1', '--quiet']) == 1
     error = capsys.readouterr().err
@@ -240,8 +247,10 @@ def test_an_unknown_extension_is_refused(tmp_path, capsys, name):
 
 
 @pytest.mark.parametrize('arguments', [
-    ['-o', 'run.parquet'], ['-o', 'run.csv', '-p', 'initial.theta:=0.0', '-p', 'spin.lz:=1.0'],
-    ['-o', 'run.mcap', '--command', '2:1.0:1.0'], ['-o', 'run.csv', '--command', '2:1.0:1.0']])
+    ['-o', 'run.parquet'], ['-o', 'run', '--format', 'parquet'],
+    ['-o', 'run.csv', '-p', 'initial.theta:=0.0', '-p', 'spin.lz:=1.0'],
+    ['-o', 'run.mcap', '--command', '2:1.0:1.0'], ['-o', 'run.csv', '--command', '2:1.0:1.0'],
+    ['-o', 'run.mcap', '--command', '1.000000001:1:1'], ['-o', 'new/'], ['-o', 'new/run.csv']])
 def test_what_is_refused_leaves_no_file(tmp_path, monkeypatch, arguments):
     monkeypatch.setitem(sys.modules, 'pyarrow', None)
     monkeypatch.chdir(tmp_path)
@@ -333,6 +342,22 @@ def test_progress_is_shown_on_a_terminal_only(monkeypatch):
         assert ('simulated 100%|' in stream.getvalue()) == shown
         assert ('20/20 s' in stream.getvalue()) == shown
         assert shown or stream.getvalue() == ''
+
+
+def test_progress_is_shown_without_tqdm_too(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    monkeypatch.setitem(sys.modules, 'tqdm', None)
+    told = ['', 'verified   0%', 'verified  50%', 'verified  50%', 'verified 100%\n']
+    for stream, quiet, shown in ((Terminal(), False, told), (Terminal(), True, ['']),
+                                 (io.StringIO(), False, [''])):
+        monkeypatch.setattr(sys, 'stderr', stream)
+        with cli.progress('verified', 20.0, 's', quiet=quiet) as show:
+            for done in (0.0, 10.0, 10.0001, 25.0):
+                show(done)
+        assert stream.getvalue().split('\r') == shown
 
 
 @pytest.mark.parametrize(('name', 'code'), [('run.csv', 0), ('run.mcap', 1)])

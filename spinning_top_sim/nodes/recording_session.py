@@ -171,6 +171,8 @@ def _open_log(topics: Sequence[Topic], run: Run) -> McapRecorder:
     values, metadata = run[-1], provenance(*run)
     recorded = [RecordedTopic(*topic) for topic in topics]
     folder = path = Path(values['record.uri']).expanduser().absolute()
+    if values['record.uri'].endswith('/'):
+        folder.mkdir(parents=True, exist_ok=True)
     named = values['record.uri'] and not path.is_dir()
     stem, number = time.strftime('spinning_top_%Y-%m-%d_%H-%M-%S'), 1
     while True:

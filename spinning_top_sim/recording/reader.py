@@ -184,6 +184,8 @@ class LogReader:
         for span in spans:
             if span.end_ns < times.start or span.start_ns >= times.stop:
                 continue
+            if names is not None and self._is_without(span, channels):
+                continue
             if span.start_ns > overlap_end:
                 yield from self._merge(overlapping, channels, times)
                 overlapping = []
@@ -217,6 +219,12 @@ class LogReader:
             yield LogMessage(channels[channel_id], log_time, publish_time, sequence,
                              bytes(plain[begin:end]), channel_id)
         self._held_bytes -= held_bytes
+
+    def _is_without(self, span: _Span, channels: Mapping[int, str]) -> bool:
+        """Whether a chunk has message indexes by the summary, and none of these channels."""
+        index = self._summary.chunks.get(span.offset)
+        return bool(index and index.message_index_offsets
+                    and index.message_index_offsets.keys().isdisjoint(channels))
 
     def scan(self) -> Scanner:
         """Begin a scan of all usable records in file order, with what former ones know."""

@@ -240,17 +240,19 @@ class Simulation:
             else:
                 stream.skipped += 1
 
-    def advance_in_blocks(self, target_ns: int, send: TakeRows) -> None:
+    def advance_in_blocks(self, target_ns: int, send: TakeRows,
+                          give_way: Callable[[], bool] = lambda: False) -> None:
         """
         Send every sample of the recorded streams up to `target_ns`, a block of a stream at a time.
 
-        The same bytes as `advance` sends, in another order; for offline use.  Raises
-        IntegrationError if the equations cannot go on; the samples before that are sent.
+        The same bytes as `advance` sends, in another order; for offline use.  True of `give_way`
+        ends the call early.  Raises IntegrationError if the equations cannot go on; the samples
+        before that are sent.
         """
         segment = self.segment
         self._schedule.invalidate()
         check_stamp(self.epoch_ns + target_ns)
-        while self.now_ns < target_ns:
+        while self.now_ns < target_ns and not give_way():
             try:
                 segment.reach(target_ns, OFFLINE_STEPS)
             except IntegrationError:

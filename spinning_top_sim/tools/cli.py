@@ -12,8 +12,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TextIO
 
-from tqdm import tqdm
-
 OK = 0
 FAILED = 1
 INTERRUPTED = 130
@@ -22,10 +20,13 @@ TEXT_WIDTH = 118            # without a terminal
 GAP = '  '                  # before each column of a table
 
 
-def exit_code(parser: argparse.ArgumentParser, argv: Sequence[str] | None,
-              command: Callable[[argparse.Namespace], int],
-              errors: tuple[type[Exception], ...]) -> int:
+def run(name: str, help_text: str | None, argv: Sequence[str] | None,
+        add_arguments: Callable[[argparse.ArgumentParser], object],
+        command: Callable[[argparse.Namespace], int], errors: tuple[type[Exception], ...]) -> int:
     """Run a command; return its code, FAILED after one of `errors`, INTERRUPTED after Ctrl-C."""
+    parser = argparse.ArgumentParser(prog=name, description=help_text,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_arguments(parser)
     arguments = parser.parse_args(argv)
     try:
         code = command(arguments)
@@ -39,24 +40,39 @@ def exit_code(parser: argparse.ArgumentParser, argv: Sequence[str] | None,
         what = str(error)
         if isinstance(error, OSError) and error.filename is not None:
             what = f'{error.filename}: {error.strerror}'
-        print_line(f'{parser.prog}: {what}', sys.stderr)
+        print_line(f'{name}: {what}', sys.stderr)
         return FAILED
     except KeyboardInterrupt:
-        print_line(f'{parser.prog}: interrupted', sys.stderr)
+        print_line(f'{name}: interrupted', sys.stderr)
         return INTERRUPTED
 
 
+def printable(text: str) -> str:
+    """Return a text with escapes for what would act on a terminal, or cannot be encoded."""
+    return ''.join(character if character.isprintable() else
+                   character.encode('unicode_escape').decode() for character in text)
+
+
 def print_line(text: str, file: TextIO | None = None) -> None:
-    """Print a line, by default to the standard output, whatever bytes a file name holds."""
-    print(text.encode(errors='backslashreplace').decode(), file=file or sys.stdout)
+    """Print a line, by default to the standard output, whatever a name in it holds."""
+    print(printable(text), file=file or sys.stdout)
 
 
 @contextlib.contextmanager
 def progress(what: str, total: float, unit: str, *, quiet: bool = False,
              ) -> Iterator[Callable[[float], None]]:
     """Show a bar on a terminal, nothing elsewhere; yield what takes the amount done so far."""
-    # None: no bar where there is no terminal.
-    with tqdm(total=total, unit=unit, desc=what, disable=quiet or not total > 0.0 or None,
+    if quiet or not total > 0.0 or not sys.stderr.isatty():
+        yield lambda done: None
+        return
+    try:
+        from tqdm import tqdm  # noqa: PLC0415 - a system may lack it
+    except ImportError:
+        yield lambda done: print(f'\r{what} {min(done / total, 1.0):4.0%}', end='',
+                                 file=sys.stderr, flush=True)
+        print(file=sys.stderr)
+        return
+    with tqdm(total=total, unit=unit, desc=what,
               bar_format='{desc} {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} {unit} '
                          '[{elapsed}<{remaining}]') as bar:
         yield lambda done: bar.update(min(done, total) - bar.n)
@@ -72,7 +88,7 @@ class Table:
 
     def lines(self, width: int) -> Iterator[str]:
         """Yield the lines; where they are too wide, the first column has lines of its own."""
-        cells = [self.head, *self.rows]
+        cells = [[*map(printable, row)] for row in (self.head, *self.rows)]
         first, *widths = (max(map(len, column)) for column in zip(*cells, strict=True))
         stacked = first + sum(widths) + len(GAP) * (len(widths) + 1) > width
         yield from ('', self.title)

@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
+from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools.analysis import Attitudes, Complexes, Reals, interpolate
 from spinning_top_sim.tools.survey import Series, Survey
 
@@ -83,15 +84,8 @@ def smooth_tip(data: Attitudes) -> tuple[Reals, Complexes, Reals]:
     return at * data.period, interpolate(data.tip, at), interpolate(data.height, at)
 
 
-def draw_page(found: Survey, path: Path, name: str) -> None:
-    """
-    Draw a page of figures about a log with samples of attitudes (`found.shown`).
-
-    path : picture to write; its extension is the format
-    name : of the log, for the title
-
-    Raises OSError or ValueError where the picture cannot be written or the format is unknown.
-    """
+def draw_page(found: Survey, path: Path) -> str:
+    """Draw a page about a log with samples of attitudes (`found.shown`); return what it shows."""
     assert found.shown is not None
     motion, data = found.shown
     assert motion.measured is not None
@@ -102,7 +96,7 @@ def draw_page(found: Survey, path: Path, name: str) -> None:
         figure = Figure(figsize=(11.0, 2.4 * rows + 0.6), layout='constrained')
         grid = figure.add_gridspec(rows, 2, height_ratios=[1.1, 1.1, 1.0, 1.0][:rows])
         regime = motion.regime or (motion.exact.name if motion.exact else '')
-        figure.suptitle(f'{name}: {regime}', fontsize=14)
+        figure.suptitle(f'{found.path.name}: {regime}', fontsize=14)
         _tip_panel(figure.add_subplot(grid[0:2, 0]), data, period or 0.0)
         tilt = figure.add_subplot(grid[0, 1])
         time, _, height = smooth_tip(data)
@@ -145,6 +139,14 @@ def draw_page(found: Survey, path: Path, name: str) -> None:
                 axes.set(title=f'{quantity.partition(" [")[0]}, {topic}', xlabel='time [s]',
                          ylabel=quantity)
         figure.savefig(path, dpi=120)
+    return f'motion {_part(found, data, float(data.time[-1]))}; drifts and errors of all of it'
+
+
+def _part(found: Survey, data: Attitudes, duration: float) -> str:
+    """Return in words which part of the log is shown."""
+    begin = float(data.stamps_ns[0] - found.damage.start_ns) / NANOSECONDS
+    whole = (found.damage.end_ns - found.damage.start_ns) / NANOSECONDS
+    return f'from {begin:.4g} to {begin + duration:.4g} s of {whole:.4g} s in the log'
 
 
 def _tip_panel(axes: Axes, data: Attitudes, period: float) -> None:
@@ -179,12 +181,8 @@ def _plot_series(axes: Axes, found: Survey, series: Series, **style: Any) -> Non
     axes.plot((stamps_ns - found.damage.start_ns) * 1e-9, values, **style)
 
 
-def animate(found: Survey, path: Path) -> None:
-    """
-    Draw the turning top as a GIF, at most LONGEST_S of it: axis, disc with a mark, trace.
-
-    Raises OSError or ValueError where the picture cannot be written.
-    """
+def animate(found: Survey, path: Path) -> str:
+    """Draw the turning top as a GIF: axis, disc with a mark, trace; else as `draw_page`."""
     assert found.shown is not None
     _, data = found.shown
     frames = max(2, int(min(LONGEST_S, float(data.time[-1])) * FRAMES_PER_S))
@@ -215,3 +213,4 @@ def animate(found: Survey, path: Path) -> None:
 
     FuncAnimation(figure, frame, frames=frames, blit=False).save(
         path, writer=PillowWriter(fps=FRAMES_PER_S))
+    return f'motion {_part(found, data, frames / FRAMES_PER_S)}'

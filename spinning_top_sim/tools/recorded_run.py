@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import operator
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +19,14 @@ from spinning_top_sim.streams.pipeline import Simulation, TakeRows
 from spinning_top_sim.streams.schedule import offline_block_ns, offline_targets
 from spinning_top_sim.streams.topics import all_streams
 
-EVENT_NAMES = ('start', 'command', 'parameters', 'reset')
+# What values raise that are not as this package writes them.
+ODD = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+LATEST_NS = 1 << 62         # of log times: the difference of any two of them fits into int64
+MOST_TEXT = 300             # of a reason
+# What is computed for a log at most: for a small one, and more for each of its bytes.
+LEAST_STEPS, STEPS_A_BYTE = 200_000, 20
+LEAST_SAMPLES, SAMPLES_A_BYTE = 100_000, 1
+MOST_BLOCKS = 20_000        # of samples between two events
 
 
 class ForeignLogError(Exception):
@@ -33,11 +41,17 @@ class DepartureError(Exception):
 class Event:
     """An entry of the journal."""
 
-    name: str                             # one of EVENT_NAMES
+    name: str                             # start, command, parameters or reset
     stamp_ns: int                         # log time [ns]
     t_ns: int                             # simulated time [ns]
     sent_ns: int                          # time up to which all samples had been sent [ns]
     details: Mapping[str, Any]            # the rest of the entry
+
+    @property
+    def acts(self) -> bool:
+        """Whether samples depend on it: of the parameters only rates take effect at once."""
+        return self.name in ('command', 'reset') or any(
+            name.endswith('.rate') for name in self.details)
 
 
 @dataclass(frozen=True)
@@ -55,6 +69,7 @@ class RunDescription:
     events_topic: str | None
     events: Sequence[Event]               # the journal
     broken: Sequence[tuple[int, str]]     # stamp [ns] of each damaged entry, and the reason
+    log_bytes: int                        # size of the log
 
 
 def read_run_description(reader: LogReader) -> RunDescription:
@@ -69,34 +84,47 @@ def read_run_description(reader: LogReader) -> RunDescription:
         epoch_ns, begun_ns = int(metadata['epoch_ns']), int(metadata['begun_ns'])
         history = [Event('command', epoch_ns + t_ns, t_ns, t_ns, {'l3': l3, 'lz': lz})
                    for t_ns, l3, lz in json.loads(metadata['history'])]
+        times_ns = [0, *(operator.index(event.t_ns) for event in history), max(begun_ns, 0)]
+        if times_ns != sorted(times_ns) or not 0 <= epoch_ns <= LATEST_NS - times_ns[-1]:
+            raise ValueError('times are out of order or too late')
         surroundings = {key: metadata[key] for key in ('version', 'platform', 'libraries')}
-    except (KeyError, TypeError, ValueError) as error:
-        raise ForeignLogError(f'its metadata {METADATA_NAME!r} cannot be used: '
-                              f'{type(error).__name__}: {error}') from error
-    topics = _topics(reader.topics, now)
+        topics = _topics(reader.topics, now)
+    except ODD as error:
+        raise ForeignLogError(
+            f'its metadata {METADATA_NAME!r} cannot be used: {reason_of(error)}') from error
     commands_topic = topics.pop(journal.COMMANDS, None)
     events_topic = topics.pop(journal.EVENTS, None)
     events: list[Event] = []
     broken: list[tuple[int, str]] = []
+    epoch, reached_ns = epoch_ns, epoch_ns - 1
     for message in () if events_topic is None else reader.messages(topics=[events_topic]):
         try:
-            events.append(_event(message.log_time, message.data))
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            broken.append((message.log_time, f'{type(error).__name__}: {error}'))
+            event = _event(message.log_time, message.data)
+            new_epoch = event.details['epoch_ns'] if event.name == 'reset' else epoch
+            if not reached_ns <= epoch + event.sent_ns <= event.stamp_ns <= LATEST_NS or not (
+                    epoch <= new_epoch <= event.stamp_ns):
+                raise ValueError(f'sent_ns = {event.sent_ns} is out of order or too late')
+            epoch, reached_ns = new_epoch, max(epoch + event.sent_ns, new_epoch - 1)
+            events.append(event)
+        except ODD as error:
+            broken.append((message.log_time, reason_of(error)))
     return RunDescription(values, now, epoch_ns, begun_ns, history, surroundings, topics,
-                          commands_topic, events_topic, events, broken)
+                          commands_topic, events_topic, events, broken, reader.size)
+
+
+def reason_of(error: Exception) -> str:
+    """Return a line about an error."""
+    text = f'{type(error).__name__}: {error}'
+    return text if len(text) <= MOST_TEXT else f'{text[:MOST_TEXT]}...'
 
 
 def _topics(topics: Sequence[LogTopic], now: Mapping[str, Any]) -> dict[str, str]:
-    """
-    Return the topic in the log of each stream and of the parts of the journal.
-
-    A log as it was written has them in a known order, whatever they were remapped to.  In a log
-    that was put together anew they are known by the ends of their names.
-    """
+    """Return the topic in the log of each stream and of the parts of the journal."""
     every = all_streams(now)
     recorded = [*((stream.topic, stream.type_name)
                   for stream in journal.recorded_streams(every, now)), *journal.TOPICS]
+    # As the log was written they have this order, whatever they were remapped to.  In a log that
+    # was put together anew they are known by the ends of their names.
     if [topic.type_name for topic in topics] == [type_name for _, type_name in recorded]:
         return {name: topic.name for topic, (name, _) in zip(topics, recorded, strict=True)}
     known = [*((stream.topic, stream.type_name) for stream in every), *journal.TOPICS]
@@ -111,15 +139,23 @@ def _topics(topics: Sequence[LogTopic], now: Mapping[str, Any]) -> dict[str, str
 
 
 def _event(stamp_ns: int, data: bytes) -> Event:
-    """Return an event from its bytes.  Raises ValueError where they are not as written."""
+    """Return an event from its bytes.  Raises one of ODD where they are not as written."""
     length_field = 4
     details = json.loads(data[len(ENCAPSULATION) + length_field:-1])
     name, t_ns, sent_ns = (details.pop(key) for key in ('event', 't_ns', 'sent_ns'))
     if journal.event(name, t_ns, sent_ns, **details) != data:
         raise ValueError('the bytes of the entry are not as it was written')
-    if name not in EVENT_NAMES:
+    operator.index(t_ns), operator.index(sent_ns)
+    if name == 'command':
+        details = {key: float(details[key]) for key in ('l3', 'lz')}
+    elif name == 'parameters':
+        details = {key: parameters.BY_NAME[key].check(value) for key, value in details.items()}
+    elif name == 'reset':
+        details = {'epoch_ns': operator.index(details['epoch_ns']),
+                   'parameters': parameters.checked(details['parameters'])}
+    elif name != 'start':
         raise ValueError(f'event {name!r} is unknown')
-    return Event(name, stamp_ns, t_ns, sent_ns, details)
+    return Event(name, stamp_ns, t_ns, sent_ns, {} if name == 'start' else details)
 
 
 def rerun(run: RunDescription, end_ns: int,
@@ -130,16 +166,30 @@ def rerun(run: RunDescription, end_ns: int,
     end_ns : log time of the end [ns]
     send : takes the samples of the log's streams in blocks; without it only motions are computed
 
-    Raises DepartureError where there is no motion with these parameters and commands.
+    Raises DepartureError where there is no motion with these parameters and commands, or where it
+    takes far more work than a run that fits into the log.
     """
     try:
-        simulation = Simulation(run.values, run.epoch_ns)
-    except (ValueError, IntegrationError) as error:
-        raise DepartureError(str(error)) from error
+        yield from _rerun(run, end_ns, send)
+    except ODD as error:
+        raise DepartureError(reason_of(error)) from error
+
+
+def _rerun(run: RunDescription, end_ns: int,
+           send: TakeRows | None) -> Iterator[tuple[Simulation, Event | None]]:
+    simulation = Simulation(run.values, run.epoch_ns)
+    most_steps = LEAST_STEPS + STEPS_A_BYTE * run.log_bytes
+    samples_left = LEAST_SAMPLES + SAMPLES_A_BYTE * run.log_bytes
+
+    def has_stepped_enough() -> bool:
+        return simulation.steps > most_steps
 
     def reach(target_ns: int) -> None:
         with contextlib.suppress(IntegrationError):     # as far as the equations go
-            simulation.advance_in_blocks(target_ns, send or (lambda *_: None))
+            simulation.advance_in_blocks(target_ns, send or (lambda *_: None), has_stepped_enough)
+        if has_stepped_enough():
+            raise DepartureError(f'over {most_steps} integration steps are too many for a log of '
+                                 f'{run.log_bytes} bytes')
 
     for event in run.history:
         reach(event.t_ns)
@@ -153,11 +203,15 @@ def rerun(run: RunDescription, end_ns: int,
         simulation.log_to(None, [stream for stream in simulation.streams
                                  if stream.topic in run.topics])
     yield simulation, Event('start', run.epoch_ns, 0, simulation.now_ns, {})
-    for item in (*(event for event in run.events if event.name != 'start'), None):
+    for item in (*(event for event in run.events if event.acts), None):
+        now_ns = max(simulation.now_ns, 0)
         stop_ns = end_ns - simulation.epoch_ns if item is None else item.sent_ns
         recorded = [stream for stream in simulation.streams if stream.has_sinks]
-        for target_ns, reached in offline_targets(
-                max(simulation.now_ns, 0), [(stop_ns, item)], offline_block_ns(recorded)):
+        samples_left -= sum(max(stop_ns - now_ns, 0) // stream.period_ns for stream in recorded)
+        if samples_left < 0:
+            raise DepartureError(f'a log of {run.log_bytes} bytes lacks most samples of this run')
+        block_ns = max(offline_block_ns(recorded), (stop_ns - now_ns) // MOST_BLOCKS)
+        for target_ns, reached in offline_targets(now_ns, [(stop_ns, item)], block_ns):
             # Without samples states are only needed where a command finds them.
             if send is not None or (reached is not None and reached.name == 'command'):
                 reach(target_ns)
@@ -177,11 +231,10 @@ def _apply(simulation: Simulation, event: Event) -> None:
             if applied_ns != event.t_ns:
                 raise ValueError(f'applied at {applied_ns} ns')
         elif event.name == 'parameters':
-            simulation.apply({name: parameters.BY_NAME[name].check(value)
-                              for name, value in details.items()})
+            simulation.apply(details)
         else:
-            simulation.restart(parameters.checked(details['parameters']))
-            simulation.epoch_ns = int(details['epoch_ns'])
-    except (KeyError, TypeError, ValueError, IntegrationError) as error:
-        raise DepartureError(f'{event.name} at t = {event.t_ns} ns: '
-                             f'{type(error).__name__}: {error}') from error
+            simulation.restart(details['parameters'])
+            simulation.epoch_ns = details['epoch_ns']
+    except ODD as error:
+        raise DepartureError(
+            f'{event.name} at t = {event.t_ns} ns: {reason_of(error)}') from error

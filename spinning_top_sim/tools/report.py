@@ -8,7 +8,6 @@ import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict
-from pathlib import Path
 
 from spinning_top_sim.recording.damage import count, seconds
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -30,11 +29,11 @@ ROWS = (('nutation period [s]', 'nutation_period', 1.0),
         ('L3^2/(4 lambda1 |P|)', 'gyroscopic_ratio', 1.0))
 
 
-def as_json(path: Path, found: Survey, verdict: Verdict | None) -> object:
+def as_json(found: Survey, verdict: Verdict | None) -> object:
     """Return all findings as what JSON can hold; docs/inspect.md tells the keys."""
     damage, run = found.damage, found.run
     content: dict[str, object] = {
-        'file': str(path), 'whole': found.whole,
+        'file': str(found.path), 'whole': found.whole,
         'damage': {'torn': damage.truncated, 'report': damage.lines(), **{
             key: getattr(damage, key) for key in (
                 'lost_bytes', 'lost_chunks', 'missing_messages', 'missing_exactly')}},
@@ -70,12 +69,12 @@ def _duration(found: Survey) -> float:
     return (found.damage.end_ns - found.damage.start_ns) / NANOSECONDS
 
 
-def as_text(path: Path, found: Survey, verdict: Verdict | None) -> Iterator[str | Table]:
+def as_text(found: Survey, verdict: Verdict | None) -> Iterator[str | Table]:
     """Yield the findings as lines and tables."""
     damage, run = found.damage, found.run
     state = ('whole' if found.whole and not damage.defects else
              'truncated' if damage.truncated else 'damaged')
-    yield f'{path}: {state}, {_duration(found):.6g} s'
+    yield f'{found.path}: {state}, {_duration(found):.6g} s'
     yield from damage.lines()
     if run is None:
         yield f'not recorded by spinning_top_sim: {found.foreign_reason}'

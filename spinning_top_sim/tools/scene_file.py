@@ -21,6 +21,11 @@ ROS_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_servi
 class _Loader(yaml.SafeLoader):
     """Finds the types of plain scalars as rcl does: 1e5 is a double, 1_000 and ~ are strings."""
 
+    def compose_node(self, *place: object) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError('rcl supports no aliases')
+        return super().compose_node(*place)
+
 
 _Loader.bool_values = yaml.SafeLoader.bool_values | {'y': True, 'n': False}
 _Loader.yaml_implicit_resolvers = {}
@@ -42,17 +47,16 @@ def read_scene(path: str | Path) -> dict[str, object]:
     Raises OSError, or ValueError which names the file and what is wrong with it.
     """
     content = _parse_yaml(Path(path).read_bytes(), str(path))
-    values: dict[str, object] = {}
-    for node, sections in content.items() if isinstance(content, Mapping) else ():
-        section = sections.get('ros__parameters') if isinstance(sections, Mapping) else None
-        if node in NODES and isinstance(section, Mapping):
-            values.update(_flatten(section))
-    if not values:
+    sections = [node['ros__parameters'] for name, node in content.items()
+                if name in NODES and isinstance(node, Mapping) and isinstance(
+                    node.get('ros__parameters'), Mapping)] if isinstance(content, Mapping) else []
+    if not sections:
         raise ValueError(f'{path} has no parameters for the node spinning_top: it must have '
                          "'/**:' or 'spinning_top:', and 'ros__parameters:' in it")
-    for name, value in values.items():
-        _check(name, value, str(path))
-    return values
+    values: dict[str, object] = {}
+    for section in sections:
+        values.update(_flatten(section))
+    return _known(values, str(path))
 
 
 def parse_assignment(text: str) -> tuple[str, object]:
@@ -61,35 +65,42 @@ def parse_assignment(text: str) -> tuple[str, object]:
     if not separator:
         raise ValueError(f'{text!r}: must be NAME:=VALUE')
     value = _parse_yaml(yaml_text, text)
-    _check(name, value, text)
+    _known({name: value}, text)
     return name, value
 
 
 def _parse_yaml(text: str | bytes, source: str) -> object:
     try:
         return yaml.load(text, _Loader)
-    except (yaml.YAMLError, ValueError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f'{source} is not YAML: {" ".join(str(error).split())}') from error
 
 
-def _flatten(section: Mapping[str, object], prefix: str = '') -> Iterator[tuple[str, object]]:
-    """Yield dotted names and values of the parameters in a section, those of ROS left out."""
+def _flatten(section: Mapping[object, object], prefix: str = '') -> Iterator[tuple[str, object]]:
+    """Yield dotted names and values of the parameters in a section."""
     for name, value in section.items():
-        if prefix or name.split('.')[0] not in ROS_PARAMETERS:
-            if isinstance(value, Mapping):
-                yield from _flatten(value, f'{prefix}{name}.')
-            else:
-                yield f'{prefix}{name}', value
+        if isinstance(value, Mapping):
+            yield from _flatten(value, f'{prefix}{name}.')
+        else:
+            yield f'{prefix}{name}', value
 
 
-def _check(name: str, value: object, source: str) -> None:
-    """Raise ValueError for a name that is unknown and a value that no ROS parameter has."""
-    if name not in parameters.BY_NAME:
-        near = difflib.get_close_matches(name, parameters.BY_NAME, 1)
-        hint = f'; did you mean {near[0]}?' if near else ''
-        raise ValueError(f'{source}: there is no parameter {name}{hint}')
-    if value is None:
-        raise ValueError(f'{source}: {name} has no value')
-    if isinstance(value, list) and len(set(map(type, value))) > 1:
-        raise ValueError(f'{source}: {name} = {value!r}: the items of a list must have one type, '
-                         'such as [0.0, 1.5]')
+def is_of_ros(name: str) -> bool:
+    """Whether rclpy takes a parameter of this name."""
+    return name.partition('.')[0] in ROS_PARAMETERS
+
+
+def _known(values: Mapping[str, object], source: str) -> dict[str, object]:
+    """Return the values but for those of ROS.  Raises ValueError for others than ours."""
+    known = {name: value for name, value in values.items() if not is_of_ros(name)}
+    for name, value in known.items():
+        if name not in parameters.BY_NAME:
+            near = difflib.get_close_matches(name, parameters.BY_NAME, 1)
+            hint = f'; did you mean {near[0]}?' if near else ''
+            raise ValueError(f'{source}: there is no parameter {name}{hint}')
+        if value is None:
+            raise ValueError(f'{source}: {name} has no value')
+        if isinstance(value, list) and len(set(map(type, value))) > 1:
+            raise ValueError(f'{source}: {name} = {value!r}: the items of a list must have one '
+                             'type, such as [0.0, 1.5]')
+    return known

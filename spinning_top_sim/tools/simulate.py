@@ -1,5 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The executable `simulate`: the node's pipeline offline, as fast as the machine goes."""
+"""
+Simulate the heavy symmetric top offline, as the node does, into a log (MCAP)
+or a table of the true states (CSV, Parquet).
+
+exit codes:
+  0    done
+  1    the run cannot be simulated or written; the reason is printed
+  2    wrong arguments
+  130  interrupted; the log holds what was computed before
+"""
 
 from __future__ import annotations
 
@@ -23,8 +32,8 @@ from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.streams.schedule import offline_block_ns, offline_targets
 from spinning_top_sim.streams.stream import Stream
-from spinning_top_sim.tools.cli import OK, exit_code, print_line, progress
-from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
+from spinning_top_sim.tools import cli
+from spinning_top_sim.tools.scene_file import is_of_ros, parse_assignment, read_scene
 from spinning_top_sim.tools.table import Stop, write_table
 
 if TYPE_CHECKING:
@@ -37,20 +46,11 @@ FORMATS = ('mcap', 'csv', 'parquet')
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    return exit_code(_parser(), argv, _run,
-                     (ValueError, RecordingError, IntegrationError, OSError))
+    return cli.run('simulate', __doc__, argv, _add_arguments, _run,
+                   (ValueError, ArithmeticError, RecordingError, IntegrationError, OSError))
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog='simulate', formatter_class=argparse.RawDescriptionHelpFormatter,
-        description='Simulate the heavy symmetric top offline, into a log (MCAP) or a table of '
-        'the\ntrue states (CSV, Parquet).',
-        epilog='exit codes:\n'
-               '  0    done\n'
-               '  1    the run cannot be simulated or written; the reason is printed\n'
-               '  2    wrong arguments\n'
-               '  130  interrupted; the log holds what was computed before\n')
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('--params', metavar='FILE', action='append', default=[],
         help='parameter file as for the node; may be repeated')
@@ -70,7 +70,6 @@ def _parser() -> argparse.ArgumentParser:
     add('--format', choices=FORMATS,
         help='format of the output; default: by the extension of its name')
     add('--quiet', action='store_true', help='no progress, no summary')
-    return parser
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -83,15 +82,15 @@ def _run(arguments: argparse.Namespace) -> int:
     if file_format not in FORMATS:
         raise ValueError(f'{output}: the name must end in .{", .".join(FORMATS)}, or --format be '
                          'given')
-    with progress('simulated', values['duration'], 's', quiet=arguments.quiet) as show:
+    with cli.progress('simulated', values['duration'], 's', quiet=arguments.quiet) as show:
         if file_format == 'mcap':
             summary = write_log(output, values, stops, show,
                                 round(arguments.epoch * NANOSECONDS), arguments.namespace)
         else:
             summary = write_table(output, file_format, values, stops, show)
     if not arguments.quiet:
-        print_line(f'{output}: {summary}')
-    return OK
+        cli.print_line(f'{output}: {summary}')
+    return cli.OK
 
 
 def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -99,7 +98,8 @@ def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
     given: dict[str, object] = {}
     for path in arguments.params:
         given.update(read_scene(path))
-    given.update(parse_assignment(text) for text in arguments.param)
+    given.update((name, value) for name, value in map(parse_assignment, arguments.param)
+                 if not is_of_ros(name))
     given.update((name, value) for name, value in vars(arguments).items()
                  if name in ('seed', 'duration') and value is not None)
     values = parameters.checked(given)

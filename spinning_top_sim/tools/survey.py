@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
 import math
 from bisect import bisect_left
@@ -11,6 +10,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,16 +21,16 @@ from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.reader import LogMessage, LogReader
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.streams.segment import Segment
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools import analysis, recorded_run
 from spinning_top_sim.tools.analysis import Attitudes, Measured, Reals
-from spinning_top_sim.tools.recorded_run import RunDescription
+from spinning_top_sim.tools.recorded_run import LATEST_NS, ODD, RunDescription, reason_of
 
 BLOCK = 16384               # messages of all topics analysed together
 MOST_POINTS = 20_000        # of a series that is kept for a picture
 MOST_GAPS = 10              # listed one by one
+MOST_EXACT = 1000           # motions that are compared with the exact one: 10 ms each
 SHOWN_NUTATIONS, SHOWN_S = 8.0, 10.0      # in pictures: whichever is longer
 IMU_TOPICS = ('imu/data_raw', 'ground_truth/imu', 'ground_truth/imu_bias')
 # Streams that measure a motion, the best first: with angles, with exact rates, with neither.
@@ -94,7 +94,9 @@ class Motion:
     segment: Segment                      # its constants and its exact solution
     exact: Description | None             # None where the closed form cannot hold it
     source: str | None                    # topic that measures it best
-    # Of this topic: log times (n,) [ns], and `Attitudes.rows`
+    streams: dict[str, Stream]            # by topic of the log
+    imu: Imu
+    # Of the source: log times (n,) [ns], and `Attitudes.rows`
     samples: list[tuple[Stamps, Reals]] = field(default_factory=list)
     measured: Measured | None = None      # the numbers of `exact` from these samples
     regime: str | None = None             # name of the motion by them
@@ -104,18 +106,17 @@ class Motion:
 class Section:
     """A part of a motion with the same rates: the samples later than begin_ns, up to end_ns."""
 
-    motion: Motion
     begin_ns: int                         # log times [ns]
     end_ns: int
     epoch_ns: int                         # stamp of t = 0 [ns]
-    streams: dict[str, Stream]            # as they are in this section, by topic of the log
-    imu: Imu
+    periods_ns: dict[str, int]            # of the streams, by topic of the log
 
 
 @dataclass
 class Survey:
     """All findings about a log."""
 
+    path: Path                            # of the log
     damage: Damage
     whole: bool                           # the log was closed, and nothing is lost
     end_ns: int                           # log time up to which samples were recorded [ns]
@@ -123,15 +124,13 @@ class Survey:
     run: RunDescription | None = None     # None for a log that this package did not record
     foreign_reason: str = ''              # why not
     motions: list[Motion] = field(default_factory=list)
-    # By topic, of energy, l3 and lz: relative to their values at the beginning of the motion,
-    # absolute where these are 0.
+    # By topic, of energy, l3 and lz: relative to the beginning of the motion, if that is not 0.
     drifts: dict[str, dict[str, Series]] = field(default_factory=dict)
     # By topic: angle between the attitude and the exact solution [rad].
     errors: dict[str, Series] = field(default_factory=dict)
     # The first motion with samples, and its samples shown in pictures.
     shown: tuple[Motion, Attitudes] | None = None
-    # By topic of the IMU, in the same time: (n, 7) time since the first motion began [s],
-    # angular velocity [rad/s], specific force [m/s^2].
+    # By topic: (n, 7) time [s], angular velocity [rad/s], specific force [m/s^2].
     readings: dict[str, list[Reals]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
@@ -142,10 +141,11 @@ class Survey:
         return max(SHOWN_S, SHOWN_NUTATIONS * ((exact and exact.nutation_period) or 0.0))
 
 
+@np.errstate(all='ignore')                  # odd numbers are findings, too
 def survey(reader: LogReader) -> Survey:
     """Return the findings about a log.  Raises LogError."""
     damage = reader.damage
-    found = Survey(damage, reader.whole and not damage.truncated and damage.lossless,
+    found = Survey(reader.path, damage, reader.whole and not damage.truncated and damage.lossless,
                    damage.end_ns, {topic.name: TopicReport(topic.type_name)
                                    for topic in reader.topics})
     sections: list[Section] = []
@@ -154,25 +154,25 @@ def survey(reader: LogReader) -> Survey:
         sections = _find_sections(found, found.run)
     except recorded_run.ForeignLogError as error:
         found.foreign_reason = str(error)
-    ends_ns = [section.end_ns for section in sections[:-1]]
+    ends_ns = [motion.end_ns for motion in found.motions[:-1]]
     blocks_ns: defaultdict[str, list[Stamps]] = defaultdict(lambda: [np.empty(0, np.int64)])
     messages = reader.messages()
     while block := sorted(itertools.islice(messages, BLOCK), key=attrgetter('topic')):
         for topic, group in itertools.groupby(block, attrgetter('topic')):
             samples = list(group)
-            blocks_ns[topic].append(np.array([sample.log_time for sample in samples]))
-            if sections and topic in sections[0].streams:
+            blocks_ns[topic].append(_stamps(samples))
+            if sections and topic in sections[0].periods_ns:
                 for number, part in itertools.groupby(
                         samples, lambda sample: bisect_left(ends_ns, sample.log_time)):
-                    _analyse(found, sections[number], topic, list(part))
+                    _analyse(found, found.motions[number], topic, list(part))
     stamps_ns = {topic: np.concatenate(blocks_ns[topic]) for topic in found.topics}
     if sections:        # the last entry of the journal may be later than the last sample
         last = sections[-1]
-        found.end_ns = last.end_ns = last.motion.end_ns = max(
-            last.begin_ns, *(int(stamps_ns[topic].max(initial=0)) for topic in last.streams), 0)
+        found.end_ns = last.end_ns = found.motions[-1].end_ns = max(
+            last.begin_ns, *(int(stamps_ns[topic].max(initial=0)) for topic in last.periods_ns), 0)
     for topic, report in found.topics.items():
-        _count(report, stamps_ns[topic], [(section, section.streams[topic].period_ns)
-                                          for section in sections if topic in section.streams])
+        _count(report, stamps_ns[topic], [(section, section.periods_ns[topic])
+                                          for section in sections if topic in section.periods_ns])
     for motion in found.motions:
         _measure(found, motion)
     return found
@@ -188,43 +188,50 @@ def _find_sections(found: Survey, run: RunDescription) -> list[Section]:
             if event is None:
                 continue
             if sections:
-                last = sections[-1]
-                last.end_ns = last.motion.end_ns = last.epoch_ns + event.sent_ns
+                sections[-1].end_ns = found.motions[-1].end_ns = (
+                    sections[-1].epoch_ns + event.sent_ns)
             begin_ns = simulation.epoch_ns + simulation.now_ns
-            streams = {run.topics[stream.topic]: copy.copy(stream)
-                       for stream in simulation.streams if stream.topic in run.topics}
+            streams = {run.topics[stream.topic]: stream for stream in simulation.streams
+                       if stream.topic in run.topics}
             if event.name != 'parameters':
-                found.motions.append(_motion(run, simulation, streams, event.name, begin_ns))
-            sections.append(Section(found.motions[-1], begin_ns, begin_ns, simulation.epoch_ns,
-                                    streams, Imu(simulation.values)))
-    except recorded_run.DepartureError as error:
-        found.notes.append(f'the run cannot be followed beyond here: {error}')
+                exact = simulation.describe() if len(found.motions) < MOST_EXACT else None
+                found.motions.append(Motion(
+                    event.name, begin_ns, begin_ns,
+                    simulation.epoch_ns + simulation.segment.start_ns, simulation.segment, exact,
+                    _source(run, streams, exact), streams, Imu(simulation.values)))
+            sections.append(Section(begin_ns, begin_ns, simulation.epoch_ns, {
+                topic: stream.period_ns for topic, stream in streams.items()}))
+    except (recorded_run.DepartureError, *ODD) as error:
+        found.notes.append(f'the run cannot be followed beyond here: {reason_of(error)}')
+    if len(found.motions) > MOST_EXACT:
+        found.notes.append(f'only the first {MOST_EXACT} motions are compared with the exact one')
     return sections
 
 
-def _motion(run: RunDescription, simulation: Simulation, streams: Mapping[str, Stream],
-            cause: str, begin_ns: int) -> Motion:
-    """Return the motion that begins now."""
-    exact = simulation.describe()
+def _source(run: RunDescription, streams: Mapping[str, Stream],
+            exact: Description | None) -> str | None:
+    """Return the topic that measures a motion best."""
     period_ns = ((exact and exact.nutation_period) or math.inf) * NANOSECONDS
-    source = max((run.topics[name] for name in SOURCES if name in run.topics), default=None,
-                 key=lambda name: min(period_ns / streams[name].period_ns, ENOUGH_SAMPLES))
-    return Motion(cause, begin_ns, begin_ns, simulation.epoch_ns + simulation.segment.start_ns,
-                  simulation.segment, exact, source)
+    return max((run.topics[name] for name in SOURCES if name in run.topics), default=None,
+               key=lambda name: min(period_ns / streams[name].period_ns, ENOUGH_SAMPLES))
 
 
-def _analyse(found: Survey, section: Section, topic: str, samples: list[LogMessage]) -> None:
-    """Analyse consecutive samples of a stream within a section."""
-    stream, motion, segment = section.streams[topic], section.motion, section.motion.segment
+def _stamps(samples: Sequence[LogMessage]) -> Stamps:
+    return np.array([min(sample.log_time, LATEST_NS) for sample in samples], np.int64)
+
+
+def _analyse(found: Survey, motion: Motion, topic: str, samples: list[LogMessage]) -> None:
+    """Analyse consecutive samples of a stream within a motion."""
+    stream, segment = motion.streams[topic], motion.segment
     fitting = [sample for sample in samples if len(sample.data) == len(stream.template)]
     found.topics[topic].odd_size += len(samples) - len(fitting)
-    stamps_ns = np.array([sample.log_time for sample in fitting], np.int64)
+    stamps_ns = _stamps(fitting)
     fields = stream.template.decode(b''.join(sample.data for sample in fitting))
     if stream.topic in IMU_TOPICS:
         time = (stamps_ns - found.motions[0].begin_ns) / NANOSECONDS
         readings = np.column_stack((time, *fields[1:]))[time <= found.shown_s]
         found.readings.setdefault(topic, []).append(readings)
-    data = analysis.attitudes_of(stream.topic, section.imu, stamps_ns, fields)
+    data = analysis.attitudes_of(stream.topic, motion.imu, stamps_ns, fields)
     if data is None:
         return
     if topic == motion.source:
@@ -236,9 +243,10 @@ def _analyse(found: Survey, section: Section, topic: str, samples: list[LogMessa
         for series, value, start in zip(
                 drifts.values(), values, (segment.energy, segment.l3, segment.lz), strict=True):
             series.add(data.stamps_ns, (value - start) / (abs(start) or 1.0))
-    exact = segment.exact
+    exact = segment.exact if motion.exact is not None else None
     if exact is not None:
-        truth = exact.states(data.stamps_ns - motion.origin_ns).rows_quaternion
+        times_ns = np.clip(data.stamps_ns - motion.origin_ns, -exact.ns_limit, exact.ns_limit)
+        truth = exact.states(times_ns).rows_quaternion
         found.errors.setdefault(topic, Series()).add(
             data.stamps_ns, angle_between(data.quaternion, truth))
 
@@ -275,6 +283,10 @@ def _measure(found: Survey, motion: Motion) -> None:
     data = analysis.longest_run(samples) if samples else None
     if data is None or len(data.stamps_ns) < 2:
         return
-    motion.measured = analysis.measure(data)
-    motion.regime = analysis.measured_regime(motion.segment.solver.top, data)
-    found.shown = found.shown or (motion, data.first(found.shown_s))
+    try:
+        motion.measured = analysis.measure(data)
+        motion.regime = analysis.measured_regime(motion.segment.solver.top, data)
+    except ODD as error:
+        found.notes.append(f'{motion.source} cannot be measured: {reason_of(error)}')
+    else:
+        found.shown = found.shown or (motion, data.first(found.shown_s))

@@ -21,18 +21,13 @@ FRAME_NAME = re.compile(r'[\w.-]+(/[\w.-]+)*')
 
 
 def arguments(values: Mapping[str, Any]) -> dict[str, str]:
-    """
-    Return the arguments of the xacro file for checked parameters.
-
-    The links between world and body get the prefix of the body's frame: a/base_link,
-    a/nutation_link.  Raises ValueError, which names the parameter, for frames that form no tree.
-    """
+    """Return the arguments of the xacro file.  Raises ValueError for frames that form no tree."""
     for name in FRAMES:
         if not FRAME_NAME.fullmatch(values[name]):
             raise ValueError(f'{name} = {values[name]!r}: must be letters, digits, _ . - with / '
                              'between')
     world, body, imu = (values[name] for name in FRAMES)
-    prefix = body[:body.rfind('/') + 1]
+    prefix = body[:body.rfind('/') + 1]         # a/base_link, a/nutation_link
     between = [prefix + name for name in LINKS_BETWEEN]
     for name, value, others in (('world_frame', world, [body, imu, *between]),
                                 ('body_frame', body, between), ('imu.frame_id', imu, between)):
@@ -42,19 +37,14 @@ def arguments(values: Mapping[str, Any]) -> dict[str, str]:
     if imu == body and any((*values['imu.lever_arm'], *values['imu.rpy'])):
         raise ValueError(f'imu.frame_id = {imu!r}: must not be the body_frame where '
                          'imu.lever_arm or imu.rpy is not zero')
-    texts = {}
-    for name, parameter in ARGUMENTS.items():
-        value = values[parameter]
-        texts[name] = ' '.join(map(str, value)) if isinstance(value, tuple) else str(value)
-    return {**texts, 'prefix': prefix}
+    given = {name: values[parameter] for name, parameter in ARGUMENTS.items()}
+    return {'prefix': prefix, **{
+        name: ' '.join(map(str, value)) if isinstance(value, tuple) else str(value)
+        for name, value in given.items()}}
 
 
 def robot_description(values: Mapping[str, Any], folder: str | Path) -> str:
-    """
-    Return the URDF of checked parameters; `folder` has the xacro file.
-
-    Raises ValueError as `arguments` does, and ImportError where xacro is not installed.
-    """
+    """Return the URDF; `folder` has the xacro file.  Raises ValueError as `arguments` does."""
     import xacro  # noqa: PLC0415
 
     document = xacro.process_file(str(Path(folder) / XACRO_FILE), mappings=arguments(values))
