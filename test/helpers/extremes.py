@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Extreme values that look legal: sets of parameters, commands, and what else is done to a node.
+
+All are plain functions of a seed, and need no ROS.  Whatever they return, a node must live on with
+it, or refuse it in one clear line.
+"""
+
+from __future__ import annotations
+
+import random
+import sys
+
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.parameters import Parameter
+
+LARGEST = sys.float_info.max
+DOUBLES = (0.0, -0.0, 5e-324, 1e-310, 1e-300, 1e-170, 1e-100, 1e-46, 1e-20, 1e-9, 1e-3, 0.5, 1.0,
+           3.141592653589793, 2.0, 14.0, 1e3, 1e5, 1e9, 1e10, 1e16, 1e17, 1e20, 1e30, 1e100, 1e154,
+           1e200, 1e300, LARGEST)
+NOT_FINITE = float('inf'), float('-inf'), float('nan')
+INTEGERS = (0, 1, -1, 2, 14, 1000, 2 ** 31 - 1, 2 ** 31, 2 ** 53 + 1, 2 ** 63 - 1, -2 ** 63)
+STRINGS = ('', 'x', 'world', '/', '~', 'a/b', 'a b', '\u00e9', '\x1b[31m', 'all', 'x' * 300, '..')
+
+
+def parameter_sets(seed: int) -> dict[str, object]:
+    """
+    Return one to eight parameters at extreme values, by name.
+
+    Most are in the range of their parameter, at its ends as often as not.  Nothing is set that
+    writes files.
+    """
+    random_ = random.Random(seed)
+    settable = [row for row in parameters.TABLE if not row.name.startswith('record.')]
+    chosen = random_.sample(settable, random_.choice((1, 1, 1, 2, 3, 5, 8)))
+    return {row.name: _value(random_, row) for row in chosen}
+
+
+def commands(seed: int) -> list[list[float]]:
+    """Return one to six messages for ~/commands: [L3, Lz] as a rule, some of another length."""
+    random_ = random.Random(seed)
+    return [[_double(random_) for _ in range(random_.choice((2, 2, 2, 2, 2, 2, 2, 0, 1, 3)))]
+            for _ in range(random_.randint(1, 6))]
+
+
+def actions(seed: int) -> list[tuple[str, object]]:
+    """
+    Return four to twelve things to do to a running node, one after the other.
+
+    ('set', parameters), ('command', [L3, Lz]), ('pause', bool), ('step', None), ('reset', None),
+    and ('wait', seconds)
+    """
+    random_ = random.Random(seed)
+    found: list[tuple[str, object]] = []
+    for _ in range(random_.randint(4, 12)):
+        kind = random_.choice(('set', 'set', 'command', 'pause', 'step', 'reset', 'wait'))
+        inner = random_.getrandbits(32)
+        found.append((kind, {
+            'set': lambda seed=inner: parameter_sets(seed),
+            'command': lambda seed=inner: commands(seed)[0],
+            'pause': lambda seed=inner: bool(seed % 2),
+            'wait': lambda seed=inner: (seed % 100) / 1000.0,
+        }.get(kind, lambda: None)()))
+    return found
+
+
+def _value(random_: random.Random, row: Parameter) -> object:
+    """Return a value of the right type as a rule."""
+    default = row.default
+    if random_.random() < 0.05:
+        return random_.choice((True, 'text', 1, 1.5, [1.0], ['a'], [], random_.choice(NOT_FINITE)))
+    if isinstance(default, tuple):
+        if isinstance(default[0], str):
+            return [random_.choice(STRINGS) for _ in range(random_.randint(0, 3))]
+        return [_double(random_) for _ in default]
+    if isinstance(default, bool):
+        return random_.random() < 0.5
+    if isinstance(default, str):
+        return random_.choice(row.choices or STRINGS)
+    bounds = [bound for bound in (row.minimum, row.maximum, row.above) if bound is not None]
+    if isinstance(default, int):
+        return random_.choice([*INTEGERS, *map(int, bounds)])
+    if bounds and random_.random() < 0.3:
+        return random_.choice([float(bound) for bound in bounds])
+    value = _double(random_)
+    return abs(value) if bounds and random_.random() < 0.9 else value
+
+
+def _double(random_: random.Random) -> float:
+    value = (random_.choice(DOUBLES) if random_.random() < 0.7
+             else 10.0 ** random_.uniform(-320.0, 308.0))
+    return value if random_.random() < 0.7 else -value
