@@ -83,14 +83,15 @@ def check_node(fault, settings, folder):
     parameters = {'record.enabled': True, 'record.uri': f'{folder}/run.mcap',
                   'pose.rate': 1000.0, 'joint_states.rate': 1000.0}
     node = SimNode(folder, parameters, namespace=f'/disk{os.getpid()}_{folder.stat().st_ino}')
-    with environment(settings):
-        node.__enter__()
-    with node:
+    with contextlib.ExitStack() as stack:
+        with environment(settings):
+            stack.enter_context(node)
         assert started(node), node.err
         pose = peer.listen(node.topic('pose'), PoseStamped).wait(500)
         if fault in STOPPING:
             try:
-                wait_for('the reason', lambda: 'recording stopped' in node.err)
+                wait_for('the reason', lambda: 'recording stopped' in node.err
+                     or 'cannot record' in node.err or not node.alive)
             except AssertionError:
                 raise AssertionError(f'no reason: {node.err}{node.out}') from None
         pose.wait_more(1000)
