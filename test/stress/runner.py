@@ -32,6 +32,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 HERE = Path(__file__).parent
+MOST_FAILURES = 20          # then enough is known
 PARTS = ('logs', 'values', 'nodes', 'services', 'disk')
 
 
@@ -119,7 +120,7 @@ def run(part, first=0, count=None, seconds=None, processes=1, tell=None):
             while end is None or time.monotonic() < end:
                 with lock:
                     seed = next(seeds, None)
-                if seed is None:
+                if seed is None or len(result.failures) >= MOST_FAILURES:
                     break
                 outcome, failure, peak_mb = worker.check(seed)
                 with lock:

@@ -8,31 +8,19 @@ a tick has time for; whatever is not is a ValueError in one line.
 
 import math
 import random
-from types import SimpleNamespace
 
 from helpers.extremes import actions, commands, parameter_sets
 from helpers.simulations import doubles
+from test_tick_loop import Run
 
-from spinning_top_sim.nodes.tick_loop import TickLoop
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.pipeline import Simulation
 
 PATIENCE_S = 60.0
 MEMORY_MB = 1000
 EPOCH_NS = 1_700_000_000_000_000_000
 TICKS = 40
-
-
-class Clock:
-    """A clock that goes on a little whenever it is read, so that budgets end."""
-
-    def __init__(self):
-        self.now_ns = 0
-
-    def __call__(self):
-        self.now_ns += 500_000
-        return self.now_ns
+CLOCK_STEP_NS = 500_000     # by which time goes on whenever it is read, so that budgets end
 
 
 class Recorded:
@@ -58,39 +46,34 @@ class Recorded:
 def check(seed, folder):
     rng = random.Random(seed)
     try:
-        values = parameters.checked(parameter_sets(seed))
-        simulation = Simulation(values, EPOCH_NS)
+        run = Run(**parameter_sets(seed))
     except (ValueError, IntegrationError) as error:
         check_reason(error)
         return 'refused'
-    clock, recorded = Clock(), Recorded(simulation)
-    loop = TickLoop(
-        simulation, values, SimpleNamespace(
-            has_room=lambda: True, write_command=lambda *_: None,
-            write_event=lambda *_, **__: None),
-        update_subscribers=lambda: None, align=lambda at: None, error=check_reason,
-        source=clock, steady=clock)
+    recorded, simulation, loop, values = (
+        Recorded(run.simulation), run.simulation, run.loop, run.values)
+    run.clock.step_ns = CLOCK_STEP_NS
     loop.start()
     refused = 0
     for kind, given in [('wait', 0.1), *actions(seed), *(('command', one)
                                                          for one in commands(seed))]:
-        before = {name: getattr(simulation.state(), name)[0] for name in ('theta', 'phi', 'psi')}
-        now_ns = loop.now_ns
+        before, now_ns = angles(simulation), loop.now_ns
         try:
             values = act(simulation, loop, values, kind, given)
         except (ValueError, RuntimeError, IntegrationError) as error:
             check_reason(error)
             refused += 1
             if kind == 'set' and loop.now_ns == now_ns:
-                after = {name: getattr(simulation.state(), name)[0] for name in before}
-                assert after == before, 'a refusal changes nothing'
+                assert angles(simulation) == before, 'a refusal changes nothing'
         for _ in range(TICKS):
-            clock.now_ns += rng.choice((1_000_000, 5_000_000, 300_000_000))
-            if loop.tick():
-                loop.idle()
-    assert recorded.count > 0 or loop.failure or not any(
-        stream.enabled for stream in simulation.streams)
+            run.tick(rng.choice((1_000_000, 5_000_000, 300_000_000)))
+    assert recorded.count > 0 or loop.failure or not simulation.streams
     return f'{"stood still" if loop.failure else "ran"}, {"some" if refused else "none"} refused'
+
+
+def angles(simulation):
+    state = simulation.state()
+    return [getattr(state, name)[0] for name in ('theta', 'theta_dot', 'phi', 'psi')]
 
 
 def act(simulation, loop, values, kind, given):
