@@ -32,12 +32,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 HERE = Path(__file__).parent
+STARTING_S = 120.0          # patience for imports
 MOST_FAILURES = 20          # then enough is known
 PARTS = ('logs', 'values', 'nodes', 'services', 'disk')
 
 
 def module_of(part):
-    return importlib.import_module(f'stress.{part}')
+    """Return the module of a part; STRESS_MODULE in the environment is another one for all."""
+    return importlib.import_module(os.environ.get('STRESS_MODULE', f'stress.{part}'))
 
 
 def repeat_command(part, seed):
@@ -74,7 +76,7 @@ class Worker:
         """Return (what came of it, None) or (None, what is wrong), and the peak memory [MB]."""
         if self._process is None or self._process.poll() is not None:
             self._start()
-            assert self._answer(60.0) == {'ready': True}, self._said()
+            assert self._answer(STARTING_S) == {'ready': True}, self._said()
         self._process.stdin.write(f'{seed}\n'.encode())
         self._process.stdin.flush()
         answer = self._answer(self._patience)

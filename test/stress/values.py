@@ -20,7 +20,7 @@ PATIENCE_S = 60.0
 MEMORY_MB = 1000
 EPOCH_NS = 1_700_000_000_000_000_000
 TICKS = 40
-CLOCK_STEP_NS = 500_000     # by which time goes on whenever it is read, so that budgets end
+CLOCK_STEP_NS = 5_000_000   # by which time goes on whenever it is read, so that budgets end
 
 
 class Recorded:
