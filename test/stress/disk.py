@@ -40,6 +40,7 @@ SOURCE = Path(__file__).with_name('disk_faults.c')
 STOPPING = ('enospc', 'eio')
 FAULTS = (*STOPPING, 'short', 'slow')
 SLOW_S = 2
+HEAD_AND_MORE = range(20_000, 400_000)       # bytes; the head alone takes some 50 000
 NO_COMPILER = 'SKIPPED: there is no C compiler (cc) to build the failing disk with'
 
 
@@ -62,7 +63,7 @@ def check(seed, folder):
     rng = random.Random(seed)
     fault = FAULTS[seed // 2 % len(FAULTS)]
     settings = {'DISK_FAULT': fault, 'DISK_FAULT_FOLDER': str(folder),
-                'DISK_FAULT_AFTER': str(rng.choice((0, 1, 5000, rng.randrange(300_000)))),
+                'DISK_FAULT_AFTER': str(rng.choice((0, 5000, *rng.sample(HEAD_AND_MORE, 4)))),
                 'DISK_FAULT_CALLS': str(rng.choice((0, 0, 1, 3))),
                 'DISK_FAULT_SECONDS': str(SLOW_S), 'LD_PRELOAD': str(library())}
     return (check_node if seed % 2 else check_simulate)(fault, settings, folder)
