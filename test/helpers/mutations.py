@@ -38,10 +38,9 @@ def mutate(data: bytes, seed: int) -> bytes:
     return bytes(changed)
 
 
-def records(data) -> list[tuple[int, int]]:
+def records(data: bytes | bytearray, offset: int = MAGIC_SIZE) -> list[tuple[int, int]]:
     """Return begin and end of each record, as far as their lengths lead."""
     found = []
-    offset = MAGIC_SIZE
     while offset + HEAD.size <= len(data):
         end = offset + HEAD.size + HEAD.unpack_from(data, offset)[1]
         if end > len(data):
@@ -150,9 +149,8 @@ def _mutate_in_chunk(data: bytearray, rng) -> None:
         content = bytearray(lz4.frame.decompress(packed))
     else:
         content = bytearray(packed)
-    places = [(a - MAGIC_SIZE, b - MAGIC_SIZE) for a, b in records(bytes(MAGIC_SIZE) + content)]
     for _ in range(rng.choice((1, 1, 3))):
-        rng.choice(_CHANGES)(content, places, rng)
+        rng.choice(_CHANGES)(content, records(content, 0), rng)
     size = len(content) if rng.random() < 0.8 else rng.choice(NUMBERS)
     crc = zlib.crc32(content) if rng.random() < 0.8 else rng.choice((0, 1))
     if rng.random() < 0.1:
