@@ -45,8 +45,9 @@ help:
 	@echo '             ARGS=...  more arguments, such as ARGS="-p time_scale:=0.5 -r __ns:=/top"'
 	@echo 'make test    run the tests;  TESTS=... selects some, ARGS=... is passed to pytest, which has'
 	@echo '             WORKERS=$(WORKERS) processes (0: none but its own, as ARGS=--pdb wants)'
-	@echo 'make stress  kill 200 recording nodes (KILLS=...), then run 100 000 random tops (STRESS=...)'
-	@echo '             with both solvers; takes an hour'
+	@echo 'make stress  kill 200 recording nodes (KILLS=...), try random logs, parameters, commands,'
+	@echo '             service calls and disk faults (each SECONDS=600), then 100 000 random tops'
+	@echo '             (STRESS=...) with both solvers; takes two hours'
 	@echo 'make performance  measure node, start-up, a long run, solvers and simulate, and write'
 	@echo '             docs/performance.md; takes an hour and a half, in the environment'
 	@echo '             .venv-benchmark'
@@ -86,9 +87,13 @@ test: dependencies
 
 STRESS ?= 100000
 KILLS ?= 200
+SECONDS ?= 600
 stress: dependencies
 	KILLS=$(KILLS) '$(VENV)/bin/pytest' -q test/test_kill.py
-	'$(VENV)/bin/python' test/stress.py $(STRESS)
+	for part in logs values nodes services disk; do \
+	    '$(VENV)/bin/python' test/stress $$part --seconds $(SECONDS) || failed=1; \
+	done; \
+	'$(VENV)/bin/python' test/stress tops --count $(STRESS) && test -z "$$failed"
 
 # The programs to compare with need hundreds of megabytes, so they have their own environment.
 benchmark performance: export OMP_NUM_THREADS ?= 1

@@ -2,7 +2,7 @@
 """
 Random tops, symmetries, edge inputs and continued branches: what must hold for every motion.
 
-STRESS_TOPS=100000 in the environment takes as many random tops; `python test/stress.py` does the
+STRESS_TOPS=100000 in the environment takes as many random tops; `python test/stress tops` does the
 same on all processors and tells the worst cases.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from helpers.random_tops import random_case
 from helpers.reference import scene_parameters
-from stress import (
+from stress.tops import (
     COLUMNS,
     EXACT,
     UNIT,

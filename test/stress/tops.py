@@ -2,26 +2,19 @@
 """
 Both solvers on random tops: what must hold for every one of them, with each bound and its reason.
 
-    python test/stress.py 100000 [--first SEED] [--processes N]
+    python test/stress tops --count 100000 [--first SEED] [--processes N]
 
 prints its progress, the worst case of each check, and what failed; its exit code says whether.
 """
 
-import argparse
 import math
 import multiprocessing
 import signal
-import sys
 import time
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-
-if __name__ == '__main__':
-    sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
-
 from helpers import taylor
 from helpers.random_tops import random_case
 from helpers.taylor import LONG
@@ -77,16 +70,16 @@ class Findings:
 
 @contextmanager
 def time_limit(seconds):
-    """Raise TimeoutError after so many seconds: a hang becomes a failure."""
+    """Raise TimeoutError after so much processor time: a hang becomes a failure."""
     def stop(signum, frame):
         raise TimeoutError(f'not done after {seconds} s')
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    before = signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, seconds)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.signal(signal.SIGPROF, before)
 
 
 def rates_across(top, start):
@@ -411,30 +404,22 @@ def report(found):
     return '\n'.join(lines)
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.split('\n')[1])
-    parser.add_argument('count', type=int, nargs='?', default=100_000)
-    parser.add_argument('--first', type=int, default=0, help='seed of the first top')
-    parser.add_argument('--processes', type=int, default=None)
-    arguments = parser.parse_args()
+def stress(first, count, processes=None):
+    """Check so many tops; return the exit code."""
     found, done, began = Findings(), 0, time.monotonic()
-    work = blocks(arguments.first, arguments.count)
-    with multiprocessing.Pool(arguments.processes) as pool:
+    work = blocks(first, count)
+    with multiprocessing.Pool(processes) as pool:
         for part in pool.imap_unordered(check_block, work):
             found.add(part)
             done += 1
             for failure in part.failures:
                 print(f'\r{failure}', flush=True)
             taken = time.monotonic() - began
-            print(f'\r{min(done * BLOCK, arguments.count)} of {arguments.count} tops, '
+            print(f'\r{min(done * BLOCK, count)} of {count} tops, '
                   f'{len(found.failures)} failures, {taken:.0f} s, about '
                   f'{taken / done * (len(work) - done):.0f} s to go   ', end='', flush=True)
     print(f'\n{report(found)}')
-    if found.counts.get(MAGNIFIED, 0) > 2 + arguments.count / 10_000:
+    if found.counts.get(MAGNIFIED, 0) > 2 + count / 10_000:
         print(f'too often: {MAGNIFIED}')
         return 1
     return 1 if found.failures else 0
-
-
-if __name__ == '__main__':
-    sys.exit(main())

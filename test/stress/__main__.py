@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Stress tests: random inputs and faults, for so long or so many.
+
+    python test/stress tops --count 100000      both solvers on random tops
+    python test/stress logs --seconds 600       odd and damaged logs, and what reads them
+    python test/stress values --seconds 600     extreme parameters and commands, without ROS
+    python test/stress nodes --seconds 600      the same at a real node
+    python test/stress services --seconds 600   several clients at a real node at once
+    python test/stress disk --seconds 600       recordings on a disk that fails
+
+A failure is told with its seed and the command that repeats it; the exit code says whether.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2])]
+sys.path.remove(str(Path(__file__).parent))     # its modules are those of a package
+
+from stress import runner, tops  # noqa: E402
+
+
+def main():
+    if sys.argv[1:2] == ['--worker']:
+        return runner.serve(*sys.argv[2:])
+    parser = argparse.ArgumentParser(
+        prog='python test/stress', description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('part', choices=('tops', *runner.PARTS))
+    parser.add_argument('--first', type=int, default=0, help='the first seed')
+    parser.add_argument('--count', type=int, help='how many seeds')
+    parser.add_argument('--seconds', type=float, help='how long')
+    parser.add_argument('--processes', type=int, default=None)
+    options = parser.parse_args()
+    if options.part == 'tops':
+        return tops.stress(options.first, options.count or 100_000, options.processes)
+    if options.count is None and options.seconds is None:
+        options.seconds = 60.0
+    return stress(options)
+
+
+def stress(options):
+    def tell(result, failure):
+        if failure is not None:
+            print(f'\r{result.failures[-1]}\n', flush=True)
+        print(f'\r{options.part}: {result.seeds} seeds, {len(result.failures)} failures ',
+              end='', flush=True)
+
+    result = runner.run(options.part, options.first, options.count, options.seconds,
+                        options.processes or 1, tell)
+    outcomes = ', '.join(f'{name} {count}' for name, count in result.outcomes.most_common())
+    print(f'\r{options.part}: seeds {options.first} to {options.first + result.seeds - 1}: '
+          f'{outcomes}; a worker had {result.peak_mb:.0f} MB at most; '
+          f'{len(result.failures)} failures')
+    return 1 if result.failures else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

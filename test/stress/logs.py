@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Odd and damaged logs: the reader, inspect, inspect --verify, recover, and what replay_node loads.
+
+Seeds are in turn of a log of ours with odd contents, and of a damaged log: of ours or a
+stranger's, whole or torn.
+"""
+
+import argparse
+import contextlib
+import functools
+import io
+import json
+import re
+import tempfile
+import time
+from pathlib import Path
+
+from helpers.mutations import mutate
+from helpers.odd_logs import odd_log
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.tools import inspect, recover, simulate
+
+PATIENCE_S = 120.0
+MEMORY_MB = 1000
+PLAY_S = 0.05               # what is wrong with a log shows when it is loaded
+TERMINAL_CODES = re.compile(r'[\x00-\x08\x0b-\x1f\x7f-\x9f]')
+
+
+def check(seed, folder):
+    path = folder / 'run.mcap'
+    if seed % 2:
+        odd_log(path, seed)
+    else:
+        originals = original_logs()
+        path.write_bytes(mutate(originals[seed // 2 % len(originals)], seed))
+    content = path.read_bytes()
+    came_of_it = [read(path), *inspected(path), recovered(path, folder), replayed(path)]
+    assert path.read_bytes() == content, 'the log was changed'
+    assert {entry.name for entry in folder.iterdir()} <= {'run.mcap', 'whole.mcap'}
+    return ' '.join(came_of_it)
+
+
+@functools.cache
+def original_logs():
+    """Return the bytes of logs to damage."""
+    logs = []
+    with tempfile.TemporaryDirectory() as folder:
+        for number, more in enumerate((
+                ['-p', 'solver.method:=rk45'], ['-p', 'record.compression:=none'],
+                ['--command', '0.1:1.7:1.4', '-p', 'markers.enabled:=true'])):
+            path = Path(folder, f'{number}.mcap')
+            assert simulate.main(['-o', str(path), '--quiet', '--duration', '0.3', *more]) == 0
+            logs.append(path.read_bytes())
+    for compression in CompressionType:
+        file = io.BytesIO()
+        writer = Writer(file, chunk_size=2000, compression=compression)
+        writer.start('ros2', 'stranger')
+        schema = writer.register_schema('std_msgs/msg/String', 'ros2msg', b'string data')
+        channels = [writer.register_channel(f'/said_{number}', 'cdr', schema)
+                    for number in range(3)]
+        for number in range(300):
+            writer.add_message(channels[number % 3], number * 1_000_000,
+                               b'\0\1\0\0\5\0\0\0text\0', number)
+        writer.add_attachment(0, 0, 'notes', 'text/plain', 500 * b'note ')
+        writer.finish()
+        logs.append(file.getvalue())
+    return logs
+
+
+def read(path):
+    try:
+        with LogReader(path) as reader:
+            for message in reader.messages():
+                assert isinstance(message.topic, str) and message.log_time >= 0
+            reader.damage.lines()
+    except LogError as error:
+        assert str(path) in str(error) and '\n' not in str(error)
+        return 'unreadable'
+    return 'read'
+
+
+def run(tool, *arguments):
+    """Return the exit code and what a tool has printed."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = tool.main([str(argument) for argument in arguments])
+    said = TERMINAL_CODES.search(out.getvalue() + err.getvalue())
+    assert said is None, f'{tool.__name__} {arguments[1:]} prints {said.group()!r}'
+    return code, out.getvalue(), err.getvalue()
+
+
+def inspected(path):
+    code, out, err = run(inspect, path)
+    assert code in (0, 1) and (out or err.count('\n') == 1), err
+    code, out, err = run(inspect, path, '--json')
+    assert code in (0, 1)
+    if out:
+        json.loads(out, parse_constant=not_json)
+    else:
+        assert err.count('\n') == 1, err
+    verified, out, err = run(inspect, path, '--verify')
+    assert verified in (0, 1) and (out or err.count('\n') == 1), err
+    return (f'inspect {code}', f'verify {verified}')
+
+
+def not_json(name):
+    raise AssertionError(f'{name} is not JSON')
+
+
+def recovered(path, folder):
+    output = folder / 'whole.mcap'
+    code, _, err = run(recover, path, '-o', output)
+    assert code in (0, 1, 3)
+    assert output.exists() == (code != 1)
+    assert err.count('\n') == (code == 1), err
+    if output.exists():
+        with output.open('rb') as file:
+            messages = sum(1 for _ in make_reader(file, validate_crcs=True).iter_messages())
+        with LogReader(output) as reader:
+            assert reader.whole
+            assert sum(1 for _ in reader.messages()) == messages
+        again, _, _ = run(recover, output, '-o', folder / 'again.mcap')
+        assert again == 0, 'what was recovered is whole'
+        (folder / 'again.mcap').unlink()
+    return f'recover {code}'
+
+
+def replayed(path):
+    """Load and begin to play a log as replay_node does, in this process."""
+    import helpers.own_domain  # noqa: F401
+    import rclpy
+
+    from spinning_top_sim.nodes.replayer import Replayer, open_log
+
+    options = argparse.Namespace(rate=1e9, loop=False, start=0.0, topics=[], clock=0.0,
+                                 start_paused=False, delay=0.0, wait_for_subscribers=0)
+    rclpy.init()
+    try:
+        log = open_log(path, True)
+        try:
+            node = Replayer(log, options)
+        except Exception:
+            log.close()
+            raise
+        node.start()
+        end = time.monotonic() + PLAY_S
+        while time.monotonic() < end and not node.finished.done():
+            rclpy.spin_once(node, timeout_sec=0.01)
+        node.stop()
+        code = node.finished.result() if node.finished.done() else 'going on'
+        node.destroy_node()
+        return f'replay {code}'
+    except ValueError as error:
+        assert '\n' not in str(error), error
+        return 'replay refused'
+    finally:
+        rclpy.shutdown()
