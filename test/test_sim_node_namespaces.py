@@ -152,7 +152,8 @@ def test_parameters_are_described(peer, pair):
             assert [limits.from_value, limits.to_value] == bounded, parameter.name
         said = descriptor.additional_constraints
         assert said == (parameter.allowed if not ranges else f'must be > {parameter.above:g}'
-                        if parameter.above is not None else '')
+                        if parameter.above is not None else
+                        f'must be 0 or >= {parameter.smallest:g}' if parameter.smallest else '')
     described = {d.name: d for d in found}
     assert described['solver.method'].additional_constraints == 'must be one of rk45, exact'
     assert 'cusp' in described['spin.lz'].description
