@@ -109,10 +109,8 @@ def carlson_rf(x: Decimal, y: Decimal, z: Decimal) -> Decimal:
 
 def reduced_turns(radians: Decimal) -> Decimal:
     """Return an angle of any size in turns, less its whole turns: in [-1/2, 1/2]."""
-    with localcontext() as context:
-        context.prec += max(0, radians.adjusted())
-        turns = radians / (2 * pi())
-        rest = turns - turns.to_integral_value()
+    with localcontext(prec=getcontext().prec + max(0, radians.adjusted())):
+        rest = (radians / (2 * pi())).remainder_near(ONE)
     return +rest
 
 

@@ -207,11 +207,8 @@ class Interpolants(NamedTuple):
     @classmethod
     def of(cls, steps: Sequence[Step], equations: Equations) -> Interpolants:
         """Return the interpolants of steps of these equations."""
-        begin = np.array([step.t0 for step in steps])
-        h = np.array([step.t1 - step.t0 for step in steps])
-        y0, y1 = _components([step.y0 for step in steps]), _components([step.y1 for step in steps])
-        first0 = _components([step.derivative0 for step in steps])
-        first1 = _components([step.derivative1 for step in steps])
+        begin, y0, first0, end, y1, first1 = map(_components, zip(*steps, strict=True))
+        h = end - begin
         rise, p, q = y1 - y0, h * first0, h * first1
         u = 0.5 * h * h * equations.second_derivative(y0, first0)
         v = 0.5 * h * h * equations.second_derivative(y1, first1)
@@ -229,7 +226,7 @@ class Interpolants(NamedTuple):
         return unknowns
 
 
-def _components(vectors: Sequence[Vector]) -> Rows:
-    """Return rows (k, n) of n vectors; a complex component makes two rows."""
+def _components(vectors: Sequence[float] | Sequence[Vector]) -> Rows:
+    """Return rows (k, n) of n vectors, or (n,) of floats; a complex component makes two rows."""
     columns: NDArray[np.generic] = np.array(vectors)
     return np.ascontiguousarray(columns.view(np.float64).T)

@@ -272,8 +272,7 @@ def _isolated_root(a2: Decimal, a1: Decimal, a0: Decimal) -> tuple[Decimal, int]
     """
     centre = -a2 / 3
     side = -1 if ((centre + a2) * centre + a1) * centre + a0 > 0 else 1
-    with localcontext() as context:
-        context.prec = 8
+    with localcontext(prec=8):
         y = side * Decimal('2.001') * max(abs(a2), abs(a1).sqrt(), abs(a0) ** (ONE / 3))
     resolution = Decimal(10) ** (3 - getcontext().prec)
     for _ in range(MOST_NEWTON_STEPS):
