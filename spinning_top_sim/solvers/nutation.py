@@ -64,12 +64,11 @@ class _FactorSeries:
            ) -> tuple[Column, Column, Column]:
         """Return modulus (signed if real), argument, and the modulus without its factor sin y."""
         polynomial = _horner(self.real, xi)
-        if not self._sense:
-            if self._crosses:
-                polynomial = flip * polynomial
-            real = prefactors[self._real_prefactor] * polynomial
-            return real, 0.0 * y, polynomial if self.has_zero else real
+        if self._crosses:
+            polynomial = flip * polynomial
         real = prefactors[self._real_prefactor] * polynomial
+        if not self._sense:
+            return real, 0.0 * y, polynomial if self.has_zero else real
         imag = prefactors[self._imag_prefactor] * _horner(self.imag, xi)
         modulus = np.hypot(real, imag)          # its square may be too small for a double
         return modulus, self._drift * y + self._sense * np.arctan2(imag, real), modulus
@@ -104,7 +103,7 @@ class _Quarter:
         prefactors = (1.0, c, s, s * c)
         alpha, alpha_argument, alpha_without_sin = self._alpha.at(y, flip, xi, prefactors)
         beta, beta_argument, beta_without_sin = self._beta.at(y, flip, xi, prefactors)
-        if not self._u_dot:              # resting, perhaps at a pole
+        if not self._u_dot:             # resting, perhaps at a pole
             return alpha, beta, alpha_argument, beta_argument, 0.0 * y
         # theta' = -u'/sin(theta), and u' is a theta series of 2y.  Where alpha or beta has a zero,
         # its factor sin y is divided out of both.

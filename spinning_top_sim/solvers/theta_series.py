@@ -121,11 +121,6 @@ class ThetaForm:
         most = next(k for k in count(1) if nome ** (k * k) <= NEGLIGIBLE)
         return ThetaForm(self.K, self.K_prime, False, nome, most + 1)
 
-    def with_all_terms(self) -> ThetaForm:
-        """Return the same form with every term that reaches the working precision."""
-        digits_per_square = -self.nome.adjusted() - 1           # at least 1
-        return replace(self, terms=2 + math.isqrt(getcontext().prec // digits_per_square))
-
     @property
     def stretch(self) -> Decimal:
         """What y is multiplied with: x = stretch y in the imaginary form."""
@@ -203,7 +198,10 @@ class ThetaForm:
 
     def log_slope(self, a: Decimal) -> Decimal:
         """tau(a) = d/da log theta2(ia), to full precision: it sets the mean rates."""
-        _, (real, imag) = self.with_all_terms().shifted(a)
+        # Every term that reaches the working precision.
+        digits_per_square = -self.nome.adjusted() - 1           # at least 1
+        form = replace(self, terms=2 + math.isqrt(getcontext().prec // digits_per_square))
+        _, (real, imag) = form.shifted(a)
         slope = imag.slope_at_zero / real.at_zero       # Cauchy-Riemann
         if self.imaginary:
             return pi() / (2 * self.K_prime) * (a / self.K + slope)

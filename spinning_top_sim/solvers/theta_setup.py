@@ -310,46 +310,36 @@ def _check_roots(roots: _Roots, a0: Decimal, a1: Decimal, a2: Decimal) -> None:
             raise _RootsTooCloseError
 
 
-class _Poles(NamedTuple):
+class _Poles:
     """
     Where the poles are, seen from the swing.
 
     Distances of its ends u1 and u2 from u = -1 and u = 1, and the phases at which alpha and beta
     vanish: i a and K + i b [DLMF 19.25(v)].  b is None if u3 = 1 exactly, where beta is a dn.
+
+    No subtraction cancels: u'^2 at u = -1 and u = 1 is -((Lz +- L3)/lambda1)^2, so the product of
+    three distances is known, and the smallest of them needs no difference.
     """
 
-    one_plus_u1: Decimal
-    one_plus_u2: Decimal
-    one_minus_u1: Decimal
-    one_minus_u2: Decimal
-    a: Decimal
-    b: Decimal | None
-
-    @classmethod
-    def of(cls, given: _Given, roots: _Roots, f3: Decimal) -> _Poles:
-        """
-        Find the poles without a subtraction that cancels.
-
-        u'^2 at u = -1 and u = 1 is -((Lz +- L3)/lambda1)^2, so the product of three distances is
-        known, and the smallest of them needs no difference.
-        """
+    def __init__(self, given: _Given, roots: _Roots, f3: Decimal) -> None:
         s0, c0 = given.sin_half ** 2, given.cos_half ** 2
-        one_plus_u2, one_minus_u1 = 2 * c0 + roots.y2, 2 * s0 - roots.y1
+        self.one_plus_u2, self.one_minus_u1 = 2 * c0 + roots.y2, 2 * s0 - roots.y1
         one_minus_u2, u3_minus_one = 2 * s0 - roots.y2, roots.y3 - 2 * s0
         one_plus_u3 = roots.y3 + 2 * c0
         scale = given.lambda1 ** 2 * f3
-        one_plus_u1 = (given.lz + given.l3) ** 2 / (scale * one_plus_u2 * one_plus_u3)
-        at_top = (given.lz - given.l3) ** 2 / (scale * one_minus_u1)
+        self.one_plus_u1 = (given.lz + given.l3) ** 2 / (scale * self.one_plus_u2 * one_plus_u3)
+        at_top = (given.lz - given.l3) ** 2 / (scale * self.one_minus_u1)
         if one_minus_u2 <= u3_minus_one:
             one_minus_u2 = at_top / u3_minus_one
         else:
             u3_minus_one = at_top / one_minus_u2
+        self.one_minus_u2 = one_minus_u2
         gap21, gap31, gap32 = roots.gap21, roots.gap31, roots.gap32
-        a = (gap31 * one_plus_u1).sqrt() * carlson_rf(
-            gap31 * gap21, gap21 * one_plus_u3, gap31 * one_plus_u2)
-        b = (gap31 * one_minus_u2).sqrt() * carlson_rf(
-            gap21 * u3_minus_one, gap21 * gap32, gap32 * one_minus_u1) if u3_minus_one else None
-        return cls(one_plus_u1, one_plus_u2, one_minus_u1, one_minus_u2, a, b)
+        self.a = (gap31 * self.one_plus_u1).sqrt() * carlson_rf(
+            gap31 * gap21, gap21 * one_plus_u3, gap31 * self.one_plus_u2)
+        self.b = (gap31 * one_minus_u2).sqrt() * carlson_rf(
+            gap21 * u3_minus_one, gap21 * gap32,
+            gap32 * self.one_minus_u1) if u3_minus_one else None
 
 
 def _nutating(given: _Given, cubic: tuple[Decimal, Decimal, Decimal, Decimal]) -> ThetaMotion:
@@ -358,7 +348,7 @@ def _nutating(given: _Given, cubic: tuple[Decimal, Decimal, Decimal, Decimal]) -
     roots = _cubic_roots(f0, f1, f2, f3)
     _check_roots(roots, f0 / f3, f1 / f3, f2 / f3)
     w = (f3 * roots.gap31 / 4).sqrt()           # of sn(w t)
-    poles = _Poles.of(given, roots, f3)
+    poles = _Poles(given, roots, f3)
     form = ThetaForm.of(roots.m, roots.m1)
     full_form = form.real() if roots.m1 >= FULL_CIRCLE_M1 else None
     quarter0, offset0 = roots.start_phase(given.theta_dot > 0, form.K)
