@@ -16,7 +16,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,10 +123,9 @@ def unrolled_step(size: int, is_complex: bool) -> StepFunction:
     lines.append(f'    {names("k7")}= k7 = f({names("z")})')
     estimate = ', '.join(f'h*({combination(ERROR, i)})' for i in range(size))
     lines.append(f'    return ({names("z")}), k7, ({estimate},)')
-    scope: dict[str, Any] = {}
+    scope: dict[str, StepFunction] = {}
     exec('\n'.join(lines), scope)
-    step: StepFunction = scope['step']
-    return step
+    return scope['step']
 
 
 class Step(NamedTuple):

@@ -39,7 +39,8 @@ class ExactSolution:
 
     theta goes smoothly through a pole that is passed exactly (and out of [0, pi]), phi and psi are
     unwrapped, the quaternion's sign is continuous.  On every motion each of them is within 5e-15,
-    relative to the value or to its start where these are larger than 1.
+    relative to the value or to its start where these are larger than 1.  See F. Klein,
+    A. Sommerfeld, *Ueber die Theorie des Kreisels*, ch. VI, and `theta_setup`.
 
     Parameters
     ----------
@@ -58,10 +59,6 @@ class ExactSolution:
 
     Raises ValueError for motions whose constants doubles cannot hold, and, from every evaluation,
     for times at which a phase exceeds 2^52 turns.
-
-    Notes
-    -----
-    F. Klein, A. Sommerfeld, *Ueber die Theorie des Kreisels*, ch. VI; see `theta_setup`.
     """
 
     steps = evaluations = 0
@@ -94,10 +91,9 @@ class ExactSolution:
         self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
         alpha, beta = motion.alpha, motion.beta
         precession, spin = alpha.rate + beta.rate, alpha.rate - beta.rate
-        for name, value in (('the rate of the nutation', motion.quarter_rate),
-                            ('the rate of (phi + psi)/2', alpha.rate),
-                            ('the rate of (phi - psi)/2', beta.rate)):
-            in_range(name, value)
+        in_range('the rate of the nutation', motion.quarter_rate)
+        in_range('the rate of (phi + psi)/2', alpha.rate)
+        in_range('the rate of (phi - psi)/2', beta.rate)
         self.mean_precession_rate = in_range('mean precession rate', precession)
         self.mean_spin_rate = in_range('mean spin rate', spin)
         self.theta_min, self.theta_max = (float(x) for x in motion.theta_bounds)

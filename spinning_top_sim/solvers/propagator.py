@@ -22,8 +22,6 @@ def propagate(top: Top, start: State, *, method: str, equations: str = 'transpor
     """
     Return the motion that begins at `start`.
 
-    Parameters
-    ----------
     method : 'exact', the closed form, or 'rk45', Dormand-Prince steps.  Motions without torque
         or nutation take no steps: 'rk45' hands them to the closed form too.
     equations : of the steps, 'transport' (regular everywhere) or 'euler' (for study)

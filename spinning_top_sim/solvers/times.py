@@ -106,11 +106,9 @@ class Times:
         return self.high / 1e9 + self.low / 1e9 if self._t is None else self._t
 
     def __len__(self) -> int:
-        """Return n."""
         return len(self._given)
 
     def __getitem__(self, part: slice | NDArray[np.bool_]) -> Times:
-        """Return a part of the times."""
         if self.ns is None:
             return Times(None, self.seconds[part])
         if isinstance(self.ns, range) and isinstance(part, slice):
