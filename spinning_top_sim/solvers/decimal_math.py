@@ -38,11 +38,6 @@ def _pi(digits: int) -> Decimal:
         return (a + b) ** 2 / (4 * t)
 
 
-def sign(x: Decimal) -> int:
-    """Return -1, 0 or 1."""
-    return int(x > 0) - int(x < 0)
-
-
 def _odd_power_series(x: Decimal, sense: int) -> Decimal:
     """Return sum_k sense^k x^(2k+1)/(2k+1)!: sin x (sense -1) or sinh x (+1), of a small x."""
     square = sense * x * x

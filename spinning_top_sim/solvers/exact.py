@@ -198,8 +198,9 @@ class _ExactStates(States):
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:
-        x, y, z, w = self._solution._series.quaternion(self._times)
-        return (-x, -y, -z, -w) if self._solution._turns % 2 else (x, y, z, w)
+        rows = self._solution._series.quaternion(self._times)
+        x, y, z, w = -rows if self._solution._turns % 2 else rows
+        return x, y, z, w
 
     @cached_property
     def half_angle_squares(self) -> tuple[Column, Column]:

@@ -91,8 +91,7 @@ class Rotations:
         return row_cosine * cosine - row_sine * sine, row_sine * cosine + row_cosine * sine
 
     def _on_grid(self, grid: range) -> tuple[Rows, Rows]:
-        step, offset = grid.step, grid.start % grid.step
-        key = step, offset
+        step, offset = key = grid.step, grid.start % grid.step
         if key not in self._grids:
             while len(self._grids) >= GRIDS_KEPT:
                 del self._grids[next(iter(self._grids))]

@@ -39,7 +39,6 @@ from spinning_top_sim.solvers.decimal_math import (
     pi,
     precision,
     reduced_turns,
-    sign,
     sin_cos,
 )
 from spinning_top_sim.solvers.theta_series import Series, ThetaForm
@@ -357,7 +356,7 @@ def _nutating(given: _Given, cubic: tuple[Decimal, Decimal, Decimal, Decimal]) -
     def factor(is_beta: bool, momentum: Decimal, spin: Decimal, zero: Decimal | None,
                distance: Decimal, turns: Decimal, derivative: Decimal) -> Factor:
         # distance: 2 |alpha|^2 or 2 |beta|^2 where it is largest;  derivative: of the modulus.
-        s, size = sign(momentum), (distance / 2).sqrt()
+        s, size = int(momentum.compare(ZERO)), (distance / 2).sqrt()
         rate = spin / 2 + momentum / (2 * given.lambda1 * distance)
         pole = form.K_prime if zero is None else zero
         if s:
@@ -419,4 +418,4 @@ def _at_start(form: ThetaForm, series: tuple[FactorSeries, FactorSeries], quarte
         return ZERO, 1
     flip = 1 if quarters % 4 < 2 else -1
     growing = flip * here.real.weights[0]           # if it is zero now, it leaves with y
-    return ZERO, sign(flip * real) or sign(growing) * sign(derivative) or 1
+    return ZERO, -1 if (flip * real or growing * derivative) < 0 else 1
