@@ -109,7 +109,7 @@ def between_steps(case: Case) -> tuple[float, ...]:
     steps = steps_to(10.0, Integrator(equations))
     begins, ends = np.array([step.t0 for step in steps]), np.array([step.t1 for step in steps])
     middles = 0.5 * (begins + ends)
-    quintic = Interpolants.of(steps, equations).at(np.arange(len(steps)), middles)
+    quintic = Interpolants(steps, equations).at(np.arange(len(steps)), middles)
     y0, y1 = (np.array([getattr(step, name) for step in steps]).T for name in ('y0', 'y1'))
     slopes0, slopes1 = (np.array(equations.derivative(*y)) for y in (y0, y1))
     cubic = 0.5 * (y0 + y1) + 0.125 * (ends - begins) * (slopes0 - slopes1)
@@ -148,7 +148,7 @@ def run(equations: TransportEquations, case: Case, duration: int, rate: int,
     t = ns / 1e9
     steps = steps_to(t[-1], integrator)
     numbers = np.searchsorted([step.t1 for step in steps], t)
-    found = attitudes_of(equations, Interpolants.of(steps, equations).at(numbers, t), t)
+    found = attitudes_of(equations, Interpolants(steps, equations).at(numbers, t), t)
     return (float(angles_between(found, case.exact.states(ns).quaternion).max()),
             integrator.evaluations)
 

@@ -81,7 +81,7 @@ def test_dense_output_is_as_good_as_the_steps(equations_type):
     for h in (0.08, 0.04, 0.02):
         integrator = Integrator(equations)
         integrator._next_step = h
-        interpolants = Interpolants.of([integrator.step()], equations)
+        interpolants = Interpolants([integrator.step()], equations)
         middle = interpolants.at(np.array([0]), np.array([0.37 * h]))[:, 0]
         truth = np.array(fixed_steps(equations, 64, 0.37 * h)).view(float)
         errors.append(np.abs(middle - truth).max())
@@ -95,7 +95,7 @@ def test_dense_output_meets_the_steps_at_their_ends(equations_type):
     equations = equations_type(top_of(LOOPING), start_of(LOOPING), 1e-7, 0.0)
     integrator = Integrator(equations)
     steps = [integrator.step() for _ in range(20)]
-    interpolants = Interpolants.of(steps, equations)
+    interpolants = Interpolants(steps, equations)
     numbers = np.array([7, 19, 0, 7, 12])
     ends = interpolants.at(numbers, np.array([steps[k].t1 for k in numbers]))
     begins = interpolants.at(numbers, np.array([steps[k].t0 for k in numbers]))

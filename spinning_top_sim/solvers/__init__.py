@@ -43,8 +43,7 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
         raise ValueError(f't = {t!r}: must be (n,) numbers, in s') from error
     if times.ndim != 1:
         raise ValueError(f't has shape {times.shape}: must be (n,)')
-    if not np.all(np.isfinite(times)):
-        at = int(np.argmin(np.isfinite(times)))
+    for at in np.flatnonzero(~np.isfinite(times))[:1]:
         raise ValueError(f't[{at}] = {times[at]} s: must be finite')
     motion = propagate(top, start, method=method, equations=equations, rtol=rtol,
                        atol=0.1 * rtol if atol is None else atol)

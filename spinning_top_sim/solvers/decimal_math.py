@@ -38,11 +38,6 @@ def _pi(digits: int) -> Decimal:
         return (a + b) ** 2 / (4 * t)
 
 
-def sign(x: Decimal) -> int:
-    """Return -1, 0 or 1."""
-    return int(x > 0) - int(x < 0)
-
-
 def _odd_power_series(x: Decimal, sense: int) -> Decimal:
     """Return sum_k sense^k x^(2k+1)/(2k+1)!: sin x (sense -1) or sinh x (+1), of a small x."""
     square = sense * x * x
@@ -109,10 +104,8 @@ def carlson_rf(x: Decimal, y: Decimal, z: Decimal) -> Decimal:
 
 def reduced_turns(radians: Decimal) -> Decimal:
     """Return an angle of any size in turns, less its whole turns: in [-1/2, 1/2]."""
-    with localcontext() as context:
-        context.prec += max(0, radians.adjusted())
-        turns = radians / (2 * pi())
-        rest = turns - turns.to_integral_value()
+    with localcontext(prec=getcontext().prec + max(0, radians.adjusted())):
+        rest = (radians / (2 * pi())).remainder_near(ONE)
     return +rest
 
 

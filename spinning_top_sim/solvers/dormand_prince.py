@@ -16,7 +16,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,10 +123,9 @@ def unrolled_step(size: int, is_complex: bool) -> StepFunction:
     lines.append(f'    {names("k7")}= k7 = f({names("z")})')
     estimate = ', '.join(f'h*({combination(ERROR, i)})' for i in range(size))
     lines.append(f'    return ({names("z")}), k7, ({estimate},)')
-    scope: dict[str, Any] = {}
+    scope: dict[str, StepFunction] = {}
     exec('\n'.join(lines), scope)
-    step: StepFunction = scope['step']
-    return step
+    return scope['step']
 
 
 class Step(NamedTuple):
@@ -192,44 +191,32 @@ class Integrator:
         return self.newest
 
 
-class Interpolants(NamedTuple):
-    """
-    The quintic Hermite polynomials of n steps in s = (t - begin)/length.
+class Interpolants:
+    """The quintic Hermite polynomials of n steps of some equations."""
 
-    begin, length : (n,) [s]
-    coefficients : (6, k, n) by power and component, real and imaginary parts apart
-    """
-
-    begin: Rows
-    length: Rows
-    coefficients: Rows
-
-    @classmethod
-    def of(cls, steps: Sequence[Step], equations: Equations) -> Interpolants:
-        """Return the interpolants of steps of these equations."""
-        begin = np.array([step.t0 for step in steps])
-        h = np.array([step.t1 - step.t0 for step in steps])
-        y0, y1 = _components([step.y0 for step in steps]), _components([step.y1 for step in steps])
-        first0 = _components([step.derivative0 for step in steps])
-        first1 = _components([step.derivative1 for step in steps])
+    def __init__(self, steps: Sequence[Step], equations: Equations) -> None:
+        self._begin, y0, first0, end, y1, first1 = map(_components, zip(*steps, strict=True))
+        h = end - self._begin
+        self._length = np.where(h > 0.0, h, 1.0)
         rise, p, q = y1 - y0, h * first0, h * first1
         u = 0.5 * h * h * equations.second_derivative(y0, first0)
         v = 0.5 * h * h * equations.second_derivative(y1, first1)
-        return cls(begin, np.where(h > 0.0, h, 1.0), np.array((
+        # (6, k, n), by powers of (t - begin)/length.
+        self._coefficients = np.array((
             y0, p, u,
             10.0 * rise - 6.0 * p - 4.0 * q - 3.0 * u + v,
             -15.0 * rise + 8.0 * p + 7.0 * q + 3.0 * u - 2.0 * v,
-            6.0 * rise - 3.0 * p - 3.0 * q - u + v)))
+            6.0 * rise - 3.0 * p - 3.0 * q - u + v))
 
     def at(self, numbers: NDArray[np.int64], t: Rows) -> Rows:
         """Return the unknowns (k, m) at m times [s] in the steps of these numbers."""
-        s = (t - self.begin[numbers]) / self.length[numbers]
-        c0, c1, c2, c3, c4, c5 = self.coefficients.take(numbers, axis=2)
+        s = (t - self._begin[numbers]) / self._length[numbers]
+        c0, c1, c2, c3, c4, c5 = self._coefficients.take(numbers, axis=2)
         unknowns: Rows = ((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0
         return unknowns
 
 
-def _components(vectors: Sequence[Vector]) -> Rows:
-    """Return rows (k, n) of n vectors; a complex component makes two rows."""
+def _components(vectors: Sequence[float] | Sequence[Vector]) -> Rows:
+    """Return rows (k, n) of n vectors, or (n,) of floats; a complex component makes two rows."""
     columns: NDArray[np.generic] = np.array(vectors)
     return np.ascontiguousarray(columns.view(np.float64).T)

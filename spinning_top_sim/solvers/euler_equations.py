@@ -64,7 +64,6 @@ class EulerEquations(Equations):
                 phi_dot, psi_dot)
 
     def second_derivative(self, y: Rows, derivative: Rows) -> Rows:
-        """Return the equations differentiated once in time, as four rows."""
         theta = y[0]
         theta_dot, theta_ddot, phi_dot, _ = derivative
         sine, cosine = np.sin(theta), np.cos(theta)

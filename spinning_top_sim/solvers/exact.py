@@ -18,12 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column, Quaternion
-from spinning_top_sim.physics.regimes import (
-    Description,
-    axis_rests,
-    precession_extremes,
-    regime,
-)
+from spinning_top_sim.physics.regimes import Description, axis_rests, precession_extremes, regime
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.decimal_math import pi, precision
@@ -44,7 +39,8 @@ class ExactSolution:
 
     theta goes smoothly through a pole that is passed exactly (and out of [0, pi]), phi and psi are
     unwrapped, the quaternion's sign is continuous.  On every motion each of them is within 5e-15,
-    relative to the value or to its start where these are larger than 1.
+    relative to the value or to its start where these are larger than 1.  See F. Klein,
+    A. Sommerfeld, *Ueber die Theorie des Kreisels*, ch. VI, and `theta_setup`.
 
     Parameters
     ----------
@@ -63,10 +59,6 @@ class ExactSolution:
 
     Raises ValueError for motions whose constants doubles cannot hold, and, from every evaluation,
     for times at which a phase exceeds 2^52 turns.
-
-    Notes
-    -----
-    F. Klein, A. Sommerfeld, *Ueber die Theorie des Kreisels*, ch. VI; see `theta_setup`.
     """
 
     steps = evaluations = 0
@@ -99,10 +91,9 @@ class ExactSolution:
         self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
         alpha, beta = motion.alpha, motion.beta
         precession, spin = alpha.rate + beta.rate, alpha.rate - beta.rate
-        for name, value in (('the rate of the nutation', motion.quarter_rate),
-                            ('the rate of (phi + psi)/2', alpha.rate),
-                            ('the rate of (phi - psi)/2', beta.rate)):
-            in_range(name, value)
+        in_range('the rate of the nutation', motion.quarter_rate)
+        in_range('the rate of (phi + psi)/2', alpha.rate)
+        in_range('the rate of (phi - psi)/2', beta.rate)
         self.mean_precession_rate = in_range('mean precession rate', precession)
         self.mean_spin_rate = in_range('mean spin rate', spin)
         self.theta_min, self.theta_max = (float(x) for x in motion.theta_bounds)
@@ -171,9 +162,7 @@ class ExactSolution:
 
         Raises ValueError if `times_ns` is not of that kind, or a time is too far away.
         """
-        times = Times.from_ns(times_ns)
-        self._refuse_beyond(self.ns_limit, times.latest, 'ns')
-        return _ExactStates(self, times)
+        return self._states(Times.from_ns(times_ns), self.ns_limit, 'ns')
 
     def states_at_seconds(self, t: Column) -> States:
         """
@@ -181,15 +170,14 @@ class ExactSolution:
 
         Raises ValueError if a time is not finite or too far away.
         """
-        times = Times.from_seconds(t)
-        self._refuse_beyond(self.time_limit, times.latest, 's')
-        return _ExactStates(self, times)
+        return self._states(Times.from_seconds(t), self.time_limit, 's')
 
-    def _refuse_beyond(self, limit: float, latest: float, unit: str) -> None:
-        if not latest <= float(limit):  # rounded as the times are; catches NaN too
+    def _states(self, times: Times, limit: float, unit: str) -> States:
+        if not times.latest <= float(limit):    # rounded as the times are; catches NaN too
             raise ValueError(
-                f't = {latest!r} {unit}: must be finite and within {limit:.6g} {unit}, where a '
-                'phase of this motion reaches 2^52 turns or int64 ends')
+                f't = {times.latest!r} {unit}: must be finite and within {limit:.6g} {unit}, '
+                'where a phase of this motion reaches 2^52 turns or int64 ends')
+        return _ExactStates(self, times)
 
 
 class _ExactStates(States):
@@ -209,29 +197,15 @@ class _ExactStates(States):
         return self._solution._nutation.at(self._times)
 
     @cached_property
-    def _half_angle(self) -> tuple[Column, Column]:
-        """Cosine and sine of theta/2."""
-        scale = 1.0 / np.hypot(self._nutation.alpha, self._nutation.beta)
-        return scale * self._nutation.alpha, scale * self._nutation.beta
-
-    def _rotation_angles(self) -> tuple[Column, Column]:
-        """Return the arguments of alpha and beta [rad], less whole turns."""
-        angles = []
-        for (rate, start), argument in zip(
-                self._solution._rotations,
-                (self._nutation.alpha_argument, self._nutation.beta_argument), strict=True):
-            turns, rest = rate.fraction(self._times)
-            angles.append(2.0 * math.pi * (turns + rest) + (start + argument))
-        return angles[0], angles[1]
-
-    @cached_property
     def rows_quaternion(self) -> Quaternion:
-        x, y, z, w = self._solution._series.quaternion(self._times)
-        return (-x, -y, -z, -w) if self._solution._turns % 2 else (x, y, z, w)
+        rows = self._solution._series.quaternion(self._times)
+        x, y, z, w = -rows if self._solution._turns % 2 else rows
+        return x, y, z, w
 
     @cached_property
     def half_angle_squares(self) -> tuple[Column, Column]:
-        cosine, sine = self._half_angle
+        scale = 1.0 / np.hypot(self._nutation.alpha, self._nutation.beta)
+        cosine, sine = scale * self._nutation.alpha, scale * self._nutation.beta
         return cosine * cosine, sine * sine
 
     @cached_property
@@ -264,7 +238,12 @@ class _ExactStates(States):
             precession = precession + solution._bottom_rate * (nutation.beta / nutation.alpha)
         if solution._top_rate:
             precession = precession + solution._top_rate * (nutation.alpha / nutation.beta)
-        alpha, beta = self._rotation_angles()
+        # psi is the difference of the arguments of alpha and beta, here less whole turns.
+        alpha, beta = (
+            2.0 * math.pi * np.add(*rate.fraction(self._times)) + (start + argument)
+            for (rate, start), argument in zip(
+                solution._rotations, (nutation.alpha_argument, nutation.beta_argument),
+                strict=True))
         cos_psi, sin_psi = np.cos(alpha - beta), np.sin(alpha - beta)
         return (nutation.theta_dot * sin_psi - precession * cos_psi,
                 nutation.theta_dot * cos_psi + precession * sin_psi)

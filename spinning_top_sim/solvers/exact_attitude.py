@@ -19,7 +19,7 @@ from decimal import Decimal
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.attitude import Column, Quaternion
+from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.solvers.decimal_math import ONE, ZERO, pi, sinh_cosh
 from spinning_top_sim.solvers.nutation import QUARTER_PERIOD_ANGLE, NutationPhase
 from spinning_top_sim.solvers.rotations import STEP_ANGLE, Rotations
@@ -66,14 +66,13 @@ class AttitudeSeries:
         self._coefficients = coefficients[:, :, np.newaxis]
         self._prefactors = [one.prefactor for one in series]
 
-    def quaternion(self, times: Times) -> Quaternion:
-        """Return x, y, z, w at n times."""
+    def quaternion(self, times: Times) -> NDArray[np.float64]:
+        """Return x, y, z, w at n times, (4, n)."""
         out = np.empty((4, len(times)))
         for first in range(0, len(times), BLOCK):
             block = slice(first, first + BLOCK)
             self._fill(out[:, block], times[block])
-        x, y, z, w = out
-        return x, y, z, w
+        return out
 
     def _fill(self, out: NDArray[np.float64], times: Times) -> None:
         if self._hyperbolic:

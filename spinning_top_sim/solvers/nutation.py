@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.attitude import Column
+from spinning_top_sim.physics.attitude import Column, Number
 from spinning_top_sim.solvers.decimal_math import ZERO, double_double
 from spinning_top_sim.solvers.theta_series import TERMS, Series
-from spinning_top_sim.solvers.theta_setup import ThetaMotion
+from spinning_top_sim.solvers.theta_setup import Factor, ThetaMotion
 from spinning_top_sim.solvers.times import Rate, Times
 
 QUARTER_PERIOD_ANGLE = 0.5 * math.pi
@@ -48,48 +48,44 @@ class NutationColumns(NamedTuple):
     half_theta: Column
 
 
-class _FactorSeries(NamedTuple):
-    """
-    Alpha or beta over even or odd quarter periods, in doubles.
+class _FactorSeries:
+    """Alpha or beta over even or odd quarter periods, in doubles."""
 
-    real, imag : coefficients in xi, highest first; the prefactors are indices into (1, cos y,
-        sin y, sin y cos y), or the hyperbolic ones.  A real factor has sense 0.
-    """
-
-    real_prefactor: int
-    real: tuple[float, ...]
-    imag_prefactor: int
-    imag: tuple[float, ...]
-    sense: int
-    drift: float
-    crosses: bool
-    has_zero: bool
+    def __init__(self, name: str, factor: Factor, odd: int) -> None:
+        series = factor.odd if odd else factor.even
+        imag = series.imag or Series('cos even', (ZERO,))
+        self.real = _coefficients(series.real.scaled(Decimal(factor.sign)), name)
+        self.imag = _coefficients(imag)
+        self._real_prefactor, self._imag_prefactor = series.real.prefactor, imag.prefactor
+        self._sense, self._drift = factor.sense, float(factor.drift)
+        self._crosses, self.has_zero = factor.crosses, series.has_zero
 
     def at(self, y: Column, flip: Column, xi: Column, prefactors: tuple[Column | float, ...],
            ) -> tuple[Column, Column, Column]:
         """Return modulus (signed if real), argument, and the modulus without its factor sin y."""
         polynomial = _horner(self.real, xi)
-        if not self.sense:
-            if self.crosses:
-                polynomial = flip * polynomial
-            real = prefactors[self.real_prefactor] * polynomial
+        if self._crosses:
+            polynomial = flip * polynomial
+        real = prefactors[self._real_prefactor] * polynomial
+        if not self._sense:
             return real, 0.0 * y, polynomial if self.has_zero else real
-        real = prefactors[self.real_prefactor] * polynomial
-        imag = prefactors[self.imag_prefactor] * _horner(self.imag, xi)
+        imag = prefactors[self._imag_prefactor] * _horner(self.imag, xi)
         modulus = np.hypot(real, imag)          # its square may be too small for a double
-        return modulus, self.drift * y + self.sense * np.arctan2(imag, real), modulus
+        return modulus, self._drift * y + self._sense * np.arctan2(imag, real), modulus
 
 
-class _Quarter(NamedTuple):
+class _Quarter:
     """Both factors and cos(theta)' over even or odd quarter periods."""
 
-    alpha: _FactorSeries
-    beta: _FactorSeries
-    u_dot: float                    # times `magnifier`, a power of 2: near a pole all is small
-    magnifier: float
-    u_dot_series: tuple[float, ...]
-    imaginary: bool
-    stretch: float
+    def __init__(self, motion: ThetaMotion, odd: int) -> None:
+        self._alpha = _FactorSeries('alpha', motion.alpha, odd)
+        self._beta = _FactorSeries('beta', motion.beta, odd)
+        smallest = min(max(map(abs, x.real + x.imag)) for x in (self._alpha, self._beta))
+        # A power of 2: near a pole all is small.
+        self._magnifier = 2.0 ** -math.frexp(smallest)[1] if smallest else 1.0
+        self._u_dot = in_range("cos(theta)'", motion.u_dot[odd] * Decimal(self._magnifier))
+        self._u_dot_series = _coefficients(motion.u_dot_series)
+        self._imaginary, self._stretch = motion.imaginary, float(motion.stretch)
 
     def at(self, y: Column, flip: Column) -> tuple[Column, ...]:
         """
@@ -97,25 +93,25 @@ class _Quarter(NamedTuple):
 
         flip : (-1)^floor(N/2) of the quarter period N
         """
-        if self.imaginary:
-            s = np.sinh(y * self.stretch)
+        if self._imaginary:
+            s = np.sinh(y * self._stretch)
             xi = -s * s
         else:
             s = np.sin(y)
             xi = s * s
         c = np.sqrt(1.0 - xi)           # cos y > 0, or cosh x
         prefactors = (1.0, c, s, s * c)
-        alpha, alpha_argument, alpha_without_sin = self.alpha.at(y, flip, xi, prefactors)
-        beta, beta_argument, beta_without_sin = self.beta.at(y, flip, xi, prefactors)
-        if not self.u_dot:              # resting, perhaps at a pole
+        alpha, alpha_argument, alpha_without_sin = self._alpha.at(y, flip, xi, prefactors)
+        beta, beta_argument, beta_without_sin = self._beta.at(y, flip, xi, prefactors)
+        if not self._u_dot:             # resting, perhaps at a pole
             return alpha, beta, alpha_argument, beta_argument, 0.0 * y
         # theta' = -u'/sin(theta), and u' is a theta series of 2y.  Where alpha or beta has a zero,
         # its factor sin y is divided out of both.
-        prefactor = 2.0 * c if self.alpha.has_zero or self.beta.has_zero else 2.0 * s * c
-        u_dot = prefactor * _horner(self.u_dot_series, 4.0 * xi * (1.0 - xi))
+        prefactor = 2.0 * c if self._alpha.has_zero or self._beta.has_zero else 2.0 * s * c
+        u_dot = prefactor * _horner(self._u_dot_series, 4.0 * xi * (1.0 - xi))
         # In this order nothing overflows on the separatrix, where all grow like cosh x.
-        theta_dot = (-0.5 * self.u_dot * (u_dot / (alpha * alpha + beta * beta))
-                     / (self.magnifier * alpha_without_sin * beta_without_sin))
+        theta_dot = (-0.5 * self._u_dot * (u_dot / (alpha * alpha + beta * beta))
+                     / (self._magnifier * alpha_without_sin * beta_without_sin))
         return alpha, beta, alpha_argument, beta_argument, theta_dot
 
 
@@ -150,22 +146,18 @@ class Nutation:
     """
     The nutation of one motion.
 
-    Raises
-    ------
-    ValueError
-        If an amplitude or a rate is out of the range in which doubles hold the motion.
+    Raises ValueError if an amplitude or a rate is out of the range in which doubles hold it.
     """
 
     def __init__(self, motion: ThetaMotion, start_theta: float) -> None:
         # Even and odd quarter periods.
-        self._kinds = _quarter(motion, 0), _quarter(motion, 1)
+        self._kinds = _Quarter(motion, 0), _Quarter(motion, 1)
         self._phase = NutationPhase(motion)
         self._turning = motion.planar_rotation
         self._turns0 = 0.0
         if motion.planar_rotation:
-            start = np.array([QUARTER_PERIOD_ANGLE * float(motion.offset0)])
-            self._turns0 = round(float(self._turns(
-                np.array([float(motion.quarter0)]), start, np.array([0.5 * start_theta]))[0]))
+            self._turns0 = round(self._turns(
+                motion.quarter0, QUARTER_PERIOD_ANGLE * float(motion.offset0), 0.5 * start_theta))
 
     def at(self, times: Times) -> NutationColumns:
         """Return the nutation at n times."""
@@ -190,7 +182,7 @@ class Nutation:
             half_theta += 2.0 * math.pi * np.rint(self._turns(quarters, y, half_theta))
         out[5] = half_theta
 
-    def _turns(self, quarters: Column, y: Column, half_theta: Column) -> Column:
+    def _turns(self, quarters: Number, y: Number, half_theta: Number) -> Number:
         """
         Return the whole turns to add to `half_theta`, before rounding.
 
@@ -209,24 +201,6 @@ def in_range(name: str, value: Decimal) -> float:
         raise ValueError(f'{name} is {value:.3e}: must be at most {MOST} for doubles to hold '
                          f'the motion; the constants of the top are too far apart in size')
     return float(value)
-
-
-def _quarter(motion: ThetaMotion, odd: int) -> _Quarter:
-    """Return the even or odd quarter periods of a motion in doubles."""
-    def series(which: str) -> _FactorSeries:
-        factor = motion.alpha if which == 'alpha' else motion.beta
-        branch = factor.odd if odd else factor.even
-        real = _coefficients(branch.real.scaled(Decimal(factor.sign)), which)
-        imag = branch.imag or Series('cos even', (ZERO,))
-        return _FactorSeries(
-            branch.real.prefactor, real, imag.prefactor, _coefficients(imag),
-            factor.sense, float(factor.drift), factor.crosses, branch.has_zero)
-    alpha, beta = series('alpha'), series('beta')
-    smallest = min(max(map(abs, x.real + x.imag)) for x in (alpha, beta))
-    magnifier = 2.0 ** -math.frexp(smallest)[1] if smallest else 1.0
-    u_dot = in_range("cos(theta)'", motion.u_dot[odd] * Decimal(magnifier))
-    return _Quarter(alpha, beta, u_dot, magnifier, _coefficients(motion.u_dot_series),
-                    motion.imaginary, float(motion.stretch))
 
 
 def _coefficients(series: Series, checked: str = '') -> tuple[float, ...]:

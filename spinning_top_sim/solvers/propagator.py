@@ -1,55 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every method offers that moves a state in time, and the choice among them."""
+"""The choice among the methods that move a state in time."""
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
-from numpy.typing import NDArray
 
-from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.regimes import axis_rests
-from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.nutation import MOST
-from spinning_top_sim.solvers.rk45 import EulerMotion, TransportMotion
+from spinning_top_sim.solvers.rk45 import EulerMotion, SteppedMotion, TransportMotion
 
 METHODS = ('rk45', 'exact')
 EQUATIONS = ('transport', 'euler')
-
-
-class Propagator(Protocol):
-    """
-    A motion that begins at t = 0, read in blocks of times: what every method offers.
-
-    A method that takes steps goes forward only; it can be read as far back as it keeps its steps.
-
-    steps, evaluations : integration steps taken, and evaluations of the right-hand side
-    latest_ns : the last nanosecond that can be read without further steps
-    """
-
-    @property
-    def top(self) -> Top: ...
-    @property
-    def steps(self) -> int: ...
-    @property
-    def evaluations(self) -> int: ...
-    @property
-    def latest_ns(self) -> int: ...
-
-    def reach(self, ns: int, max_steps: int | None = None) -> bool:
-        """Take steps up to `ns`; return False if `max_steps` were too few."""
-
-    def release(self, before_ns: int) -> None:
-        """Forget the steps that only states before this time need."""
-
-    def states(self, times_ns: NDArray[np.int64] | range) -> States:
-        """Return the states at ascending integer nanoseconds (n,) after the start."""
-
-    def states_at_seconds(self, t: Column) -> States:
-        """Return the states at ascending times t (n,) [s] after the start."""
+# A motion that begins at t = 0, read in blocks of times.
+Propagator = ExactSolution | SteppedMotion
 
 
 def propagate(top: Top, start: State, *, method: str, equations: str = 'transport',
@@ -57,8 +22,6 @@ def propagate(top: Top, start: State, *, method: str, equations: str = 'transpor
     """
     Return the motion that begins at `start`.
 
-    Parameters
-    ----------
     method : 'exact', the closed form, or 'rk45', Dormand-Prince steps.  Motions without torque
         or nutation take no steps: 'rk45' hands them to the closed form too.
     equations : of the steps, 'transport' (regular everywhere) or 'euler' (for study)

@@ -123,7 +123,7 @@ class SteppedMotion(ABC):
         """Return the rows that `_states_of` needs at times [s] within the steps that are kept."""
         steps = np.array([step.t1 for step in self._kept]).searchsorted(t)
         first, last = (int(steps[0]), int(steps[-1])) if len(t) else (0, 0)
-        interpolants = Interpolants.of(self._kept[first:last + 1], self._equations)
+        interpolants = Interpolants(self._kept[first:last + 1], self._equations)
         return np.concatenate((interpolants.at(steps - first, t), self._phases_at(steps)))
 
     def _phases_at(self, steps: NDArray[np.int64]) -> Rows:

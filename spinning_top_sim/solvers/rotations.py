@@ -9,6 +9,7 @@ from decimal import Decimal
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.solvers.decimal_math import ONE
 from spinning_top_sim.solvers.times import NANOSECONDS, Rate, Times, halves
 
 Rows = NDArray[np.float64]
@@ -53,18 +54,14 @@ class Rotations:
     """
 
     def __init__(self, angles: Sequence[tuple[Decimal, Decimal]]) -> None:
-        rate_high, rate_low, start_steps, start_rests = [], [], [], []
+        rows = []
         for rate, start in angles:
-            in_steps = rate * STEPS / 10 ** 9
-            rate_high.append(halves(float(in_steps))[0])
-            rate_low.append(float(in_steps - Decimal(rate_high[-1])))
-            start_in_steps = (start - start.to_integral_value()) * STEPS
-            start_steps.append(float(start_in_steps.to_integral_value()))
-            start_rests.append(float(start_in_steps - Decimal(start_steps[-1])))
+            per_ns, at_zero = rate * STEPS / 10 ** 9, start.remainder_near(ONE) * STEPS
+            rate_high, whole = halves(float(per_ns))[0], at_zero.to_integral_value()
+            rows.append((rate_high, float(per_ns - Decimal(rate_high)),
+                         WHOLE + float(whole), float(at_zero - whole)))
         self._rate_high, self._rate_low, self._whole, self._start_rest = (
-            np.array(numbers)[:, np.newaxis]
-            for numbers in (rate_high, rate_low, [WHOLE + steps for steps in start_steps],
-                            start_rests))
+            np.array(rows).T[:, :, np.newaxis])
         self._rates = [Rate(rate) for rate, _ in angles]
         fastest = max(abs(rate.high) for rate in self._rates)
         self._short_ns = SHORT_TURNS / fastest if fastest else np.inf
@@ -94,8 +91,7 @@ class Rotations:
         return row_cosine * cosine - row_sine * sine, row_sine * cosine + row_cosine * sine
 
     def _on_grid(self, grid: range) -> tuple[Rows, Rows]:
-        step, offset = grid.step, grid.start % grid.step
-        key = step, offset
+        step, offset = key = grid.step, grid.start % grid.step
         if key not in self._grids:
             while len(self._grids) >= GRIDS_KEPT:
                 del self._grids[next(iter(self._grids))]
@@ -104,14 +100,11 @@ class Rotations:
         seconds = np.arange(first, grid[-1] // NANOSECONDS + 1)
         row_cosine, row_sine = (x[:, :, np.newaxis] for x in self._at_seconds(seconds))
         cosine, sine = (x[:, np.newaxis, :] for x in self._grids[key])
-        cosines = row_cosine * cosine
-        cosines -= row_sine * sine
-        sines = row_sine * cosine
-        sines += row_cosine * sine
         begin = (grid.start - first * NANOSECONDS) // step
         part = slice(begin, begin + len(grid))
-        count = len(self._whole)
-        return cosines.reshape(count, -1)[:, part], sines.reshape(count, -1)[:, part]
+        cosines = (row_cosine * cosine - row_sine * sine).reshape(len(self._whole), -1)
+        sines = (row_sine * cosine + row_cosine * sine).reshape(len(self._whole), -1)
+        return cosines[:, part], sines[:, part]
 
     def _at_seconds(self, seconds: NDArray[np.int64]) -> tuple[Rows, Rows]:
         return self.cosines_and_sines(Times.from_ns(seconds * NANOSECONDS))

@@ -14,15 +14,9 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from decimal import Decimal, getcontext
+from itertools import count, zip_longest
 
-from spinning_top_sim.solvers.decimal_math import (
-    ONE,
-    ZERO,
-    carlson_rf,
-    pi,
-    sin_cos,
-    sinh_cosh,
-)
+from spinning_top_sim.solvers.decimal_math import ONE, ZERO, carlson_rf, pi, sin_cos, sinh_cosh
 
 TERMS = 4               # the nome is <= exp(-pi): the fifth term is below 1e-21
 NEGLIGIBLE = Decimal('1e-19')   # beside 1; ends the series of a form with a larger nome
@@ -39,12 +33,10 @@ class Series:
     kind: str
     weights: tuple[Decimal, ...]
 
-    PREFACTORS = {'cos even': 0, 'cos odd': 1, 'sin odd': 2, 'sin even': 3}  # noqa: RUF012
-
     @property
     def prefactor(self) -> int:
         """Index of what the terms have in common in (1, cos y, sin y, sin y cos y)."""
-        return self.PREFACTORS[self.kind]
+        return ('cos even', 'cos odd', 'sin odd', 'sin even').index(self.kind)
 
     def polynomial(self) -> list[Decimal]:
         """Return c[i] with sum = prefactor * sum_i c[i] xi^i, xi = sin^2 y (or -sinh^2 x)."""
@@ -92,12 +84,8 @@ def _multiple_angles(kind: str) -> Iterator[list[int]]:
                    'cos even': ([1, -2], [1]), 'sin even': ([-2], [0])}[kind]
     while True:
         yield now
-        after = [2 * x for x in now] + [0]
-        for i, x in enumerate(now):
-            after[i + 1] -= 4 * x
-        for i, x in enumerate(before):
-            after[i] -= x
-        before, now = now, after
+        before, now = now, [2 * x - 4 * lower - y for x, lower, y in
+                            zip_longest(now, [0, *now], before, fillvalue=0)]
 
 
 def _alternating(weights: Iterable[Decimal]) -> tuple[Decimal, ...]:
@@ -130,15 +118,8 @@ class ThetaForm:
     def real(self) -> ThetaForm:
         """Return the real form whatever the nome, with all the terms it takes."""
         nome = (-pi() * self.K_prime / self.K).exp()
-        terms = 1
-        while nome ** (terms * terms) > NEGLIGIBLE:
-            terms += 1
-        return ThetaForm(self.K, self.K_prime, False, nome, terms + 1)
-
-    def with_all_terms(self) -> ThetaForm:
-        """Return the same form with every term that reaches the working precision."""
-        digits_per_square = -self.nome.adjusted() - 1           # at least 1
-        return replace(self, terms=2 + math.isqrt(getcontext().prec // digits_per_square))
+        most = next(k for k in count(1) if nome ** (k * k) <= NEGLIGIBLE)
+        return ThetaForm(self.K, self.K_prime, False, nome, most + 1)
 
     @property
     def stretch(self) -> Decimal:
@@ -217,7 +198,10 @@ class ThetaForm:
 
     def log_slope(self, a: Decimal) -> Decimal:
         """tau(a) = d/da log theta2(ia), to full precision: it sets the mean rates."""
-        _, (real, imag) = self.with_all_terms().shifted(a)
+        # Every term that reaches the working precision.
+        digits_per_square = -self.nome.adjusted() - 1           # at least 1
+        form = replace(self, terms=2 + math.isqrt(getcontext().prec // digits_per_square))
+        _, (real, imag) = form.shifted(a)
         slope = imag.slope_at_zero / real.at_zero       # Cauchy-Riemann
         if self.imaginary:
             return pi() / (2 * self.K_prime) * (a / self.K + slope)

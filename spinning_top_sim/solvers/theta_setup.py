@@ -39,7 +39,6 @@ from spinning_top_sim.solvers.decimal_math import (
     pi,
     precision,
     reduced_turns,
-    sign,
     sin_cos,
 )
 from spinning_top_sim.solvers.theta_series import Series, ThetaForm
@@ -272,8 +271,7 @@ def _isolated_root(a2: Decimal, a1: Decimal, a0: Decimal) -> tuple[Decimal, int]
     """
     centre = -a2 / 3
     side = -1 if ((centre + a2) * centre + a1) * centre + a0 > 0 else 1
-    with localcontext() as context:
-        context.prec = 8
+    with localcontext(prec=8):
         y = side * Decimal('2.001') * max(abs(a2), abs(a1).sqrt(), abs(a0) ** (ONE / 3))
     resolution = Decimal(10) ** (3 - getcontext().prec)
     for _ in range(MOST_NEWTON_STEPS):
@@ -311,46 +309,36 @@ def _check_roots(roots: _Roots, a0: Decimal, a1: Decimal, a2: Decimal) -> None:
             raise _RootsTooCloseError
 
 
-class _Poles(NamedTuple):
+class _Poles:
     """
     Where the poles are, seen from the swing.
 
     Distances of its ends u1 and u2 from u = -1 and u = 1, and the phases at which alpha and beta
     vanish: i a and K + i b [DLMF 19.25(v)].  b is None if u3 = 1 exactly, where beta is a dn.
+
+    No subtraction cancels: u'^2 at u = -1 and u = 1 is -((Lz +- L3)/lambda1)^2, so the product of
+    three distances is known, and the smallest of them needs no difference.
     """
 
-    one_plus_u1: Decimal
-    one_plus_u2: Decimal
-    one_minus_u1: Decimal
-    one_minus_u2: Decimal
-    a: Decimal
-    b: Decimal | None
-
-    @classmethod
-    def of(cls, given: _Given, roots: _Roots, f3: Decimal) -> _Poles:
-        """
-        Find the poles without a subtraction that cancels.
-
-        u'^2 at u = -1 and u = 1 is -((Lz +- L3)/lambda1)^2, so the product of three distances is
-        known, and the smallest of them needs no difference.
-        """
+    def __init__(self, given: _Given, roots: _Roots, f3: Decimal) -> None:
         s0, c0 = given.sin_half ** 2, given.cos_half ** 2
-        one_plus_u2, one_minus_u1 = 2 * c0 + roots.y2, 2 * s0 - roots.y1
+        self.one_plus_u2, self.one_minus_u1 = 2 * c0 + roots.y2, 2 * s0 - roots.y1
         one_minus_u2, u3_minus_one = 2 * s0 - roots.y2, roots.y3 - 2 * s0
         one_plus_u3 = roots.y3 + 2 * c0
         scale = given.lambda1 ** 2 * f3
-        one_plus_u1 = (given.lz + given.l3) ** 2 / (scale * one_plus_u2 * one_plus_u3)
-        at_top = (given.lz - given.l3) ** 2 / (scale * one_minus_u1)
+        self.one_plus_u1 = (given.lz + given.l3) ** 2 / (scale * self.one_plus_u2 * one_plus_u3)
+        at_top = (given.lz - given.l3) ** 2 / (scale * self.one_minus_u1)
         if one_minus_u2 <= u3_minus_one:
             one_minus_u2 = at_top / u3_minus_one
         else:
             u3_minus_one = at_top / one_minus_u2
+        self.one_minus_u2 = one_minus_u2
         gap21, gap31, gap32 = roots.gap21, roots.gap31, roots.gap32
-        a = (gap31 * one_plus_u1).sqrt() * carlson_rf(
-            gap31 * gap21, gap21 * one_plus_u3, gap31 * one_plus_u2)
-        b = (gap31 * one_minus_u2).sqrt() * carlson_rf(
-            gap21 * u3_minus_one, gap21 * gap32, gap32 * one_minus_u1) if u3_minus_one else None
-        return cls(one_plus_u1, one_plus_u2, one_minus_u1, one_minus_u2, a, b)
+        self.a = (gap31 * self.one_plus_u1).sqrt() * carlson_rf(
+            gap31 * gap21, gap21 * one_plus_u3, gap31 * self.one_plus_u2)
+        self.b = (gap31 * one_minus_u2).sqrt() * carlson_rf(
+            gap21 * u3_minus_one, gap21 * gap32,
+            gap32 * self.one_minus_u1) if u3_minus_one else None
 
 
 def _nutating(given: _Given, cubic: tuple[Decimal, Decimal, Decimal, Decimal]) -> ThetaMotion:
@@ -359,7 +347,7 @@ def _nutating(given: _Given, cubic: tuple[Decimal, Decimal, Decimal, Decimal]) -
     roots = _cubic_roots(f0, f1, f2, f3)
     _check_roots(roots, f0 / f3, f1 / f3, f2 / f3)
     w = (f3 * roots.gap31 / 4).sqrt()           # of sn(w t)
-    poles = _Poles.of(given, roots, f3)
+    poles = _Poles(given, roots, f3)
     form = ThetaForm.of(roots.m, roots.m1)
     full_form = form.real() if roots.m1 >= FULL_CIRCLE_M1 else None
     quarter0, offset0 = roots.start_phase(given.theta_dot > 0, form.K)
@@ -368,7 +356,7 @@ def _nutating(given: _Given, cubic: tuple[Decimal, Decimal, Decimal, Decimal]) -
     def factor(is_beta: bool, momentum: Decimal, spin: Decimal, zero: Decimal | None,
                distance: Decimal, turns: Decimal, derivative: Decimal) -> Factor:
         # distance: 2 |alpha|^2 or 2 |beta|^2 where it is largest;  derivative: of the modulus.
-        s, size = sign(momentum), (distance / 2).sqrt()
+        s, size = int(momentum.compare(ZERO)), (distance / 2).sqrt()
         rate = spin / 2 + momentum / (2 * given.lambda1 * distance)
         pole = form.K_prime if zero is None else zero
         if s:
@@ -430,4 +418,4 @@ def _at_start(form: ThetaForm, series: tuple[FactorSeries, FactorSeries], quarte
         return ZERO, 1
     flip = 1 if quarters % 4 < 2 else -1
     growing = flip * here.real.weights[0]           # if it is zero now, it leaves with y
-    return ZERO, sign(flip * real) or sign(growing) * sign(derivative) or 1
+    return ZERO, -1 if (flip * real or growing * derivative) < 0 else 1

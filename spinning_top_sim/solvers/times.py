@@ -76,11 +76,12 @@ class Times:
             first, second = halves(self.seconds)
             high = self.seconds * 1e9               # 1e9 has 21 bits
             return high, (first * 1e9 - high) + second * 1e9
-        count = _integers(ns) if isinstance(ns, range) else ns
+        if isinstance(ns, range):       # `numpy.arange` takes its length from doubles
+            ns = (ns.start if ns else 0) + ns.step * np.arange(len(ns), dtype=np.int64)
         if self.latest <= 2.0 ** 53:
-            return count.astype(np.float64), np.broadcast_to(0.0, len(count))
-        upper = (count >> 20).astype(np.float64) * 2.0 ** 20
-        lower = (count & (2 ** 20 - 1)).astype(np.float64)
+            return ns.astype(np.float64), np.broadcast_to(0.0, len(ns))
+        upper = (ns >> 20).astype(np.float64) * 2.0 ** 20
+        lower = (ns & (2 ** 20 - 1)).astype(np.float64)
         high = upper + lower
         return high, lower - (high - upper)
 
@@ -105,11 +106,9 @@ class Times:
         return self.high / 1e9 + self.low / 1e9 if self._t is None else self._t
 
     def __len__(self) -> int:
-        """Return n."""
         return len(self._given)
 
     def __getitem__(self, part: slice | NDArray[np.bool_]) -> Times:
-        """Return a part of the times."""
         if self.ns is None:
             return Times(None, self.seconds[part])
         if isinstance(self.ns, range) and isinstance(part, slice):
@@ -119,11 +118,6 @@ class Times:
     @property
     def _given(self) -> NDArray[np.int64] | range | Column:
         return self.seconds if self.ns is None else self.ns
-
-
-def _integers(times: range) -> NDArray[np.int64]:
-    """Return a range as an array; `numpy.arange` takes its length from doubles."""
-    return (times.start if times else 0) + times.step * np.arange(len(times), dtype=np.int64)
 
 
 class Rate:

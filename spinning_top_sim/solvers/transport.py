@@ -117,7 +117,6 @@ class TransportEquations(Equations):
                 self._fall * (alpha * beta))
 
     def second_derivative(self, y: Rows, derivative: Rows) -> Rows:
-        """Return alpha'', beta'' and m'', the equations differentiated once, as six rows."""
         a, a_imag, b, b_imag, m, m_imag = y
         da, da_imag, db, db_imag, dm, dm_imag = derivative
         turn_a, turn_b, fall = self._turn_alpha.imag, self._turn_beta.imag, self._fall.real
@@ -135,7 +134,6 @@ class TransportEquations(Equations):
         return largest((abs(da), abs(db), abs(dm) / self._scale)) / self.tolerance
 
     def accepted(self, y: Vector, y_new: Vector) -> Vector:
-        """Return the projected end of a step."""
         return self.project(y_new)
 
     def project(self, y: Vector) -> Vector:
