@@ -95,8 +95,8 @@ class SteppedMotion(ABC):
         the steps cannot go on to the last time, or it is too many of them away.
         """
         if len(t) and t[0] < self._kept[0].t0:
-            raise ValueError(f't = {t[0]!r} s: steps go forward, and the oldest one that is kept '
-                             f'begins at {self._kept[0].t0!r} s')
+            raise ValueError(f't = {float(t[0])!r} s: steps go forward, and the oldest one that '
+                             f'is kept begins at {self._kept[0].t0!r} s')
         parts, begin = [], 0
         while begin < len(t):
             while self._kept[-1].t1 < t[-1] and len(self._kept) < STEPS_TOGETHER:
