@@ -87,10 +87,9 @@ def precession_rate(top: Top, l3: float, lz: float, cos2_half: Number,
 def angular_acceleration(top: Top, omega: Vector, vertical: Vector,
                          ) -> tuple[Column | float, Column | float]:
     """
-    Return omega_1' and omega_2' [rad/s^2] in the body frame by Euler's equations; omega_3' = 0.
+    Return omega_1' and omega_2' [rad/s^2] by Euler's equations; omega_3' = 0.
 
-    omega : angular velocity in the body frame [rad/s]
-    vertical : upward vertical in the body frame
+    omega : angular velocity [rad/s]; it and the upward vertical are in the body frame too
     """
     gyroscopic = (top.lambda1 - top.lambda3) * omega[2]
     torque = top.gravity_torque
@@ -101,14 +100,10 @@ def angular_acceleration(top: Top, omega: Vector, vertical: Vector,
 def specific_force(gravity: float, point: tuple[float, float, float], omega: Vector,
                    acceleration: Vector, vertical: Vector) -> Vector:
     """
-    Return what an ideal accelerometer at a point of the body measures, in the body frame [m/s^2].
+    Return what an ideal accelerometer at a point of the body measures [m/s^2].
 
-    f = omega' x r + omega x (omega x r) + g z: at rest +g upwards, as REP-145 has it.
-
-    gravity : [m/s^2]
-    point : r in the body frame [m]
-    omega, acceleration : angular velocity [rad/s] and acceleration [rad/s^2], body frame
-    vertical : upward vertical in the body frame
+    f = omega' x r + omega x (omega x r) + g z: at rest +g upwards, as REP-145 has it.  In the body
+    frame: point r [m], omega [rad/s], acceleration omega' [rad/s^2], upward vertical z.
     """
     r1, r2, r3 = point
     w1, w2, w3 = omega

@@ -17,10 +17,10 @@ SMALLEST, LARGEST = 1e-6, 1e6
 @dataclass(frozen=True)
 class Shape:
     """
-    A solid cylinder about the axis e3, and the end of the axis: lengths in m, in the body frame.
+    A solid cylinder about the axis e3, and the end of the axis [m].
 
-    radius, height: > 0;  centre: of the cylinder along e3, signed: the centre of mass
-    tip: along e3, on the side of the centre of mass, half a radius out of the cylinder
+    centre : of the cylinder along e3, signed: the centre of mass
+    tip : along e3, on the side of the centre of mass, half a radius out of the cylinder
     """
 
     radius: float
