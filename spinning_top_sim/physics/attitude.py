@@ -2,9 +2,8 @@
 """
 Attitude mathematics of the top in unit quaternions, regular at every attitude.
 
-The attitude of the body in the world is the ZYZ rotation Rz(phi) Ry(theta) Rz(psi).  Its unit
-quaternion (x, y, z, w) holds the Cayley-Klein parameters of Klein & Sommerfeld, *Theorie des
-Kreisels*, ch. I:
+The unit quaternion (x, y, z, w) of the body in the world holds the Cayley-Klein parameters of
+Klein & Sommerfeld, *Theorie des Kreisels*, ch. I:
 
     alpha = w + i z = cos(theta/2) exp(i (phi + psi)/2),
     beta  = y - i x = sin(theta/2) exp(i (phi - psi)/2).

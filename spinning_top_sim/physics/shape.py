@@ -33,9 +33,9 @@ def shape_of(top: Top) -> Shape:
     """
     Return the cylinder to draw for a top.
 
-    A solid cylinder has lambda3 = M r^2/2 along its axis and M (3 r^2 + h^2)/12 across it (about
-    the centre of mass); there is one for every top that can be (`Top.is_realizable`).  Where there
-    is none it is a thin disc with the same lambda3, and without a mass it is drawn as of 1 kg.
+    It has lambda3 = M r^2/2 along its axis and M (3 r^2 + h^2)/12 across it, about the centre of
+    mass.  Where there is none (see `Top.is_realizable`) it is a thin disc with the same lambda3,
+    and without a mass it is drawn as of 1 kg.
     """
     mass = top.mass or 1.0
     radius = _drawable(math.sqrt(2.0 * (top.lambda3 / mass)))

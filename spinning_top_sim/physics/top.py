@@ -51,12 +51,7 @@ class Top:
 
     @property
     def is_realizable(self) -> bool:
-        """
-        Whether some body has this inertia.
-
-        About the centre of mass the moments obey the triangle inequality, so with the parallel
-        axis theorem lambda3 <= 2 (lambda1 - M R^2).  The equations of motion do not need it.
-        """
+        """Whether some body has this inertia: the triangle inequality about its centre of mass."""
         return self.lambda3 <= 2.0 * self.lambda1_at_com * (1.0 + 1e-12)
 
     @property
@@ -96,11 +91,7 @@ class State:
 
 
 class ContinuedState(State):
-    """
-    A state that a motion through a pole has reached: theta is any real number.
-
-    A motion that starts anew from it goes on with its angles.
-    """
+    """A state that a motion through a pole has reached: theta may be any real number."""
 
     def __post_init__(self) -> None:
         """Accept every theta."""

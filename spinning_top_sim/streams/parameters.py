@@ -224,11 +224,7 @@ BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in T
 
 
 def checked(values: Mapping[str, Value]) -> dict[str, Value]:
-    """
-    Return the defaults with these values put in, each and all together validated.
-
-    Raises ValueError naming the parameter, its value and what is allowed.
-    """
+    """Return the defaults with these values put in.  Raises ValueError for what is not allowed."""
     result = {parameter.name: parameter.default for parameter in TABLE}
     for name, value in values.items():
         if name not in BY_NAME:

@@ -43,7 +43,7 @@ class Segment:
     @cached_property
     def exact(self) -> ExactSolution | None:
         """
-        The exact solution of the same motion; None for a motion that it cannot hold for so long.
+        The exact solution of the same motion; None where it cannot hold that for so long.
 
         Its set-up takes milliseconds, and may be done in another thread than the simulation's.
         """
@@ -82,11 +82,7 @@ class Segment:
         return range(times.start - self.start_ns, times.stop - self.start_ns, times.step)
 
     def orientation_error(self, states: States, times: range) -> NDArray[np.float64]:
-        """
-        Return the angles (n,) between states at simulated times and the exact solution [rad].
-
-        0 for the exact solution itself; NaN where there is none.
-        """
+        """Return the angles (n,) [rad] to the exact attitudes, NaN where these are not known."""
         if self.exact is self.solver:
             return np.zeros(len(times))
         errors = np.full(len(times), math.nan)
@@ -99,11 +95,7 @@ class Segment:
         return errors
 
     def exact_axis(self, times_ns: NDArray[np.int64]) -> Axis:
-        """
-        Return the symmetry axis in the world by the exact solution at simulated times (n,) [ns].
-
-        It stands still where there is no such solution.
-        """
+        """Return the exact axis in the world at times (n,) [ns]; where not known, it rests."""
         if self.exact is not None:
             return self.exact.states(
                 np.minimum(times_ns - self.start_ns, self.exact.ns_limit)).rows_axis

@@ -80,11 +80,7 @@ class Stream:
             self.on_change()
 
     def encode(self, states: States, epoch_ns: int, times: range) -> NDArray[np.uint8]:
-        """
-        Return the messages at sample times [ns] as rows of bytes (n, size).
-
-        They are valid until the next call.  The stamp of t = 0 is epoch_ns [ns].
-        """
+        """Return messages of states at times [ns]; epoch_ns is t = 0; see `Template.encode`."""
         stamps_ns = np.arange(epoch_ns + times.start, epoch_ns + times.stop, times.step)
         return self.template.encode(stamps_ns, *self.fields(states, times))
 
