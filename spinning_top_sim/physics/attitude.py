@@ -83,17 +83,12 @@ def precession_rate(top: Top, l3: float, lz: float, cos2_half: Number,
     return 0.25 / top.lambda1 * (bottom + upright)
 
 
-def angular_acceleration(top: Top, omega: Vector, vertical: Vector,
-                         ) -> tuple[Column | float, Column | float]:
-    """
-    Return omega_1' and omega_2' [rad/s^2] by Euler's equations; omega_3' = 0.
-
-    omega : angular velocity [rad/s]; it and the upward vertical are in the body frame too
-    """
+def angular_acceleration(top: Top, omega: Vector, vertical: Vector) -> Vector:
+    """Return omega' [rad/s^2] from omega [rad/s] by Euler's equations, all in the body frame."""
     gyroscopic = (top.lambda1 - top.lambda3) * omega[2]
     torque = top.gravity_torque
     return ((gyroscopic * omega[1] + torque * vertical[1]) / top.lambda1,
-            -(gyroscopic * omega[0] + torque * vertical[0]) / top.lambda1)
+            -(gyroscopic * omega[0] + torque * vertical[0]) / top.lambda1, 0.0)
 
 
 def specific_force(gravity: float, point: tuple[float, float, float], omega: Vector,

@@ -133,8 +133,8 @@ class States:
 
     @cached_property
     def rows_angular_acceleration(self) -> Vector:
-        return (*attitude.angular_acceleration(self.top, self.rows_angular_velocity,
-                                               self.rows_vertical), 0.0)
+        return attitude.angular_acceleration(self.top, self.rows_angular_velocity,
+                                             self.rows_vertical)
 
     @cached_property
     def angular_acceleration(self) -> NDArray[np.float64]:

@@ -83,6 +83,6 @@ class Markers(Stream):
         begins = [segment.start_ns for segment in self._segments]
         # A segment ends with the command that begins the next one, that instant included.
         ends = np.searchsorted(times_ns, begins[1:], 'right')
-        parts = [np.stack(segment.exact_axis(times), axis=-1) for segment, times in zip(
-            self._segments, np.split(times_ns, ends), strict=True) if len(times)]
-        return np.concatenate(parts)
+        return np.concatenate([
+            np.stack(segment.exact_axis(times), axis=-1) for segment, times in zip(
+                self._segments, np.split(times_ns, ends), strict=True) if len(times)])

@@ -133,7 +133,7 @@ def _marker(writer: CdrWriter, frame_id: str, namespace: str, kind: int, scale: 
     writer.append('I', 0, 0)                                # texture: stamp, frame, format, data
     writer.string('', '')
     writer.append('I', 0, 0)                                # and uv_coordinates
-    writer.string('', '', '')                           # text, mesh_resource, mesh_file's name
+    writer.string('', '', '')                               # text, mesh_resource, mesh_file's name
     writer.append('I', 0)                                   # and data
     writer.append('?', False)                               # mesh_use_embedded_materials
 

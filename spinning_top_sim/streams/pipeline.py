@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulation: solver -> streams -> sinks, the same live and offline, in nanoseconds."""
+"""The simulation, the same live and offline; times are integer nanoseconds since the start."""
 
 from __future__ import annotations
 

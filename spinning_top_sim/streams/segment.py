@@ -43,7 +43,7 @@ class Segment:
     @cached_property
     def exact(self) -> ExactSolution | None:
         """
-        The exact solution of the same motion; None where it cannot hold that for so long.
+        The exact solution of the same motion; None for a motion that it cannot hold for so long.
 
         Its set-up takes milliseconds, and may be done in another thread than the simulation's.
         """

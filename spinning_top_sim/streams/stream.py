@@ -68,7 +68,7 @@ class Stream:
         return (max(t_ns, self._skipped_until_ns - 1) // self.period_ns + 1) * self.period_ns
 
     def times(self, after_ns: int, until_ns: int) -> range:
-        """Return the times of the samples after `after_ns` up to `until_ns` [ns]."""
+        """Return the times of the samples after `after_ns` and up to `until_ns` [ns]."""
         return range(self.first_after(after_ns), until_ns + 1, self.period_ns)
 
     def skip(self, after_ns: int, before_ns: int) -> None:

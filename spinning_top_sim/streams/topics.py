@@ -110,7 +110,7 @@ class GroundTruthImu(ImuStream):
 
 
 class Invariants(Stream):
-    """How well the constants of the motion are kept; a drift from 0 is absolute."""
+    """How well the constants of the motion are kept: relative drifts, absolute where one is 0."""
 
     parameter, topic, type_name = 'invariants', '~/invariants', 'std_msgs/msg/Float64MultiArray'
 
