@@ -48,7 +48,7 @@ def parameter_file(path: Path) -> None:
         if lowest is not None or parameter.maximum is not None:
             bounds = [-largest if lowest is None else lowest,
                       largest if parameter.maximum is None else parameter.maximum]
-        rows.append([parameter.name, 1.0 if value is None else value, parameter.description,
+        rows.append([parameter.name, 1.0 if value is None else value, parameter.describe(),
                      bounds])
     path.write_text(json.dumps(rows))
 

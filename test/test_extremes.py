@@ -126,7 +126,7 @@ def test_a_node_survives_extreme_parameters_commands_and_resets(peer, tmp_path):
     from rclpy.parameter import Parameter
 
     defaults = {name: list(value) if isinstance(value, tuple) else value
-                for name, value in parameters.defaults().items()
+                for name, value in parameters.checked({}).items()
                 if parameters.BY_NAME[name].effect is not parameters.Effect.START
                 and not name.startswith('spin.')}
     with SimNode(tmp_path, {'status_period': 0.5}) as node:

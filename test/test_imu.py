@@ -93,7 +93,7 @@ def test_a_pendulum_reads_what_the_textbook_says():
     "Classical Mechanics", 3rd ed., 2002, chapter 5).
     """
     theta, theta_dot, g = 0.7, 1.3, 9.80665
-    values = parameters.defaults()
+    values = parameters.checked({})
     torque = values['top.mass'] * g * values['top.com_distance'] * math.sin(theta)
     percussion = values['top.lambda1'] / (values['top.mass'] * values['top.com_distance'])
     for z in (0.1, percussion):
@@ -192,7 +192,7 @@ def test_the_turn_on_bias_is_a_draw_of_its_own():
     """Over its deviation it is none of the numbers that noise and walk are made of."""
     _, bias = errors(gyroscope_turn_on_bias=1.0, accelerometer_turn_on_bias=1.0)
     # Deviations of 1 at the rate that the IMU has.
-    density = math.sqrt(1.0 / parameters.defaults()['imu.rate'])
+    density = math.sqrt(1.0 / parameters.checked({})['imu.rate'])
     white, _ = errors(gyroscope_noise_density=density, accelerometer_noise_density=density)
     _, walk = errors(gyroscope_random_walk=1.0 / density, accelerometer_random_walk=1.0 / density)
     numbers = np.concatenate((white.ravel(), walk.ravel(), np.diff(walk, axis=0).ravel()))

@@ -305,7 +305,7 @@ def test_the_rviz_page_shows_topics_that_there_are():
     robot = displays['RobotModel']['Description Topic']
     assert robot['Value'] == '/robot_description'
     assert robot['Durability Policy'] == 'Transient Local', 'it is published once'
-    assert page['Global Options']['Fixed Frame'] == parameters.defaults()['world_frame']
+    assert page['Global Options']['Fixed Frame'] == parameters.checked({})['world_frame']
 
 
 # ---------------------------------------------------------------------------------- the real thing

@@ -44,7 +44,7 @@ def test_samples_are_on_the_grid_and_in_order_of_time():
     all_times = [t_ns for _, t_ns, _ in taken]
     assert all_times == sorted(all_times)
     for one in simulation.streams:
-        period = round(SECOND / parameters.defaults()[f'{one.parameter}.rate'])
+        period = round(SECOND / parameters.checked({})[f'{one.parameter}.rate'])
         assert times(taken, one.topic) == list(range(0, 2 * SECOND + 1, period))
 
 
@@ -172,7 +172,7 @@ def test_only_the_stream_with_a_subscriber_is_encoded(topic):
     simulation.advance(SECOND)
     taken = publish(simulation, topic)
     simulation.advance(2 * SECOND)
-    rate = parameters.defaults()[f'{stream(simulation, topic).parameter}.rate']
+    rate = parameters.checked({})[f'{stream(simulation, topic).parameter}.rate']
     assert len(taken) == rate
     assert encoded.pop(topic).count == states.count == rate
     assert all(counted.count == 0 for counted in encoded.values())

@@ -4,6 +4,7 @@
 import math
 from collections import Counter
 
+import numpy as np
 import pytest
 from helpers import short_lives
 from helpers.simulations import MILLISECOND, SECOND, record, simulate, stream
@@ -69,6 +70,25 @@ def test_a_closed_form_that_ends_stops_the_motion_there():
         simulation.advance(limit_ns + SECOND)
     simulation.command(1.0, 0.5)
     assert simulation.advance(limit_ns + SECOND)
+
+
+def test_where_the_exact_solution_ends_the_steps_go_on_and_their_error_is_unknown():
+    """A nutation so slow that steps take weeks, about an axis that spins very fast."""
+    simulation = simulate(top__lambda3=1e-87, top__mass=1e-20, spin__l3=2e-79, spin__lz=1e-12,
+                          initial__theta_dot=1e-9)
+    segment = simulation.segment
+    end_ns = segment.exact.ns_limit
+    later_ns = LAST_STAMP_NS - simulation.epoch_ns
+    assert end_ns + 10 ** 17 < later_ns
+    while segment.reached_ns <= later_ns:
+        segment.reach(later_ns, 1000)
+    times = range(end_ns - 2 * SECOND, end_ns + 3 * SECOND + 1, SECOND)
+    for block in (times, times[:3], times[3:], range(later_ns, later_ns + 1)):
+        errors = segment.orientation_error(segment.states(block), block)
+        assert np.isnan(errors).tolist() == [t_ns > end_ns for t_ns in block]
+    axis = np.array(segment.exact_axis(np.array(times)))
+    assert (axis[:, 3:] == axis[:, 2:3]).all()
+    assert axis[:, :3] == pytest.approx(np.array(segment.states(times[:3]).rows_axis), abs=1e-6)
 
 
 # -------------------------------------------------------------------------------------- stamps

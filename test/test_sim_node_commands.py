@@ -34,7 +34,7 @@ from spinning_top_sim.streams import parameters
 PERIOD_NS = 2_000_000
 LAMBDA1 = 0.123
 TORQUE = 2.0 * 0.15 * GRAVITY
-LAMBDA3 = parameters.defaults()['top.lambda3']
+LAMBDA3 = parameters.checked({})['top.lambda3']
 
 
 def listen_to_motion(peer, node):

@@ -22,7 +22,7 @@ from sensor_msgs.msg import JointState
 
 from spinning_top_sim.streams import parameters
 
-LAMBDA3 = parameters.defaults()['top.lambda3']
+LAMBDA3 = parameters.checked({})['top.lambda3']
 REFUSED_COMMANDS = [(), (1.0,), (1.0, 1.0, 1.0), (math.nan, 1.0), (1.0, math.nan),
                     (math.inf, 1.0), (1.0, -math.inf), (1e300, 1e300), (1e20, 1.0),
                     (1e100, 1e100), (-1e150, 1e15)]

@@ -35,7 +35,7 @@ def overrides(argv: Sequence[str]) -> list[str]:
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     """Return what `ros2 param describe` shows; dynamic types, as `Parameter.check` decides."""
     result = ParameterDescriptor(
-        name=parameter.name, description=parameter.summary, dynamic_typing=True,
+        name=parameter.name, description=parameter.describe(range_too=False), dynamic_typing=True,
         read_only=parameter.effect is Effect.START)
     lowest = parameter.minimum if parameter.above is None else parameter.above
     if lowest is None or parameter.maximum is None:

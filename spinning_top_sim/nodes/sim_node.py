@@ -45,7 +45,7 @@ def _prepare(argv: list[str]) -> Callable[[], Simulator] | None:
             default = parameter.default
             shown = list(default) if isinstance(default, tuple) else default
             print(f'  {parameter.name}  (default {"unset" if shown is None else shown})\n'
-                  f'      {parameter.description}')
+                  f'      {parameter.describe()}')
         return None
     if '--version' in argv[1:]:
         from spinning_top_sim.recording.provenance import version  # noqa: PLC0415

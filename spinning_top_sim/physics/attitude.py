@@ -2,9 +2,8 @@
 """
 Attitude mathematics of the top in unit quaternions, regular at every attitude.
 
-The attitude of the body in the world is the ZYZ rotation Rz(phi) Ry(theta) Rz(psi).  Its unit
-quaternion (x, y, z, w) holds the Cayley-Klein parameters of Klein & Sommerfeld, *Theorie des
-Kreisels*, ch. I:
+The unit quaternion (x, y, z, w) of the body in the world holds the Cayley-Klein parameters of
+Klein & Sommerfeld, *Theorie des Kreisels*, ch. I:
 
     alpha = w + i z = cos(theta/2) exp(i (phi + psi)/2),
     beta  = y - i x = sin(theta/2) exp(i (phi - psi)/2).
@@ -84,31 +83,21 @@ def precession_rate(top: Top, l3: float, lz: float, cos2_half: Number,
     return 0.25 / top.lambda1 * (bottom + upright)
 
 
-def angular_acceleration(top: Top, omega: Vector, vertical: Vector,
-                         ) -> tuple[Column | float, Column | float]:
-    """
-    Return omega_1' and omega_2' [rad/s^2] in the body frame by Euler's equations; omega_3' = 0.
-
-    omega : angular velocity in the body frame [rad/s]
-    vertical : upward vertical in the body frame
-    """
+def angular_acceleration(top: Top, omega: Vector, vertical: Vector) -> Vector:
+    """Return omega' [rad/s^2] from omega [rad/s] by Euler's equations, all in the body frame."""
     gyroscopic = (top.lambda1 - top.lambda3) * omega[2]
     torque = top.gravity_torque
     return ((gyroscopic * omega[1] + torque * vertical[1]) / top.lambda1,
-            -(gyroscopic * omega[0] + torque * vertical[0]) / top.lambda1)
+            -(gyroscopic * omega[0] + torque * vertical[0]) / top.lambda1, 0.0)
 
 
 def specific_force(gravity: float, point: tuple[float, float, float], omega: Vector,
                    acceleration: Vector, vertical: Vector) -> Vector:
     """
-    Return what an ideal accelerometer at a point of the body measures, in the body frame [m/s^2].
+    Return what an ideal accelerometer at a point of the body measures [m/s^2].
 
-    f = omega' x r + omega x (omega x r) + g z: at rest +g upwards, as REP-145 has it.
-
-    gravity : [m/s^2]
-    point : r in the body frame [m]
-    omega, acceleration : angular velocity [rad/s] and acceleration [rad/s^2], body frame
-    vertical : upward vertical in the body frame
+    f = omega' x r + omega x (omega x r) + g z: at rest +g upwards, as REP-145 has it.  In the body
+    frame: point r [m], omega [rad/s], acceleration omega' [rad/s^2], upward vertical z.
     """
     r1, r2, r3 = point
     w1, w2, w3 = omega

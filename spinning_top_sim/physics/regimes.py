@@ -19,20 +19,17 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.top import State, Top
 
 Real = TypeVar('Real', float, Decimal)
+# Relative distance below which two roots, or a root and Lz/L3, are said to coincide.
+COINCIDE = 1e-12
 
 
 @dataclass(frozen=True)
 class Description:
     """
-    A motion in the numbers that a physicist asks for.
+    A motion in the numbers that a physicist asks for: angles [rad], rates [rad/s].
 
-    Attributes
-    ----------
-    name : see `regime`
     nutation_period : [s], None where theta rests
-    theta_min, theta_max : between which the axis swings [rad]
-    mean_precession_rate, mean_spin_rate : <phi'>, <psi'> over a nutation [rad/s]
-    precession_min, precession_max : extremes of phi' [rad/s]
+    mean_precession_rate, mean_spin_rate : <phi'>, <psi'> over a nutation
     separatrix_distance : 1 - m of the elliptic functions; 0 is the motion that rises for ever
     gyroscopic_ratio : L3^2/(4 lambda1 |P|); an upright top sleeps above 1; inf without gravity
     """
@@ -67,10 +64,6 @@ def _span(low: float, high: float) -> str:
     return ' to '.join(f'{x:.{digits}g}' for x in ends)
 
 
-# Relative distance below which two roots, or a root and Lz/L3, are said to coincide.
-COINCIDE = 1e-12
-
-
 def swing(top: Top, state: State) -> tuple[float, float]:
     """Return the least and the greatest cos(theta) between which the axis swings."""
     sin_half, cos_half = math.sin(0.5 * state.theta), math.cos(0.5 * state.theta)
@@ -91,10 +84,10 @@ def swing(top: Top, state: State) -> tuple[float, float]:
     return u0 + low, u0 + high
 
 
-def axis_rests(top: Top, state: State, coincide: float = COINCIDE) -> bool:
+def axis_rests(top: Top, state: State) -> bool:
     """Return whether theta stays as it is: sleeping, hanging at a pole, steady precession."""
     low, high = swing(top, state)
-    return high - low <= coincide
+    return high - low <= COINCIDE
 
 
 def nutation_cubic(lambda1: Real, torque: Real, l3: Real, lz: Real, theta_dot: Real,
@@ -102,9 +95,7 @@ def nutation_cubic(lambda1: Real, torque: Real, l3: Real, lz: Real, theta_dot: R
     """
     Return f0 .. f3 of u'^2 = f0 + f1 y + f2 y^2 + f3 y^3, y = u - u0, u = cos(theta).
 
-    lambda1, torque, l3, lz, theta_dot : constants, and the nutation rate at the start
-    sin_half, cos_half : of theta/2 at the start; they stand for theta, so that nothing cancels at
-        either pole
+    sin_half and cos_half of theta/2 stand for theta0, so that nothing cancels at either pole.
     """
     s0, c0 = sin_half * sin_half, cos_half * cos_half
     u0, sine = c0 - s0, 2 * sin_half * cos_half

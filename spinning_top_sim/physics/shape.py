@@ -17,10 +17,10 @@ SMALLEST, LARGEST = 1e-6, 1e6
 @dataclass(frozen=True)
 class Shape:
     """
-    A solid cylinder about the axis e3, and the end of the axis: lengths in m, in the body frame.
+    A solid cylinder about the axis e3, and the end of the axis [m].
 
-    radius, height: > 0;  centre: of the cylinder along e3, signed: the centre of mass
-    tip: along e3, on the side of the centre of mass, half a radius out of the cylinder
+    centre : of the cylinder along e3, signed: the centre of mass
+    tip : along e3, on the side of the centre of mass, half a radius out of the cylinder
     """
 
     radius: float
@@ -33,9 +33,9 @@ def shape_of(top: Top) -> Shape:
     """
     Return the cylinder to draw for a top.
 
-    A solid cylinder has lambda3 = M r^2/2 along its axis and M (3 r^2 + h^2)/12 across it (about
-    the centre of mass); there is one for every top that can be (`Top.is_realizable`).  Where there
-    is none it is a thin disc with the same lambda3, and without a mass it is drawn as of 1 kg.
+    It has lambda3 = M r^2/2 along its axis and M (3 r^2 + h^2)/12 across it, about the centre of
+    mass.  Where there is none (see `Top.is_realizable`) it is a thin disc with the same lambda3,
+    and without a mass it is drawn as of 1 kg.
     """
     mass = top.mass or 1.0
     radius = _drawable(math.sqrt(2.0 * (top.lambda3 / mass)))

@@ -17,16 +17,15 @@ class States:
     """
     States of a top at n times.
 
-    Each column is computed when it is first asked for, so that a pose costs no angle and an angle
-    no angular velocity.  A value depends on its own time only, never on the other times.  A solver
-    has a subclass with the columns that raise NotImplementedError here; all others follow.
+    A pose costs no angle, and an angle no angular velocity.  A value depends on its own time only,
+    never on the other times.  A solver has a subclass with the columns that raise
+    NotImplementedError here; all others follow.
 
     Attributes
     ----------
-    top : Top
     t : (n,) times since the start of the motion [s]
     theta, phi, psi : (n,) ZYZ Euler angles [rad], unwrapped and continued through the poles
-    theta_dot, phi_dot, psi_dot : (n,) [rad/s]
+    theta_dot, phi_dot, psi_dot : (n,) nutation, precession and spin rate [rad/s]
     theta_folded : (n,) tilt from the upward vertical, in [0, pi] [rad]
     quaternion : (n, 4) attitude q(world <- body) as x, y, z, w, its sign continuous in time
     angular_velocity, angular_acceleration : (n, 3) in the body frame [rad/s], [rad/s^2]
@@ -40,7 +39,6 @@ class States:
         self.top, self._l3, self._lz, self._n = top, start.l3, start.lz, n
 
     def __len__(self) -> int:
-        """Return n."""
         return self._n
 
     # ------------------------------------------------------- the columns of a solver's subclass
@@ -51,7 +49,7 @@ class States:
 
     @cached_property
     def angles(self) -> tuple[Column, Column, Column]:
-        """phi, theta and psi (n,) [rad], unwrapped and continued through the poles."""
+        """phi, theta and psi."""
         raise NotImplementedError
 
     @cached_property
@@ -60,17 +58,16 @@ class States:
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:
-        """Attitude q(world <- body): x, y, z, w."""
         raise NotImplementedError
 
     @cached_property
     def half_angle_squares(self) -> tuple[Column, Column]:
-        """cos^2 and sin^2 of theta/2, (n,) each."""
+        """cos^2 and sin^2 of theta/2."""
         raise NotImplementedError
 
     @cached_property
     def transverse_velocity(self) -> tuple[Column, Column]:
-        """Angular velocity about the first two body axes, (n,) each [rad/s]."""
+        """Angular velocity about the first two body axes [rad/s]."""
         raise NotImplementedError
 
     @cached_property
@@ -93,12 +90,12 @@ class States:
 
     @cached_property
     def phi_dot(self) -> Column:
-        """Precession rate (n,) [rad/s], eq. (31) of "Analysis of Symmetric Spinning Top"."""
+        """Eq. (31) of "Analysis of Symmetric Spinning Top"."""
         return attitude.precession_rate(self.top, self._l3, self._lz, *self.half_angle_squares)
 
     @cached_property
     def psi_dot(self) -> Column:
-        """Spin rate (n,) [rad/s], eq. (32)."""
+        """Eq. (32)."""
         cos2, sin2 = self.half_angle_squares
         return self._l3 / self.top.lambda3 - self.phi_dot * (cos2 - sin2)
 
@@ -128,7 +125,6 @@ class States:
 
     @cached_property
     def rows_angular_velocity(self) -> Vector:
-        """Angular velocity in the body frame [rad/s]; the third component is constant."""
         return (*self.transverse_velocity, self._l3 / self.top.lambda3)
 
     @cached_property
@@ -137,9 +133,8 @@ class States:
 
     @cached_property
     def rows_angular_acceleration(self) -> Vector:
-        """Angular acceleration in the body frame [rad/s^2]."""
-        return (*attitude.angular_acceleration(self.top, self.rows_angular_velocity,
-                                               self.rows_vertical), 0.0)
+        return attitude.angular_acceleration(self.top, self.rows_angular_velocity,
+                                             self.rows_vertical)
 
     @cached_property
     def angular_acceleration(self) -> NDArray[np.float64]:

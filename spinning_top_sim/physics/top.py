@@ -18,11 +18,11 @@ class Top:
     """
     The constants of a top.
 
-    lambda1: principal moment of inertia across the axis, *about the pivot* [kg m^2], > 0
-    lambda3: principal moment of inertia along the axis [kg m^2], > 0
-    mass: [kg], >= 0
-    com_distance: signed distance from pivot to centre of mass along +e3 [m]
-    gravity: [m/s^2], downwards positive
+    lambda1 : principal moment of inertia across the axis, *about the pivot* [kg m^2], > 0
+    lambda3 : principal moment of inertia along the axis [kg m^2], > 0
+    mass : [kg], >= 0
+    com_distance : signed distance from pivot to centre of mass along +e3 [m]
+    gravity : [m/s^2], downwards positive
 
     Raises ValueError naming the field, its value and what is allowed.
     """
@@ -51,12 +51,7 @@ class Top:
 
     @property
     def is_realizable(self) -> bool:
-        """
-        Whether some body has this inertia.
-
-        About the centre of mass the moments obey the triangle inequality, so with the parallel
-        axis theorem lambda3 <= 2 (lambda1 - M R^2).  The equations of motion do not need it.
-        """
+        """Whether some body has this inertia: the triangle inequality about its centre of mass."""
         return self.lambda3 <= 2.0 * self.lambda1_at_com * (1.0 + 1e-12)
 
     @property
@@ -70,12 +65,10 @@ class State:
     """
     Where the top is and how it moves at one instant.
 
-    theta: tilt of the axis from the upward vertical [rad], in [0, pi]
-    theta_dot: [rad/s];  phi, psi: precession and spin angle [rad], any real number
-    l3: angular momentum along the body axis [kg m^2/s];  lz: along the vertical [kg m^2/s]
+    theta, theta_dot : tilt of the axis from the upward vertical, in [0, pi] [rad], [rad/s]
+    phi, psi : precession and spin angle [rad]; their rates follow from l3 and lz
+    l3, lz : angular momentum along the body axis and along the vertical [kg m^2/s]
 
-    phi' and psi' follow from l3 and lz.  With the axis exactly vertical, lz = l3 (theta = 0) or
-    lz = -l3 (theta = pi, the double next to it) is the only possibility.
     Raises ValueError naming the field, its value and what is allowed.
     """
 
@@ -98,12 +91,7 @@ class State:
 
 
 class ContinuedState(State):
-    """
-    A state whose theta may be any real number: one that a motion through a pole has reached.
-
-    There theta, phi and psi go on smoothly (theta changes sign at the top, or passes pi), and a
-    motion that starts anew from it keeps them so.
-    """
+    """A state that a motion through a pole has reached: theta may be any real number."""
 
     def __post_init__(self) -> None:
         """Accept every theta."""
@@ -120,10 +108,9 @@ def pole_momentum(theta: float, l3: float) -> float | None:
 
 def cusp_momentum(theta: float, l3: float) -> float:
     """
-    Return the lz of a top that was spun about its axis only, and let go: L3 cos(theta0).
+    Return the lz of a top that was spun about its axis only, and let go: its tip draws cusps.
 
-    There phi' = 0 at theta0, the axis rests, and the tip draws cusps ("Analysis of Symmetric
-    Spinning Top", 2023, sect. 4.1 and eq. 33).
+    ("Analysis of Symmetric Spinning Top", 2023, sect. 4.1 and eq. 33)
     """
     return l3 * math.cos(theta)
 

@@ -43,13 +43,9 @@ class CdrWriter:
             self.buffer += bytes(-(len(self.buffer) - len(ENCAPSULATION)) % size)
         self.buffer += struct.pack(f'<{len(values)}{code}', *values)
 
-    def doubles(self, *values: float) -> None:
-        """Append doubles that are the same in every message."""
-        self.append('d', *values)
-
     def field(self, count: int) -> None:
         """Append doubles that differ from message to message."""
-        self.doubles(*(count * (0.0,)))
+        self.append('d', *(count * (0.0,)))
         self.fields.append((len(self.buffer) - 8 * count, count))
 
     def stamp(self) -> None:
@@ -57,11 +53,12 @@ class CdrWriter:
         self.append('I', 0, 0)
         self.stamps_at.append(len(self.buffer) - 8)
 
-    def string(self, text: str) -> None:
-        """Append a string."""
-        data = text.encode() + b'\0'
-        self.append('I', len(data))
-        self.buffer += data
+    def string(self, *texts: str) -> None:
+        """Append strings."""
+        for text in texts:
+            data = text.encode() + b'\0'
+            self.append('I', len(data))
+            self.buffer += data
 
     def header(self, frame_id: str) -> None:
         """Append a std_msgs/Header."""
@@ -129,6 +126,5 @@ class Template:
                 return -1, 0, stamp_at
         for field, (begin, count) in enumerate(self._fields):
             if 0 <= at - begin < 8 * count:
-                element = (at - begin) // 8
-                return field, element, begin + 8 * element
+                return field, (at - begin) // 8, at - (at - begin) % 8
         return None

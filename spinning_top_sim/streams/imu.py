@@ -2,9 +2,8 @@
 """
 The inertial measurement unit: where it sits on the body, and what it adds to the truth.
 
-Rates and specific force come from the state itself, never from differences; the errors follow
-kalibr's model, with its names and units.  Conventions: REP-145
-(at rest an accelerometer reads +g upwards), REP-103 (x, y, z right-handed), URDF roll-pitch-yaw.
+The errors follow kalibr's model, with its names and units.  Conventions: REP-145 (at rest an
+accelerometer reads +g upwards), REP-103 (x, y, z right-handed), URDF roll-pitch-yaw.
 """
 
 from __future__ import annotations
@@ -34,12 +33,7 @@ WHITE, TURN_ON, WALK_STEPS, WALK_ENDS = range(4)
 
 
 class Imu:
-    """
-    One IMU: at `imu.lever_arm` [m] and `imu.rpy` [rad] of the body frame.
-
-    What it measures there is `true`; what it reads there with samples every `period_ns`,
-    `sensor(period_ns).read`.
-    """
+    """One IMU, at `imu.lever_arm` [m] and `imu.rpy` [rad]; what it adds is of its `sensor`."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self._lever_arm: tuple[float, float, float] = values['imu.lever_arm']
@@ -78,8 +72,7 @@ class Sensor:
     A reading between two samples has the noise of the one before, as of a driver that sends the
     newest sample, so that all streams agree where they have a time in common.
 
-    rate_variance, force_variance : of what is added to a sample besides the bias: white noise and
-        rounding
+    rate_variance, force_variance : of white noise and rounding together
 
     (kalibr, "IMU Noise Model"; N. Trawny, S. Roumeliotis, "Indirect Kalman filter for 3D attitude
     estimation", 2005, eqs. 133, 140)
@@ -106,11 +99,7 @@ class Sensor:
         self._newest: tuple[range, Rows, Rows] = range(0), NO_ERRORS, NO_ERRORS
 
     def read(self, exact: tuple[Vector, Vector], times: range) -> tuple[Vector, Vector]:
-        """
-        Return the readings of rates [rad/s] and force [m/s^2] at these times [ns].
-
-        exact : what an ideal sensor reads there
-        """
+        """Return the readings [rad/s], [m/s^2] at these times [ns] of what is exact there."""
         if self._is_perfect:
             return exact
         rows = []
@@ -163,10 +152,9 @@ def _rows(block: Callable[[int], Rows], numbers: NDArray[np.int64]) -> Rows:
 @lru_cache(8)
 def _normal(seed: int, purpose: int, number: int, count: int = DRAWN_TOGETHER) -> Rows:
     """
-    Draw normal numbers (count, 6), the same ones for the same arguments.
+    Draw normal numbers (count, 6) that depend on nothing else that is drawn.
 
-    Philox is counter-based (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC11):
-    what is drawn for one block does not depend on what else is drawn.
+    Philox is counter-based (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC11).
     """
     return np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, purpose, number])
                                ).standard_normal((count, 6))

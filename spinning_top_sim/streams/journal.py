@@ -37,9 +37,8 @@ def resolve_topic(topic: str, namespace: str) -> str:
 
 def is_enabled(parameter: str, values: Mapping[str, Any]) -> bool:
     """Return whether a stream is switched on; /clock has two switches."""
-    if parameter == 'clock' and values['publish_clock']:
-        return True
-    return bool(values[f'{parameter}.enabled'])
+    return bool(values[f'{parameter}.enabled']
+                or (parameter == 'clock' and values['publish_clock']))
 
 
 def command(l3: float, lz: float) -> bytes:
@@ -53,7 +52,6 @@ def event(name: str, t_ns: int, sent_ns: int, **details: object) -> bytes:
 
     sent_ns : up to there all samples had been sent (-1: not even that of t = 0), of the motion
         that a reset ended [ns]
-    details : further members of the JSON object
     """
     return messages.string(json.dumps(
         {'event': name, 't_ns': t_ns, 'sent_ns': sent_ns, **details}, default=list))

@@ -23,13 +23,10 @@ class Markers(Stream):
     """
     The top and the trace of its tip, in the world frame: no TF is needed.
 
-    The body is the cylinder of `shape_of`; a line along the axis and down its side shows the spin.
-
-    Every message has the whole trace, so that a viewer who comes late, or moves about in a log,
-    sees it at once.  Its points are those of the exact solution at fixed times m * spacing before
-    the sample, so that a message does not depend on earlier ones; the tip of the body ends it:
-    with a coarse `solver.rtol` one sees the body leave the path.  Before t = 0 it rests at the
-    start.
+    A line along the axis and down the side of the body shows the spin.  Every message has the
+    whole trace, so that a viewer who comes late, or moves about in a log, sees it at once.  Its
+    points are those of the exact solution at fixed times m * spacing before the sample; the tip of
+    the body ends it: with a coarse `solver.rtol` one sees the body leave the path.
     """
 
     parameter, topic, type_name = 'markers', 'markers', 'visualization_msgs/msg/MarkerArray'
@@ -86,6 +83,6 @@ class Markers(Stream):
         begins = [segment.start_ns for segment in self._segments]
         # A segment ends with the command that begins the next one, that instant included.
         ends = np.searchsorted(times_ns, begins[1:], 'right')
-        parts = [np.stack(segment.exact_axis(times), axis=-1) for segment, times in zip(
-            self._segments, np.split(times_ns, ends), strict=True) if len(times)]
-        return np.concatenate(parts)
+        return np.concatenate([
+            np.stack(segment.exact_axis(times), axis=-1) for segment, times in zip(
+                self._segments, np.split(times_ns, ends), strict=True) if len(times)])

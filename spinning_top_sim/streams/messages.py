@@ -29,7 +29,7 @@ def pose_stamped(frame_id: str) -> Template:
     """geometry_msgs/PoseStamped at the origin; fields: orientation x, y, z, w."""
     writer = CdrWriter()
     writer.header(frame_id)
-    writer.doubles(0.0, 0.0, 0.0)
+    writer.append('d', 0.0, 0.0, 0.0)
     writer.field(4)
     return Template(writer)
 
@@ -39,8 +39,7 @@ def joint_state(names: Sequence[str]) -> Template:
     writer = CdrWriter()
     writer.header('')
     writer.append('I', len(names))
-    for name in names:
-        writer.string(name)
+    writer.string(*names)
     for _ in ('position', 'velocity'):
         writer.append('I', len(names))
         writer.field(len(names))
@@ -48,16 +47,13 @@ def joint_state(names: Sequence[str]) -> Template:
     return Template(writer)
 
 
-def imu(frame_id: str, orientation_covariance: Sequence[float],
-        angular_velocity_covariance: Sequence[float],
-        linear_acceleration_covariance: Sequence[float]) -> Template:
+def imu(frame_id: str, *covariances: Sequence[float]) -> Template:
     """sensor_msgs/Imu; fields: orientation x, y, z, w, angular velocity, linear acceleration."""
     writer = CdrWriter()
     writer.header(frame_id)
-    for count, covariance in ((4, orientation_covariance), (3, angular_velocity_covariance),
-                              (3, linear_acceleration_covariance)):
+    for count, covariance in zip((4, 3, 3), covariances, strict=True):
         writer.field(count)
-        writer.doubles(*covariance)
+        writer.append('d', *covariance)
     return Template(writer)
 
 
@@ -67,9 +63,9 @@ def odometry(frame_id: str, child_frame_id: str) -> Template:
     writer.header(frame_id)
     writer.string(child_frame_id)
     for count in (4, 3):
-        writer.doubles(0.0, 0.0, 0.0)               # position, linear velocity: the pivot is fixed
+        writer.append('d', 0.0, 0.0, 0.0)           # position, linear velocity: the pivot rests
         writer.field(count)
-        writer.doubles(*(36 * (0.0,)))
+        writer.append('d', *(36 * (0.0,)))
     return Template(writer)
 
 
@@ -100,7 +96,6 @@ def markers(frame_id: str, size: Sequence[float], lines: Sequence[float], line_w
     size : diameters and height of the cylinder [m]
     lines : x, y and z of begin and end of each line, in the body frame [m]
     line_width : [m]; the trace is half as wide
-    trace_points : how many, 0 for no trace
     """
     writer = CdrWriter()
     writer.append('I', 3 if trace_points else 2)
@@ -115,24 +110,19 @@ def markers(frame_id: str, size: Sequence[float], lines: Sequence[float], line_w
 
 def _marker(writer: CdrWriter, frame_id: str, namespace: str, kind: int, scale: Sequence[float],
             color: Sequence[float], *fields: str, points: Sequence[float] = ()) -> None:
-    """
-    Append a visualization_msgs/Marker of id 0 that stays until another takes its place.
-
-    fields : which of position, orientation and points differ from message to message
-    points : x, y, z of each [m]
-    """
+    """Append a visualization_msgs/Marker whose `fields` differ from message to message."""
     def numbers(name: str, *values: float) -> None:
         if name in fields:
             writer.field(len(values))
         else:
-            writer.doubles(*values)
+            writer.append('d', *values)
 
     writer.header(frame_id)
     writer.string(namespace)
     writer.append('i', 0, kind, 0)                          # id, type, action: add, or modify
     numbers('position', 0.0, 0.0, 0.0)
     numbers('orientation', 0.0, 0.0, 0.0, 1.0)
-    writer.doubles(*scale)
+    writer.append('d', *scale)
     writer.append('f', *color)
     writer.append('I', 0, 0)                                # lifetime: for ever
     writer.append('?', False)                               # frame_locked
@@ -141,13 +131,10 @@ def _marker(writer: CdrWriter, frame_id: str, namespace: str, kind: int, scale: 
     writer.append('I', 0)                                   # colors
     writer.string('')                                       # texture_resource
     writer.append('I', 0, 0)                                # texture: stamp, frame, format, data
-    writer.string('')
-    writer.string('')
+    writer.string('', '')
     writer.append('I', 0, 0)                                # and uv_coordinates
-    writer.string('')                                       # text
-    writer.string('')                                       # mesh_resource
-    writer.string('')                                       # mesh_file: filename, data
-    writer.append('I', 0)
+    writer.string('', '', '')                               # text, mesh_resource, mesh_file's name
+    writer.append('I', 0)                                   # and data
     writer.append('?', False)                               # mesh_use_embedded_materials
 
 

@@ -13,6 +13,7 @@ import enum
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from spinning_top_sim.physics.top import State, Top, cusp_momentum
@@ -57,21 +58,13 @@ class Parameter:
         """Whether the value is a double (an integer is taken for one)."""
         return self.default is None or isinstance(self.default, float)
 
-    @property
-    def description(self) -> str:
+    def describe(self, range_too: bool = True) -> str:
         """Return text, unit, range and effect as one line."""
-        allowed = f'; {self.allowed}' if self.choices or self._bounds() else ''
-        return self._describe(allowed)
-
-    @property
-    def summary(self) -> str:
-        """Return the description without what is allowed."""
-        return self._describe('')
-
-    def _describe(self, allowed: str) -> str:
-        unit = f' [{self.unit}]' if self.unit else ''
-        unset = '; unset: L3 cos(theta0), the cusp' if self.default is None else ''
-        return f'{self.text}{unit}{allowed}{unset}; {self.effect.value}'
+        return '; '.join(filter(None, (
+            self.text + (f' [{self.unit}]' if self.unit else ''),
+            self.allowed if range_too and (self.choices or self._bounds()) else '',
+            'unset: L3 cos(theta0), the cusp' if self.default is None else '',
+            self.effect.value)))
 
     def _bounds(self) -> str:
         bounds = (('0 or >=', self.smallest) if self.smallest else ('>=', self.minimum),
@@ -133,106 +126,95 @@ STREAM_DEFAULTS = (
     ('markers', 20.0, False, 'markers (visualization_msgs/MarkerArray)'),
     ('clock', 100.0, False, '/clock (rosgraph_msgs/Clock)'),
 )
-LOWEST_RATE, HIGHEST_RATE = 1e-6, 10_000.0
-
-
+HIGHEST_RATE = 10_000.0
 # Values of physics up to here have squares and products that doubles hold.
 LARGEST = 1e30
 # The longest time of anything [s], three years.
 LONGEST = 1e8
 
+# Parameters that a running node does not take over at once.
+_at_reset = partial(Parameter, effect=Effect.RESET)
+_at_start = partial(Parameter, effect=Effect.START)
+_at_recording = partial(Parameter, effect=Effect.RECORDING)
+
 
 def _stream(name: str, rate: float, enabled: bool, text: str) -> tuple[Parameter, Parameter]:
     return (Parameter(f'{name}.enabled', enabled, f'Whether there is {text}; a recording keeps '
                       'the streams that it began with'),
-            Parameter(f'{name}.rate', rate, f'Rate of {text}', 'Hz', LOWEST_RATE, HIGHEST_RATE))
+            Parameter(f'{name}.rate', rate, f'Rate of {text}', 'Hz', 1e-6, HIGHEST_RATE))
 
 
-def _axes(kind: str, unit: str) -> list[Parameter]:
+def _axes(kind: str, unit: str, walk_unit: str) -> list[Parameter]:
     """Return the error model of three axes; names and units of the first two are kalibr's."""
-    walk = {'rad/s': 'rad/s^2', 'm/s^2': 'm/s^3'}[unit]
     return [
-        Parameter(f'imu.{kind}_{name}', 0.0, text, unit_text, 0.0, 1e12, smallest=1e-12,
-                  effect=Effect.RESET)
+        _at_reset(f'imu.{kind}_{name}', 0.0, text, unit_text, 0.0, 1e12, smallest=1e-12)
         for name, text, unit_text in (
             ('noise_density', f'White noise of the {kind}, 0 = none', f'{unit}/sqrt(Hz)'),
-            ('random_walk', f'Random walk of the bias of the {kind}, 0 = none',
-             f'{walk}/sqrt(Hz)'),
+            ('random_walk', f'Random walk of the bias of the {kind}, 0 = none', walk_unit),
             ('turn_on_bias', f'Standard deviation of the bias of the {kind} at the start', unit),
             ('range', f'Largest reading of the {kind}, 0 = unlimited', unit),
             ('resolution', f'Smallest step of the readings of the {kind}, 0 = none', unit))]
 
 
 TABLE: tuple[Parameter, ...] = (
-    Parameter('top.mass', 2.0, 'Mass of the top', 'kg', 0.0, LARGEST, effect=Effect.RESET),
-    Parameter('top.com_distance', 0.15, 'From the pivot to the centre of mass along the axis, '
-              'signed', 'm', -LARGEST, LARGEST, effect=Effect.RESET),
-    Parameter('top.lambda1', 0.123, 'Moment of inertia across the axis, about the pivot',
-              'kg m^2', above=0.0, maximum=LARGEST, effect=Effect.RESET),
-    Parameter('top.lambda3', 0.15, 'Moment of inertia along the axis', 'kg m^2', above=0.0,
-              maximum=LARGEST, effect=Effect.RESET),
-    Parameter('top.gravity', 9.80665, 'Gravity, downwards positive', 'm/s^2', -LARGEST, LARGEST,
-              effect=Effect.RESET),
-    Parameter('initial.theta', math.radians(30.0), 'Tilt at the start', 'rad', 0.0, math.pi,
-              effect=Effect.RESET),
-    Parameter('initial.theta_dot', 0.0, 'Nutation rate at the start', 'rad/s', -1e12, 1e12,
-              effect=Effect.RESET),
-    Parameter('initial.phi', 0.0, 'Precession angle at the start', 'rad', -1e12, 1e12,
-              effect=Effect.RESET),
-    Parameter('initial.psi', 0.0, 'Spin angle at the start', 'rad', -1e12, 1e12,
-              effect=Effect.RESET),
+    _at_reset('top.mass', 2.0, 'Mass of the top', 'kg', 0.0, LARGEST),
+    _at_reset('top.com_distance', 0.15, 'From the pivot to the centre of mass along the axis, '
+              'signed', 'm', -LARGEST, LARGEST),
+    _at_reset('top.lambda1', 0.123, 'Moment of inertia across the axis, about the pivot',
+              'kg m^2', above=0.0, maximum=LARGEST),
+    _at_reset('top.lambda3', 0.15, 'Moment of inertia along the axis', 'kg m^2', above=0.0,
+              maximum=LARGEST),
+    _at_reset('top.gravity', 9.80665, 'Gravity, downwards positive', 'm/s^2', -LARGEST, LARGEST),
+    _at_reset('initial.theta', math.radians(30.0), 'Tilt at the start', 'rad', 0.0, math.pi),
+    _at_reset('initial.theta_dot', 0.0, 'Nutation rate at the start', 'rad/s', -1e12, 1e12),
+    _at_reset('initial.phi', 0.0, 'Precession angle at the start', 'rad', -1e12, 1e12),
+    _at_reset('initial.psi', 0.0, 'Spin angle at the start', 'rad', -1e12, 1e12),
     # These two without a range: the motion decides what is too fast.
     Parameter('spin.l3', 1.6, 'Angular momentum along the axis; a change is a command',
               'kg m^2/s'),
     Parameter('spin.lz', None, 'Angular momentum along the vertical; a change is a command',
               'kg m^2/s'),
-    Parameter('solver.method', 'rk45', 'Dormand-Prince steps or the closed form',
-              choices=METHODS, effect=Effect.RESET),
-    Parameter('solver.equations', 'transport', "rk45: regular form, or the paper's to the letter",
-              choices=EQUATIONS, effect=Effect.RESET),
-    Parameter('solver.rtol', 1e-11, 'rk45: relative tolerance of a step', '', 1e-14, 1e-2,
-              effect=Effect.RESET),
-    Parameter('solver.atol', 1e-12, 'rk45: absolute tolerance of a step', '', 0.0, 1e-2,
-              effect=Effect.RESET),
+    _at_reset('solver.method', 'rk45', 'Dormand-Prince steps or the closed form', choices=METHODS),
+    _at_reset('solver.equations', 'transport', "rk45: regular form, or the paper's to the letter",
+              choices=EQUATIONS),
+    _at_reset('solver.rtol', 1e-11, 'rk45: relative tolerance of a step', '', 1e-14, 1e-2),
+    _at_reset('solver.atol', 1e-12, 'rk45: absolute tolerance of a step', '', 0.0, 1e-2),
     Parameter('max_error', 1e-6, 'rk45: warn in /diagnostics when the orientation is further '
               'from the exact solution; 0 = do not look', 'rad', 0.0, 1e6),
-    Parameter('pacing', 'timer', 'Without effect, and accepted for older files: a thread with '
-              'absolute deadlines makes the ticks', choices=('timer', 'thread'),
-              effect=Effect.START),
+    _at_start('pacing', 'timer', 'Without effect, and accepted for older files: a thread with '
+              'absolute deadlines makes the ticks', choices=('timer', 'thread')),
     Parameter('tick_rate', 200.0, 'How often due samples are sent', 'Hz', 1e-2, HIGHEST_RATE),
     Parameter('time_scale', 1.0, 'Simulated over real time', '', 1e-6, 1e6),
-    Parameter('start_paused', False, 'Wait for ~/set_pause or ~/step', effect=Effect.START),
-    Parameter('publish_clock', False, 'Publish /clock (the same as clock.enabled)',
-              effect=Effect.START),
-    Parameter('world_frame', 'world', 'Frame of the pivot, z up', effect=Effect.START),
-    Parameter('body_frame', 'base_link', 'Frame of the body, z along its axis',
-              effect=Effect.START),
-    Parameter('seed', 0, 'Seed of the noise', '', 0, 2 ** 63 - 1, effect=Effect.RESET),
+    _at_start('start_paused', False, 'Wait for ~/set_pause or ~/step'),
+    _at_start('publish_clock', False, 'Publish /clock (the same as clock.enabled)'),
+    _at_start('world_frame', 'world', 'Frame of the pivot, z up'),
+    _at_start('body_frame', 'base_link', 'Frame of the body, z along its axis'),
+    _at_reset('seed', 0, 'Seed of the noise', '', 0, 2 ** 63 - 1),
     *(parameter for row in STREAM_DEFAULTS for parameter in _stream(*row)),
-    Parameter('imu.frame_id', 'imu_link', 'Frame of the IMU', effect=Effect.START),
-    Parameter('imu.lever_arm', (0.0, 0.0, 0.0), 'Position of the IMU in the body', 'm', -1e12,
-              1e12, effect=Effect.RESET),
-    Parameter('imu.rpy', (0.0, 0.0, 0.0), 'Orientation of the IMU in the body, roll, pitch and '
-              'yaw about fixed axes', 'rad', -1e6, 1e6, effect=Effect.RESET),
-    *_axes('gyroscope', 'rad/s'),
-    *_axes('accelerometer', 'm/s^2'),
-    Parameter('markers.trace_length', 4.0, 'How far back the trace of the tip goes, 0 = no trace',
-              's', 0.0, 3600.0, effect=Effect.RESET),
-    Parameter('markers.trace_points', 200, 'Points of the trace, evenly spaced in time', '', 1,
-              10_000, effect=Effect.RESET),
+    _at_start('imu.frame_id', 'imu_link', 'Frame of the IMU'),
+    _at_reset('imu.lever_arm', (0.0, 0.0, 0.0), 'Position of the IMU in the body', 'm', -1e12,
+              1e12),
+    _at_reset('imu.rpy', (0.0, 0.0, 0.0), 'Orientation of the IMU in the body, roll, pitch and '
+              'yaw about fixed axes', 'rad', -1e6, 1e6),
+    *_axes('gyroscope', 'rad/s', 'rad/s^2/sqrt(Hz)'),
+    *_axes('accelerometer', 'm/s^2', 'm/s^3/sqrt(Hz)'),
+    _at_reset('markers.trace_length', 4.0, 'How far back the trace of the tip goes, 0 = no trace',
+              's', 0.0, 3600.0),
+    _at_reset('markers.trace_points', 200, 'Points of the trace, evenly spaced in time', '', 1,
+              10_000),
     Parameter('duration', 0.0, 'End after this much simulated time, 0 = never', 's', 0.0,
               LONGEST, smallest=1e-9),
-    Parameter('record.enabled', False, 'Record from the start', effect=Effect.START),
-    Parameter('record.uri', '', 'File or folder of a recording; empty: '
-              'spinning_top_<date>_<time>.mcap here', effect=Effect.RECORDING),
-    Parameter('record.streams', ('all',), 'Which streams to record, by name; all: each enabled '
-              'one', effect=Effect.RECORDING),
-    Parameter('record.max_loss', 0.5, 'At most this much is lost by a power cut', 's', 0.01, 60.0,
-              effect=Effect.RECORDING),
-    Parameter('record.compression', 'zstd', 'Compression of the chunks',
-              choices=('zstd', 'lz4', 'none'), effect=Effect.RECORDING),
-    Parameter('record.min_free_bytes', 100_000_000, 'Stop recording when the disk has less free',
-              'bytes', 0, 2 ** 62, effect=Effect.RECORDING),
+    _at_start('record.enabled', False, 'Record from the start'),
+    _at_recording('record.uri', '', 'File or folder of a recording; empty: '
+                  'spinning_top_<date>_<time>.mcap here'),
+    _at_recording('record.streams', ('all',), 'Which streams to record, by name; all: each '
+                  'enabled one'),
+    _at_recording('record.max_loss', 0.5, 'At most this much is lost by a power cut', 's', 0.01,
+                  60.0),
+    _at_recording('record.compression', 'zstd', 'Compression of the chunks',
+                  choices=('zstd', 'lz4', 'none')),
+    _at_recording('record.min_free_bytes', 100_000_000, 'Stop recording when the disk has less '
+                  'free', 'bytes', 0, 2 ** 62),
     Parameter('step.count', 1, 'Steps of one ~/step', '', 1, 1_000_000),
     Parameter('step.dt', 0.01, 'Simulated time of one step', 's', 1e-6, 1e3),
     Parameter('status_period', 1.0, 'Of the status line on the terminal, 0 = none', 's', 0.0,
@@ -241,18 +223,9 @@ TABLE: tuple[Parameter, ...] = (
 BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in TABLE}
 
 
-def defaults() -> dict[str, Value]:
-    """Return every parameter's default."""
-    return {parameter.name: parameter.default for parameter in TABLE}
-
-
 def checked(values: Mapping[str, Value]) -> dict[str, Value]:
-    """
-    Return the defaults with these values put in, each and all together validated.
-
-    Raises ValueError naming the parameter, its value and what is allowed.
-    """
-    result = defaults()
+    """Return the defaults with these values put in.  Raises ValueError for what is not allowed."""
+    result = {parameter.name: parameter.default for parameter in TABLE}
     for name, value in values.items():
         if name not in BY_NAME:
             raise ValueError(f'{name} = {value!r}: there is no such parameter')

@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-The simulation: solver -> streams -> sinks, the same live and offline.
-
-Time is integer nanoseconds since the start.  The caller says how far to go and which streams have
-sinks; every sample due until then is sent in order of time.
-"""
+"""The simulation, the same live and offline; times are integer nanoseconds since the start."""
 
 from __future__ import annotations
 
@@ -45,7 +40,6 @@ class Simulation:
     """
     One top in motion.
 
-    epoch_ns : stamp of t = 0 [ns]
     values, top : checked parameters of the run, and the top that they describe
     streams : every stream; the caller sets `publish` of each, and records them with `log_to`
     now_ns : simulated time up to which every sample has been sent (-1: not even that of t = 0)
@@ -200,8 +194,7 @@ class Simulation:
         """
         Do what `advance` does if everything due is computed; return False, and do nothing, if not.
 
-        The fast path of a tick: it touches little, as little is in the processor's caches after a
-        rest.
+        The fast path of a tick touches little: after a rest little is in the processor's caches.
         """
         schedule = self._schedule
         if target_ns >= schedule.computed_ns or target_ns > self.segment.reached_ns:
@@ -298,11 +291,7 @@ class Simulation:
 
 
 def _segment(top: Top, start: State, start_ns: int, values: Mapping[str, Any]) -> Segment:
-    """
-    Return the motion from `start` at `start_ns` with the solver of the parameters.
-
-    Raises ValueError where the first nanosecond shows that there is none.
-    """
+    """Return the motion from a start.  Raises ValueError if its first nanosecond shows none."""
     try:
         solver = propagate(top, start, method=values['solver.method'],
                            equations=values['solver.equations'], rtol=values['solver.rtol'],

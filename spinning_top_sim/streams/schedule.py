@@ -71,8 +71,7 @@ class Schedule:
     """
     The messages of the streams of one run, in order of time.
 
-    Blocks are computed where there is time: `prepare` in pieces after a tick, `compute` at once.
-    What is sent does not depend on it.  `follow` comes first.
+    What is sent does not depend on when it is computed.  `follow` comes first.
 
     epoch_ns : stamp of t = 0 [ns]; after a change, call `invalidate`
     ready : instants that are computed and not yet sent
@@ -208,11 +207,7 @@ def offline_block_ns(streams: Iterable[Stream]) -> int:
 
 def offline_targets(now_ns: int, stops: Iterable[tuple[int, Item]], block_ns: int,
                     ) -> Iterator[tuple[int, Item | None]]:
-    """
-    Yield the times up to which to advance, at most `block_ns` apart.
-
-    stops : times in ascending order [ns], each with an item that is yielded with it
-    """
+    """Yield times to advance to, at most `block_ns` apart; among them all stops, with items."""
     for stop_ns, item in stops:
         while stop_ns - now_ns > block_ns:
             now_ns += block_ns

@@ -27,7 +27,6 @@ class Segment:
     A motion from its start, or from a command, until the next command, in simulated time.
 
     solver : its t = 0 is `start_ns`; only the segment lets it step
-    start, start_ns : where it begins, and at which simulated time [ns]
     reached_ns : simulated time up to which no further steps are needed [ns]
     energy, l3, lz : constants of the motion, as it began
     """
@@ -83,26 +82,23 @@ class Segment:
         return range(times.start - self.start_ns, times.stop - self.start_ns, times.step)
 
     def orientation_error(self, states: States, times: range) -> NDArray[np.float64]:
-        """
-        Return the angles (n,) between states at simulated times and the exact solution [rad].
-
-        0 for the exact solution itself; NaN for a motion that it cannot hold.
-        """
-        if self.exact is None:
-            return np.full(len(times), math.nan)
+        """Return the angles (n,) [rad] to the exact attitudes, NaN where these are not known."""
         if self.exact is self.solver:
             return np.zeros(len(times))
-        return attitude.angle_between(
-            states.rows_quaternion, self.exact.states(self._since_start(times)).rows_quaternion)
+        errors = np.full(len(times), math.nan)
+        if self.exact is not None:
+            end_ns = min(times.stop, self.start_ns + self.exact.ns_limit + 1)
+            held = range(times.start, end_ns, times.step)
+            truth = self.exact.states(self._since_start(held)).rows_quaternion
+            x, y, z, w = (column[:len(held)] for column in states.rows_quaternion)
+            errors[:len(held)] = attitude.angle_between((x, y, z, w), truth)
+        return errors
 
     def exact_axis(self, times_ns: NDArray[np.int64]) -> Axis:
-        """
-        Return the symmetry axis in the world by the exact solution at simulated times (n,) [ns].
-
-        Without an exact solution it stands still.
-        """
+        """Return the exact axis in the world at times (n,) [ns]; where not known, it rests."""
         if self.exact is not None:
-            return self.exact.states(times_ns - self.start_ns).rows_axis
+            return self.exact.states(
+                np.minimum(times_ns - self.start_ns, self.exact.ns_limit)).rows_axis
         start, ones = self.start, np.ones(len(times_ns))
         across = math.sin(start.theta)
         return (across * math.cos(start.phi) * ones, across * math.sin(start.phi) * ones,

@@ -19,9 +19,6 @@ class Stream:
     One topic: samples at t = k * period, k = 0, 1, 2.., whoever listens and however ticks fall.
 
     parameter : prefix of its parameters
-    topic, type_name : of its messages
-    template : Template
-    period_ns : of its samples [ns]
     log_index : its number in the log that records it, None for no log; see `Simulation.log_to`
     sent, skipped : counts of samples published, and of those that came too late for that
     on_change : called when its sinks, its rate or the numbers in its samples change
@@ -55,11 +52,7 @@ class Stream:
         """Begin with the samples of a motion, or of the one after a command."""
 
     def apply(self, values: Mapping[str, Any]) -> None:
-        """
-        Take over parameters that take effect at once: the rate, where it is among `values`.
-
-        A stream with others of its own takes them here too, and calls `on_change`.
-        """
+        """Take over those of these parameters that take effect at once."""
         rate = values.get(f'{self.parameter}.rate')
         if rate is not None and period_ns(rate) != self.period_ns:
             self.period_ns = period_ns(rate)
@@ -87,13 +80,7 @@ class Stream:
             self.on_change()
 
     def encode(self, states: States, epoch_ns: int, times: range) -> NDArray[np.uint8]:
-        """
-        Return the messages at sample times as rows of bytes (n, size), valid until the next call.
-
-        states : the states at `times`
-        epoch_ns : stamp of t = 0 [ns]
-        times : of n samples [ns]; see `times`
-        """
+        """Return messages of states at times [ns]; epoch_ns is t = 0; see `Template.encode`."""
         stamps_ns = np.arange(epoch_ns + times.start, epoch_ns + times.stop, times.step)
         return self.template.encode(stamps_ns, *self.fields(states, times))
 

@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-The streams: for each a topic, a message type, a rate, and how states become bytes.
-
-A new stream is a subclass of `Stream` here, its place in `all_streams`, a template in messages.py
-and a line in parameters.STREAM_DEFAULTS.
-"""
+"""The streams.  What a new one needs is said in docs/architecture.md."""
 
 from __future__ import annotations
 
@@ -30,9 +25,6 @@ class Pose(Stream):
 
     parameter, topic, type_name = 'pose', 'pose', 'geometry_msgs/msg/PoseStamped'
 
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values, messages.pose_stamped(values['world_frame']))
-
     def fields(self, states: States, times: range) -> Sequence[Field]:
         return (states.rows_quaternion,)
 
@@ -41,9 +33,6 @@ class JointStates(Stream):
     """The Euler angles as joints of the URDF."""
 
     parameter, topic, type_name = 'joint_states', 'joint_states', 'sensor_msgs/msg/JointState'
-
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values, messages.joint_state(JOINTS))
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         return ((states.phi, states.theta, states.psi),
@@ -55,9 +44,6 @@ class GroundTruthOdometry(Stream):
 
     parameter, topic, type_name = ('ground_truth_odom', 'ground_truth/odom',
                                    'nav_msgs/msg/Odometry')
-
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values, messages.odometry(values['world_frame'], values['body_frame']))
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         return states.rows_quaternion, states.rows_angular_velocity
@@ -124,16 +110,9 @@ class GroundTruthImu(ImuStream):
 
 
 class Invariants(Stream):
-    """
-    How well the constants of the motion are kept; see `INVARIANTS` for the columns.
-
-    A drift is relative to the value that the motion began with (absolute where that is 0); the
-    orientation error [rad] is against the exact solution.
-    """
+    """How well the constants of the motion are kept: relative drifts, absolute where one is 0."""
 
     parameter, topic, type_name = 'invariants', '~/invariants', 'std_msgs/msg/Float64MultiArray'
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values, messages.float64_multi_array(INVARIANTS))
 
     def follow(self, segment: Segment) -> None:
         self._segment = segment
@@ -151,16 +130,15 @@ class Clock(Stream):
 
     parameter, topic, type_name = 'clock', '/clock', 'rosgraph_msgs/msg/Clock'
 
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values, messages.clock())
-
     def fields(self, states: States, times: range) -> Sequence[Field]:
         return ()
 
 
 def all_streams(values: Mapping[str, Any]) -> list[Stream]:
     """Return every stream, in the order in which samples of one instant are sent."""
-    imu = Imu(values)
-    return [Clock(values), Pose(values), JointStates(values), ImuRaw(values, imu),
+    imu, world, body = Imu(values), values['world_frame'], values['body_frame']
+    return [Clock(values, messages.clock()), Pose(values, messages.pose_stamped(world)),
+            JointStates(values, messages.joint_state(JOINTS)), ImuRaw(values, imu),
             ImuData(values, imu), ImuBias(values, imu), GroundTruthImu(values, imu),
-            GroundTruthOdometry(values), Invariants(values), Markers(values)]
+            GroundTruthOdometry(values, messages.odometry(world, body)),
+            Invariants(values, messages.float64_multi_array(INVARIANTS)), Markers(values)]
