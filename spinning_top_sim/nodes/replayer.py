@@ -38,18 +38,7 @@ from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
 from spinning_top_sim.streams.cdr import NANOSECONDS
 
-# REP-144 and the ROS 2 interface names.
-TYPE_NAME = re.compile(r'([a-z][a-z0-9_]*)/(?:msg/)?([A-Z][A-Za-z0-9_]*)')
-AMENT_INDEX = 'share/ament_index/resource_index/packages'
 SLOWEST, FASTEST = 1e-6, 1e9
-# Longest wait for the last messages to be acknowledged: Fast DDS asks for it every 3 s.
-LAST_WORD_S = 5.0
-# Wait for subscribers that acknowledge nothing: shared memory goes with its sender.
-UNACKNOWLEDGED_S = 0.3
-# How often subscribers are counted while waiting.
-LOOK_S = 0.02
-# The thread that sends gets Python's lock this soon from the one that reads ahead.
-SWITCH_INTERVAL_S = 0.0005
 
 
 class Replayer(Node):
@@ -60,7 +49,7 @@ class Replayer(Node):
         super().__init__('replay', parameter_overrides=given)
         self.finished: Future = Future()    # completes with the exit code when all is played
         self._reader, self._options = log, options
-        self._terminal = reports.Terminal()
+        self._terminal = reports.Terminal(self.get_logger())
         self._log_begin_ns, self._end_ns = log.span
         self._begin_ns = self._log_begin_ns + round(options.start * NANOSECONDS)
         self._span_ns = self._end_ns - self._begin_ns
@@ -86,18 +75,12 @@ class Replayer(Node):
         self._thread = threading.Thread(target=self._play, name='playback', daemon=True)
         self._ahead = ReadAhead(rounds(self._messages, self._span_ns, options.loop))
 
-    @property
-    def _log(self) -> Any:
-        """The logger; what it says does not stand behind the status line."""
-        self._terminal.end()
-        return self.get_logger()
-
     def _open_publishers(self) -> dict[int, Publisher]:
         """Return the publishers by channel; warn of the topics that cannot be played."""
         there = {channel.name for channel in self._reader.topics}
         wanted = set(self._options.topics) or there
         for name in sorted(wanted - there):
-            self._log.warning(f'the log has no topic {name}')
+            self._terminal.log.warning(f'the log has no topic {name}')
         channels: dict[tuple[str, str], list[LogTopic]] = defaultdict(list)
         for channel in self._reader.topics:
             if channel.name in wanted:
@@ -107,7 +90,7 @@ class Replayer(Node):
             try:
                 outputs |= dict.fromkeys([one.channel_id for one in alike], self._publisher(alike))
             except Exception as error:      # whatever a log may ask for: the others are played
-                self._log.warning(one_line(f'{name} is not played: {error}'))
+                self._terminal.log.warning(one_line(f'{name} is not played: {error}'))
         if wanted and not outputs and not self._options.clock:
             raise ValueError('none of the topics can be played; the log has '
                              f'{", ".join(sorted(there)) or "none at all"}')
@@ -124,16 +107,17 @@ class Replayer(Node):
         type_hash = topic.metadata.get('topic_type_hash')
         with contextlib.suppress(DefinitionNotFoundError):
             if type_hash and type_hash != find_definition(topic.type_name).type_hash:
-                self._log.warning(f'{topic.name} was recorded with another {topic.type_name} than '
-                                  'is installed: subscribers may misread it')
+                self._terminal.log.warning(
+                    f'{topic.name} was recorded with another {topic.type_name} than is '
+                    'installed: subscribers may misread it')
         profiles = [profile for channel in channels for profile in channel.qos] or [DEFAULT_QOS]
         try:
             if any(profile != profiles[0] for profile in profiles):
                 raise ValueError('its publishers had different ones')
             qos = qos_profile(profiles[0])
         except ValueError as error:
-            self._log.warning(f'{topic.name} is published with default QoS, not with the '
-                                      f'recorded one: {error}')
+            self._terminal.log.warning(f'{topic.name} is published with default QoS, not with '
+                                       f'the recorded one: {error}')
             qos = qos_profile(DEFAULT_QOS)
         return self.create_publisher(
             kind, topic.name, qos,
@@ -149,7 +133,8 @@ class Replayer(Node):
 
     def start(self) -> None:
         """Begin to play: after `delay`, and when there are enough subscribers."""
-        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        # The thread that sends gets Python's lock this soon from the one that reads ahead [s].
+        sys.setswitchinterval(0.0005)
         self._thread.start()
 
     def stop(self) -> None:
@@ -163,16 +148,22 @@ class Replayer(Node):
         self._terminal.end()
 
     def _play(self) -> None:
-        """Play all; the body of a thread beside the executor's."""
+        """Wait for subscribers and the delay, then play all; runs beside the executor's thread."""
+        begin = time.monotonic() + self._options.delay
         try:
-            self._wait_to_begin()
+            while not self._stopping.wait(0.02) and (time.monotonic() < begin or sum(
+                    publisher.get_subscription_count() for publisher in self._senders
+                    ) < self._options.wait_for_subscribers):
+                pass
             self._playback.run(self._ahead)
-            self._stopping.wait(UNACKNOWLEDGED_S)
-            wait_for_all_acked(self._senders, LAST_WORD_S, self._stopping.is_set)
+            # For subscribers that acknowledge nothing: shared memory goes with its sender.
+            self._stopping.wait(0.3)
+            # Fast DDS asks every 3 s whether messages are acknowledged.
+            wait_for_all_acked(self._senders, 5.0, self._stopping.is_set)
             code = 2 if self._tell_damage() else 0
         except Exception as error:
             if self.context.ok():           # publishing fails once the context is down
-                self._log.error(f'cannot be played any further: {error}')
+                self._terminal.log.error(f'cannot be played any further: {error}')
             code = 2
         if self.context.ok():
             self._terminal.tell(
@@ -198,17 +189,9 @@ class Replayer(Node):
         """Return whether messages are missing unexpectedly; say so once."""
         damaged = self._reader.left_out > 0 and not self._options.partial
         if damaged:
-            self._log.error(f'{self._reader.path} is damaged inside, and messages are left '
-                                    'out: `recover` tells which', once=True)
+            self._terminal.log.error(f'{self._reader.path} is damaged inside, and messages are '
+                                     'left out: `recover` tells which', once=True)
         return damaged
-
-    def _wait_to_begin(self) -> None:
-        """Wait for subscribers and the delay."""
-        begin = time.monotonic() + self._options.delay
-        while not self._stopping.wait(LOOK_S) and (time.monotonic() < begin or sum(
-                publisher.get_subscription_count() for publisher in self._senders
-                ) < self._options.wait_for_subscribers):
-            pass
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._playback.pause(request.data)
@@ -249,13 +232,15 @@ def open_log(path: Path, partial: bool) -> LogReader:
 
 def message_class(type_name: str) -> type:
     """Return a message class of an installed ROS package.  Raises LookupError for all else."""
-    match = TYPE_NAME.fullmatch(type_name)
+    # REP-144 and the ROS 2 interface names.
+    match = re.fullmatch(r'([a-z][a-z0-9_]*)/(?:msg/)?([A-Z][A-Za-z0-9_]*)', type_name)
     if match is None:
         raise LookupError(f'{type_name!r} is not the name of a message type')
     package, name = match.groups()
     prefixes = [*filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)),
                 sys.prefix]
-    if any(Path(prefix, AMENT_INDEX, package).is_file() for prefix in prefixes):
+    if any(Path(prefix, 'share/ament_index/resource_index/packages', package).is_file()
+           for prefix in prefixes):
         with contextlib.suppress(ImportError, AttributeError):
             kind = getattr(importlib.import_module(f'{package}.msg'), name)
             if hasattr(kind, 'get_fields_and_field_types'):

@@ -7,10 +7,12 @@ import math
 import os
 import sys
 import time
+from operator import itemgetter
 from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.impl.rcutils_logger import RcutilsLogger
 from std_msgs.msg import Header
 
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -35,19 +37,15 @@ class MotionReport:
         """Return the message for /diagnostics; without a `max_error` no error is computed."""
         simulation, loop, session = self._simulation, self._loop, self._session
         error = simulation.orientation_error if max_error else math.nan
-        problems = [(DiagnosticStatus.OK, 'paused' if loop.paused else 'running')]
-        if loop.waits_for_clock:
-            problems.append((DiagnosticStatus.WARN, 'waiting for /clock'))
-        if self.overloaded:
-            problems.append((DiagnosticStatus.WARN, 'this machine cannot keep up'))
-        if error > max_error > 0.0:
-            problems.append((DiagnosticStatus.WARN, f'orientation error {error:.3g} rad: more '
-                                                    f'than max_error = {max_error:g} rad'))
-        if session.error:
-            problems.append((DiagnosticStatus.ERROR, f'recording: {session.error}'))
-        if loop.failure:
-            problems.append((DiagnosticStatus.ERROR, loop.failure))
-        level, message = max(problems, key=lambda problem: problem[0])
+        states = (      # whether it is so, how bad that is, and what is said of it
+            (True, DiagnosticStatus.OK, 'paused' if loop.paused else 'running'),
+            (loop.waits_for_clock, DiagnosticStatus.WARN, 'waiting for /clock'),
+            (self.overloaded, DiagnosticStatus.WARN, 'this machine cannot keep up'),
+            (error > max_error > 0.0, DiagnosticStatus.WARN,
+             f'orientation error {error:.3g} rad: more than max_error = {max_error:g} rad'),
+            (session.error, DiagnosticStatus.ERROR, f'recording: {session.error}'),
+            (loop.failure, DiagnosticStatus.ERROR, loop.failure))
+        _, level, message = max(filter(itemgetter(0), states), key=itemgetter(1))
         now_ns = loop.now_ns
         numbers = {
             'simulated time [s]': f'{now_ns / NANOSECONDS:.6f}',
@@ -112,9 +110,16 @@ class MotionReport:
 class Terminal:
     """Shows a line that overwrites itself, and whole ones where a launch or a file reads them."""
 
-    def __init__(self) -> None:
+    def __init__(self, logger: RcutilsLogger) -> None:
+        self._logger = logger
         self._columns = os.get_terminal_size(1).columns if sys.stdout.isatty() else 0
         self._open = False              # the cursor stands behind a line
+
+    @property
+    def log(self) -> RcutilsLogger:
+        """The logger; what it says does not stand behind the line."""
+        self.end()
+        return self._logger
 
     def show(self, line: str) -> None:
         """Show the newest line, on a terminal as many of its parts as fit."""

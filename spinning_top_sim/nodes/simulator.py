@@ -37,15 +37,7 @@ from spinning_top_sim.streams.parameters import Effect
 from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.streams.stream import Stream
 
-# Threads let go of the interpreter this soon when a tick is due; Python's default is 5 ms.
-SWITCH_INTERVAL_S = 1e-4
-# How often the first message of a followed /clock is looked for.
-CLOCK_PERIOD_S = 0.02
-# A /clock that stands for longer is said to have stopped.
-CLOCK_PATIENCE_S = 2.0
-# At the end of `duration` all subscribers together are waited for at most this long.
-ACKNOWLEDGED_S = 1.0
-RECORDED_POLICIES = ('history', 'depth', 'reliability', 'durability', 'liveliness')
+CLOCK_PATIENCE_S = 2.0      # a followed /clock that stands for longer is said to have stopped
 
 
 class StreamPublishers:
@@ -84,11 +76,12 @@ class StreamPublishers:
 
     def topics_to_record(self, streams: Sequence[Stream]) -> list[Topic]:
         """Return the topics of these streams, and behind them those of the journal."""
+        policies = ('history', 'depth', 'reliability', 'durability', 'liveliness')
         topics: list[Topic] = []
         for stream in streams:
             publisher = self.by_topic[stream.topic]
             topics.append((publisher.topic_name, stream.type_name, {
-                name: int(getattr(publisher.qos_profile, name)) for name in RECORDED_POLICIES}))
+                name: int(getattr(publisher.qos_profile, name)) for name in policies}))
         return [*topics, *((self._node.resolve_topic_name(name), type_name, {})
                            for name, type_name in journal.TOPICS)]
 
@@ -98,14 +91,14 @@ class Simulator(Node):
     The node.  Raises ValueError for a bad parameter.
 
     One thread ticks, the executor's does everything else; both hold the lock while they use the
-    simulation.  `finished` completes after `duration`.
+    simulation.
     """
 
     def __init__(self, argv: Sequence[str] = ()) -> None:
         super().__init__('spinning_top', cli_args=ros_parameters.overrides(argv),
                          automatically_declare_parameters_from_overrides=True)
-        self.finished: Future = Future()
-        self._terminal = reports.Terminal()
+        self.finished: Future = Future()        # completes after `duration`
+        self._terminal = reports.Terminal(self.get_logger())
         values = ros_parameters.declare(self)
         simulation = self._simulation = Simulation(values)
         # A reset goes back to this; an unset spin.lz is the cusp of the tilt that there is then.
@@ -139,22 +132,16 @@ class Simulator(Node):
         self._status_timer: Timer | None = None
         self._set_status_period(values['status_period'])
         if not simulation.top.is_realizable:
-            self._log.warning(
+            self._terminal.log.warning(
                 f'top.lambda3 = {simulation.top.lambda3!r} kg m^2: no rigid body has more than '
                 f'2 (lambda1 - M R^2) = {2.0 * simulation.top.lambda1_at_com:g}; simulated all '
                 'the same')
 
-    @property
-    def _log(self) -> Any:
-        """The logger; what it says does not stand behind the status line."""
-        self._terminal.end()
-        return self.get_logger()
-
     def _tell(self, text: str, failed: bool) -> None:
         if failed:
-            self._log.error(text)
+            self._terminal.log.error(text)
         else:
-            self._log.warning(text)
+            self._terminal.log.warning(text)
 
     def _steady_timer(self, period: float, callback: Callable[[], object]) -> Timer:
         """Create a timer that no clock can hold up; unexpected errors stop the motion."""
@@ -175,8 +162,9 @@ class Simulator(Node):
 
     def start(self) -> None:
         """Let time run: simulated t = 0 is the next point of the stamps' grid."""
-        sys.setswitchinterval(SWITCH_INTERVAL_S)
-        self._begin_timer = self._steady_timer(CLOCK_PERIOD_S, self._begin)
+        # Threads let go of the interpreter this soon when a tick is due; the default is 5 ms.
+        sys.setswitchinterval(1e-4)
+        self._begin_timer = self._steady_timer(0.02, self._begin)
         self._begin()
 
     def _begin(self) -> None:
@@ -195,10 +183,10 @@ class Simulator(Node):
         self._pacer.start()
         if open_log is not None:
             try:
-                self._log.info(open_log())
+                self._terminal.log.info(open_log())
             except RecordingError as error:
                 self._session.error = str(error)
-                self._log.error(f'not recording: {error}')
+                self._terminal.log.error(f'not recording: {error}')
 
     def _watch_clock(self) -> None:
         """Say that the /clock that is followed has stopped, or not begun, and that it goes on."""
@@ -207,9 +195,9 @@ class Simulator(Node):
             self._clock_seen = date_ns, now
         waits = self._follows and (date_ns == 0 or now > self._clock_seen[1] + CLOCK_PATIENCE_S)
         if waits and not self._loop.waits_for_clock:
-            self._log.warning('waiting for /clock (use_sim_time is set)')
+            self._terminal.log.warning('waiting for /clock (use_sim_time is set)')
         elif self._loop.waits_for_clock and not waits:
-            self._log.info('/clock goes on')
+            self._terminal.log.info('/clock goes on')
         self._loop.waits_for_clock = waits
 
     def stop(self) -> None:
@@ -226,7 +214,7 @@ class Simulator(Node):
         with self._lock:
             wants_idle = self._loop.tick()
         if self._loop.ended and not self.finished.done():
-            wait_for_all_acked(self._outputs.by_topic.values(), ACKNOWLEDGED_S)
+            wait_for_all_acked(self._outputs.by_topic.values(), 1.0)
             self.finished.set_result(None)
         return wants_idle
 
@@ -238,7 +226,7 @@ class Simulator(Node):
         """Stop the motion after an unexpected error, and close the log while it is whole."""
         if not self.context.ok():       # publishing fails once the context is down
             return
-        self._log.error(traceback.format_exc())
+        self._terminal.log.error(traceback.format_exc())
         reason = f'unexpected {type(error).__name__}: {error}'
         with self._lock:
             self._loop.fail(reason)
@@ -263,7 +251,7 @@ class Simulator(Node):
             self._loop.rejected_commands += 1
             reason = f'data has {len(message.data)} values: must be [L3, Lz]'
         if reason:
-            self._log.warning(f'~/commands: refused: {reason}')
+            self._terminal.log.warning(f'~/commands: refused: {reason}')
 
     def _on_set_parameters(self, given: list[Parameter]) -> SetParametersResult:
         """Apply all changes together or none."""
@@ -297,7 +285,7 @@ class Simulator(Node):
             names = [name for name in rest if parameters.BY_NAME[name].effect is effect
                      and values[name] != self._values[name]]
             if names:
-                self._log.info(f'{", ".join(names)}: {effect.value}')
+                self._terminal.log.info(f'{", ".join(names)}: {effect.value}')
         self._values = values
 
     def _serve(self, act: Callable[[Any], str], request: object, response: Any) -> object:
@@ -325,7 +313,6 @@ class Simulator(Node):
     def _reset(self, _: Trigger.Request) -> str:
         with self._lock:
             self._check_started()
-            # Back to the spin it was started with, whatever was commanded since.
             self._loop.reset({**self._values, **self._start_spin}, self._date_ns())
         self._values |= {'spin.l3': self._simulation.l3, 'spin.lz': self._simulation.lz}
         self._resetting = True
@@ -342,18 +329,18 @@ class Simulator(Node):
         return self._session.start(self._values)()
 
     def _publish_diagnostics(self) -> None:
-        """Look at the recording, and publish /diagnostics."""
+        """Look at /clock, the recording and other nodes, and publish /diagnostics."""
         self._watch_clock()
         reason = self._session.check()
         if reason:
-            self._log.error(f'recording stopped: {reason}; the simulation goes on')
+            self._terminal.log.error(f'recording stopped: {reason}; the simulation goes on')
         names = self.get_node_names_and_namespaces()
         if names.count((self.get_name(), self.get_namespace())) > 1:
-            self._log.warning(
+            self._terminal.log.warning(
                 f'there is another node {self.get_fully_qualified_name()}: give one of them a '
                 'namespace, with --ros-args -r __ns:=/NAME', once=True)
         if self._report.overloaded:
-            self._log.warning(
+            self._terminal.log.warning(
                 'this machine cannot keep up with these rates: live topics skip samples, or the '
                 'clock slips; a recording stays complete, and /diagnostics counts', once=True)
         if self._values['max_error'] > 0.0:
@@ -370,5 +357,5 @@ class Simulator(Node):
         with self._lock:
             motion, line = self._report.new_motion(), self._report.status_line()
         if motion:
-            self._log.info(motion)
+            self._terminal.log.info(motion)
         self._terminal.show(line)
