@@ -130,7 +130,7 @@ def screen(monkeypatch):
         monkeypatch.setattr(reports.sys, 'stdout', out)
         monkeypatch.setattr(reports.os, 'get_terminal_size', lambda *_: os.terminal_size(
             (out.columns, 24)))
-        return reports.Terminal(None), out
+        return reports.Terminal(), out
     return of
 
 

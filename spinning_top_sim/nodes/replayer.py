@@ -49,7 +49,7 @@ class Replayer(Node):
         super().__init__('replay', parameter_overrides=given)
         self.finished: Future = Future()    # completes with the exit code when all is played
         self._reader, self._options = log, options
-        self._terminal = reports.Terminal(self.get_logger())
+        self._terminal = reports.Terminal()
         self._log_begin_ns, self._end_ns = log.span
         self._begin_ns = self._log_begin_ns + round(options.start * NANOSECONDS)
         self._span_ns = self._end_ns - self._begin_ns
@@ -75,12 +75,18 @@ class Replayer(Node):
         self._thread = threading.Thread(target=self._play, name='playback', daemon=True)
         self._ahead = ReadAhead(rounds(self._messages, self._span_ns, options.loop))
 
+    @property
+    def _log(self) -> Any:
+        """The logger; what it says does not stand behind the status line."""
+        self._terminal.end()
+        return self.get_logger()
+
     def _open_publishers(self) -> dict[int, Publisher]:
         """Return the publishers by channel; warn of the topics that cannot be played."""
         there = {channel.name for channel in self._reader.topics}
         wanted = set(self._options.topics) or there
         for name in sorted(wanted - there):
-            self._terminal.log.warning(f'the log has no topic {name}')
+            self._log.warning(f'the log has no topic {name}')
         channels: dict[tuple[str, str], list[LogTopic]] = defaultdict(list)
         for channel in self._reader.topics:
             if channel.name in wanted:
@@ -90,7 +96,7 @@ class Replayer(Node):
             try:
                 outputs |= dict.fromkeys([one.channel_id for one in alike], self._publisher(alike))
             except Exception as error:      # whatever a log may ask for: the others are played
-                self._terminal.log.warning(one_line(f'{name} is not played: {error}'))
+                self._log.warning(one_line(f'{name} is not played: {error}'))
         if wanted and not outputs and not self._options.clock:
             raise ValueError('none of the topics can be played; the log has '
                              f'{", ".join(sorted(there)) or "none at all"}')
@@ -107,17 +113,16 @@ class Replayer(Node):
         type_hash = topic.metadata.get('topic_type_hash')
         with contextlib.suppress(DefinitionNotFoundError):
             if type_hash and type_hash != find_definition(topic.type_name).type_hash:
-                self._terminal.log.warning(
-                    f'{topic.name} was recorded with another {topic.type_name} than is '
-                    'installed: subscribers may misread it')
+                self._log.warning(f'{topic.name} was recorded with another {topic.type_name} than '
+                                  'is installed: subscribers may misread it')
         profiles = [profile for channel in channels for profile in channel.qos] or [DEFAULT_QOS]
         try:
             if any(profile != profiles[0] for profile in profiles):
                 raise ValueError('its publishers had different ones')
             qos = qos_profile(profiles[0])
         except ValueError as error:
-            self._terminal.log.warning(f'{topic.name} is published with default QoS, not with '
-                                       f'the recorded one: {error}')
+            self._log.warning(f'{topic.name} is published with default QoS, not with '
+                              f'the recorded one: {error}')
             qos = qos_profile(DEFAULT_QOS)
         return self.create_publisher(
             kind, topic.name, qos,
@@ -163,7 +168,7 @@ class Replayer(Node):
             code = 2 if self._tell_damage() else 0
         except Exception as error:
             if self.context.ok():           # publishing fails once the context is down
-                self._terminal.log.error(f'cannot be played any further: {error}')
+                self._log.error(f'cannot be played any further: {error}')
             code = 2
         if self.context.ok():
             self._terminal.tell(
@@ -189,8 +194,8 @@ class Replayer(Node):
         """Return whether messages are missing unexpectedly; say so once."""
         damaged = self._reader.left_out > 0 and not self._options.partial
         if damaged:
-            self._terminal.log.error(f'{self._reader.path} is damaged inside, and messages are '
-                                     'left out: `recover` tells which', once=True)
+            self._log.error(f'{self._reader.path} is damaged inside, and messages are '
+                            'left out: `recover` tells which', once=True)
         return damaged
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:

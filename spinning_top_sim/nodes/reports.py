@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.impl.rcutils_logger import RcutilsLogger
 from std_msgs.msg import Header
 
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -110,16 +109,9 @@ class MotionReport:
 class Terminal:
     """Shows a line that overwrites itself, and whole ones where a launch or a file reads them."""
 
-    def __init__(self, logger: RcutilsLogger) -> None:
-        self._logger = logger
+    def __init__(self) -> None:
         self._columns = os.get_terminal_size(1).columns if sys.stdout.isatty() else 0
         self._open = False              # the cursor stands behind a line
-
-    @property
-    def log(self) -> RcutilsLogger:
-        """The logger; what it says does not stand behind the line."""
-        self.end()
-        return self._logger
 
     def show(self, line: str) -> None:
         """Show the newest line, on a terminal as many of its parts as fit."""

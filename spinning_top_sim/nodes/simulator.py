@@ -98,7 +98,7 @@ class Simulator(Node):
         super().__init__('spinning_top', cli_args=ros_parameters.overrides(argv),
                          automatically_declare_parameters_from_overrides=True)
         self.finished: Future = Future()        # completes after `duration`
-        self._terminal = reports.Terminal(self.get_logger())
+        self._terminal = reports.Terminal()
         values = ros_parameters.declare(self)
         simulation = self._simulation = Simulation(values)
         # A reset goes back to this; an unset spin.lz is the cusp of the tilt that there is then.
@@ -132,16 +132,22 @@ class Simulator(Node):
         self._status_timer: Timer | None = None
         self._set_status_period(values['status_period'])
         if not simulation.top.is_realizable:
-            self._terminal.log.warning(
+            self._log.warning(
                 f'top.lambda3 = {simulation.top.lambda3!r} kg m^2: no rigid body has more than '
                 f'2 (lambda1 - M R^2) = {2.0 * simulation.top.lambda1_at_com:g}; simulated all '
                 'the same')
 
+    @property
+    def _log(self) -> Any:
+        """The logger; what it says does not stand behind the status line."""
+        self._terminal.end()
+        return self.get_logger()
+
     def _tell(self, text: str, failed: bool) -> None:
         if failed:
-            self._terminal.log.error(text)
+            self._log.error(text)
         else:
-            self._terminal.log.warning(text)
+            self._log.warning(text)
 
     def _steady_timer(self, period: float, callback: Callable[[], object]) -> Timer:
         """Create a timer that no clock can hold up; unexpected errors stop the motion."""
@@ -183,10 +189,10 @@ class Simulator(Node):
         self._pacer.start()
         if open_log is not None:
             try:
-                self._terminal.log.info(open_log())
+                self._log.info(open_log())
             except RecordingError as error:
                 self._session.error = str(error)
-                self._terminal.log.error(f'not recording: {error}')
+                self._log.error(f'not recording: {error}')
 
     def _watch_clock(self) -> None:
         """Say that the /clock that is followed has stopped, or not begun, and that it goes on."""
@@ -195,9 +201,9 @@ class Simulator(Node):
             self._clock_seen = date_ns, now
         waits = self._follows and (date_ns == 0 or now > self._clock_seen[1] + CLOCK_PATIENCE_S)
         if waits and not self._loop.waits_for_clock:
-            self._terminal.log.warning('waiting for /clock (use_sim_time is set)')
+            self._log.warning('waiting for /clock (use_sim_time is set)')
         elif self._loop.waits_for_clock and not waits:
-            self._terminal.log.info('/clock goes on')
+            self._log.info('/clock goes on')
         self._loop.waits_for_clock = waits
 
     def stop(self) -> None:
@@ -226,7 +232,7 @@ class Simulator(Node):
         """Stop the motion after an unexpected error, and close the log while it is whole."""
         if not self.context.ok():       # publishing fails once the context is down
             return
-        self._terminal.log.error(traceback.format_exc())
+        self._log.error(traceback.format_exc())
         reason = f'unexpected {type(error).__name__}: {error}'
         with self._lock:
             self._loop.fail(reason)
@@ -251,7 +257,7 @@ class Simulator(Node):
             self._loop.rejected_commands += 1
             reason = f'data has {len(message.data)} values: must be [L3, Lz]'
         if reason:
-            self._terminal.log.warning(f'~/commands: refused: {reason}')
+            self._log.warning(f'~/commands: refused: {reason}')
 
     def _on_set_parameters(self, given: list[Parameter]) -> SetParametersResult:
         """Apply all changes together or none."""
@@ -285,7 +291,7 @@ class Simulator(Node):
             names = [name for name in rest if parameters.BY_NAME[name].effect is effect
                      and values[name] != self._values[name]]
             if names:
-                self._terminal.log.info(f'{", ".join(names)}: {effect.value}')
+                self._log.info(f'{", ".join(names)}: {effect.value}')
         self._values = values
 
     def _serve(self, act: Callable[[Any], str], request: object, response: Any) -> object:
@@ -333,14 +339,14 @@ class Simulator(Node):
         self._watch_clock()
         reason = self._session.check()
         if reason:
-            self._terminal.log.error(f'recording stopped: {reason}; the simulation goes on')
+            self._log.error(f'recording stopped: {reason}; the simulation goes on')
         names = self.get_node_names_and_namespaces()
         if names.count((self.get_name(), self.get_namespace())) > 1:
-            self._terminal.log.warning(
+            self._log.warning(
                 f'there is another node {self.get_fully_qualified_name()}: give one of them a '
                 'namespace, with --ros-args -r __ns:=/NAME', once=True)
         if self._report.overloaded:
-            self._terminal.log.warning(
+            self._log.warning(
                 'this machine cannot keep up with these rates: live topics skip samples, or the '
                 'clock slips; a recording stays complete, and /diagnostics counts', once=True)
         if self._values['max_error'] > 0.0:
@@ -357,5 +363,5 @@ class Simulator(Node):
         with self._lock:
             motion, line = self._report.new_motion(), self._report.status_line()
         if motion:
-            self._terminal.log.info(motion)
+            self._log.info(motion)
         self._terminal.show(line)
