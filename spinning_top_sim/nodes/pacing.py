@@ -13,11 +13,9 @@ from collections.abc import Callable, Iterable, Iterator
 
 Message = tuple[int, Callable[[bytes], object], bytes]      # time [ns], what sends it, CDR
 
-# Between the last message of a round and the first of the next.
-ROUND_GAP_NS = 10_000_000
-# A message sent later than this is counted.
-LATE_NS = 10_000_000
-BATCH_BYTES, BATCH_MESSAGES, BATCHES = 256_000, 512, 16        # read ahead
+ROUND_GAP_NS = 10_000_000       # from the end of a round to the first message of the next
+LATE_NS = 10_000_000            # a message sent later than this is counted
+BATCH_BYTES, BATCH_MESSAGES, BATCHES = 256_000, 512, 16     # read ahead
 
 
 class SimulatedClock:
@@ -72,8 +70,7 @@ class DeadlineThread(threading.Thread):
     """
     Calls `tick` at absolute deadlines until it is stopped, and `idle` behind it where it asks so.
 
-    A late tick comes at once, and deadlines that have passed are skipped.  It costs less processor
-    time than an rclpy timer (`benchmark/wake_up.py`).
+    A late tick comes at once, and deadlines that have passed are skipped.
 
     grid : returns a deadline on the monotonic clock and the time between two [s]
     failed : takes any error of these; the thread goes on

@@ -33,7 +33,7 @@ from spinning_top_sim.nodes import reports
 from spinning_top_sim.nodes.executable import one_line, wait_for_all_acked
 from spinning_top_sim.nodes.pacing import ROUND_GAP_NS, Message, Playback, ReadAhead, rounds
 from spinning_top_sim.recording.definitions import find_definition
-from spinning_top_sim.recording.errors import DefinitionNotFoundError, LogError
+from spinning_top_sim.recording.errors import DefinitionNotFoundError
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -137,7 +137,6 @@ class Replayer(Node):
         return SetParametersResult(successful=True)
 
     def start(self) -> None:
-        """Begin to play: after `delay`, and when there are enough subscribers."""
         # The thread that sends gets Python's lock this soon from the one that reads ahead [s].
         sys.setswitchinterval(0.0005)
         self._thread.start()
@@ -177,7 +176,6 @@ class Replayer(Node):
             self.finished.set_result(code)
 
     def _messages(self) -> Iterator[Message]:
-        """Yield the messages of a round."""
         names = {channel.name for channel in self._reader.topics
                  if channel.channel_id in self._outputs}
         # A reader that is told where to start takes the index's word for it.
@@ -220,12 +218,9 @@ class Replayer(Node):
 
 
 def open_log(path: Path, partial: bool) -> LogReader:
-    """Open a log.  Raises ValueError for what is none, and for a torn one unless `partial`."""
-    try:
-        log = LogReader(path)
-        torn = not log.whole and (log.damage.truncated or log.damage.losses)
-    except LogError as error:
-        raise ValueError(error) from error
+    """Open a log.  Raises LogError, or ValueError for a torn one unless `partial`."""
+    log = LogReader(path)
+    torn = not log.whole and (log.damage.truncated or log.damage.losses)
     if torn and not partial:
         raise ValueError(f'{path} is torn: `recover` makes a whole log of it, --partial plays '
                          'what is whole')
