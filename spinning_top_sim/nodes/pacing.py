@@ -233,7 +233,6 @@ class Playback:
         self._changed.set()
 
     def stop(self) -> None:
-        """Make `run` return, soon."""
         with self._lock:
             self._stopped = True
         self._changed.set()

@@ -125,7 +125,6 @@ class RecordingSession:
             self._write((index,), stamp_ns, (data,), len(data))
 
     def has_room(self) -> bool:
-        """Return whether more messages can be taken without losing any."""
         if self._recorder is not None:
             return self._recorder.room
         return len(self._pending) < MOST_PENDING
