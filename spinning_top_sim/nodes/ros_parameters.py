@@ -84,7 +84,7 @@ def declare(node: Node) -> dict[str, Any]:
 
 
 def with_doubles(given: Sequence[RosParameter]) -> list[RosParameter]:
-    """Make doubles for rclpy of integers, and of texts: `ros2 param` takes 1e-9 for one."""
+    """Make doubles where the table has some: of integers, and of texts, as YAML 1.1 has 1e-9."""
     result = []
     for one in given:
         row, value = parameters.BY_NAME.get(one.name), one.value
