@@ -56,12 +56,13 @@ class FakeTime:
         self.at_rest = {}       # time: what to do when it has come
         self.sleeps = 0
 
-    def now(self):
+    def monotonic_ns(self):
         return self.now_ns
 
-    def sleep(self, seconds):
+    def wait(self, seconds):
         self.sleeps += 1
-        wanted = None if seconds is None else self.now_ns + max(1, round(seconds * 1e9))
+        for_ever = seconds == threading.TIMEOUT_MAX
+        wanted = None if for_ever else self.now_ns + max(1, round(seconds * 1e9))
         planned = min(self.at_rest, default=None)
         if planned is not None and (wanted is None or planned <= wanted):
             self.now_ns = planned
@@ -69,6 +70,11 @@ class FakeTime:
         else:
             assert wanted is not None, 'sleeps for ever'
             self.now_ns = wanted
+
+    def set(self):
+        """Wake who waits: nobody else does while this runs."""
+
+    clear = set
 
 
 def play(messages, rate=1.0, plan=None, cost_ns=0, **options):
@@ -80,10 +86,14 @@ def play(messages, rate=1.0, plan=None, cost_ns=0, **options):
         sent.append((int(data), fake.now_ns - 77))
         fake.now_ns += cost_ns
 
-    player = Playback(EPOCH_NS, source=fake.now, sleep=fake.sleep, **options)
-    player.set_rate(rate)
-    fake.at_rest = {77 + at: (lambda act=act: act(player)) for at, act in (plan or {}).items()}
-    player.run((at_ns, send, data) for at_ns, _, data in messages)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pacing, 'time', fake)
+        player = Playback(EPOCH_NS, **options)
+        player._changed = fake
+        player.set_rate(rate)
+        fake.at_rest = {77 + at: (lambda act=act: act(player))
+                        for at, act in (plan or {}).items()}
+        player.run((at_ns, send, data) for at_ns, _, data in messages)
     return sent, player, fake
 
 

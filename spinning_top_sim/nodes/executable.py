@@ -12,14 +12,13 @@ from collections.abc import Callable, Iterable
 from os import _exit
 from typing import TYPE_CHECKING, Protocol, cast
 
+from spinning_top_sim.recording.errors import LogError
+
 if TYPE_CHECKING:
     from rclpy.executors import Executor
     from rclpy.node import Node
     from rclpy.publisher import Publisher
     from rclpy.task import Future
-
-# Longest wait of the executor [s]: Python answers signals between two waits.
-SPIN_S = 0.2
 
 
 class RunnableNode(Protocol):
@@ -62,9 +61,9 @@ def run(name: str, argv: list[str],
         executor = _executor(node)
         node.start()
         started = True
-        # Without a timeout, the EventsExecutor of Jazzy hangs.
+        # Python answers signals between waits; without a timeout, Jazzy's EventsExecutor hangs.
         while rclpy.ok() and not interrupts and not node.finished.done():
-            executor.spin_once(SPIN_S)
+            executor.spin_once(0.2)
         return (node.finished.result() or 0) if node.finished.done() else 0
     except Exception as error:
         # A call that the end of the context interrupts may raise anything.
@@ -94,7 +93,8 @@ def _ignore_signals() -> None:
 def _cannot_start(name: str, error: Exception) -> int:
     """Say why in one line; return the exit code."""
     kind = type(error).__name__
-    expected = isinstance(error, ValueError | RuntimeError | OSError) or kind.startswith('Invalid')
+    expected = (isinstance(error, ValueError | RuntimeError | OSError | LogError)
+                or kind.startswith('Invalid'))
     print(f'{name}: cannot start: {"" if expected else f"{kind}: "}{one_line(error)}',
           file=sys.stderr)
     return 2
@@ -109,8 +109,7 @@ def one_line(text: object) -> str:
 
 def _executor(node: RunnableNode) -> Executor:
     """Return an executor that has the node, with little for the garbage collector to do."""
-    try:
-        # It takes least processor time.
+    try:                    # this one takes least processor time
         from rclpy.experimental import EventsExecutor as Executor  # noqa: PLC0415
     except ImportError:
         from rclpy.executors import SingleThreadedExecutor as Executor  # noqa: PLC0415

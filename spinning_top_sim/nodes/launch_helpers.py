@@ -17,8 +17,6 @@ from spinning_top_sim.streams.journal import resolve_topic
 from spinning_top_sim.tools.urdf import inertia_warning, robot_description
 
 STATE_PUBLISHER = 'robot_state_publisher'
-# The highest rate that it accepts [Hz].
-HIGHEST_PUBLISH_FREQUENCY = 1000.0
 
 
 def state_publisher(share: Path, values: Mapping[str, Any], namespace: str, joint_states: str,
@@ -34,7 +32,7 @@ def state_publisher(share: Path, values: Mapping[str, Any], namespace: str, join
         package=STATE_PUBLISHER, executable=STATE_PUBLISHER, namespace=namespace,
         remappings=[('joint_states', joint_states)], parameters=[{
             'robot_description': ParameterValue(description, value_type=str),
-            'publish_frequency': min(values['joint_states.rate'], HIGHEST_PUBLISH_FREQUENCY),
+            'publish_frequency': min(values['joint_states.rate'], 1000.0),      # its highest [Hz]
             'use_sim_time': use_sim_time}])]
 
 

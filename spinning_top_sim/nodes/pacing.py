@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
+import math
 import queue
 import threading
 import time
@@ -11,12 +13,9 @@ from collections.abc import Callable, Iterable, Iterator
 
 Message = tuple[int, Callable[[bytes], object], bytes]      # time [ns], what sends it, CDR
 
-# Between the last message of a round and the first of the next.
-ROUND_GAP_NS = 10_000_000
-# A message sent later than this is counted.
-LATE_NS = 10_000_000
-# Read ahead.
-BATCH_BYTES, BATCH_MESSAGES, BATCHES = 256_000, 512, 16
+ROUND_GAP_NS = 10_000_000       # from the end of a round to the first message of the next
+LATE_NS = 10_000_000            # a message sent later than this is counted
+BATCH_BYTES, BATCH_MESSAGES, BATCHES = 256_000, 512, 16     # read ahead
 
 
 class SimulatedClock:
@@ -33,13 +32,11 @@ class SimulatedClock:
         self._from_simulated = simulated_ns
 
     def set_scale(self, scale: float) -> None:
-        """Go on from the present time at another speed."""
         self.set(self.now(), self.running)
         self._scale = scale
 
     @property
     def running(self) -> bool:
-        """Whether time passes."""
         return self._from_source is not None
 
     def now(self) -> int:
@@ -73,8 +70,7 @@ class DeadlineThread(threading.Thread):
     """
     Calls `tick` at absolute deadlines until it is stopped, and `idle` behind it where it asks so.
 
-    A late tick comes at once, and deadlines that have passed are skipped.  It costs less processor
-    time than an rclpy timer (`benchmark/wake_up.py`).
+    A late tick comes at once, and deadlines that have passed are skipped.
 
     grid : returns a deadline on the monotonic clock and the time between two [s]
     failed : takes any error of these; the thread goes on
@@ -119,7 +115,6 @@ class DeadlineThread(threading.Thread):
             self._idle()
 
     def stop(self) -> None:
-        """Ask the thread to end, and wait for it."""
         self._stopped = True
         if self.is_alive():
             self.join(5.0)
@@ -127,14 +122,13 @@ class DeadlineThread(threading.Thread):
 
 def rounds(read: Callable[[], Iterable[Message]], span_ns: int, loop: bool) -> Iterator[Message]:
     """Yield the messages of a round, `span_ns` long, or those of round after round."""
-    shift = 0
-    while True:
+    for number in itertools.count():
+        shift = number * (span_ns + ROUND_GAP_NS)
         at_ns = None
         for at_ns, send, data in read():
             yield at_ns + shift, send, data
         if at_ns is None or not loop:
             return
-        shift += span_ns + ROUND_GAP_NS
 
 
 class ReadAhead:
@@ -183,23 +177,14 @@ class ReadAhead:
 
 
 class Playback:
-    """
-    Sends messages at their times, late ones at once, by a clock with pauses and a rate.
+    """Sends messages at their times, late ones at once, by a clock with pauses and a rate."""
 
-    begin_ns : time at which the clock starts [ns]
-    source, sleep : returns steady time [ns]; waits at most so many seconds (None: until woken)
-    """
-
-    def __init__(self, begin_ns: int, *, paused: bool = False,
-                 source: Callable[[], int] = time.monotonic_ns,
-                 sleep: Callable[[float | None], object] | None = None) -> None:
-        self._source = source
-        self._clock = SimulatedClock(source, 1.0)
+    def __init__(self, begin_ns: int, paused: bool = False) -> None:
+        self._clock = SimulatedClock(time.monotonic_ns, 1.0)
         self._clock.set(begin_ns, running=False)
         self._sent_until = begin_ns         # all messages before this time are sent
         self._stopped = False
-        self._wake = threading.Event()
-        self._sleep = sleep or self._sleep_until_woken
+        self._changed = threading.Event()   # wakes the thread that plays
         self._lock = FairLock()             # the clock, and sending
         self.paused = paused
         self.sent = self.late = 0
@@ -211,8 +196,24 @@ class Playback:
                 with self._lock:
                     self._clock.set(self._sent_until, not self.paused)
             self._sent_until = at_ns
-            if not self._send_when_due(at_ns, send, data):
+            while (left_ns := self._send_if_due(at_ns, send, data)) > 0:
+                self._changed.wait(min(left_ns / 1e9, threading.TIMEOUT_MAX))
+                self._changed.clear()
+            if self._stopped:
                 return
+
+    def _send_if_due(self, at_ns: int, send: Callable[[bytes], object], data: bytes) -> float:
+        """Send a message whose time has come; return how long others wait [ns], 0 if stopped."""
+        with self._lock:
+            if self._stopped:
+                return 0.0
+            due_ns = self._clock.when(at_ns)
+            left_ns = math.inf if due_ns is None else due_ns - time.monotonic_ns()
+            if left_ns <= 0:
+                send(data)
+                self.sent += 1
+                self.late += left_ns < -LATE_NS
+            return left_ns
 
     def now(self) -> int:
         """Return the time up to which all messages are sent [ns]."""
@@ -224,35 +225,14 @@ class Playback:
         with self._lock:
             self.paused = paused
             self._clock.set(self._clock.now(), not paused)
-        self._wake.set()
+        self._changed.set()
 
     def set_rate(self, rate: float) -> None:
-        """Go on at another rate."""
         with self._lock:
             self._clock.set_scale(rate)
-        self._wake.set()
+        self._changed.set()
 
     def stop(self) -> None:
-        """Make `run` return, soon."""
         with self._lock:
             self._stopped = True
-        self._wake.set()
-
-    def _send_when_due(self, at_ns: int, send: Callable[[bytes], object], data: bytes) -> bool:
-        """Send a message when its time has come; return False when stopped before."""
-        while True:
-            with self._lock:
-                if self._stopped:
-                    return False
-                due = self._clock.when(at_ns)
-                left = None if due is None else due - self._source()
-                if left is not None and left <= 0:
-                    send(data)
-                    self.sent += 1
-                    self.late += left < -LATE_NS
-                    return True
-            self._sleep(None if left is None else left / 1e9)
-
-    def _sleep_until_woken(self, seconds: float | None) -> None:
-        self._wake.wait(None if seconds is None else min(seconds, threading.TIMEOUT_MAX))
-        self._wake.clear()
+        self._changed.set()

@@ -19,11 +19,9 @@ from spinning_top_sim.streams.stream import Stream
 if TYPE_CHECKING:
     from spinning_top_sim.recording.writer import McapRecorder, Messages
 
-# Stamps whose messages wait at most for the file that is being opened.
-MOST_PENDING = 20_000
+MOST_PENDING = 20_000       # stamps whose messages wait for the file that is being opened
 
-# Full name, type, and offered QoS.
-Topic = tuple[str, str, dict[str, int]]
+Topic = tuple[str, str, dict[str, int]]     # full name, type, and offered QoS
 # What `provenance` takes.
 Run = tuple[Mapping[str, Any], int, int, tuple[tuple[int, float, float], ...], Mapping[str, Any]]
 
@@ -133,7 +131,6 @@ class RecordingSession:
             self._write((index,), stamp_ns, (data,), len(data))
 
     def has_room(self) -> bool:
-        """Return whether more messages can be taken without losing any."""
         if self._recorder is not None:
             return self._recorder.room
         return len(self._pending) < MOST_PENDING
@@ -145,7 +142,7 @@ class RecordingSession:
 
     @property
     def size(self) -> str:
-        """Size of the log, for the user; empty without one."""
+        """Size of the log for the user, empty without one."""
         recorder = self._recorder
         return '' if recorder is None else f'{recorder.counters.bytes / 1e6:.1f} MB'
 

@@ -33,23 +33,12 @@ from spinning_top_sim.nodes import reports
 from spinning_top_sim.nodes.executable import one_line, wait_for_all_acked
 from spinning_top_sim.nodes.pacing import ROUND_GAP_NS, Message, Playback, ReadAhead, rounds
 from spinning_top_sim.recording.definitions import find_definition
-from spinning_top_sim.recording.errors import DefinitionNotFoundError, LogError
+from spinning_top_sim.recording.errors import DefinitionNotFoundError
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
 from spinning_top_sim.streams.cdr import NANOSECONDS
 
-# REP-144 and the ROS 2 interface names.
-TYPE_NAME = re.compile(r'([a-z][a-z0-9_]*)/(?:msg/)?([A-Z][A-Za-z0-9_]*)')
-AMENT_INDEX = 'share/ament_index/resource_index/packages'
 SLOWEST, FASTEST = 1e-6, 1e9
-# Longest wait for the last messages to be acknowledged: Fast DDS asks for it every 3 s.
-LAST_WORD_S = 5.0
-# Wait for subscribers that acknowledge nothing: shared memory goes with its sender.
-UNACKNOWLEDGED_S = 0.3
-# How often subscribers are counted while waiting.
-LOOK_S = 0.02
-# The thread that sends gets Python's lock this soon from the one that reads ahead.
-SWITCH_INTERVAL_S = 0.0005
 
 
 class Replayer(Node):
@@ -132,8 +121,8 @@ class Replayer(Node):
                 raise ValueError('its publishers had different ones')
             qos = qos_profile(profiles[0])
         except ValueError as error:
-            self._log.warning(f'{topic.name} is published with default QoS, not with the '
-                                      f'recorded one: {error}')
+            self._log.warning(f'{topic.name} is published with default QoS, not with '
+                              f'the recorded one: {error}')
             qos = qos_profile(DEFAULT_QOS)
         return self.create_publisher(
             kind, topic.name, qos,
@@ -148,8 +137,8 @@ class Replayer(Node):
         return SetParametersResult(successful=True)
 
     def start(self) -> None:
-        """Begin to play: after `delay`, and when there are enough subscribers."""
-        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        # The thread that sends gets Python's lock this soon from the one that reads ahead [s].
+        sys.setswitchinterval(0.0005)
         self._thread.start()
 
     def stop(self) -> None:
@@ -163,12 +152,18 @@ class Replayer(Node):
         self._terminal.end()
 
     def _play(self) -> None:
-        """Play all; the body of a thread beside the executor's."""
+        """Wait for subscribers and the delay, then play all; runs beside the executor's thread."""
+        begin = time.monotonic() + self._options.delay
         try:
-            self._wait_to_begin()
+            while not self._stopping.wait(0.02) and (time.monotonic() < begin or sum(
+                    publisher.get_subscription_count() for publisher in self._senders
+                    ) < self._options.wait_for_subscribers):
+                pass
             self._playback.run(self._ahead)
-            self._stopping.wait(UNACKNOWLEDGED_S)
-            wait_for_all_acked(self._senders, LAST_WORD_S, self._stopping.is_set)
+            # For subscribers that acknowledge nothing: shared memory goes with its sender.
+            self._stopping.wait(0.3)
+            # Fast DDS asks every 3 s whether messages are acknowledged.
+            wait_for_all_acked(self._senders, 5.0, self._stopping.is_set)
             code = 2 if self._tell_damage() else 0
         except Exception as error:
             if self.context.ok():           # publishing fails once the context is down
@@ -181,7 +176,6 @@ class Replayer(Node):
             self.finished.set_result(code)
 
     def _messages(self) -> Iterator[Message]:
-        """Yield the messages of a round."""
         names = {channel.name for channel in self._reader.topics
                  if channel.channel_id in self._outputs}
         # A reader that is told where to start takes the index's word for it.
@@ -198,17 +192,9 @@ class Replayer(Node):
         """Return whether messages are missing unexpectedly; say so once."""
         damaged = self._reader.left_out > 0 and not self._options.partial
         if damaged:
-            self._log.error(f'{self._reader.path} is damaged inside, and messages are left '
-                                    'out: `recover` tells which', once=True)
+            self._log.error(f'{self._reader.path} is damaged inside, and messages are '
+                            'left out: `recover` tells which', once=True)
         return damaged
-
-    def _wait_to_begin(self) -> None:
-        """Wait for subscribers and the delay."""
-        begin = time.monotonic() + self._options.delay
-        while not self._stopping.wait(LOOK_S) and (time.monotonic() < begin or sum(
-                publisher.get_subscription_count() for publisher in self._senders
-                ) < self._options.wait_for_subscribers):
-            pass
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._playback.pause(request.data)
@@ -232,12 +218,9 @@ class Replayer(Node):
 
 
 def open_log(path: Path, partial: bool) -> LogReader:
-    """Open a log.  Raises ValueError for what is none, and for a torn one unless `partial`."""
-    try:
-        log = LogReader(path)
-        torn = not log.whole and (log.damage.truncated or log.damage.losses)
-    except LogError as error:
-        raise ValueError(error) from error
+    """Open a log.  Raises LogError, or ValueError for a torn one unless `partial`."""
+    log = LogReader(path)
+    torn = not log.whole and (log.damage.truncated or log.damage.losses)
     if torn and not partial:
         raise ValueError(f'{path} is torn: `recover` makes a whole log of it, --partial plays '
                          'what is whole')
@@ -249,13 +232,15 @@ def open_log(path: Path, partial: bool) -> LogReader:
 
 def message_class(type_name: str) -> type:
     """Return a message class of an installed ROS package.  Raises LookupError for all else."""
-    match = TYPE_NAME.fullmatch(type_name)
+    # REP-144 and the ROS 2 interface names.
+    match = re.fullmatch(r'([a-z][a-z0-9_]*)/(?:msg/)?([A-Z][A-Za-z0-9_]*)', type_name)
     if match is None:
         raise LookupError(f'{type_name!r} is not the name of a message type')
     package, name = match.groups()
     prefixes = [*filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)),
                 sys.prefix]
-    if any(Path(prefix, AMENT_INDEX, package).is_file() for prefix in prefixes):
+    if any(Path(prefix, 'share/ament_index/resource_index/packages', package).is_file()
+           for prefix in prefixes):
         with contextlib.suppress(ImportError, AttributeError):
             kind = getattr(importlib.import_module(f'{package}.msg'), name)
             if hasattr(kind, 'get_fields_and_field_types'):

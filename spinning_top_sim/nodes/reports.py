@@ -7,6 +7,7 @@ import math
 import os
 import sys
 import time
+from operator import itemgetter
 from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Time
@@ -35,21 +36,16 @@ class MotionReport:
         """Return the message for /diagnostics; without a `max_error` no error is computed."""
         simulation, loop, session = self._simulation, self._loop, self._session
         error = simulation.orientation_error if max_error else math.nan
-        problems = [(DiagnosticStatus.OK, 'paused' if loop.paused else 'running')]
-        if loop.waits_for_clock:
-            problems.append((DiagnosticStatus.WARN, 'waiting for /clock'))
-        if self.overloaded:
-            problems.append((DiagnosticStatus.WARN, 'this machine cannot keep up'))
-        if error > max_error > 0.0:
-            problems.append((DiagnosticStatus.WARN, f'orientation error {error:.3g} rad: more '
-                                                    f'than max_error = {max_error:g} rad'))
-        if session.warning:
-            problems.append((DiagnosticStatus.WARN, f'recording: {session.warning}'))
-        if session.error:
-            problems.append((DiagnosticStatus.ERROR, f'recording: {session.error}'))
-        if loop.failure:
-            problems.append((DiagnosticStatus.ERROR, loop.failure))
-        level, message = max(problems, key=lambda problem: problem[0])
+        states = (      # whether it is so, how bad that is, and what is said of it
+            (True, DiagnosticStatus.OK, 'paused' if loop.paused else 'running'),
+            (loop.waits_for_clock, DiagnosticStatus.WARN, 'waiting for /clock'),
+            (self.overloaded, DiagnosticStatus.WARN, 'this machine cannot keep up'),
+            (error > max_error > 0.0, DiagnosticStatus.WARN,
+             f'orientation error {error:.3g} rad: more than max_error = {max_error:g} rad'),
+            (session.warning, DiagnosticStatus.WARN, f'recording: {session.warning}'),
+            (session.error, DiagnosticStatus.ERROR, f'recording: {session.error}'),
+            (loop.failure, DiagnosticStatus.ERROR, loop.failure))
+        _, level, message = max(filter(itemgetter(0), states), key=itemgetter(1))
         now_ns = loop.now_ns
         numbers = {
             'simulated time [s]': f'{now_ns / NANOSECONDS:.6f}',

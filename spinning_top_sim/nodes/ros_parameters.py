@@ -18,8 +18,6 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.parameters import Effect, Parameter
 
 SPIN = ('spin.l3', 'spin.lz')
-# Parameters that rclpy declares itself.
-OF_RCLPY = ('use_sim_time', 'start_type_description_service')
 
 
 def overrides(argv: Sequence[str]) -> list[str]:
@@ -56,18 +54,18 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
 
 def declare(node: Node) -> dict[str, Any]:
     """
-    Declare the whole table, warn of unknown parameters, and return the checked start values.
+    Declare the table, warn of unknown parameters; return the start values or raise ValueError.
 
     The node was made with `automatically_declare_parameters_from_overrides`, the public way to
-    learn of overrides that nobody declares.  Raises ValueError for a bad value.
+    learn of overrides that nobody declares.
     """
     given = {}
     for name in node.get_parameters_by_prefix(''):
         value = node.get_parameter(name).value
         if name == 'use_sim_time' and not isinstance(value, bool):
             raise ValueError(f'{name} = {value!r}: must be true or false')
-        if name in OF_RCLPY:
-            continue
+        if name in {'use_sim_time', 'start_type_description_service'}:
+            continue        # rclpy declares these itself
         if name in parameters.BY_NAME:
             given[name] = list(value) if isinstance(value, array.array) else value
         elif not name.startswith('qos_overrides.'):
@@ -86,11 +84,7 @@ def declare(node: Node) -> dict[str, Any]:
 
 
 def with_doubles(given: Sequence[RosParameter]) -> list[RosParameter]:
-    """
-    Make doubles where the table has doubles: of integers, and of texts that are numbers.
-
-    It is called before rclpy looks at ranges.  `ros2 param` takes 1e-9 for a text, as YAML 1.1.
-    """
+    """Make doubles where the table has some: of integers, and of texts, as YAML 1.1 has 1e-9."""
     result = []
     for one in given:
         row, value = parameters.BY_NAME.get(one.name), one.value
@@ -111,15 +105,12 @@ def _as_double(value: object) -> object:
 
 def changed(values: Mapping[str, Any], changes: Mapping[str, Any],
             start_spin: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    Return the values with changes put in, all validated.  Raises ValueError.
-
-    A reset goes back to the start state with `start_spin`, so these are checked together.  The
-    present spin belongs to the present state: whether there is such a motion shows the command.
-    """
+    """Return the values with changes put in, all validated.  Raises ValueError."""
     for name, value in changes.items():
         if value is None:
             raise ValueError(f'{name}: cannot be unset while the node runs')
+    # A reset goes back to the start state with `start_spin`, so these are checked together.  The
+    # present spin belongs to the present state: whether there is such a motion shows the command.
     checked = parameters.checked({**values, **changes, **start_spin})
     return {**checked, **{name: parameters.BY_NAME[name].check(changes.get(name, values[name]))
                           for name in SPIN}}

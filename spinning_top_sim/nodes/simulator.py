@@ -37,15 +37,7 @@ from spinning_top_sim.streams.parameters import Effect
 from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.streams.stream import Stream
 
-# Threads let go of the interpreter this soon when a tick is due; Python's default is 5 ms.
-SWITCH_INTERVAL_S = 1e-4
-# How often the first message of a followed /clock is looked for.
-CLOCK_PERIOD_S = 0.02
-# A /clock that stands for longer is said to have stopped.
-CLOCK_PATIENCE_S = 2.0
-# At the end of `duration` all subscribers together are waited for at most this long.
-ACKNOWLEDGED_S = 1.0
-RECORDED_POLICIES = ('history', 'depth', 'reliability', 'durability', 'liveliness')
+CLOCK_PATIENCE_S = 2.0      # a followed /clock that stands for longer is said to have stopped
 
 
 class StreamPublishers:
@@ -84,11 +76,12 @@ class StreamPublishers:
 
     def topics_to_record(self, streams: Sequence[Stream]) -> list[Topic]:
         """Return the topics of these streams, and behind them those of the journal."""
+        policies = ('history', 'depth', 'reliability', 'durability', 'liveliness')
         topics: list[Topic] = []
         for stream in streams:
             publisher = self.by_topic[stream.topic]
             topics.append((publisher.topic_name, stream.type_name, {
-                name: int(getattr(publisher.qos_profile, name)) for name in RECORDED_POLICIES}))
+                name: int(getattr(publisher.qos_profile, name)) for name in policies}))
         return [*topics, *((self._node.resolve_topic_name(name), type_name, {})
                            for name, type_name in journal.TOPICS)]
 
@@ -98,13 +91,13 @@ class Simulator(Node):
     The node.  Raises ValueError for a bad parameter.
 
     One thread ticks, the executor's does everything else; both hold the lock while they use the
-    simulation.  `finished` completes after `duration`.
+    simulation.
     """
 
     def __init__(self, argv: Sequence[str] = ()) -> None:
         super().__init__('spinning_top', cli_args=ros_parameters.overrides(argv),
                          automatically_declare_parameters_from_overrides=True)
-        self.finished: Future = Future()
+        self.finished: Future = Future()        # completes after `duration`
         self._terminal = reports.Terminal()
         values = ros_parameters.declare(self)
         simulation = self._simulation = Simulation(values)
@@ -175,8 +168,9 @@ class Simulator(Node):
 
     def start(self) -> None:
         """Let time run: simulated t = 0 is the next point of the stamps' grid."""
-        sys.setswitchinterval(SWITCH_INTERVAL_S)
-        self._begin_timer = self._steady_timer(CLOCK_PERIOD_S, self._begin)
+        # Threads let go of the interpreter this soon when a tick is due; the default is 5 ms.
+        sys.setswitchinterval(1e-4)
+        self._begin_timer = self._steady_timer(0.02, self._begin)
         self._begin()
 
     def _begin(self) -> None:
@@ -226,7 +220,7 @@ class Simulator(Node):
         with self._lock:
             wants_idle = self._loop.tick()
         if self._loop.ended and not self.finished.done():
-            wait_for_all_acked(self._outputs.by_topic.values(), ACKNOWLEDGED_S)
+            wait_for_all_acked(self._outputs.by_topic.values(), 1.0)
             self.finished.set_result(None)
         return wants_idle
 
@@ -325,7 +319,6 @@ class Simulator(Node):
     def _reset(self, _: Trigger.Request) -> str:
         with self._lock:
             self._check_started()
-            # Back to the spin it was started with, whatever was commanded since.
             self._loop.reset({**self._values, **self._start_spin}, self._date_ns())
         self._values |= {'spin.l3': self._simulation.l3, 'spin.lz': self._simulation.lz}
         self._resetting = True
@@ -342,7 +335,7 @@ class Simulator(Node):
         return self._session.start(self._values)()
 
     def _publish_diagnostics(self) -> None:
-        """Look at the recording, and publish /diagnostics."""
+        """Look at /clock, the recording and other nodes, and publish /diagnostics."""
         self._watch_clock()
         reason = self._session.check()
         if reason:

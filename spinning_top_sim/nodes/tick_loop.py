@@ -16,8 +16,7 @@ from spinning_top_sim.streams.schedule import NEVER_NS
 
 # The stamp of t = 0 is a multiple of this, so that grids meet across streams and runs.
 EPOCH_GRID_NS = 10_000_000
-# How often subscribers are counted; a new one waits at most this long.
-SUBSCRIBERS_PERIOD_NS = 50_000_000
+SUBSCRIBERS_PERIOD_NS = 50_000_000      # subscribers are counted so often
 # The look-ahead is computed in pieces that fill this share of the time between two ticks.  It
 # begins this many ticks, or this much time, before it is needed.
 BUSY_SHARE = 0.35
@@ -25,8 +24,7 @@ TICKS_AHEAD, AHEAD_NS = 24, 50_000_000
 # One tick works at most this long before services and signals get their turn; so does one step.
 TICK_BUDGET_NS = 50_000_000
 STEP_BUDGET_NS = 2_000_000_000
-# Samples later than this are recorded, but not published any more.
-LATEST_NS = 500_000_000
+LATEST_NS = 500_000_000         # samples later than this are recorded, but not published any more
 # A simulation further behind than this lets its clock slip: its real-time factor falls below 1.
 LONGEST_LAG_NS = 1_000_000_000
 # A day before the seconds of a stamp, an int32, end: no look-ahead goes that far.
@@ -43,12 +41,11 @@ def next_epoch(date_ns: int) -> int:
 
 class TickLoop:
     """
-    Moves a simulation along with a clock, one tick at a time.
+    Moves a simulation along with a clock; calls from several threads need a lock around them.
 
-    A tick sends all samples that are due, so none depends on how ticks fall.  Calls from several
-    threads need a lock around them.
+    A tick sends all samples that are due and find room in the recording: none depends on how ticks
+    fall.
 
-    recording : where it has no room, nothing is sent
     update_subscribers : sets `publish` of each stream that has subscribers
     tell : takes a text for the log, and whether the motion has failed
     source : returns the time that simulated time follows [ns]
@@ -71,8 +68,6 @@ class TickLoop:
         self._steady, self._is_steady = steady, source is steady
         self._clock = SimulatedClock(source, values['time_scale'])
         self._subscribers_due_ns = 0            # on the steady clock
-        self._late_from_ns = NEVER_NS           # on the steady clock
-        self._fast_until_ns = -1                # simulated time until which ticks are fast
         self._computing = False                 # whether a look-ahead is being computed
         self.set_pace(values)
 
@@ -230,8 +225,8 @@ class TickLoop:
         """
         Go back to the start state of these parameters, and out of a failure; a pause remains.
 
-        t = 0 has this date or, as stamps never go back, a later one.  Raises ValueError or
-        IntegrationError if no motion begins there; the present one goes on then.
+        t = 0 has this date or, as stamps never go back, a later one.  Raises ValueError if no
+        motion begins there; the present one goes on then.
         """
         simulation, sent_ns = self._simulation, self._simulation.now_ns
         epoch_ns = next_epoch(max(simulation.epoch_ns + sent_ns + 1, date_ns))
@@ -257,5 +252,6 @@ class TickLoop:
         self._late_after_ns = round(1.5 * self._tick_period_ns)
         self._ahead_ns = round(self._time_scale * max(
             1.5 * self._tick_period_ns, min(TICKS_AHEAD * self._tick_period_ns, AHEAD_NS)))
-        self._late_from_ns, self._fast_until_ns = NEVER_NS, -1
+        self._late_from_ns = NEVER_NS           # on the steady clock
+        self._fast_until_ns = -1                # simulated time until which ticks are fast
         self._clock.set_scale(self._time_scale)
