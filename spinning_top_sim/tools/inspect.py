@@ -64,7 +64,8 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(as_json(found, verdict), indent=2, allow_nan=False))
     else:
-        cli.print_report(as_text(found, verdict))
+        for line in as_text(found, verdict):
+            cli.print_line(line)
     passed = found.whole and not found.damage.defects
     if arguments.verify:
         if verdict is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The findings about a log: as JSON, and as human-readable lines and tables."""
+"""The findings about a log: as JSON, and as human-readable lines."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dataclasses import asdict
 
 from spinning_top_sim.recording.damage import count, seconds
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.tools.cli import Table
+from spinning_top_sim.tools.cli import table
 from spinning_top_sim.tools.survey import Motion, Survey
 from spinning_top_sim.tools.verify import Verdict
 
@@ -69,8 +69,8 @@ def _duration(found: Survey) -> float:
     return (found.damage.end_ns - found.damage.start_ns) / NANOSECONDS
 
 
-def as_text(found: Survey, verdict: Verdict | None) -> Iterator[str | Table]:
-    """Yield the findings as lines and tables."""
+def as_text(found: Survey, verdict: Verdict | None) -> Iterator[str]:
+    """Yield the findings as lines of text."""
     damage, run = found.damage, found.run
     state = ('whole' if found.whole and not damage.defects else
              'truncated' if damage.truncated else 'damaged')
@@ -96,21 +96,27 @@ def as_text(found: Survey, verdict: Verdict | None) -> Iterator[str | Table]:
         yield from _motion(number, motion, damage.start_ns)
     if len(found.motions) > MOST_MOTIONS:
         yield f'and {len(found.motions) - MOST_MOTIONS} more motions (all are in --json)'
-    yield 'drifts of E, L3, Lz: no topic with rates (joint_states, ground_truth/...)' if not (
-        found.drifts) else Table(
-        'largest drifts since the start of each motion, relative', ('from', 'E', 'L3', 'Lz'),
-        [(topic, *(f'{series.largest:.2g}' for series in drifts.values()))
-         for topic, drifts in found.drifts.items()])
-    yield 'orientation error: no topic with an attitude' if not found.errors else Table(
-        'orientation error against the exact solution [rad]', ('from', 'max', 'rms'),
-        [(topic, f'{series.largest:.3g}', f'{series.rms:.3g}')
-         for topic, series in found.errors.items()])
+    if found.drifts:
+        yield from table(
+            'largest drifts since the start of each motion, relative', ('from', 'E', 'L3', 'Lz'),
+            [(topic, *(f'{series.largest:.2g}' for series in drifts.values()))
+             for topic, drifts in found.drifts.items()])
+    else:
+        yield 'drifts of E, L3, Lz: no topic with rates (joint_states, ground_truth/...)'
+    if found.errors:
+        yield from table('orientation error against the exact solution [rad]',
+                         ('from', 'max', 'rms'),
+                         [(topic, f'{series.largest:.3g}', f'{series.rms:.3g}')
+                          for topic, series in found.errors.items()])
+    else:
+        yield 'orientation error: no topic with an attitude'
     if verdict is not None:
         yield from _verdict(verdict)
 
 
-def _topics(found: Survey) -> Iterator[str | Table]:
-    yield Table('topics', ('topic', 'type', 'messages', 'rate [Hz]', 'grid [Hz]', 'missing'), [
+def _topics(found: Survey) -> Iterator[str]:
+    head = 'topic', 'type', 'messages', 'rate [Hz]', 'grid [Hz]', 'missing'
+    yield from table('topics', head, [
         (name, topic.type, str(topic.count), _number(topic.rate), _number(topic.grid_rate),
          _number(topic.missing, 15)) for name, topic in found.topics.items()])
     for name, topic in found.topics.items():
@@ -122,7 +128,7 @@ def _topics(found: Survey) -> Iterator[str | Table]:
             yield f'{name}: {topic.odd_size} messages do not have the size of this stream'
 
 
-def _motion(number: int, motion: Motion, begin_ns: int) -> Iterator[str | Table]:
+def _motion(number: int, motion: Motion, begin_ns: int) -> Iterator[str]:
     exact, measured = motion.exact, motion.measured
     begin, end = (max(at_ns - begin_ns, 0) / NANOSECONDS
                   for at_ns in (motion.begin_ns, motion.end_ns))
@@ -135,7 +141,7 @@ def _motion(number: int, motion: Motion, begin_ns: int) -> Iterator[str | Table]
         expected, seen = (None if value is None else value * factor for value in (
             getattr(exact, key, None), getattr(measured, key, None)))
         rows.append((text, _number(expected, 12), _number(seen, 12), _difference(expected, seen)))
-    yield Table(title, ('', 'exact', 'measured', 'difference'), rows)
+    yield from table(title, ('', 'exact', 'measured', 'difference'), rows)
     if measured is not None:
         yield f'measured from {motion.source}: {count(measured.nutations, "whole nutation")}'
         yield from (f'not measured: {reason}' for reason in measured.missing)
