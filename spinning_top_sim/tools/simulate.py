@@ -143,7 +143,6 @@ def write_log(path: Path, values: Mapping[str, Any], stops: Sequence[Stop],
     stops : in ascending order of time, the last one is the end of the run
     show : takes the simulated time reached [s]
     epoch_ns : stamp of t = 0 [ns]
-    namespace : of the topics
     """
     from spinning_top_sim.recording.writer import create_file  # noqa: PLC0415 - needs mcap
 
