@@ -122,7 +122,8 @@ def _as_json(found: Survey, verdict: Verdict | None) -> object:
         'damage': {'torn': damage.truncated, 'report': damage.lines(), **{
             key: getattr(damage, key) for key in (
                 'lost_bytes', 'lost_chunks', 'missing_messages', 'missing_exactly')}},
-        'begin_ns': damage.start_ns, 'end_ns': damage.end_ns, 'duration': _duration(found),
+        'begin_ns': damage.start_ns, 'end_ns': damage.end_ns,
+        'duration': (damage.end_ns - damage.start_ns) / NANOSECONDS,
         'topics': {name: asdict(topic) for name, topic in found.topics.items()},
         'ours': run is not None, 'why_not_ours': found.foreign_reason or None,
         'notes': found.notes,
@@ -150,16 +151,12 @@ def _as_json(found: Survey, verdict: Verdict | None) -> object:
     return json.loads(json.dumps(content), parse_constant=lambda name: None)
 
 
-def _duration(found: Survey) -> float:
-    return (found.damage.end_ns - found.damage.start_ns) / NANOSECONDS
-
-
 def _as_text(found: Survey, verdict: Verdict | None) -> Iterator[str]:
     """Yield the findings as lines of text."""
     damage, run = found.damage, found.run
     state = ('whole' if found.whole and not damage.defects else
              'truncated' if damage.truncated else 'damaged')
-    yield f'{found.path}: {state}, {_duration(found):.6g} s'
+    yield f'{found.path}: {state}, {(damage.end_ns - damage.start_ns) / NANOSECONDS:.6g} s'
     yield from damage.lines()
     if run is None:
         yield f'not recorded by spinning_top_sim: {found.foreign_reason}'
