@@ -511,12 +511,13 @@ def test_text_tells_the_numbers(stepped, capsys):
 
 
 @pytest.mark.parametrize(('width', 'stacked'), [(120, False), (98, True), (80, True), (40, True)])
-def test_a_table_breaks_no_cell_however_narrow(width, stacked):
+def test_a_table_breaks_no_cell_however_narrow(width, stacked, monkeypatch):
     """Where a line is too wide, the first column has lines of its own."""
     head = ('topic', 'type', 'messages', 'rate [Hz]', 'grid [Hz]', 'missing')
     rows = [('/ground_truth/imu_bias', 'visualization_msgs/msg/MarkerArray', '1000', '99.9', '',
              '0'), ('/markers', 'geometry_msgs/msg/PoseStamped', '', '', '100', '')]
-    _, title, *lines = cli.Table('topics', head, rows).lines(width)
+    monkeypatch.setenv('COLUMNS', str(width))
+    _, title, *lines = cli.table('topics', head, rows)
     assert title == 'topics'
     assert max(map(len, lines)) <= max(width, 80)
     cells = [' '.join(row).split() for row in (head, *rows)]

@@ -125,24 +125,24 @@ def longest_run(blocks: list[tuple[NDArray[np.int64], Reals]]) -> Attitudes:
     return Attitudes(stamps_ns[part], rows[:, part])
 
 
-def interpolate(values: NDArray[Number], at: Reals) -> NDArray[Number]:
+def interpolate(values: NDArray[Number], at: Reals | float) -> NDArray[Number]:
     """
-    Return values at fractional indices, on the polynomial through the POINTS samples around.
+    Return values at fractional indices, or at one, on the polynomial through POINTS samples.
 
     Berrut & Trefethen, "Barycentric Lagrange interpolation", SIAM Review 46 (2004), eq. 4.2.
     SciPy's BarycentricInterpolator is for one set of nodes, and orders them at random, so that
     the last bits change from run to run; a spline is less accurate at the ends of the data.
     """
     points = min(POINTS, len(values))
+    at = np.asarray(at)[..., np.newaxis]
     first = np.clip(np.floor(at).astype(int) - points // 2 + 1, 0, len(values) - points)
     weights = np.array([(-1.0) ** k * math.comb(points - 1, k) for k in range(points)])
-    nodes = first[:, None] + np.arange(points)
-    distance = at[:, None] - nodes
+    nodes = first + np.arange(points)
+    distance = at - nodes
     hit = distance == 0.0
-    terms = weights / np.where(hit, 1.0, distance)
-    terms[hit.any(axis=1)] = 0.0
-    terms[hit] = 1.0
-    return (terms * values[nodes]).sum(axis=1) / terms.sum(axis=1)
+    # On a sample there is that one alone.
+    terms = np.where(hit.any(axis=-1, keepdims=True), hit, weights / np.where(hit, 1.0, distance))
+    return (terms * values[nodes]).sum(axis=-1) / terms.sum(axis=-1)
 
 
 @dataclass(frozen=True)
@@ -194,16 +194,11 @@ def _extreme(data: Attitudes, sign: float) -> float:
     extreme = float(square[index])
     if 0 < index < len(square) - 1 and len(square) >= POINTS:
         found = minimize_scalar(
-            lambda at: sign * _value(square, at), bounds=(index - 1.0, index + 1.0),
+            lambda at: sign * interpolate(square, at), bounds=(index - 1.0, index + 1.0),
             method='bounded', options={'xatol': 1e-9})
         extreme = sign * min(sign * extreme, float(found.fun))
     angle = 2.0 * math.asin(math.sqrt(min(max(extreme, 0.0), 1.0)))
     return angle if near_top else math.pi - angle
-
-
-def _value(values: Reals, at: float) -> float:
-    """Return the interpolated value at one fractional index."""
-    return float(interpolate(values, np.array([at]))[0])
 
 
 def _crossings(data: Attitudes) -> tuple[int, float, float]:
@@ -214,7 +209,7 @@ def _crossings(data: Attitudes) -> tuple[int, float, float]:
     rising = np.flatnonzero((values[:-1] < middle) & (values[1:] >= middle))
     if len(rising) < 2:
         return 0, 0.0, 0.0
-    begin, end = (float(brentq(lambda at: _value(values, at) - middle, index, index + 1.0,
+    begin, end = (float(brentq(lambda at: interpolate(values, at) - middle, index, index + 1.0,
                                xtol=1e-15, rtol=1e-15)) for index in rising[[0, -1]])
     return len(rising) - 1, begin, end
 

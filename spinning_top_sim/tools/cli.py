@@ -9,7 +9,6 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import TextIO
 
 OK = 0
@@ -78,33 +77,22 @@ def progress(what: str, total: float, unit: str, *, quiet: bool = False,
         yield lambda done: bar.update(min(done, total) - bar.n)
 
 
-@dataclass(frozen=True)
-class Table:
-    """A table of text, with numbers in all columns but the first."""
+def table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    """
+    Yield the lines of a table of text, with numbers in all columns but the first.
 
-    title: str
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
-
-    def lines(self, width: int) -> Iterator[str]:
-        """Yield the lines; where they are too wide, the first column has lines of its own."""
-        cells = [[*map(printable, row)] for row in (self.head, *self.rows)]
-        first, *widths = (max(map(len, column)) for column in zip(*cells, strict=True))
-        stacked = first + sum(widths) + len(GAP) * (len(widths) + 1) > width
-        yield from ('', self.title)
-        for name, *numbers in cells:
-            line = GAP + name.ljust(first)
-            if stacked:
-                yield GAP + name
-                line = GAP
-            for number, wide in zip(numbers, widths, strict=True):
-                line += GAP + number.rjust(wide)
-            yield line.rstrip()
-
-
-def print_report(content: Iterable[str | Table]) -> None:
-    """Print lines and tables, as wide as the terminal."""
-    width = shutil.get_terminal_size((TEXT_WIDTH, 0)).columns
-    for item in content:
-        for line in [item] if isinstance(item, str) else item.lines(width):
-            print_line(line)
+    Where they are wider than the terminal, the first column has lines of its own.
+    """
+    cells = [[*map(printable, row)] for row in (head, *rows)]
+    first, *widths = (max(map(len, column)) for column in zip(*cells, strict=True))
+    stacked = (first + sum(widths) + len(GAP) * (len(widths) + 1)
+               > shutil.get_terminal_size((TEXT_WIDTH, 0)).columns)
+    yield from ('', title)
+    for name, *numbers in cells:
+        line = GAP + name.ljust(first)
+        if stacked:
+            yield GAP + name
+            line = GAP
+        for number, wide in zip(numbers, widths, strict=True):
+            line += GAP + number.rjust(wide)
+        yield line.rstrip()

@@ -16,17 +16,35 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from spinning_top_sim.recording.damage import count, seconds
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import cli
 
 if TYPE_CHECKING:
-    from spinning_top_sim.tools.survey import Survey
+    from spinning_top_sim.tools.survey import Motion, Survey
+    from spinning_top_sim.tools.verify import Verdict
+
+MOST_MOTIONS = 12           # shown one by one in the text
+DEGREES = math.degrees(1.0)
+# Rows of the table of a motion: what it is, field of Description and Measured, factor.
+ROWS = (('nutation period [s]', 'nutation_period', 1.0),
+        ('mean precession [rad/s]', 'mean_precession_rate', 1.0),
+        ('mean spin [rad/s]', 'mean_spin_rate', 1.0),
+        ('least tilt [deg]', 'theta_min', DEGREES),
+        ('greatest tilt [deg]', 'theta_max', DEGREES),
+        ('least precession [rad/s]', 'precession_min', 1.0),
+        ('greatest precession [rad/s]', 'precession_max', 1.0),
+        ('1 - m', 'separatrix_distance', 1.0),
+        ('L3^2/(4 lambda1 |P|)', 'gyroscopic_ratio', 1.0))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -48,7 +66,6 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     # Not before: --help needs none of it.
     from spinning_top_sim.recording.reader import LogReader  # noqa: PLC0415
-    from spinning_top_sim.tools.report import as_json, as_text  # noqa: PLC0415
     from spinning_top_sim.tools.survey import survey  # noqa: PLC0415
     from spinning_top_sim.tools.verify import verify  # noqa: PLC0415
 
@@ -62,9 +79,10 @@ def _run(arguments: argparse.Namespace) -> int:
                 verdict = verify(reader, found.run, end_ns,
                                  lambda stamp_ns: show((stamp_ns - begin_ns) / NANOSECONDS))
     if arguments.json:
-        print(json.dumps(as_json(found, verdict), indent=2, allow_nan=False))
+        print(json.dumps(_as_json(found, verdict), indent=2, allow_nan=False))
     else:
-        cli.print_report(as_text(found, verdict))
+        for line in _as_text(found, verdict):
+            cli.print_line(line)
     passed = found.whole and not found.damage.defects
     if arguments.verify:
         if verdict is None:
@@ -94,6 +112,159 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> bool:
         reason = str(error)
     cli.print_line(f'inspect: {reason}', sys.stderr)
     return False
+
+
+def _as_json(found: Survey, verdict: Verdict | None) -> object:
+    """Return all findings as what JSON can hold; docs/inspect.md tells the keys."""
+    damage, run = found.damage, found.run
+    content: dict[str, object] = {
+        'file': str(found.path), 'whole': found.whole,
+        'damage': {'torn': damage.truncated, 'report': damage.lines(), **{
+            key: getattr(damage, key) for key in (
+                'lost_bytes', 'lost_chunks', 'missing_messages', 'missing_exactly')}},
+        'begin_ns': damage.start_ns, 'end_ns': damage.end_ns,
+        'duration': (damage.end_ns - damage.start_ns) / NANOSECONDS,
+        'topics': {name: asdict(topic) for name, topic in found.topics.items()},
+        'ours': run is not None, 'why_not_ours': found.foreign_reason or None,
+        'notes': found.notes,
+        'run': run and {
+            'parameters': run.values, 'seed': run.values['seed'], 'epoch_ns': run.epoch_ns,
+            'begun_ns': run.begun_ns, **run.surroundings},
+        'events': [
+            {'event': event.name, 'stamp_ns': event.stamp_ns, 't_ns': event.t_ns, **event.details}
+            for event in (run.events if run else ())],
+        'motions': [{
+            **{key: getattr(motion, key) for key in (
+                'cause', 'begin_ns', 'end_ns', 'source', 'regime')},
+            **{key: getattr(motion.segment, key) for key in ('l3', 'lz', 'energy')},
+            'exact': motion.exact and asdict(motion.exact),
+            'measured': motion.measured and asdict(motion.measured)} for motion in found.motions],
+        'drifts': {topic: {name: series.largest for name, series in drifts.items()}
+                   for topic, drifts in found.drifts.items()},
+        'orientation_error': {topic: {'max': series.largest, 'rms': series.rms}
+                              for topic, series in found.errors.items()},
+        'verify': verdict and {
+            'identical': verdict.identical, 'whole': found.whole, **asdict(verdict),
+            'first': verdict.first and verdict.first._asdict()},
+    }
+    # Numbers that JSON does not have become null.
+    return json.loads(json.dumps(content), parse_constant=lambda name: None)
+
+
+def _as_text(found: Survey, verdict: Verdict | None) -> Iterator[str]:
+    """Yield the findings as lines of text."""
+    damage, run = found.damage, found.run
+    state = ('whole' if found.whole and not damage.defects else
+             'truncated' if damage.truncated else 'damaged')
+    yield f'{found.path}: {state}, {(damage.end_ns - damage.start_ns) / NANOSECONDS:.6g} s'
+    yield from damage.lines()
+    if run is None:
+        yield f'not recorded by spinning_top_sim: {found.foreign_reason}'
+        yield from _topics(found)
+        return
+    solver = run.values['solver.method']
+    if solver != 'exact':
+        solver += f" ({run.values['solver.equations']}, rtol {run.values['solver.rtol']:g})"
+    yield f'spinning_top_sim {run.surroundings["version"]}, {solver}, seed {run.values["seed"]}'
+    yield from _topics(found)
+    counts = Counter(event.name for event in run.events)
+    yield ('no journal: commands and resets are unknown' if run.events_topic is None else
+           f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
+           f'{counts["parameters"]} changes of parameters')
+    for stamp_ns, reason in run.broken:
+        yield f'journal, entry at {seconds(stamp_ns)}: {reason}'
+    yield from found.notes
+    for number, motion in enumerate(found.motions[:MOST_MOTIONS], start=1):
+        yield from _motion(number, motion, damage.start_ns)
+    if len(found.motions) > MOST_MOTIONS:
+        yield f'and {len(found.motions) - MOST_MOTIONS} more motions (all are in --json)'
+    if found.drifts:
+        yield from cli.table(
+            'largest drifts since the start of each motion, relative', ('from', 'E', 'L3', 'Lz'),
+            [(topic, *(f'{series.largest:.2g}' for series in drifts.values()))
+             for topic, drifts in found.drifts.items()])
+    else:
+        yield 'drifts of E, L3, Lz: no topic with rates (joint_states, ground_truth/...)'
+    if found.errors:
+        yield from cli.table('orientation error against the exact solution [rad]',
+                         ('from', 'max', 'rms'),
+                         [(topic, f'{series.largest:.3g}', f'{series.rms:.3g}')
+                          for topic, series in found.errors.items()])
+    else:
+        yield 'orientation error: no topic with an attitude'
+    if verdict is not None:
+        yield from _verdict(verdict)
+
+
+def _topics(found: Survey) -> Iterator[str]:
+    head = 'topic', 'type', 'messages', 'rate [Hz]', 'grid [Hz]', 'missing'
+    yield from cli.table('topics', head, [
+        (name, topic.type, str(topic.count), _number(topic.rate), _number(topic.grid_rate),
+         _number(topic.missing, 15)) for name, topic in found.topics.items()])
+    for name, topic in found.topics.items():
+        for begin, end in topic.gaps_ns:
+            yield f'gap: {name} from {seconds(begin)} to {seconds(end)}'
+        if topic.off_grid:
+            yield f'{name}: {topic.off_grid} stamps are not on the grid'
+        if topic.odd_size:
+            yield f'{name}: {topic.odd_size} messages do not have the size of this stream'
+
+
+def _motion(number: int, motion: Motion, begin_ns: int) -> Iterator[str]:
+    exact, measured = motion.exact, motion.measured
+    begin, end = (max(at_ns - begin_ns, 0) / NANOSECONDS
+                  for at_ns in (motion.begin_ns, motion.end_ns))
+    name = exact.name if exact is not None else 'beyond the closed form'
+    title = f'motion {number} ({motion.cause}), {begin:.6g} to {end:.6g} s: {name}'
+    if motion.regime is not None and motion.regime != name:
+        title += f' (the data look like: {motion.regime})'
+    rows = []
+    for text, key, factor in ROWS:
+        expected, seen = (None if value is None else value * factor for value in (
+            getattr(exact, key, None), getattr(measured, key, None)))
+        rows.append((text, _number(expected, 12), _number(seen, 12), _difference(expected, seen)))
+    yield from cli.table(title, ('', 'exact', 'measured', 'difference'), rows)
+    if measured is not None:
+        yield f'measured from {motion.source}: {count(measured.nutations, "whole nutation")}'
+        yield from (f'not measured: {reason}' for reason in measured.missing)
+    elif motion.source is not None:
+        yield 'not measured: too few samples'
+    else:
+        yield 'not measured: no topic with an attitude (joint_states, pose, ground_truth/...)'
+
+
+def _verdict(verdict: Verdict) -> Iterator[str]:
+    for warning in verdict.warnings:
+        yield f'verify: {warning}: the last bits may differ for that'
+    compared = sum(verdict.compared.values())
+    if verdict.stopped:
+        yield f'verify: the run cannot be computed again: {verdict.stopped}'
+    if verdict.identical:
+        yield f'verify: identical, all {compared} messages byte for byte'
+    elif not (verdict.different or verdict.unexpected or verdict.stopped):
+        yield (f'verify: incomplete, {count(verdict.missing, "message")} missing; '
+               f'the other {compared} are identical byte for byte')
+    else:
+        yield (f'verify: DIFFERENT: {verdict.different} of {compared} messages differ, '
+               f'{verdict.missing} are missing, {verdict.unexpected} should not be there')
+    first = verdict.first
+    if first is not None:
+        place = '' if first.byte is None else f', byte {first.byte}'
+        yield (f'verify: first: {first.topic} at {seconds(first.stamp_ns)}{place}, '
+               f'{first.field}: in the log {first.logged}, computed {first.computed}')
+
+
+def _number(value: float | None, digits: int = 6) -> str:
+    return '' if value is None else f'{value:.{digits}g}'
+
+
+def _difference(expected: float | None, seen: float | None) -> str:
+    if expected is None or seen is None:
+        return ''
+    difference = seen - expected
+    if abs(difference) > abs(expected):         # also where that is 0
+        return f'{difference:.1e} absolute'
+    return f'{difference / abs(expected):.1e}' if difference else '0'
 
 
 if __name__ == '__main__':

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools.analysis import Attitudes, Complexes, Reals, interpolate
-from spinning_top_sim.tools.survey import Series, Survey
+from spinning_top_sim.tools.survey import Survey
 
 # From the world to the viewer: towards, right, up.
 VIEW = Rotation.from_euler('zy', (60.0, 45.0), degrees=True)
@@ -87,7 +87,7 @@ def smooth_tip(data: Attitudes) -> tuple[Reals, Complexes, Reals]:
 def draw_page(found: Survey, path: Path) -> str:
     """Draw a page about a log with samples of attitudes (`found.shown`); return what it shows."""
     assert found.shown is not None
-    motion, data = found.shown
+    (motion, data), start_ns = found.shown, found.damage.start_ns
     assert motion.measured is not None
     period, mean = motion.measured.nutation_period, motion.measured.mean_precession_rate
     data = data.first(PAGE_NUTATIONS * period if period else PAGE_S)
@@ -109,20 +109,22 @@ def draw_page(found: Survey, path: Path) -> str:
             topic = min(found.drifts, key=lambda name: found.drifts[name]['energy'].largest)
             for series, style, label in zip(found.drifts[topic].values(), ('-', '--', ':'),
                                             ('E', '$L_3$', '$L_z$'), strict=True):
-                _plot_series(drifts, found, series, linestyle=style, label=label)
+                stamps_ns, values = series.points
+                drifts.plot((stamps_ns - start_ns) * 1e-9, values, linestyle=style, label=label)
             drifts.legend(loc='upper left', ncols=3)
             drifts.margins(y=0.25)
             drifts.set_title(f'drift of the constants, from {topic}')
         if found.errors:
             topic = min(found.errors, key=lambda name: found.errors[name].largest)
-            _plot_series(errors, found, found.errors[topic], color=COLOURS[2])
+            stamps_ns, values = found.errors[topic].points
+            errors.plot((stamps_ns - start_ns) * 1e-9, values, color=COLOURS[2])
             errors.set_title(f'error against the exact solution, from {topic}')
             errors.set_ylim(bottom=0.0)
         for axes, quantity in ((drifts, 'relative drift'), (errors, 'orientation error [rad]')):
             axes.set(xlabel='time in the log [s]', ylabel=quantity)
             for later in found.motions[1:] if len(found.motions) <= MOST_MARKS else ():
-                axes.axvline((later.begin_ns - found.damage.start_ns) * 1e-9, color=FAINT,
-                             linewidth=0.8, zorder=0)
+                axes.axvline((later.begin_ns - start_ns) * 1e-9, color=FAINT, linewidth=0.8,
+                             zorder=0)
         if found.readings:
             # The noisy readings, else the noise-free ones, else the bias.
             topic = min(found.readings, key=lambda name: (not name.endswith('data_raw'),
@@ -174,11 +176,6 @@ def _precession_panel(axes: Axes, data: Attitudes, mean: float | None) -> None:
     if mean is not None:
         axes.axhline(mean, color=INK, linewidth=0.9, linestyle='--')
         axes.set_title(f'precession, mean {mean:.9g} rad/s (dashed)')
-
-
-def _plot_series(axes: Axes, found: Survey, series: Series, **style: Any) -> None:
-    stamps_ns, values = series.points
-    axes.plot((stamps_ns - found.damage.start_ns) * 1e-9, values, **style)
 
 
 def animate(found: Survey, path: Path) -> str:

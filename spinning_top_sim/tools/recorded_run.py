@@ -47,12 +47,6 @@ class Event:
     sent_ns: int                          # time up to which all samples had been sent [ns]
     details: Mapping[str, Any]            # the rest of the entry
 
-    @property
-    def acts(self) -> bool:
-        """Whether samples depend on it: of the parameters only rates take effect at once."""
-        return self.name in ('command', 'reset') or any(
-            name.endswith('.rate') for name in self.details)
-
 
 @dataclass(frozen=True)
 class RunDescription:
@@ -203,7 +197,10 @@ def _rerun(run: RunDescription, end_ns: int,
         simulation.log_to(None, [stream for stream in simulation.streams
                                  if stream.topic in run.topics])
     yield simulation, Event('start', run.epoch_ns, 0, simulation.now_ns, {})
-    for item in (*(event for event in run.events if event.acts), None):
+    # Of the parameters only rates take effect at once.
+    acting = [event for event in run.events if event.name in ('command', 'reset')
+              or any(name.endswith('.rate') for name in event.details)]
+    for item in (*acting, None):
         now_ns = max(simulation.now_ns, 0)
         stop_ns = end_ns - simulation.epoch_ns if item is None else item.sent_ns
         recorded = [stream for stream in simulation.streams if stream.has_sinks]

@@ -53,10 +53,8 @@ def read_scene(path: str | Path) -> dict[str, object]:
     if not sections:
         raise ValueError(f'{path} has no parameters for the node spinning_top: it must have '
                          "'/**:' or 'spinning_top:', and 'ros__parameters:' in it")
-    values: dict[str, object] = {}
-    for section in sections:
-        values.update(_flatten(section))
-    return _known(values, str(path))
+    return _known({name: value for section in sections for name, value in _flatten(section)},
+                  str(path))
 
 
 def parse_assignment(text: str) -> tuple[str, object]:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,14 +34,21 @@ from spinning_top_sim.streams.schedule import offline_block_ns, offline_targets
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools import cli
 from spinning_top_sim.tools.scene_file import is_of_ros, parse_assignment, read_scene
-from spinning_top_sim.tools.table import Stop, write_table
 
 if TYPE_CHECKING:
     from spinning_top_sim.recording.mcap_writer import McapWriter
 
-# In ROS a stamp of 0 means "no time".
-DEFAULT_EPOCH = 1.0
 FORMATS = ('mcap', 'csv', 'parquet')
+# Names and units of the columns of a table.
+UNITS = {
+    't': 's', 'theta': 'rad', 'theta_dot': 'rad/s', 'phi': 'rad', 'phi_dot': 'rad/s',
+    'psi': 'rad', 'psi_dot': 'rad/s', 'qx': '1', 'qy': '1', 'qz': '1', 'qw': '1',
+    'omega_1': 'rad/s', 'omega_2': 'rad/s', 'omega_3': 'rad/s', 'energy': 'J',
+    'l3': 'kg m^2/s', 'lz': 'kg m^2/s'}
+ROWS_AT_ONCE = 20_000
+
+# Time [ns], and L3 and Lz commanded there [kg m^2/s].
+Stop = tuple[int, tuple[float, float] | None]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -64,7 +71,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--command', metavar='T:L3:LZ', action='append', default=[],
         help='at T [s] set L3 and Lz [kg m^2/s]; may be repeated; commands at the same time are '
         'applied in the order given')
-    add('--epoch', type=float, default=DEFAULT_EPOCH, metavar='S',
+    # In ROS a stamp of 0 means "no time".
+    add('--epoch', type=float, default=1.0, metavar='S',
         help='stamp of t = 0 [s], default %(default)g')
     add('--namespace', default='/', help='of the topics in the log')
     add('--format', choices=FORMATS,
@@ -135,7 +143,6 @@ def write_log(path: Path, values: Mapping[str, Any], stops: Sequence[Stop],
     stops : in ascending order of time, the last one is the end of the run
     show : takes the simulated time reached [s]
     epoch_ns : stamp of t = 0 [ns]
-    namespace : of the topics
     """
     from spinning_top_sim.recording.writer import create_file  # noqa: PLC0415 - needs mcap
 
@@ -172,16 +179,12 @@ class _LogWriter:
         self._file, self._streams = file, streams
         self._blocks: list[tuple[int, NDArray[np.int64], NDArray[np.uint8]]] = []
         self._executor = ThreadPoolExecutor(1)
-        self._chunk: Future[None] | None = None         # that is being written
-
-    def _wait(self) -> None:
-        chunk, self._chunk = self._chunk, None
-        if chunk is not None:
-            chunk.result()
+        # The chunk that is being written; at first there is none to wait for.
+        self._chunk: Future[None] = self._executor.submit(lambda: None)
 
     def write(self, topic_index: int, stamp_ns: int, data: bytes) -> None:
         """Write an entry of the journal with the next chunk."""
-        self._wait()
+        self._chunk.result()
         if self._file.append(topic_index, stamp_ns, data):
             self._file.write_chunk()
 
@@ -195,18 +198,73 @@ class _LogWriter:
         blocks, self._blocks = self._blocks, []
         if blocks:
             chunk = self._file.chunk_of_rows(blocks)
-            self._wait()
+            self._chunk.result()
             self._file.write_chunk()
             self._chunk = self._executor.submit(self._file.put_plain_chunk, chunk)
 
     def close(self) -> None:
         """Finish the file."""
         try:
-            self._wait()
+            self._chunk.result()
         finally:
             self._executor.shutdown()
             self._file.write_chunk()
             self._file.finish()
+
+
+def write_table(path: Path, file_format: str, values: Mapping[str, Any], stops: Sequence[Stop],
+                show: Callable[[float], object]) -> str:
+    """
+    Simulate a run into a new table of states, on the grid of `pose.rate`; return what it holds.
+
+    file_format : 'csv' or 'parquet'
+    stops, show : see `write_log`
+    """
+    period_ns = max(1, round(NANOSECONDS / values['pose.rate']))
+    # Before there is a file: there may be no motion.
+    blocks = _rows(Simulation(values), period_ns, stops, show)
+    (_write_csv if file_format == 'csv' else _write_parquet)(path, blocks)
+    return f'{stops[-1][0] // period_ns + 1} rows of {", ".join(UNITS)}'
+
+
+def _rows(simulation: Simulation, period_ns: int, stops: Sequence[Stop],
+          show: Callable[[float], object]) -> Iterator[NDArray[np.float64]]:
+    """Yield blocks (columns, n) of the table.  A command changes the rows after its time."""
+    next_ns = 0
+    for target_ns, momenta in offline_targets(0, stops, ROWS_AT_ONCE * period_ns):
+        times = range(next_ns, target_ns + 1, period_ns)
+        if times:
+            states = simulation.segment.states(times)
+            yield np.stack(np.broadcast_arrays(
+                np.array(times) / NANOSECONDS, states.theta, states.theta_dot, states.phi,
+                states.phi_dot, states.psi, states.psi_dot, *states.quaternion.T,
+                *states.angular_velocity.T, states.energy, states.l3, states.lz))
+            next_ns = times[-1] + period_ns
+        simulation.advance(target_ns)
+        if momenta is not None:
+            simulation.command(*momenta)
+        show(target_ns / NANOSECONDS)
+
+
+def _write_csv(path: Path, blocks: Iterable[NDArray[np.float64]]) -> None:
+    with open(path, 'x', encoding='utf-8') as file:
+        file.write(','.join(f'{name} [{unit}]' for name, unit in UNITS.items()) + '\n')
+        for rows in blocks:
+            # csv.writer looks for what to quote in every number, and takes a third longer.
+            file.writelines(','.join(map(repr, row)) + '\n' for row in rows.T.tolist())
+
+
+def _write_parquet(path: Path, blocks: Iterable[NDArray[np.float64]]) -> None:
+    """Write a Parquet file.  Raises ValueError, and makes no file, where pyarrow is missing."""
+    try:
+        import pyarrow as pa  # noqa: PLC0415
+        from pyarrow import parquet  # noqa: PLC0415
+    except ImportError as error:
+        raise ValueError(f'parquet needs the Python package pyarrow: {error}') from error
+    schema = pa.schema([(name, pa.float64()) for name in UNITS])
+    with open(path, 'xb') as file, parquet.ParquetWriter(file, schema) as writer:
+        for rows in blocks:
+            writer.write_table(pa.table(list(rows), schema=schema))
 
 
 if __name__ == '__main__':

@@ -16,7 +16,6 @@ FRAMES = ('world_frame', 'body_frame', 'imu.frame_id')
 ARGUMENTS = {name.removeprefix('top.').replace('.', '_'): name for name in (
     'top.mass', 'top.com_distance', 'top.lambda1', 'top.lambda3', 'imu.lever_arm', 'imu.rpy',
     *FRAMES)}
-LINKS_BETWEEN = ('precession_link', 'nutation_link')
 FRAME_NAME = re.compile(r'[\w.-]+(/[\w.-]+)*')
 
 
@@ -28,7 +27,7 @@ def arguments(values: Mapping[str, Any]) -> dict[str, str]:
                              'between')
     world, body, imu = (values[name] for name in FRAMES)
     prefix = body[:body.rfind('/') + 1]         # a/base_link, a/nutation_link
-    between = [prefix + name for name in LINKS_BETWEEN]
+    between = [f'{prefix}precession_link', f'{prefix}nutation_link']
     for name, value, others in (('world_frame', world, [body, imu, *between]),
                                 ('body_frame', body, between), ('imu.frame_id', imu, between)):
         if value in others:
@@ -37,10 +36,9 @@ def arguments(values: Mapping[str, Any]) -> dict[str, str]:
     if imu == body and any((*values['imu.lever_arm'], *values['imu.rpy'])):
         raise ValueError(f'imu.frame_id = {imu!r}: must not be the body_frame where '
                          'imu.lever_arm or imu.rpy is not zero')
-    given = {name: values[parameter] for name, parameter in ARGUMENTS.items()}
-    return {'prefix': prefix, **{
-        name: ' '.join(map(str, value)) if isinstance(value, tuple) else str(value)
-        for name, value in given.items()}}
+    given = {'prefix': prefix, **{name: values[key] for name, key in ARGUMENTS.items()}}
+    return {name: ' '.join(map(str, value)) if isinstance(value, tuple) else str(value)
+            for name, value in given.items()}
 
 
 def robot_description(values: Mapping[str, Any], folder: str | Path) -> str:

@@ -7,7 +7,7 @@ import math
 import re
 import struct
 from collections import defaultdict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import NamedTuple
@@ -76,7 +76,8 @@ def verify(reader: LogReader, run: RunDescription, end_ns: int,
     end_ns : log time up to which samples were recorded [ns]
     show : takes the log time reached [ns]
     """
-    verdict = Verdict({topic: 0 for topic in (*run.topics.values(), run.commands_topic)
+    commands = run.commands_topic
+    verdict = Verdict({topic: 0 for topic in (*run.topics.values(), commands)
                        if topic is not None}, warnings=_warnings(run))
     for stamp_ns, reason in run.broken:
         verdict.different += 1
@@ -85,42 +86,42 @@ def verify(reader: LogReader, run: RunDescription, end_ns: int,
     computed: defaultdict[tuple[int, str], deque[tuple[Stream | None, bytes]]] = defaultdict(deque)
 
     def take(stream: Stream, stamps_ns: NDArray[np.int64], rows: NDArray[np.uint8]) -> None:
-        topic, size, data = run.topics[stream.topic], rows.shape[1], rows.tobytes()
-        for number, stamp_ns in enumerate(stamps_ns.tolist()):
-            computed[stamp_ns, topic].append((stream, data[number * size:(number + 1) * size]))
+        for stamp_ns, row in zip(stamps_ns.tolist(), rows, strict=True):
+            computed[stamp_ns, run.topics[stream.topic]].append((stream, row.tobytes()))
 
-    messages = reader.messages(topics=verdict.compared)
-    message = next(messages, None)
+    def computing() -> Iterator[float]:
+        """Compute the run; yield the log times before which all is computed, at last infinity."""
+        try:
+            for simulation, event in rerun(run, end_ns, take):
+                if commands is not None and event is not None and event.name == 'command':
+                    computed[event.stamp_ns, commands].append(
+                        (None, journal.command(event.details['l3'], event.details['lz'])))
+                reached_ns = simulation.epoch_ns + simulation.now_ns
+                show(reached_ns)
+                # Not up to it: another command at this very time may follow.
+                yield reached_ns
+        except DepartureError as error:
+            verdict.stopped = str(error)
+        yield math.inf
 
-    def compare(before_ns: float) -> None:
-        nonlocal message
-        while message is not None and message.log_time < before_ns:
-            key = message.log_time, message.topic
-            if key in computed:
-                stream, expected = computed[key].popleft()
-                if not computed[key]:
-                    del computed[key]
-                verdict.compared[message.topic] += 1
-                if message.data != expected:
-                    verdict.different += 1
-                    verdict.note(_difference(key, stream, message.data, expected))
-            else:
-                verdict.unexpected += 1
-                verdict.note(Difference(*key, 'message', 'there', 'no such message'))
-            message = next(messages, None)
-
-    try:
-        for simulation, event in rerun(run, end_ns, take):
-            if event is not None and event.name == 'command' and run.commands_topic is not None:
-                computed[event.stamp_ns, run.commands_topic].append(
-                    (None, journal.command(event.details['l3'], event.details['lz'])))
-            reached_ns = simulation.epoch_ns + simulation.now_ns
-            show(reached_ns)
-            # Another command at this very time may follow.
-            compare(reached_ns)
-    except DepartureError as error:
-        verdict.stopped = str(error)
-    compare(math.inf)
+    reached, before_ns = computing(), -math.inf
+    for message in reader.messages(topics=verdict.compared):
+        while message.log_time >= before_ns:
+            before_ns = next(reached)
+        key = message.log_time, message.topic
+        if key in computed:
+            stream, expected = computed[key].popleft()
+            if not computed[key]:
+                del computed[key]
+            verdict.compared[message.topic] += 1
+            if message.data != expected:
+                verdict.different += 1
+                verdict.note(_difference(key, stream, message.data, expected))
+        else:
+            verdict.unexpected += 1
+            verdict.note(Difference(*key, 'message', 'there', 'no such message'))
+    for _ in reached:
+        pass
     for key, left in computed.items():
         verdict.missing += len(left)
         verdict.note(Difference(*key, 'message', 'no such message', 'there'))
