@@ -1007,7 +1007,7 @@ def test_chunks_are_made_in_memory_that_is_there(tmp_path, rows):
 
     def write():
         if rows:
-            file.put_plain_chunk(file.chunk_of_rows([(0, times, messages)]))
+            file.write_chunk(file.chunk_of_rows([(0, times, messages)]))
             return
         for time_ns in range(1000):
             file.append(0, time_ns, message)

@@ -35,7 +35,7 @@ Entries = Mapping[int, 'array[int]']
 MESSAGE = struct.Struct('<BQHIQQ')  # opcode, length, channel, sequence, log and publish time
 MESSAGE_FIELDS = 2 + 4 + 8 + 8      # what `length` counts besides the data
 _MESSAGE_DTYPE = [('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
-                  ('log_time', '<u8'), ('publish_time', '<u8')]
+                  ('log_time', '<u8'), ('publish_time', '<u8')]     # and the data
 _MESSAGE_OPCODE = int(Opcode.MESSAGE)   # is packed faster
 INDEX_HEAD = struct.Struct('<BQHI')     # opcode, length, channel, length of the entries
 ENTRY_SIZE = 8 + 8                      # of a message index
@@ -50,8 +50,9 @@ class PlainChunk:
     """
 
     def __init__(self) -> None:
-        self._memory = _new_memory(2 * CHUNK_BYTES)
         self.clear()
+        self._memory = memoryview(b'')
+        self._enlarge(2 * CHUNK_BYTES)
 
     def clear(self) -> None:
         """Remove all messages."""
@@ -93,24 +94,25 @@ class PlainChunk:
         """
         import numpy as np  # noqa: PLC0415 - recovery needs none
 
-        count, length = len(rows), MESSAGE.size + rows.shape[1]
-        offset, end = self.size, self.size + count * length
+        count, size = rows.shape
+        dtype = np.dtype([*_MESSAGE_DTYPE, ('data', 'u1', (size,))])
+        offset, end = self.size, self.size + count * dtype.itemsize
         if end > len(self._memory):
             self._enlarge(end)
-        records = np.frombuffer(self._memory[offset:end], 'u1').reshape(count, length)
-        heads = records[:, :MESSAGE.size].view(_MESSAGE_DTYPE)[:, 0]
-        heads['opcode'] = Opcode.MESSAGE
-        heads['length'] = MESSAGE_FIELDS + rows.shape[1]
-        heads['channel'] = channel_id
-        heads['sequence'] = sequence + np.arange(count) & 0xFFFFFFFF
-        heads['log_time'] = heads['publish_time'] = times_ns
-        records[:, MESSAGE.size:] = rows
-        entries = np.column_stack((times_ns, np.arange(offset, end, length))).astype('u8')
+        messages = np.frombuffer(self._memory[offset:end], dtype)
+        messages['opcode'] = Opcode.MESSAGE
+        messages['length'] = MESSAGE_FIELDS + size
+        messages['channel'] = channel_id
+        messages['sequence'] = sequence + np.arange(count) & 0xFFFFFFFF
+        messages['log_time'] = messages['publish_time'] = times_ns
+        messages['data'] = rows
+        entries = np.column_stack((times_ns, np.arange(offset, end, dtype.itemsize))).astype('u8')
         self.entries.setdefault(channel_id, array('Q')).frombytes(entries.tobytes())
         self.size = end
 
     def _enlarge(self, size: int) -> None:
-        larger = _new_memory(size)
+        # Private: a process that forks would share it with its children.
+        larger = memoryview(mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS))
         larger[:self.size] = self.data
         self._memory = larger
 
@@ -145,8 +147,3 @@ def time_span(entries: Entries) -> tuple[int, int]:
     """Return the earliest and the latest stamp in the entries of a chunk; (0, 0) in none."""
     times = [numbers[::2] for numbers in entries.values()]
     return min(map(min, times), default=0), max(map(max, times), default=0)
-
-
-def _new_memory(size: int) -> memoryview:
-    # Private: a process that forks would share it with its children.
-    return memoryview(mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS))

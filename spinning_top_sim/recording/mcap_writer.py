@@ -2,8 +2,7 @@
 """
 Writes MCAP files that end after a whole record at any time, whatever happens to the disk.
 
-mcap's own Writer buffers what it cannot write, then reports success, and cannot go back.  So the
-file is laid out here, from mcap's record classes.
+mcap's own Writer buffers what it cannot write, then reports success, and cannot go back.
 
 Layout: header, metadata of the run, schemas, channels | chunk, its message indexes | ... |
 `rosbag2` metadata, data end | summary, footer.
@@ -15,7 +14,6 @@ import contextlib
 import dataclasses
 import itertools
 import os
-import struct
 import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -61,7 +59,6 @@ class McapWriter:
     Every write goes to an explicit position behind the last whole record, so neither an OSError
     nor an interrupt can shift what follows.  After an OSError `finish` may still be tried.
 
-    header : the record
     compression : of chunks that are made here, 'zstd', 'lz4' or 'none'
     """
 
@@ -74,7 +71,6 @@ class McapWriter:
 
         self.message_counts: dict[int, int] = {}    # messages in the file by channel id
         self.chunk_count = 0
-        self.synced_size = 0                        # bytes that are certainly on the disk
         self._start_ns = self._end_ns = 0           # earliest and latest stamp; 0 without messages
         self._end = 0, 0    # size and checksum of the file; one assignment, so always consistent
         self._next_sequence: dict[int, int] = {}
@@ -93,11 +89,6 @@ class McapWriter:
     def size(self) -> int:
         """Size of the file, all of it whole records [bytes]."""
         return self._end[0]
-
-    @property
-    def counts(self) -> list[int]:
-        """Messages in the file by channel, in the order in which the channels were written."""
-        return list(self.message_counts.values())
 
     @contextlib.contextmanager
     def discarded_on_failure(self) -> Iterator[None]:
@@ -140,13 +131,13 @@ class McapWriter:
 
     def append(self, topic_index: int, log_time_ns: int, data: bytes) -> bool:
         """Add the next message of channel `topic_index + 1`; return whether the chunk is full."""
-        return self.add_message(topic_index + 1, self._number(topic_index, 1), log_time_ns,
-                                log_time_ns, data)
+        channel_id = topic_index + 1
+        sequence = self._next_sequence[channel_id]
+        self._next_sequence[channel_id] += 1
+        return self.add_message(channel_id, sequence, log_time_ns, log_time_ns, data)
 
-    def add_message(
-        self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int,
-        data: bytes | bytearray | memoryview,
-    ) -> bool:
+    def add_message(self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int,
+                    data: bytes | bytearray | memoryview) -> bool:
         """Add a message to the chunk in memory; return whether the chunk is full."""
         self._chunk.add(channel_id, sequence, log_time_ns, publish_time_ns, data)
         return self._chunk.size >= CHUNK_BYTES
@@ -155,38 +146,29 @@ class McapWriter:
         self, blocks: Iterable[tuple[int, NDArray[np.integer], NDArray[np.uint8]]],
     ) -> PlainChunk:
         """
-        Make a chunk for `put_plain_chunk`, which another thread may be running.
+        Make a chunk for `write_chunk`, which another thread may be running.
 
         blocks : topic index, log times of the next messages (n,) [ns], messages (n, size)
         """
         chunk = self._spare_chunks.pop() if self._spare_chunks else PlainChunk()
         for topic_index, times_ns, rows in blocks:
-            chunk.add_rows(topic_index + 1, self._number(topic_index, len(rows)), times_ns, rows)
+            channel_id = topic_index + 1
+            chunk.add_rows(channel_id, self._next_sequence[channel_id], times_ns, rows)
+            self._next_sequence[channel_id] += len(rows)
         return chunk
 
-    def _number(self, topic_index: int, count: int) -> int:
-        """Return the sequence number of the next of `count` messages of a topic."""
-        sequence = self._next_sequence[topic_index + 1]
-        self._next_sequence[topic_index + 1] = sequence + count
-        return sequence
-
-    def put_plain_chunk(self, chunk: PlainChunk) -> None:
-        """Compress and write a chunk of rows."""
-        self._put(chunk)
-        self._spare_chunks.append(chunk)
-
-    def write_chunk(self) -> None:
-        """Compress and write the chunk in memory, if it holds anything."""
-        if self._chunk.size:
-            self._put(self._chunk)
-
-    def _put(self, chunk: PlainChunk) -> None:
-        start_ns, end_ns = time_span(chunk.entries)
-        self.copy_chunk(Chunk(
-            compression=self._compression, data=self._compress(chunk.data),
-            uncompressed_size=chunk.size, uncompressed_crc=zlib.crc32(chunk.data),
-            message_start_time=start_ns, message_end_time=end_ns), chunk.entries)
-        chunk.clear()
+    def write_chunk(self, rows: PlainChunk | None = None) -> None:
+        """Compress and write a chunk of rows, or the one in memory if it holds anything."""
+        chunk = rows or self._chunk
+        if chunk.size:
+            start_ns, end_ns = time_span(chunk.entries)
+            self.copy_chunk(Chunk(
+                compression=self._compression, data=self._compress(chunk.data),
+                uncompressed_size=chunk.size, uncompressed_crc=zlib.crc32(chunk.data),
+                message_start_time=start_ns, message_end_time=end_ns), chunk.entries)
+            chunk.clear()
+        if rows:
+            self._spare_chunks.append(rows)
 
     def copy_chunk(self, chunk: Chunk, entries: Entries, raw: bytes = b'') -> None:
         """Write a compressed chunk and its message indexes; `raw` is as in `write`."""
@@ -214,9 +196,7 @@ class McapWriter:
 
     def sync(self) -> None:
         """Wait until everything written is on the disk."""
-        size = self.size
         os.fsync(self._file.fileno())
-        self.synced_size = size
 
     def check_disk(self, min_free_bytes: int) -> None:
         """Raise OSError if the disk has too little left, or the file was deleted."""
@@ -272,12 +252,10 @@ class McapWriter:
                     group_opcode=opcode, group_start=self.size + len(summary),
                     group_length=len(group)))
                 summary += group
-        offsets_start = self.size + len(summary)
-        summary += offsets
+        footer = record_bytes(Footer(self.size, self.size + len(summary), 0))
         # The summary's checksum runs on into the footer, up to the checksum itself.
-        footer = record_bytes(Footer(self.size, offsets_start, 0))
-        summary += footer[:-4]
-        return bytes(summary) + struct.pack('<I', zlib.crc32(summary)) + MCAP0_MAGIC
+        summary += offsets + footer[:-4]
+        return bytes(summary) + zlib.crc32(summary).to_bytes(4, 'little') + MCAP0_MAGIC
 
     def _write(self, blocks: Iterable[bytes]) -> None:
         """Write whole records that come in blocks, or none of them."""
@@ -302,8 +280,7 @@ def record_bytes(record: McapRecord) -> bytes:
     """Return a record as it stands in a file."""
     builder = RecordBuilder()
     record.write(builder)
-    written: bytes = builder.end()
-    return written
+    return builder.end()
 
 
 def sync_directory(directory: Path) -> None:

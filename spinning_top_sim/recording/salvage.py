@@ -89,7 +89,7 @@ def _recover(
         if scanner.found_late:
             raise _FoundLateError
         copy.put_rest()
-        messages = sum(writer.counts)
+        messages = sum(writer.message_counts.values())
         if not messages and not reader.whole:
             raise LogError(f'nothing to save in {reader.path}: there is no whole message in it')
         os.chmod(draft, reader.source.mode)

@@ -151,7 +151,7 @@ class McapRecorder:
     def counters(self) -> RecordingSummary:
         """Where the recording stands now."""
         running = self.state == 'recording'     # read first: nothing is written after it
-        counts = dict(zip(self._names, self._file.counts, strict=True))
+        counts = dict(zip(self._names, self._file.message_counts.values(), strict=True))
         missing = self._offered - sum(counts.values())
         return RecordingSummary(
             path=self.path, bytes=self._file.size, counts=counts,
@@ -259,7 +259,7 @@ class McapRecorder:
         if self._syncing is not None and self._syncing.is_alive():
             return
         written = now, self._bytes_out
-        if self._file.size == self._file.synced_size:
+        if self._bytes_out == self._on_disk[1]:
             self._on_disk = written
             return
         self._syncing = threading.Thread(
