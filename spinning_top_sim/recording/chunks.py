@@ -11,6 +11,7 @@ from __future__ import annotations
 import mmap
 import struct
 from array import array
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
@@ -57,7 +58,7 @@ class PlainChunk:
     def clear(self) -> None:
         """Remove all messages."""
         self.size = 0       # [bytes]
-        self.entries: dict[int, array[int]] = {}
+        self.entries: dict[int, array[int]] = defaultdict(lambda: array('Q'))
 
     @property
     def data(self) -> memoryview:
@@ -76,9 +77,7 @@ class PlainChunk:
             self._memory, offset, _MESSAGE_OPCODE, MESSAGE_FIELDS + len(data), channel_id,
             sequence & 0xFFFFFFFF, log_time_ns, publish_time_ns)
         self._memory[start:end] = data
-        entries = self.entries.get(channel_id)
-        if entries is None:
-            entries = self.entries[channel_id] = array('Q')
+        entries = self.entries[channel_id]
         entries.append(log_time_ns)
         entries.append(offset)
         self.size = end
@@ -107,7 +106,7 @@ class PlainChunk:
         messages['log_time'] = messages['publish_time'] = times_ns
         messages['data'] = rows
         entries = np.column_stack((times_ns, np.arange(offset, end, dtype.itemsize))).astype('u8')
-        self.entries.setdefault(channel_id, array('Q')).frombytes(entries.tobytes())
+        self.entries[channel_id].frombytes(entries.tobytes())
         self.size = end
 
     def _enlarge(self, size: int) -> None:

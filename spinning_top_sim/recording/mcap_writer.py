@@ -129,18 +129,19 @@ class McapWriter:
             self._summary_records[Opcode.ATTACHMENT_INDEX].append(
                 record_bytes(dataclasses.replace(index, offset=offset)))
 
-    def append(self, topic_index: int, log_time_ns: int, data: bytes) -> bool:
-        """Add the next message of channel `topic_index + 1`; return whether the chunk is full."""
+    def append(self, topic_index: int, log_time_ns: int, data: bytes) -> None:
+        """Add the next message of channel `topic_index + 1`, as `add_message` does."""
         channel_id = topic_index + 1
         sequence = self._next_sequence[channel_id]
         self._next_sequence[channel_id] += 1
-        return self.add_message(channel_id, sequence, log_time_ns, log_time_ns, data)
+        self.add_message(channel_id, sequence, log_time_ns, log_time_ns, data)
 
     def add_message(self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int,
-                    data: bytes | bytearray | memoryview) -> bool:
-        """Add a message to the chunk in memory; return whether the chunk is full."""
+                    data: bytes | bytearray | memoryview) -> None:
+        """Add a message to the chunk in memory; write the chunk when it is full."""
         self._chunk.add(channel_id, sequence, log_time_ns, publish_time_ns, data)
-        return self._chunk.size >= CHUNK_BYTES
+        if self._chunk.size >= CHUNK_BYTES:
+            self.write_chunk()
 
     def chunk_of_rows(
         self, blocks: Iterable[tuple[int, NDArray[np.integer], NDArray[np.uint8]]],

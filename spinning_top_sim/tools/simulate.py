@@ -182,8 +182,7 @@ class _LogWriter:
     def write(self, topic_index: int, stamp_ns: int, data: bytes) -> None:
         """Write an entry of the journal with the next chunk."""
         self._wait()
-        if self._file.append(topic_index, stamp_ns, data):
-            self._file.write_chunk()
+        self._file.append(topic_index, stamp_ns, data)
 
     def take(self, stream: Stream, stamps_ns: NDArray[np.int64],
              rows: NDArray[np.uint8]) -> None:
