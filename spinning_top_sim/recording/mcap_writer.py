@@ -19,32 +19,12 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import (
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
 from mcap.writer import MCAP0_MAGIC
 
-from spinning_top_sim.recording.chunks import (
-    CHUNK_BYTES,
-    Entries,
-    PlainChunk,
-    compressor,
-    message_indexes,
-    time_span,
-)
+from spinning_top_sim.recording import chunks
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA, bag_metadata_yaml
 
 if TYPE_CHECKING:
@@ -65,9 +45,9 @@ class McapWriter:
     def __init__(self, path: Path, *, header: bytes, compression: str) -> None:
         self._path = path
         self._compression = '' if compression == 'none' else compression
-        self._compress = compressor(compression)
-        self._chunk = PlainChunk()                  # of messages that come one by one
-        self._spare_chunks: list[PlainChunk] = []   # for rows
+        self._compress = chunks.compressor(compression)
+        self._chunk = chunks.PlainChunk()           # of messages that come one by one
+        self._spare_chunks: list[chunks.PlainChunk] = []    # for rows
 
         self.message_counts: dict[int, int] = {}    # messages in the file by channel id
         self.chunk_count = 0
@@ -75,7 +55,7 @@ class McapWriter:
         self._end = 0, 0    # size and checksum of the file; one assignment, so always consistent
         self._next_sequence: dict[int, int] = {}
         self._type_names: dict[int, str] = {}       # by schema id
-        self._channels: dict[int, Channel] = {}
+        self._channels: dict[int, records.Channel] = {}
         # Records of the summary.  Serialized: thousands of objects would take memory.
         self._summary_records: dict[Opcode, list[bytes]] = {kind: [] for kind in (
             Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.CHUNK_INDEX,
@@ -101,7 +81,8 @@ class McapWriter:
                 self._path.unlink()
             raise
 
-    def write(self, record: Schema | Channel | Metadata, raw: bytes = b'') -> None:
+    def write(self, record: records.Schema | records.Channel | records.Metadata,
+              raw: bytes = b'') -> None:
         """
         Write a record, a schema before its channels; the summary repeats the first of each id.
 
@@ -110,22 +91,22 @@ class McapWriter:
         offset = self.size
         raw = raw or record_bytes(record)
         self._write([raw])
-        if isinstance(record, Metadata):
+        if isinstance(record, records.Metadata):
             self._summary_records[Opcode.METADATA_INDEX].append(
-                record_bytes(MetadataIndex(offset=offset, length=len(raw), name=record.name)))
-        elif isinstance(record, Schema) and record.id not in self._type_names:
+                record_bytes(records.MetadataIndex(offset, len(raw), record.name)))
+        elif isinstance(record, records.Schema) and record.id not in self._type_names:
             self._type_names[record.id] = record.name
             self._summary_records[Opcode.SCHEMA].append(raw)
-        elif isinstance(record, Channel) and record.id not in self._channels:
+        elif isinstance(record, records.Channel) and record.id not in self._channels:
             self._channels[record.id] = record
             self._summary_records[Opcode.CHANNEL].append(raw)
             self.message_counts[record.id] = self._next_sequence[record.id] = 0
 
-    def copy_record(self, blocks: Iterable[bytes], index: McapRecord | None = None) -> None:
+    def copy_record(self, blocks: Iterable[bytes], index: records.McapRecord | None) -> None:
         """Write an attachment, or a record of unknown kind, in blocks of any size."""
         offset = self.size
         self._write(blocks)
-        if isinstance(index, AttachmentIndex):
+        if isinstance(index, records.AttachmentIndex):
             self._summary_records[Opcode.ATTACHMENT_INDEX].append(
                 record_bytes(dataclasses.replace(index, offset=offset)))
 
@@ -140,30 +121,30 @@ class McapWriter:
                     data: bytes | bytearray | memoryview) -> None:
         """Add a message to the chunk in memory; write the chunk when it is full."""
         self._chunk.add(channel_id, sequence, log_time_ns, publish_time_ns, data)
-        if self._chunk.size >= CHUNK_BYTES:
+        if self._chunk.size >= chunks.CHUNK_BYTES:
             self.write_chunk()
 
     def chunk_of_rows(
         self, blocks: Iterable[tuple[int, NDArray[np.integer], NDArray[np.uint8]]],
-    ) -> PlainChunk:
+    ) -> chunks.PlainChunk:
         """
         Make a chunk for `write_chunk`, which another thread may be running.
 
         blocks : topic index, log times of the next messages (n,) [ns], messages (n, size)
         """
-        chunk = self._spare_chunks.pop() if self._spare_chunks else PlainChunk()
+        chunk = self._spare_chunks.pop() if self._spare_chunks else chunks.PlainChunk()
         for topic_index, times_ns, rows in blocks:
             channel_id = topic_index + 1
             chunk.add_rows(channel_id, self._next_sequence[channel_id], times_ns, rows)
             self._next_sequence[channel_id] += len(rows)
         return chunk
 
-    def write_chunk(self, rows: PlainChunk | None = None) -> None:
+    def write_chunk(self, rows: chunks.PlainChunk | None = None) -> None:
         """Compress and write a chunk of rows, or the one in memory if it holds anything."""
         chunk = rows or self._chunk
         if chunk.size:
-            start_ns, end_ns = time_span(chunk.entries)
-            self.copy_chunk(Chunk(
+            start_ns, end_ns = chunks.time_span(chunk.entries)
+            self.copy_chunk(records.Chunk(
                 compression=self._compression, data=self._compress(chunk.data),
                 uncompressed_size=chunk.size, uncompressed_crc=zlib.crc32(chunk.data),
                 message_start_time=start_ns, message_end_time=end_ns), chunk.entries)
@@ -171,13 +152,13 @@ class McapWriter:
         if rows:
             self._spare_chunks.append(rows)
 
-    def copy_chunk(self, chunk: Chunk, entries: Entries, raw: bytes = b'') -> None:
+    def copy_chunk(self, chunk: records.Chunk, entries: chunks.Entries, raw: bytes = b'') -> None:
         """Write a compressed chunk and its message indexes; `raw` is as in `write`."""
         raw = raw or record_bytes(chunk)
-        indexes = message_indexes(entries)
+        indexes = chunks.message_indexes(entries)
         offsets = list(itertools.accumulate(
             map(len, indexes.values()), initial=self.size + len(raw)))
-        chunk_index = record_bytes(ChunkIndex(
+        chunk_index = record_bytes(records.ChunkIndex(
             chunk_start_offset=self.size, chunk_length=len(raw),
             message_index_offsets=dict(zip(indexes, offsets, strict=False)),
             message_index_length=offsets[-1] - offsets[0],
@@ -223,11 +204,11 @@ class McapWriter:
                 topics = [(channel, self._type_names.get(channel.schema_id, ''),
                            self.message_counts[channel.id])
                           for channel in self._channels.values()]
-                self.write(Metadata(BAG_METADATA, {
+                self.write(records.Metadata(BAG_METADATA, {
                     'serialized_metadata': bag_metadata_yaml(
                         topics, file_name=file_name or self._path.name, start_ns=self._start_ns,
                         end_ns=self._end_ns, former=former_bag)}))
-            self._write([record_bytes(DataEnd(self._end[1]))])
+            self._write([record_bytes(records.DataEnd(self._end[1]))])
             self._write([self._summary()])
             self.sync()
             sync_directory(self._path.parent)
@@ -237,7 +218,7 @@ class McapWriter:
     def _summary(self) -> bytes:
         """Return the summary section, the footer and the closing magic."""
         groups = self._summary_records
-        groups[Opcode.STATISTICS] = [record_bytes(Statistics(
+        groups[Opcode.STATISTICS] = [record_bytes(records.Statistics(
             message_count=sum(self.message_counts.values()),
             schema_count=len(groups[Opcode.SCHEMA]), channel_count=len(groups[Opcode.CHANNEL]),
             attachment_count=len(groups[Opcode.ATTACHMENT_INDEX]),
@@ -246,14 +227,14 @@ class McapWriter:
             channel_message_counts=self.message_counts))]
         summary = bytearray()
         offsets = bytearray()
-        for opcode, records in groups.items():
-            group = b''.join(records)
+        for opcode, members in groups.items():
+            group = b''.join(members)
             if group:
-                offsets += record_bytes(SummaryOffset(
+                offsets += record_bytes(records.SummaryOffset(
                     group_opcode=opcode, group_start=self.size + len(summary),
                     group_length=len(group)))
                 summary += group
-        footer = record_bytes(Footer(self.size, self.size + len(summary), 0))
+        footer = record_bytes(records.Footer(self.size, self.size + len(summary), 0))
         # The summary's checksum runs on into the footer, up to the checksum itself.
         summary += offsets + footer[:-4]
         return bytes(summary) + zlib.crc32(summary).to_bytes(4, 'little') + MCAP0_MAGIC
@@ -277,7 +258,7 @@ class McapWriter:
         self._end = offset, crc
 
 
-def record_bytes(record: McapRecord) -> bytes:
+def record_bytes(record: records.McapRecord) -> bytes:
     """Return a record as it stands in a file."""
     builder = RecordBuilder()
     record.write(builder)
