@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    # The next messages of a topic: its index, log times (n,) [ns], messages (n, size).
+    Rows = tuple[int, NDArray[np.integer], NDArray[np.uint8]]
+
 CHUNK_BYTES = 1 << 20   # uncompressed; a single larger message still makes a chunk of its own
 
 # Half the time of zstd's own default, 3, and less memory, for files that are 1 to 6 % larger:

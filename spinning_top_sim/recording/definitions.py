@@ -8,6 +8,7 @@ that of rosbag2's LocalMessageDefinitionSource (rosbag2_cpp, jazzy), byte for by
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import json
 import os
@@ -83,10 +84,8 @@ def _prefixes(package: str) -> Iterator[Path]:
     """Yield the installation prefixes that may hold a package, as ROS overlays them."""
     yield from map(Path, filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)))
     yield Path(sys.prefix)
-    try:
+    with contextlib.suppress(ValueError):   # of a module that tells no origin, such as __main__
         spec = importlib.util.find_spec(package)
-    except ValueError:
-        return
-    for location in (spec.submodule_search_locations or ()) if spec else ():
-        # <prefix>/lib/python3.x/site-packages/<package>, or below <prefix>/local on Debian
-        yield from Path(location).parents[3:5]
+        for location in (spec.submodule_search_locations or ()) if spec else ():
+            # <prefix>/lib/python3.x/site-packages/<package>, or below <prefix>/local on Debian
+            yield from Path(location).parents[3:5]

@@ -17,7 +17,6 @@ import os
 import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mcap import records
 from mcap.data_stream import RecordBuilder
@@ -26,10 +25,6 @@ from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording import chunks
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA, bag_metadata_yaml
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 
 class McapWriter:
@@ -124,14 +119,8 @@ class McapWriter:
         if self._chunk.size >= chunks.CHUNK_BYTES:
             self.write_chunk()
 
-    def chunk_of_rows(
-        self, blocks: Iterable[tuple[int, NDArray[np.integer], NDArray[np.uint8]]],
-    ) -> chunks.PlainChunk:
-        """
-        Make a chunk for `write_chunk`, which another thread may be running.
-
-        blocks : topic index, log times of the next messages (n,) [ns], messages (n, size)
-        """
+    def chunk_of_rows(self, blocks: Iterable[chunks.Rows]) -> chunks.PlainChunk:
+        """Make a chunk for `write_chunk`, which another thread may be running."""
         chunk = self._spare_chunks.pop() if self._spare_chunks else chunks.PlainChunk()
         for topic_index, times_ns, rows in blocks:
             channel_id = topic_index + 1

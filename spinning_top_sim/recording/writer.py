@@ -40,7 +40,8 @@ QUEUE_BYTES = 32_000_000            # where a recording has no more room, see `M
 
 _ENTRY_BYTES = 128  # what a queued message costs besides its data, about
 
-# Messages of one stamp: topic indices, log time [ns], CDR of each, size of all [bytes].
+# Messages of one stamp: the topic of each, an index of the recorder's `topics`; log time [ns]; CDR
+# of each; size of all [bytes].
 Messages = tuple[Sequence[int], int, Sequence[bytes], int]
 
 
@@ -153,13 +154,10 @@ class McapRecorder:
     def write_all(self, topic_indices: Sequence[int], log_time_ns: int,
                   messages: Sequence[bytes], size: int) -> None:
         """
-        Hand over messages (CDR) of one stamp, from one thread at a time; they keep their order.
+        Hand over `Messages`, from one thread at a time; they keep their order.
 
         Never waits for the disk, never raises for its sake.  After the recording stopped the
         messages are only counted, as lost.
-
-        topic_indices : the topic of each, an index of the recorder's `topics`
-        size : of all messages [bytes]
         """
         self._offered += len(messages)
         if self._accepting:
@@ -272,9 +270,8 @@ class McapRecorder:
 def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[str, str], *,
                 compression: str, min_free_bytes: int = 0) -> McapWriter:
     """
-    Create a log and bring its head to the disk.
+    Create a log, which must not exist, and bring its head to the disk.
 
-    path : the file, which must not exist
     topics : all stand before the first chunk, so that a truncated file tells them in any case
     metadata : the `spinning_top_sim` record at the head of the file
     compression : one of COMPRESSIONS
