@@ -15,6 +15,7 @@ on a busy machine.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import platform
 import statistics
@@ -48,7 +49,7 @@ def record(path: Path, seconds: float) -> dict[str, list[int]]:
                           for n in range(int(seconds * rate))]
              for topic, rate, shift in zip(topics, RATES_HZ, SHIFTS_NS, strict=True)}
     data = messages.float64_multi_array(('a', 'b')).encode_one(0, np.array([1.0, 2.0]))
-    with McapRecorder.open(path, topics, {}, min_free_bytes=0) as recorder:
+    with contextlib.closing(McapRecorder(path, topics, {}, min_free_bytes=0)) as recorder:
         for at_ns, index in sorted((at_ns, index) for index, stamps in enumerate(times.values())
                                    for at_ns in stamps):
             recorder.write(index, at_ns, data)

@@ -21,6 +21,7 @@ import threading
 import time
 import tracemalloc
 import zlib
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -89,7 +90,8 @@ def some_messages(count: int) -> list[tuple[int, int, bytes]]:
 
 
 def record(path, messages, **options):
-    with McapRecorder.open(path, TOPICS, METADATA, **{'min_free_bytes': 0} | options) as recorder:
+    with closing(McapRecorder(
+            path, TOPICS, METADATA, **{'min_free_bytes': 0} | options)) as recorder:
         for message in messages:
             recorder.write(*message)
         return recorder.close()
@@ -357,8 +359,9 @@ def test_the_same_messages_give_the_same_bytes(tmp_path):
     messages = some_messages(3000)
     seen = []
     for name, pause in (('a', 0.0), ('b', 0.02)):
-        with McapRecorder.open(tmp_path / name, TOPICS, METADATA, min_free_bytes=0,
-                               max_loss=0.01 if pause else 60.0) as recorder:
+        with closing(McapRecorder(
+                tmp_path / name, TOPICS, METADATA, min_free_bytes=0,
+                max_loss=0.01 if pause else 60.0)) as recorder:
             for number, message in enumerate(messages):
                 recorder.write(*message)
                 if pause and number % 1000 == 500:
@@ -446,7 +449,7 @@ def test_definitions_are_found_beside_the_python_package(tmp_path, monkeypatch):
     'geometry_msgs/msg/NoSuchType', 'no_such_msgs/msg/Type', 'PoseStamped', '../msg/passwd', ''])
 def test_a_missing_definition_is_named(tmp_path, type_name):
     with pytest.raises(DefinitionNotFoundError) as caught:
-        McapRecorder.open(
+        McapRecorder(
             tmp_path / 'run.mcap', [RecordedTopic('/a', type_name)], {}, min_free_bytes=0)
     assert type_name in str(caught.value)
     if '_msgs' in type_name:
@@ -460,20 +463,20 @@ def test_an_existing_file_is_left_alone(tmp_path):
     path = tmp_path / 'run.mcap'
     path.write_text('precious')
     with pytest.raises(RecordingError, match=r'run\.mcap.*exists'):
-        McapRecorder.open(path, TOPICS, METADATA, min_free_bytes=0)
+        McapRecorder(path, TOPICS, METADATA, min_free_bytes=0)
     assert path.read_text() == 'precious'
 
 
 def test_a_dangling_link_is_not_followed(tmp_path):
     (tmp_path / 'run.mcap').symlink_to(tmp_path / 'elsewhere')
     with pytest.raises(RecordingError, match='exists'):
-        McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+        McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
     assert not (tmp_path / 'elsewhere').exists()
 
 
 def test_a_missing_directory_is_named(tmp_path):
     with pytest.raises(RecordingError, match=f'no directory {tmp_path}/logs'):
-        McapRecorder.open(tmp_path / 'logs' / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+        McapRecorder(tmp_path / 'logs' / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
 
 
 def test_a_file_that_may_not_be_made_is_named(tmp_path, monkeypatch):
@@ -482,25 +485,25 @@ def test_a_file_that_may_not_be_made_is_named(tmp_path, monkeypatch):
 
     monkeypatch.setattr(mcap_writer, 'open', open_read_only, raising=False)
     with pytest.raises(RecordingError, match=r'run\.mcap: Permission denied$'):
-        McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+        McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
 
 
 def test_a_parent_that_is_a_file_is_named(tmp_path):
     (tmp_path / 'file').write_text('')
     with pytest.raises(RecordingError, match=r'run\.mcap: Not a directory'):
-        McapRecorder.open(tmp_path / 'file' / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+        McapRecorder(tmp_path / 'file' / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
 
 
 def test_too_little_space_at_the_start_leaves_no_file(tmp_path):
     with pytest.raises(RecordingError, match=r'run\.mcap: \d+ bytes are free .* 10{30}'):
-        McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=10 ** 30)
+        McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=10 ** 30)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_head_that_cannot_be_written_leaves_no_file(tmp_path, monkeypatch):
     monkeypatch.setattr(os, 'fsync', refuse_to_sync)
     with pytest.raises(RecordingError, match=r'run\.mcap: Input/output error'):
-        McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+        McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
     assert not list(tmp_path.iterdir())
 
 
@@ -513,13 +516,13 @@ def refuse_to_sync(descriptor):
     ('compression', 'zip'), ('min_free_bytes', -1)])
 def test_arguments_out_of_range_are_named(tmp_path, argument, value):
     with pytest.raises(ValueError, match=f'{argument} = {value!r}'):
-        McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, **{argument: value})
+        McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, **{argument: value})
     assert not list(tmp_path.iterdir())
 
 
 def test_topics_twice_are_refused(tmp_path):
     with pytest.raises(ValueError, match="'/top/pose' is listed twice"):
-        McapRecorder.open(tmp_path / 'run.mcap', [TOPICS[0], TOPICS[0]], {})
+        McapRecorder(tmp_path / 'run.mcap', [TOPICS[0], TOPICS[0]], {})
 
 
 # Running and ending
@@ -528,17 +531,16 @@ def test_what_is_written_reaches_the_disk_without_being_closed(tmp_path, monkeyp
     synced = []
     fsync = os.fsync
     monkeypatch.setattr(os, 'fsync', lambda fd: (fsync(fd), synced.append(fd)))
-    recorder = McapRecorder.open(
+    recorder = McapRecorder(
         tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02, min_free_bytes=0)
     before = len(synced)
     for message in some_messages(100):
         recorder.write(*message)
-    eventually(lambda: recorder.counters.flushes > 0 and recorder.counters.queued == 0)
+    eventually(lambda: recorder.counters.longest_flush > 0.0 and recorder.counters.queued == 0)
     assert recorder.state == 'recording'
     assert len(synced) > before
     assert len(complete_messages(tmp_path / 'run.mcap')) == 100
     assert recorder.counters.bytes == (tmp_path / 'run.mcap').stat().st_size
-    assert recorder.counters.longest_flush > 0.0
     recorder.close()
 
 
@@ -557,7 +559,7 @@ def test_a_file_and_its_name_are_on_the_disk_when_it_is_closed(tmp_path, monkeyp
 
 
 def test_a_torn_file_tells_its_topics_and_its_run(tmp_path):
-    recorder = McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+    recorder = McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
     with open(tmp_path / 'run.mcap', 'rb') as file:
         records = []
         with pytest.raises(McapError):
@@ -571,7 +573,7 @@ def test_a_torn_file_tells_its_topics_and_its_run(tmp_path):
 
 
 def test_closing_twice_changes_nothing(tmp_path):
-    recorder = McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+    recorder = McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
     recorder.write(0, 1, pose_cdr(1))
     first = recorder.close()
     content = first.path.read_bytes()
@@ -591,8 +593,9 @@ def test_messages_of_any_length_are_all_kept(tmp_path):
     """
     rng = random.Random(5)
     wanted = [[], [], []]
-    with McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=100.0,
-                           min_free_bytes=0) as recorder:
+    with closing(McapRecorder(
+            tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=100.0,
+            min_free_bytes=0)) as recorder:
         for time_ns in range(5000):
             topic = rng.randrange(3)
             size = (1000, rng.choice([12, 12, 12, 700]), time_ns % 7)[topic]
@@ -644,7 +647,7 @@ def test_a_full_queue_says_so_and_loses_nothing(tmp_path, monkeypatch):
 
     monkeypatch.setattr(McapWriter, 'append', append_slowly)
     monkeypatch.setattr(writer, 'QUEUE_BYTES', 10_000)
-    recorder = McapRecorder.open(
+    recorder = McapRecorder(
         tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.01, min_free_bytes=0)
     recorder.write(0, 0, pose_cdr(0))
     assert blocked.wait(PATIENCE_S)  # with the first message, out of the queue
@@ -667,7 +670,7 @@ def test_a_disk_that_hangs_does_not_hang_the_end(tmp_path, monkeypatch):
     write_chunk = McapWriter.write_chunk
     monkeypatch.setattr(
         McapWriter, 'write_chunk', lambda self: (disk_is_back.wait(PATIENCE_S), write_chunk(self)))
-    recorder = McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+    recorder = McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
     recorder.write(0, 1, pose_cdr(1))
     summary = recorder.close(timeout=0.05)
     assert 'could not be closed within 0.05 s' in (summary.error or '')
@@ -681,7 +684,7 @@ def test_a_disk_that_hangs_does_not_hang_the_end(tmp_path, monkeypatch):
     'pass', 'sys.exit(3)', 'raise KeyboardInterrupt', 'os.kill(os.getpid(), signal.SIGINT)'])
 def test_an_interpreter_that_ends_without_closing_leaves_a_whole_file(tmp_path, ending):
     child = start_child(f"""
-        recorder = McapRecorder.open(sys.argv[1], TOPICS, {{}}, min_free_bytes=0, max_loss=60.0)
+        recorder = McapRecorder(sys.argv[1], TOPICS, {{}}, min_free_bytes=0, max_loss=60.0)
         for number in range(100):
             recorder.write(0, number, bytes(8))
         {ending}
@@ -695,7 +698,7 @@ def test_an_interpreter_that_ends_without_closing_leaves_a_whole_file(tmp_path, 
 def test_what_is_handed_over_is_on_the_disk_within_max_loss(tmp_path, monkeypatch, fsync_s):
     """On a simulated clock, which waiting and a slow disk advance; messages come all the time."""
     max_loss, step_s = 1.0, 0.01
-    now, on_disk, waits = 0.0, 0, []
+    now, on_disk, flushes, waits = 0.0, 0, 0, []
     handed_over = []    # times
 
     class Event(threading.Event):
@@ -723,21 +726,22 @@ def test_what_is_handed_over_is_on_the_disk_within_max_loss(tmp_path, monkeypatc
             recorder._accepting = False
 
     def fsync(_):
-        nonlocal on_disk
+        nonlocal on_disk, flushes
         written = recorder.counters.messages
         advance(fsync_s)
         on_disk = written
+        flushes += 1
 
     monkeypatch.setattr(writer, 'time', SimpleNamespace(monotonic=lambda: now))
     monkeypatch.setattr(writer, 'threading', SimpleNamespace(
         Event=Event, Thread=Thread, TIMEOUT_MAX=threading.TIMEOUT_MAX))
-    recorder = McapRecorder.open(
+    recorder = McapRecorder(
         tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=max_loss, min_free_bytes=0)
     monkeypatch.setattr(os, 'fsync', fsync)
     recorder._run()
     summary = recorder.close()
     assert (summary.error, summary.lost) == (None, 0)
-    assert summary.flushes > 30
+    assert flushes > 30
     assert len(waits) > 1900 and 0.9 * max_loss / 2 < max(waits) <= max_loss
 
 
@@ -752,7 +756,8 @@ def slow_disk(monkeypatch):
 def test_recording_goes_on_while_the_disk_is_slow_and_says_what_may_be_lost(tmp_path, slow_disk):
     path = tmp_path / 'run.mcap'
     slow_disk.set()
-    with McapRecorder.open(path, TOPICS, METADATA, max_loss=0.05, min_free_bytes=0) as recorder:
+    with closing(McapRecorder(
+            path, TOPICS, METADATA, max_loss=0.05, min_free_bytes=0)) as recorder:
         assert (recorder.warning, recorder.possible_loss) == (None, 0.0)
         slow_disk.clear()
         for number in range(3):
@@ -771,7 +776,7 @@ def test_recording_goes_on_while_the_disk_is_slow_and_says_what_may_be_lost(tmp_
 
 def test_a_sync_that_hangs_does_not_hang_the_end(tmp_path, slow_disk):
     slow_disk.set()
-    recorder = McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02,
+    recorder = McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02,
                                  min_free_bytes=0)
     slow_disk.clear()
     recorder.write(0, 1, pose_cdr(1))
@@ -786,7 +791,7 @@ def test_a_sync_that_hangs_does_not_hang_the_end(tmp_path, slow_disk):
 def test_a_log_that_is_deleted_is_an_error(tmp_path, what, when):
     path = tmp_path / 'logs' / 'run.mcap'
     path.parent.mkdir()
-    recorder = McapRecorder.open(path, TOPICS, METADATA, min_free_bytes=0,
+    recorder = McapRecorder(path, TOPICS, METADATA, min_free_bytes=0,
                                  max_loss=0.02 if when == 'recording' else 60.0)
     recorder.write(0, 1, pose_cdr(1))
     path.unlink() if what == 'file' else shutil.rmtree(path.parent)
@@ -804,7 +809,7 @@ def test_a_kill_takes_nothing_that_was_in_the_file(tmp_path):
             folder = tmp_path / str(number)
             folder.mkdir()
             children.append(start_child("""
-                recorder = McapRecorder.open(
+                recorder = McapRecorder(
                     sys.argv[1] + '/run.mcap', TOPICS, {}, min_free_bytes=0, max_loss=0.2)
                 with open(sys.argv[1] + '/written', 'wb', buffering=0) as written:
                     for number in range(1_000_000):
@@ -866,7 +871,7 @@ def test_a_full_disk_stops_the_recording_and_leaves_an_indexed_file(tmp_path):
     """The torn chunk is cut off, and where it stood there is room for the summary."""
     child = start_child(FILL + """
     writer.QUEUE_BYTES = 4_000_000
-    recorder = McapRecorder.open(sys.argv[1], TOPICS, {}, min_free_bytes=0, max_loss=100.0)
+    recorder = McapRecorder(sys.argv[1], TOPICS, {}, min_free_bytes=0, max_loss=100.0)
     write(recorder, 2000)       # half full, so that chunks of 1 MB are made
     wait_until(lambda: recorder.counters.messages > 1000)
     limit(recorder.counters.bytes + 100_000)
@@ -890,7 +895,7 @@ def test_a_full_disk_stops_the_recording_and_leaves_an_indexed_file(tmp_path):
 
 def test_a_disk_that_fills_at_the_very_end_costs_only_the_index(tmp_path):
     child = start_child(FILL + """
-    recorder = McapRecorder.open(sys.argv[1], TOPICS, {}, min_free_bytes=0, max_loss=0.02)
+    recorder = McapRecorder(sys.argv[1], TOPICS, {}, min_free_bytes=0, max_loss=0.02)
     write(recorder, 300)
     wait_until(lambda: recorder.counters.queued == 0)
     limit(recorder.counters.bytes + 100)
@@ -912,7 +917,7 @@ def report(child: subprocess.Popen) -> dict:
 
 
 def test_a_failing_disk_stops_the_recording(tmp_path, monkeypatch):
-    recorder = McapRecorder.open(
+    recorder = McapRecorder(
         tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02, min_free_bytes=0)
     monkeypatch.setattr(os, 'fsync', refuse_to_sync)
     for message in some_messages(50):
@@ -928,7 +933,7 @@ def test_a_failing_disk_stops_the_recording(tmp_path, monkeypatch):
 
 
 def test_a_disk_that_runs_short_stops_the_recording_in_good_order(tmp_path, monkeypatch):
-    recorder = McapRecorder.open(
+    recorder = McapRecorder(
         tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02, min_free_bytes=1)
     monkeypatch.setattr(os, 'fstatvfs', lambda fd: SimpleNamespace(f_bavail=0, f_frsize=4096))
     recorder.write(0, 7, pose_cdr(7))
@@ -972,7 +977,7 @@ def test_an_interrupted_write_shifts_nothing(tmp_path, monkeypatch):
 
 
 def test_a_message_that_cannot_be_packed_is_no_exception_for_the_simulation(tmp_path):
-    recorder = McapRecorder.open(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+    recorder = McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
     recorder.write(0, -1, b'')
     summary = recorder.close()
     assert recorder.state == 'failed'
@@ -1007,7 +1012,7 @@ def test_chunks_are_made_in_memory_that_is_there(tmp_path, rows):
 
     def write():
         if rows:
-            file.put_plain_chunk(file.chunk_of_rows([(0, times, messages)]))
+            file.write_chunk(file.chunk_of_rows([(0, times, messages)]))
             return
         for time_ns in range(1000):
             file.append(0, time_ns, message)

@@ -16,9 +16,8 @@ from helpers.node_logs import events_in, log_of
 
 from spinning_top_sim.nodes.pacing import FairLock
 from spinning_top_sim.nodes.recording_session import RecordingSession
-from spinning_top_sim.recording import provenance
+from spinning_top_sim.recording import provenance, writer
 from spinning_top_sim.recording.errors import RecordingError
-from spinning_top_sim.recording.writer import McapRecorder
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.pipeline import Simulation
 
@@ -67,14 +66,14 @@ def test_a_name_with_a_slash_is_a_folder(tmp_path, uri):
 def slow_disk(monkeypatch):
     """Have a log opened no sooner than `go_on` is set; `opening` says that it is at it."""
     disk = SimpleNamespace(opening=threading.Event(), go_on=threading.Event())
-    ordinary = McapRecorder.open.__func__
+    ordinary = writer.McapRecorder
 
-    def opened(cls, *arguments, **options):
+    def opened(*arguments, **options):
         disk.opening.set()
         assert disk.go_on.wait(PATIENCE_S)
-        return ordinary(cls, *arguments, **options)
+        return ordinary(*arguments, **options)
 
-    monkeypatch.setattr(McapRecorder, 'open', classmethod(opened))
+    monkeypatch.setattr(writer, 'McapRecorder', opened)
     return disk
 
 

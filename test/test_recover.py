@@ -270,7 +270,7 @@ def test_zeros_behind_the_tear_are_no_records(tmp_path, log):
 def test_a_killed_recording_is_recovered(tmp_path):
     path, whole = tmp_path / 'run.mcap', tmp_path / 'whole.mcap'
     child = start_child("""
-        recorder = McapRecorder.open(
+        recorder = McapRecorder(
             sys.argv[1], TOPICS, {'seed': '5'}, min_free_bytes=0, max_loss=0.1)
         for number in range(1_000_000):
             recorder.write(0, number, struct.pack('<4sIIId', bytes(4), 0, 0, 1, 0.0))

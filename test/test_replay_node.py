@@ -305,7 +305,8 @@ def write_log(path, count, step_ns=2_000_000, padding=0, **options):
                  twist_cdr(n) if n % 2 else string_cdr(n, padding)) for n in range(count)]
     topics = [RecordedTopic('/ours/text', STRING),
               RecordedTopic('/ours/twist', TWIST, {'depth': 3, 'durability': 1})]
-    with McapRecorder.open(path, topics, {}, **{'min_free_bytes': 0} | options) as recorder:
+    with contextlib.closing(McapRecorder(
+            path, topics, {}, **{'min_free_bytes': 0} | options)) as recorder:
         for message in messages:
             recorder.write(*message)
     return [[data for index, _, data in messages if index == topic] for topic in (0, 1)]

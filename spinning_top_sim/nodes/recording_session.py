@@ -176,7 +176,7 @@ def _open_log(topics: Sequence[Topic], run: Run) -> McapRecorder:
         if not named:
             path = folder / f'{stem}{f"_{number}" if number > 1 else ""}.mcap'
         try:
-            return McapRecorder.open(
+            return McapRecorder(
                 path, recorded, metadata, max_loss=values['record.max_loss'],
                 compression=values['record.compression'],
                 min_free_bytes=values['record.min_free_bytes'])

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Self-contained MCAP logs: finding message definitions, writing with bounded loss.
+MCAP logs: what turns (topic, stamp, CDR bytes) into files and back.
 
-Here belongs what turns (topic, stamp, CDR bytes) into files and back.  What never does: rclpy, a
-clock of the simulation, the content of a message, physics.  mcap and its compressors are imported
-when a recording starts, not before.
+What never belongs here: rclpy, a clock of the simulation, the content of a message, physics.
+mcap and its compressors are imported when a recording starts, not before.
 """

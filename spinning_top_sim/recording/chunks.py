@@ -11,6 +11,7 @@ from __future__ import annotations
 import mmap
 import struct
 from array import array
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,9 @@ from mcap.opcode import Opcode
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+    # The next messages of a topic: its index, log times (n,) [ns], messages (n, size).
+    Rows = tuple[int, NDArray[np.integer], NDArray[np.uint8]]
 
 CHUNK_BYTES = 1 << 20   # uncompressed; a single larger message still makes a chunk of its own
 
@@ -35,7 +39,7 @@ Entries = Mapping[int, 'array[int]']
 MESSAGE = struct.Struct('<BQHIQQ')  # opcode, length, channel, sequence, log and publish time
 MESSAGE_FIELDS = 2 + 4 + 8 + 8      # what `length` counts besides the data
 _MESSAGE_DTYPE = [('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
-                  ('log_time', '<u8'), ('publish_time', '<u8')]
+                  ('log_time', '<u8'), ('publish_time', '<u8')]     # and the data
 _MESSAGE_OPCODE = int(Opcode.MESSAGE)   # is packed faster
 INDEX_HEAD = struct.Struct('<BQHI')     # opcode, length, channel, length of the entries
 ENTRY_SIZE = 8 + 8                      # of a message index
@@ -50,13 +54,14 @@ class PlainChunk:
     """
 
     def __init__(self) -> None:
-        self._memory = _new_memory(2 * CHUNK_BYTES)
         self.clear()
+        self._memory = memoryview(b'')
+        self._enlarge(2 * CHUNK_BYTES)
 
     def clear(self) -> None:
         """Remove all messages."""
         self.size = 0       # [bytes]
-        self.entries: dict[int, array[int]] = {}
+        self.entries: dict[int, array[int]] = defaultdict(lambda: array('Q'))
 
     @property
     def data(self) -> memoryview:
@@ -75,9 +80,7 @@ class PlainChunk:
             self._memory, offset, _MESSAGE_OPCODE, MESSAGE_FIELDS + len(data), channel_id,
             sequence & 0xFFFFFFFF, log_time_ns, publish_time_ns)
         self._memory[start:end] = data
-        entries = self.entries.get(channel_id)
-        if entries is None:
-            entries = self.entries[channel_id] = array('Q')
+        entries = self.entries[channel_id]
         entries.append(log_time_ns)
         entries.append(offset)
         self.size = end
@@ -93,24 +96,25 @@ class PlainChunk:
         """
         import numpy as np  # noqa: PLC0415 - recovery needs none
 
-        count, length = len(rows), MESSAGE.size + rows.shape[1]
-        offset, end = self.size, self.size + count * length
+        count, size = rows.shape
+        dtype = np.dtype([*_MESSAGE_DTYPE, ('data', 'u1', (size,))])
+        offset, end = self.size, self.size + count * dtype.itemsize
         if end > len(self._memory):
             self._enlarge(end)
-        records = np.frombuffer(self._memory[offset:end], 'u1').reshape(count, length)
-        heads = records[:, :MESSAGE.size].view(_MESSAGE_DTYPE)[:, 0]
-        heads['opcode'] = Opcode.MESSAGE
-        heads['length'] = MESSAGE_FIELDS + rows.shape[1]
-        heads['channel'] = channel_id
-        heads['sequence'] = sequence + np.arange(count) & 0xFFFFFFFF
-        heads['log_time'] = heads['publish_time'] = times_ns
-        records[:, MESSAGE.size:] = rows
-        entries = np.column_stack((times_ns, np.arange(offset, end, length))).astype('u8')
-        self.entries.setdefault(channel_id, array('Q')).frombytes(entries.tobytes())
+        messages = np.frombuffer(self._memory[offset:end], dtype)
+        messages['opcode'] = Opcode.MESSAGE
+        messages['length'] = MESSAGE_FIELDS + size
+        messages['channel'] = channel_id
+        messages['sequence'] = sequence + np.arange(count) & 0xFFFFFFFF
+        messages['log_time'] = messages['publish_time'] = times_ns
+        messages['data'] = rows
+        entries = np.column_stack((times_ns, np.arange(offset, end, dtype.itemsize))).astype('u8')
+        self.entries[channel_id].frombytes(entries.tobytes())
         self.size = end
 
     def _enlarge(self, size: int) -> None:
-        larger = _new_memory(size)
+        # Private: a process that forks would share it with its children.
+        larger = memoryview(mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS))
         larger[:self.size] = self.data
         self._memory = larger
 
@@ -145,8 +149,3 @@ def time_span(entries: Entries) -> tuple[int, int]:
     """Return the earliest and the latest stamp in the entries of a chunk; (0, 0) in none."""
     times = [numbers[::2] for numbers in entries.values()]
     return min(map(min, times), default=0), max(map(max, times), default=0)
-
-
-def _new_memory(size: int) -> memoryview:
-    # Private: a process that forks would share it with its children.
-    return memoryview(mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS))

@@ -8,6 +8,7 @@ that of rosbag2's LocalMessageDefinitionSource (rosbag2_cpp, jazzy), byte for by
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import json
 import os
@@ -19,7 +20,6 @@ from pathlib import Path
 
 from spinning_top_sim.recording.errors import DefinitionNotFoundError
 
-_SEPARATOR = '=' * 80
 # rosbag2's own expression: it takes the word before white space at the start of a line.
 _FIELD_TYPE = re.compile(r'(?:^|\n)\s*([a-zA-Z0-9_/]+)(?:\[[^\]]*\])?\s+', re.ASCII)
 _PRIMITIVES = frozenset({
@@ -31,7 +31,6 @@ _PRIMITIVES = frozenset({
 class MessageDefinition:
     """What a log says about one message type."""
 
-    type_name: str  # 'package/msg/Type'
     text: str       # its `ros2msg` schema: the definition followed by those it depends on
     type_hash: str  # 'RIHS01_' and 64 hexadecimal digits (REP-2011)
 
@@ -45,29 +44,23 @@ def find_definition(type_name: str) -> MessageDefinition:
     if not re.fullmatch(r'[a-zA-Z0-9_]+/msg/[a-zA-Z0-9_]+', type_name, re.ASCII):
         raise DefinitionNotFoundError(
             f'{type_name!r} is not the name of a message type: expected package/msg/Type')
-    return MessageDefinition(
-        type_name, _with_dependencies(type_name, seen=set()), _find_hash(type_name))
+    text = _with_dependencies(type_name, seen=set())
+    for entry in json.loads(_read(type_name, '.json'))['type_hashes']:
+        if entry['type_name'] == type_name:
+            return MessageDefinition(text, entry['hash_string'])
+    raise DefinitionNotFoundError(f'the description of {type_name} does not hold its type hash')
 
 
 def _with_dependencies(type_name: str, seen: set[str]) -> str:
     """Return a definition followed by those it needs: depth first, sorted, each only once."""
     package = type_name.partition('/')[0]
-    text = _read(type_name, '.msg')
-    whole = text
+    text = whole = _read(type_name, '.msg')
     names = set(_FIELD_TYPE.findall(text)) - _PRIMITIVES
     for name in sorted(name if '/' in name else f'{package}/{name}' for name in names):
         if name not in seen:
             seen.add(name)
-            whole += f'\n{_SEPARATOR}\nMSG: {name}\n{_with_dependencies(name, seen)}'
+            whole += f'\n{"=" * 80}\nMSG: {name}\n{_with_dependencies(name, seen)}'
     return whole
-
-
-def _find_hash(type_name: str) -> str:
-    """Return the type hash that the package's build computed."""
-    for entry in json.loads(_read(type_name, '.json'))['type_hashes']:
-        if entry['type_name'] == type_name:
-            return str(entry['hash_string'])
-    raise DefinitionNotFoundError(f'the description of {type_name} does not hold its type hash')
 
 
 def _read(type_name: str, suffix: str) -> str:
@@ -89,14 +82,10 @@ def _read(type_name: str, suffix: str) -> str:
 
 def _prefixes(package: str) -> Iterator[Path]:
     """Yield the installation prefixes that may hold a package, as ROS overlays them."""
-    for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
-        if prefix:
-            yield Path(prefix)
+    yield from map(Path, filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)))
     yield Path(sys.prefix)
-    try:
+    with contextlib.suppress(ValueError):   # of a module that tells no origin, such as __main__
         spec = importlib.util.find_spec(package)
-    except ValueError:
-        return
-    for location in (spec.submodule_search_locations or ()) if spec else ():
-        # <prefix>/lib/python3.x/site-packages/<package>, or below <prefix>/local on Debian
-        yield from Path(location).parents[3:5]
+        for location in (spec.submodule_search_locations or ()) if spec else ():
+            # <prefix>/lib/python3.x/site-packages/<package>, or below <prefix>/local on Debian
+            yield from Path(location).parents[3:5]

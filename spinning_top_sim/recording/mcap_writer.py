@@ -2,8 +2,7 @@
 """
 Writes MCAP files that end after a whole record at any time, whatever happens to the disk.
 
-mcap's own Writer buffers what it cannot write, then reports success, and cannot go back.  So the
-file is laid out here, from mcap's record classes.
+mcap's own Writer buffers what it cannot write, then reports success, and cannot go back.
 
 Layout: header, metadata of the run, schemas, channels | chunk, its message indexes | ... |
 `rosbag2` metadata, data end | summary, footer.
@@ -15,43 +14,17 @@ import contextlib
 import dataclasses
 import itertools
 import os
-import struct
 import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import (
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
 from mcap.writer import MCAP0_MAGIC
 
-from spinning_top_sim.recording.chunks import (
-    CHUNK_BYTES,
-    Entries,
-    PlainChunk,
-    compressor,
-    message_indexes,
-    time_span,
-)
+from spinning_top_sim.recording import chunks
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA, bag_metadata_yaml
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 
 class McapWriter:
@@ -61,25 +34,23 @@ class McapWriter:
     Every write goes to an explicit position behind the last whole record, so neither an OSError
     nor an interrupt can shift what follows.  After an OSError `finish` may still be tried.
 
-    header : the record
     compression : of chunks that are made here, 'zstd', 'lz4' or 'none'
     """
 
     def __init__(self, path: Path, *, header: bytes, compression: str) -> None:
         self._path = path
         self._compression = '' if compression == 'none' else compression
-        self._compress = compressor(compression)
-        self._chunk = PlainChunk()                  # of messages that come one by one
-        self._spare_chunks: list[PlainChunk] = []   # for rows
+        self._compress = chunks.compressor(compression)
+        self._chunk = chunks.PlainChunk()           # of messages that come one by one
+        self._spare_chunks: list[chunks.PlainChunk] = []    # for rows
 
         self.message_counts: dict[int, int] = {}    # messages in the file by channel id
         self.chunk_count = 0
-        self.synced_size = 0                        # bytes that are certainly on the disk
         self._start_ns = self._end_ns = 0           # earliest and latest stamp; 0 without messages
         self._end = 0, 0    # size and checksum of the file; one assignment, so always consistent
         self._next_sequence: dict[int, int] = {}
         self._type_names: dict[int, str] = {}       # by schema id
-        self._channels: dict[int, Channel] = {}
+        self._channels: dict[int, records.Channel] = {}
         # Records of the summary.  Serialized: thousands of objects would take memory.
         self._summary_records: dict[Opcode, list[bytes]] = {kind: [] for kind in (
             Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.CHUNK_INDEX,
@@ -94,11 +65,6 @@ class McapWriter:
         """Size of the file, all of it whole records [bytes]."""
         return self._end[0]
 
-    @property
-    def counts(self) -> list[int]:
-        """Messages in the file by channel, in the order in which the channels were written."""
-        return list(self.message_counts.values())
-
     @contextlib.contextmanager
     def discarded_on_failure(self) -> Iterator[None]:
         """Close and remove the file if the body of the `with` statement raises."""
@@ -110,7 +76,8 @@ class McapWriter:
                 self._path.unlink()
             raise
 
-    def write(self, record: Schema | Channel | Metadata, raw: bytes = b'') -> None:
+    def write(self, record: records.Schema | records.Channel | records.Metadata,
+              raw: bytes = b'') -> None:
         """
         Write a record, a schema before its channels; the summary repeats the first of each id.
 
@@ -119,82 +86,68 @@ class McapWriter:
         offset = self.size
         raw = raw or record_bytes(record)
         self._write([raw])
-        if isinstance(record, Metadata):
+        if isinstance(record, records.Metadata):
             self._summary_records[Opcode.METADATA_INDEX].append(
-                record_bytes(MetadataIndex(offset=offset, length=len(raw), name=record.name)))
-        elif isinstance(record, Schema) and record.id not in self._type_names:
+                record_bytes(records.MetadataIndex(offset, len(raw), record.name)))
+        elif isinstance(record, records.Schema) and record.id not in self._type_names:
             self._type_names[record.id] = record.name
             self._summary_records[Opcode.SCHEMA].append(raw)
-        elif isinstance(record, Channel) and record.id not in self._channels:
+        elif isinstance(record, records.Channel) and record.id not in self._channels:
             self._channels[record.id] = record
             self._summary_records[Opcode.CHANNEL].append(raw)
             self.message_counts[record.id] = self._next_sequence[record.id] = 0
 
-    def copy_record(self, blocks: Iterable[bytes], index: McapRecord | None = None) -> None:
+    def copy_record(self, blocks: Iterable[bytes], index: records.McapRecord | None) -> None:
         """Write an attachment, or a record of unknown kind, in blocks of any size."""
         offset = self.size
         self._write(blocks)
-        if isinstance(index, AttachmentIndex):
+        if isinstance(index, records.AttachmentIndex):
             self._summary_records[Opcode.ATTACHMENT_INDEX].append(
                 record_bytes(dataclasses.replace(index, offset=offset)))
 
-    def append(self, topic_index: int, log_time_ns: int, data: bytes) -> bool:
-        """Add the next message of channel `topic_index + 1`; return whether the chunk is full."""
-        return self.add_message(topic_index + 1, self._number(topic_index, 1), log_time_ns,
-                                log_time_ns, data)
+    def append(self, topic_index: int, log_time_ns: int, data: bytes) -> None:
+        """Add the next message of channel `topic_index + 1`, as `add_message` does."""
+        channel_id = topic_index + 1
+        sequence = self._next_sequence[channel_id]
+        self._next_sequence[channel_id] += 1
+        self.add_message(channel_id, sequence, log_time_ns, log_time_ns, data)
 
-    def add_message(
-        self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int,
-        data: bytes | bytearray | memoryview,
-    ) -> bool:
-        """Add a message to the chunk in memory; return whether the chunk is full."""
+    def add_message(self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int,
+                    data: bytes | bytearray | memoryview) -> None:
+        """Add a message to the chunk in memory; write the chunk when it is full."""
         self._chunk.add(channel_id, sequence, log_time_ns, publish_time_ns, data)
-        return self._chunk.size >= CHUNK_BYTES
+        if self._chunk.size >= chunks.CHUNK_BYTES:
+            self.write_chunk()
 
-    def chunk_of_rows(
-        self, blocks: Iterable[tuple[int, NDArray[np.integer], NDArray[np.uint8]]],
-    ) -> PlainChunk:
-        """
-        Make a chunk for `put_plain_chunk`, which another thread may be running.
-
-        blocks : topic index, log times of the next messages (n,) [ns], messages (n, size)
-        """
-        chunk = self._spare_chunks.pop() if self._spare_chunks else PlainChunk()
+    def chunk_of_rows(self, blocks: Iterable[chunks.Rows]) -> chunks.PlainChunk:
+        """Make a chunk for `write_chunk`, which another thread may be running."""
+        chunk = self._spare_chunks.pop() if self._spare_chunks else chunks.PlainChunk()
         for topic_index, times_ns, rows in blocks:
-            chunk.add_rows(topic_index + 1, self._number(topic_index, len(rows)), times_ns, rows)
+            channel_id = topic_index + 1
+            chunk.add_rows(channel_id, self._next_sequence[channel_id], times_ns, rows)
+            self._next_sequence[channel_id] += len(rows)
         return chunk
 
-    def _number(self, topic_index: int, count: int) -> int:
-        """Return the sequence number of the next of `count` messages of a topic."""
-        sequence = self._next_sequence[topic_index + 1]
-        self._next_sequence[topic_index + 1] = sequence + count
-        return sequence
+    def write_chunk(self, rows: chunks.PlainChunk | None = None) -> None:
+        """Compress and write a chunk of rows, or the one in memory if it holds anything."""
+        chunk = rows or self._chunk
+        if chunk.size:
+            start_ns, end_ns = chunks.time_span(chunk.entries)
+            self.copy_chunk(records.Chunk(
+                compression=self._compression, data=self._compress(chunk.data),
+                uncompressed_size=chunk.size, uncompressed_crc=zlib.crc32(chunk.data),
+                message_start_time=start_ns, message_end_time=end_ns), chunk.entries)
+            chunk.clear()
+        if rows:
+            self._spare_chunks.append(rows)
 
-    def put_plain_chunk(self, chunk: PlainChunk) -> None:
-        """Compress and write a chunk of rows."""
-        self._put(chunk)
-        self._spare_chunks.append(chunk)
-
-    def write_chunk(self) -> None:
-        """Compress and write the chunk in memory, if it holds anything."""
-        if self._chunk.size:
-            self._put(self._chunk)
-
-    def _put(self, chunk: PlainChunk) -> None:
-        start_ns, end_ns = time_span(chunk.entries)
-        self.copy_chunk(Chunk(
-            compression=self._compression, data=self._compress(chunk.data),
-            uncompressed_size=chunk.size, uncompressed_crc=zlib.crc32(chunk.data),
-            message_start_time=start_ns, message_end_time=end_ns), chunk.entries)
-        chunk.clear()
-
-    def copy_chunk(self, chunk: Chunk, entries: Entries, raw: bytes = b'') -> None:
+    def copy_chunk(self, chunk: records.Chunk, entries: chunks.Entries, raw: bytes = b'') -> None:
         """Write a compressed chunk and its message indexes; `raw` is as in `write`."""
         raw = raw or record_bytes(chunk)
-        indexes = message_indexes(entries)
+        indexes = chunks.message_indexes(entries)
         offsets = list(itertools.accumulate(
             map(len, indexes.values()), initial=self.size + len(raw)))
-        chunk_index = record_bytes(ChunkIndex(
+        chunk_index = record_bytes(records.ChunkIndex(
             chunk_start_offset=self.size, chunk_length=len(raw),
             message_index_offsets=dict(zip(indexes, offsets, strict=False)),
             message_index_length=offsets[-1] - offsets[0],
@@ -214,9 +167,7 @@ class McapWriter:
 
     def sync(self) -> None:
         """Wait until everything written is on the disk."""
-        size = self.size
         os.fsync(self._file.fileno())
-        self.synced_size = size
 
     def check_disk(self, min_free_bytes: int) -> None:
         """Raise OSError if the disk has too little left, or the file was deleted."""
@@ -242,11 +193,11 @@ class McapWriter:
                 topics = [(channel, self._type_names.get(channel.schema_id, ''),
                            self.message_counts[channel.id])
                           for channel in self._channels.values()]
-                self.write(Metadata(BAG_METADATA, {
+                self.write(records.Metadata(BAG_METADATA, {
                     'serialized_metadata': bag_metadata_yaml(
                         topics, file_name=file_name or self._path.name, start_ns=self._start_ns,
                         end_ns=self._end_ns, former=former_bag)}))
-            self._write([record_bytes(DataEnd(self._end[1]))])
+            self._write([record_bytes(records.DataEnd(self._end[1]))])
             self._write([self._summary()])
             self.sync()
             sync_directory(self._path.parent)
@@ -256,7 +207,7 @@ class McapWriter:
     def _summary(self) -> bytes:
         """Return the summary section, the footer and the closing magic."""
         groups = self._summary_records
-        groups[Opcode.STATISTICS] = [record_bytes(Statistics(
+        groups[Opcode.STATISTICS] = [record_bytes(records.Statistics(
             message_count=sum(self.message_counts.values()),
             schema_count=len(groups[Opcode.SCHEMA]), channel_count=len(groups[Opcode.CHANNEL]),
             attachment_count=len(groups[Opcode.ATTACHMENT_INDEX]),
@@ -265,19 +216,17 @@ class McapWriter:
             channel_message_counts=self.message_counts))]
         summary = bytearray()
         offsets = bytearray()
-        for opcode, records in groups.items():
-            group = b''.join(records)
+        for opcode, members in groups.items():
+            group = b''.join(members)
             if group:
-                offsets += record_bytes(SummaryOffset(
+                offsets += record_bytes(records.SummaryOffset(
                     group_opcode=opcode, group_start=self.size + len(summary),
                     group_length=len(group)))
                 summary += group
-        offsets_start = self.size + len(summary)
-        summary += offsets
+        footer = record_bytes(records.Footer(self.size, self.size + len(summary), 0))
         # The summary's checksum runs on into the footer, up to the checksum itself.
-        footer = record_bytes(Footer(self.size, offsets_start, 0))
-        summary += footer[:-4]
-        return bytes(summary) + struct.pack('<I', zlib.crc32(summary)) + MCAP0_MAGIC
+        summary += offsets + footer[:-4]
+        return bytes(summary) + zlib.crc32(summary).to_bytes(4, 'little') + MCAP0_MAGIC
 
     def _write(self, blocks: Iterable[bytes]) -> None:
         """Write whole records that come in blocks, or none of them."""
@@ -298,12 +247,11 @@ class McapWriter:
         self._end = offset, crc
 
 
-def record_bytes(record: McapRecord) -> bytes:
+def record_bytes(record: records.McapRecord) -> bytes:
     """Return a record as it stands in a file."""
     builder = RecordBuilder()
     record.write(builder)
-    written: bytes = builder.end()
-    return written
+    return builder.end()
 
 
 def sync_directory(directory: Path) -> None:

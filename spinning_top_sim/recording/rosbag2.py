@@ -23,8 +23,6 @@ Qos = Mapping[str, Any]
 
 BAG_METADATA = 'rosbag2'  # name of the metadata record
 
-_METADATA_VERSION = 9  # of rosbag2_storage::BagMetadata in jazzy
-_MAX_QOS_TEXT = 1 << 16
 _NEVER = {'sec': 9223372036, 'nsec': 854775807}  # RMW_DURATION_INFINITE
 
 # What a reliable publisher with a queue of ten offers, rmw's enum values.
@@ -58,11 +56,7 @@ class RecordedTopic(NamedTuple):
 
 
 def offered_qos_yaml(topic: RecordedTopic) -> str:
-    """
-    Return the `offered_qos_profiles` of a channel: a list of one profile, policies as integers.
-
-    Names would do for jazzy; integers are what older releases read, and jazzy too.
-    """
+    """Return the `offered_qos_profiles` of a channel, in integers as older releases read too."""
     return _dump([{**DEFAULT_QOS, **topic.qos}])
 
 
@@ -74,7 +68,7 @@ def qos_profiles(channel: Channel) -> tuple[Qos, ...]:
     profiles has none.
     """
     text = channel.metadata.get('offered_qos_profiles', '')
-    if len(text) > _MAX_QOS_TEXT or '<<' in text:   # merged keys may grow exponentially
+    if len(text) > 1 << 16 or '<<' in text:     # merged keys may grow exponentially
         return ()
     try:
         profiles = yaml.safe_load(text)
@@ -114,7 +108,6 @@ def bag_metadata_yaml(
     Return the `serialized_metadata` of the `rosbag2` record.
 
     topics : channels with their type and the number of their messages, in the order of the file
-    start_ns, end_ns : the earliest and the latest stamp; both 0 in an empty log
     former : the metadata of the log that this one is made from; its ROS distribution and custom
         data stay, as they are
     """
@@ -125,7 +118,7 @@ def bag_metadata_yaml(
     total = sum(messages for _, _, messages in topics)
     return '\n'.join((
         _dump({
-            'version': _METADATA_VERSION,
+            'version': 9,   # of rosbag2_storage::BagMetadata in jazzy
             'storage_identifier': 'mcap',
             'duration': duration,
             'starting_time': start,
@@ -167,6 +160,5 @@ class _Dumper(yaml.SafeDumper):
 
 
 def _dump(value: object) -> str:
-    text: str = yaml.dump(value, Dumper=_Dumper, sort_keys=False, allow_unicode=True,
-                          width=float('inf'))
-    return text.rstrip('\n')
+    return yaml.dump(value, Dumper=_Dumper, sort_keys=False, allow_unicode=True,
+                     width=float('inf')).rstrip('\n')

@@ -89,7 +89,7 @@ def _recover(
         if scanner.found_late:
             raise _FoundLateError
         copy.put_rest()
-        messages = sum(writer.counts)
+        messages = sum(writer.message_counts.values())
         if not messages and not reader.whole:
             raise LogError(f'nothing to save in {reader.path}: there is no whole message in it')
         os.chmod(draft, reader.source.mode)
@@ -139,10 +139,9 @@ class _Copy:
             self._writer.copy_chunk(scanned.record, contents.entries, scanned.raw)
             return
         for message in contents.messages():
-            if self._writer.add_message(
-                    message.channel_id, message.sequence, message.log_time,
-                    message.publish_time, contents.plain[message.start:message.end]):
-                self._writer.write_chunk()
+            self._writer.add_message(
+                message.channel_id, message.sequence, message.log_time, message.publish_time,
+                contents.plain[message.start:message.end])
 
     def _declare(self, record: Schema | Channel, raw: bytes = b'') -> None:
         """Write a schema or channel outside of chunks, once, a schema before its channels."""

@@ -18,7 +18,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Self
+from typing import Literal
 
 from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import RecordingError
@@ -39,9 +39,9 @@ OUR_LIBRARY = 'spinning_top_sim '   # what the header of our files begins with
 QUEUE_BYTES = 32_000_000            # where a recording has no more room, see `McapRecorder.room`
 
 _ENTRY_BYTES = 128  # what a queued message costs besides its data, about
-_CLOSE_AT_EXIT_S = 10.0
 
-# Messages of one stamp: topic indices, log time [ns], CDR of each, size of all [bytes].
+# Messages of one stamp: the topic of each, an index of the recorder's `topics`; log time [ns]; CDR
+# of each; size of all [bytes].
 Messages = tuple[Sequence[int], int, Sequence[bytes], int]
 
 
@@ -54,8 +54,7 @@ class RecordingSummary:
     counts: dict[str, int]  # messages in it by topic name
     queued: int             # messages accepted, not yet in the file
     lost: int               # handed over after the recording stopped, or when it failed
-    flushes: int            # how often the file was brought to the disk
-    longest_flush: float    # [s]
+    longest_flush: float    # that brought the file to the disk [s]
     error: str | None       # why the recording stopped early
     indexed: bool           # whether the file has its summary; ordinary readers refuse it without
 
@@ -67,20 +66,30 @@ class RecordingSummary:
 
 class McapRecorder:
     """
-    A running recording.  `open` starts one, `close` ends it; also a context manager.
+    A running recording into a new file, until `close`.
 
     Trouble with the disk never reaches the caller: the recording stops, `state` becomes 'failed'
     and `error` says why, naming the path.  What was written up to then stays readable.
     """
 
-    def __init__(self, path: Path, topics: Sequence[RecordedTopic], file: McapWriter,
-                 max_loss: float, min_free_bytes: int) -> None:
-        """For `open`, which checks the arguments."""
-        self.path = path
+    def __init__(
+        self, path: str | os.PathLike[str], topics: Sequence[RecordedTopic],
+        metadata: Mapping[str, str], *, max_loss: float = 0.5, compression: str = 'zstd',
+        min_free_bytes: int = 100_000_000,
+    ) -> None:
+        """
+        Create the file and start recording; raises as `create_file`.
+
+        max_loss : most wall time whose messages a SIGKILL or a power loss may take [s], > 0
+        """
+        if not 0.0 < max_loss <= threading.TIMEOUT_MAX:
+            raise ValueError(f'max_loss = {max_loss!r} s: must be > 0 and finite')
+        self.path = Path(path)
+        self._file = create_file(self.path, topics, metadata, compression=compression,
+                                 min_free_bytes=min_free_bytes)
         self.state: Literal['recording', 'closed', 'failed'] = 'recording'
         self.error: str | None = None
         self._names = [topic.name for topic in topics]
-        self._file = file
         self._max_loss = max_loss
         self._min_free_bytes = min_free_bytes
 
@@ -90,7 +99,6 @@ class McapRecorder:
         self._offered = 0              # messages handed over, ever
         self._accepting = True
         self._indexed = False
-        self._flushes = 0
         self._longest_flush = 0.0
         self._on_disk = time.monotonic(), 0     # what came by this time; bytes out of the queue
         self._sync_error: Exception | None = None
@@ -101,33 +109,14 @@ class McapRecorder:
         # exit handler runs before daemons are stopped and closes the file properly.
         self._thread = threading.Thread(target=self._run, name='recorder', daemon=True)
         self._thread.start()
-        atexit.register(self.close, _CLOSE_AT_EXIT_S)
-
-    @classmethod
-    def open(
-        cls, path: str | os.PathLike[str], topics: Sequence[RecordedTopic],
-        metadata: Mapping[str, str], *, max_loss: float = 0.5, compression: str = 'zstd',
-        min_free_bytes: int = 100_000_000,
-    ) -> Self:
-        """
-        Create a file and start recording into it; raises as `create_file`.
-
-        max_loss : most wall time whose messages a SIGKILL or a power loss may take [s], > 0
-        """
-        path = Path(path)
-        if not 0.0 < max_loss <= threading.TIMEOUT_MAX:
-            raise ValueError(f'max_loss = {max_loss!r} s: must be > 0 and finite')
-        file = create_file(path, topics, metadata, compression=compression,
-                           min_free_bytes=min_free_bytes)
-        return cls(path, topics, file, max_loss, min_free_bytes)
+        atexit.register(self.close)
 
     @property
     def room(self) -> bool:
         """
         Whether the queue has room, or the recording has stopped.
 
-        Where it has none, hold the simulation's clock instead of dropping anything; a burst that
-        began with room may be written to its end.
+        Where it has none, hold the simulation's clock; a burst that began with room may go on.
         """
         return self._bytes_in - self._bytes_out < QUEUE_BYTES
 
@@ -151,13 +140,12 @@ class McapRecorder:
     def counters(self) -> RecordingSummary:
         """Where the recording stands now."""
         running = self.state == 'recording'     # read first: nothing is written after it
-        counts = dict(zip(self._names, self._file.counts, strict=True))
+        counts = dict(zip(self._names, self._file.message_counts.values(), strict=True))
         missing = self._offered - sum(counts.values())
         return RecordingSummary(
             path=self.path, bytes=self._file.size, counts=counts,
             queued=missing if running else 0, lost=0 if running else missing,
-            flushes=self._flushes, longest_flush=self._longest_flush, error=self.error,
-            indexed=self._indexed)
+            longest_flush=self._longest_flush, error=self.error, indexed=self._indexed)
 
     def write(self, topic_index: int, log_time_ns: int, data: bytes) -> None:
         """Hand over one message; see `write_all`."""
@@ -166,13 +154,10 @@ class McapRecorder:
     def write_all(self, topic_indices: Sequence[int], log_time_ns: int,
                   messages: Sequence[bytes], size: int) -> None:
         """
-        Hand over messages (CDR) of one stamp, from one thread at a time; they keep their order.
+        Hand over `Messages`, from one thread at a time; they keep their order.
 
         Never waits for the disk, never raises for its sake.  After the recording stopped the
         messages are only counted, as lost.
-
-        topic_indices : the topic of each, an index of the `topics` of `open`
-        size : of all messages [bytes]
         """
         self._offered += len(messages)
         if self._accepting:
@@ -204,12 +189,6 @@ class McapRecorder:
             late = f'{self.path} could not be closed within {timeout:g} s'
             return replace(self.counters, error=self.error or late)
         return self.counters
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _run(self) -> None:
         """Record until closed or something fails; in the recorder's own thread."""
@@ -259,12 +238,12 @@ class McapRecorder:
         if self._syncing is not None and self._syncing.is_alive():
             return
         written = now, self._bytes_out
-        if self._file.size == self._file.synced_size:
+        if self._bytes_out == self._on_disk[1]:
             self._on_disk = written
-            return
-        self._syncing = threading.Thread(
-            target=self._sync, args=(written,), name='recorder sync', daemon=True)
-        self._syncing.start()
+        else:
+            self._syncing = threading.Thread(
+                target=self._sync, args=(written,), name='recorder sync', daemon=True)
+            self._syncing.start()
 
     def _sync(self, written: tuple[float, int]) -> None:
         start = time.monotonic()
@@ -273,18 +252,16 @@ class McapRecorder:
         except Exception as error:
             self._sync_error = error
             self._wake.set()
-            return
-        self._on_disk = written
-        self._flushes += 1
-        self._longest_flush = max(self._longest_flush, time.monotonic() - start)
+        else:
+            self._on_disk = written
+            self._longest_flush = max(self._longest_flush, time.monotonic() - start)
 
     def _write_queued(self) -> None:
-        """Take what is in the queue now and put it into chunks; write those that are full."""
+        """Take what is in the queue now and put it into chunks."""
         for _ in range(len(self._queue)):
             topic_indices, log_time_ns, messages, size = self._queue.popleft()
             for topic_index, data in zip(topic_indices, messages, strict=True):
-                if self._file.append(topic_index, log_time_ns, data):
-                    self._file.write_chunk()
+                self._file.append(topic_index, log_time_ns, data)
             self._bytes_out += size + _ENTRY_BYTES * len(messages)
         if self.room:
             self._taken.set()
@@ -293,9 +270,8 @@ class McapRecorder:
 def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[str, str], *,
                 compression: str, min_free_bytes: int = 0) -> McapWriter:
     """
-    Create a log and bring its head to the disk.
+    Create a log, which must not exist, and bring its head to the disk.
 
-    path : the file, which must not exist
     topics : all stand before the first chunk, so that a truncated file tells them in any case
     metadata : the `spinning_top_sim` record at the head of the file
     compression : one of COMPRESSIONS
@@ -319,15 +295,13 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
         with file.discarded_on_failure():
             file.check_disk(min_free_bytes)
             file.write(Metadata(METADATA_NAME, dict(metadata)))
-            schema_ids = {}
             for number, (name, definition) in enumerate(definitions.items(), start=1):
-                schema_ids[name] = number
                 file.write(Schema(
                     id=number, name=name, encoding='ros2msg', data=definition.text.encode()))
             for number, topic in enumerate(topics, start=1):
                 file.write(Channel(
                     id=number, topic=topic.name, message_encoding='cdr',
-                    schema_id=schema_ids[topic.type_name],
+                    schema_id=1 + list(definitions).index(topic.type_name),
                     metadata={'offered_qos_profiles': offered_qos_yaml(topic),
                               'topic_type_hash': definitions[topic.type_name].type_hash}))
             file.sync()

@@ -169,7 +169,7 @@ def write_log(path: Path, values: Mapping[str, Any], stops: Sequence[Stop],
                     'command', t_ns, simulation.now_ns, l3=l3, lz=lz))
                 writer.write(commands_topic, epoch_ns + t_ns, journal.command(l3, lz))
             show(target_ns / NANOSECONDS)
-    return f'{sum(file.counts)} messages, {file.size / 1e6:.1f} MB'
+    return f'{sum(file.message_counts.values())} messages, {file.size / 1e6:.1f} MB'
 
 
 class _LogWriter:
@@ -185,8 +185,7 @@ class _LogWriter:
     def write(self, topic_index: int, stamp_ns: int, data: bytes) -> None:
         """Write an entry of the journal with the next chunk."""
         self._chunk.result()
-        if self._file.append(topic_index, stamp_ns, data):
-            self._file.write_chunk()
+        self._file.append(topic_index, stamp_ns, data)
 
     def take(self, stream: Stream, stamps_ns: NDArray[np.int64],
              rows: NDArray[np.uint8]) -> None:
@@ -200,7 +199,7 @@ class _LogWriter:
             chunk = self._file.chunk_of_rows(blocks)
             self._chunk.result()
             self._file.write_chunk()
-            self._chunk = self._executor.submit(self._file.put_plain_chunk, chunk)
+            self._chunk = self._executor.submit(self._file.write_chunk, chunk)
 
     def close(self) -> None:
         """Finish the file."""
