@@ -8,6 +8,7 @@ Memory holds the chunks that overlap in time: one in a log that was written in o
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import heapq
 import os
@@ -28,10 +29,10 @@ from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.records import (
     HEAD,
     MAX_BYTES,
+    MAX_DECLARED,
     ChunkContents,
     DamagedError,
     break_up,
-    check_declared,
     open_chunk,
 )
 from spinning_top_sim.recording.rosbag2 import Qos, qos_profiles
@@ -76,15 +77,15 @@ class LogMessage(NamedTuple):
 
 
 class _Span(NamedTuple):
-    """A chunk, or adjacent messages outside of chunks, in the order of the log times."""
+    """A chunk, or adjacent messages outside of chunks."""
 
-    start_ns: int
     offset: int
     end: int        # offset
-    end_ns: int
+    start_ns: int   # the earliest log time
+    end_ns: int     # the latest
 
 
-# Where the messages are, and the metadata records by name.
+# Where the messages are, in file order, and the metadata records by name.
 _Index = tuple[list[_Span], dict[str, dict[str, str]]]
 
 
@@ -159,7 +160,7 @@ class LogReader:
         """
         spans, _ = self._index
         dated = [span for span in spans if span.end_ns]
-        if dated and dated[0].start_ns > _FIRST_DATE:
+        if min((span.start_ns for span in dated), default=0) > _FIRST_DATE:
             spans = dated
         return (min((span.start_ns for span in spans), default=0),
                 max((span.end_ns for span in spans), default=0))
@@ -179,24 +180,10 @@ class LogReader:
         channels = {number: channel.topic for number, channel in self._summary.channels.items()
                     if (names is None or channel.topic in names) and self._summary.knows(number)}
         times = range(start or 0, 1 << 64 if end is None else end)
-        overlapping: list[_Span] = []
-        overlap_end = 0
-        for span in spans:
-            if span.end_ns < times.start or span.start_ns >= times.stop:
-                continue
-            if span.start_ns > overlap_end:
-                yield from self._merge(overlapping, channels, times)
-                overlapping = []
-            overlapping.append(span)
-            overlap_end = max(overlap_end, span.end_ns)
-        yield from self._merge(overlapping, channels, times)
-
-    def _merge(self, spans: Iterable[_Span], channels: Mapping[int, str], times: range,
-               ) -> Iterator[LogMessage]:
-        """Yield messages of spans in order; a span is read when its time comes."""
-        spans = sorted(spans, key=attrgetter('offset'))
         self._held_bytes = 0
-        streams = [self._stream(span, channels) for span in spans]
+        # A span is read when its time comes.
+        streams = [self._stream(span, channels) for span in spans
+                   if span.end_ns >= times.start and span.start_ns < times.stop]
         for message in heapq.merge(*streams, key=attrgetter('log_time')):
             if message.channel_id >= 0 and message.log_time in times:
                 yield message
@@ -213,9 +200,10 @@ class LogReader:
                            f'time, and these have more than {2 * self.source.max_bytes} bytes')
         for channel_id in contents.entries.keys() - channels:
             del contents.entries[channel_id]
-        for channel_id, sequence, log_time, publish_time, begin, end in contents.sorted_messages():
-            yield LogMessage(channels[channel_id], log_time, publish_time, sequence,
-                             bytes(plain[begin:end]), channel_id)
+        for message in contents.messages(by_time=True):
+            yield LogMessage(
+                channels[message.channel_id], message.log_time, message.publish_time,
+                message.sequence, bytes(plain[message.start:message.end]), message.channel_id)
         self._held_bytes -= held_bytes
 
     def scan(self) -> Scanner:
@@ -231,18 +219,15 @@ class LogReader:
         metadata = {}
         metadata_bytes = 0
         for index in self._summary.metadata:
-            try:
-                metadata_bytes += index.length
-                check_declared(metadata_bytes)
-                record = self.source.record(index.offset, self._summary.data_limit)
-            except DamagedError:
-                continue
-            if isinstance(record, Metadata):
+            record = self.source.record(index.offset, self._summary.data_limit, Metadata)
+            metadata_bytes += index.length
+            if record is not None and metadata_bytes <= MAX_DECLARED:
                 metadata[record.name] = record.metadata
-        spans = [_Span(chunk.message_start_time, offset, offset + chunk.chunk_length,
-                       chunk.message_end_time) for offset, chunk in self._summary.chunks.items()
+        spans = [_Span(offset, offset + chunk.chunk_length, chunk.message_start_time,
+                       chunk.message_end_time)
+                 for offset, chunk in sorted(self._summary.chunks.items())
                  if indexed_messages(chunk)]
-        return sorted(spans), metadata
+        return spans, metadata
 
     def _leads_to_chunk(self, offset: int) -> bool:
         """Return whether the chunk there is the one that the summary tells of."""
@@ -270,26 +255,19 @@ class LogReader:
         if magic != MCAP0_MAGIC and MCAP0_MAGIC.startswith(magic):
             raise LogError(
                 f'cannot read {self.path}: it ends after {self.size} bytes of an MCAP file')
-        try:
-            header = self.source.record(MAGIC_SIZE, self.size)
-        except DamagedError:
-            header = None
-        if isinstance(header, Header):
-            return header
-        if magic != MCAP0_MAGIC:
+        header = self.source.record(MAGIC_SIZE, self.size, Header)
+        if header is None and magic != MCAP0_MAGIC:
             raise LogError(f'cannot read {self.path}: it is no MCAP file')
-        return Header(profile='ros2', library='')
+        return header or Header(profile='ros2', library='')
 
     def _read(self, span: _Span) -> ChunkContents:
         """Return the messages of a span; none if it is damaged."""
-        try:
+        with contextlib.suppress(DamagedError):
             if self.source.read(span.offset, 1) == bytes([Opcode.MESSAGE]):
                 return break_up(self.source.read(span.offset, span.end - span.offset))
-            chunk = self.source.record(span.offset, span.end)
-            if isinstance(chunk, Chunk):
+            chunk = self.source.record(span.offset, span.end, Chunk)
+            if chunk is not None:
                 return open_chunk(chunk, self.source.max_bytes)
-        except DamagedError:
-            pass
         self.left_out += 1
         return ChunkContents(b'')
 
@@ -310,6 +288,6 @@ def _scan_all(scanner: Scanner) -> _Index:
             run = spans.pop()
             offset = run.offset
             start_ns, end_ns = min(run.start_ns, start_ns), max(run.end_ns, end_ns)
-        spans.append(_Span(start_ns, offset, scanned.end, end_ns))
+        spans.append(_Span(offset, scanned.end, start_ns, end_ns))
         run_end = scanned.end if scanned.record is None else 0
-    return sorted(spans), metadata
+    return spans, metadata

@@ -63,7 +63,7 @@ class RecordFinder:
             elif opcode == Opcode.MESSAGE_INDEX:
                 parse_message_index(self._source.raw(offset, end))
             else:
-                self._source.record(offset, end)
+                parse(self._source.raw(offset, end))
         except TooLargeError:
             return opcode == Opcode.CHUNK
         except DamagedError:

@@ -82,7 +82,7 @@ def _recover(
               else record_bytes(Header(reader.profile, reader.library)))
     writer = McapWriter(draft, header=header, compression=_COMPRESSION)
     with writer.discarded_on_failure():
-        copy = _Copy(scanner, writer)
+        copy = _Copy(reader, scanner, writer)
         for scanned in filter(None, itertools.chain([first], records)):
             copy.put(scanned)
             progress(scanned.offset, reader.size)
@@ -103,7 +103,8 @@ def _recover(
 class _Copy:
     """Writes scanned records into a new file, as they are or as they should be."""
 
-    def __init__(self, scanner: Scanner, writer: McapWriter) -> None:
+    def __init__(self, reader: LogReader, scanner: Scanner, writer: McapWriter) -> None:
+        self._reader = reader
         self._scanner = scanner
         self._writer = writer
         self._declared: set[tuple[type, int]] = set()
@@ -121,7 +122,8 @@ class _Copy:
         elif isinstance(record, Metadata):
             self._writer.write(record, scanned.raw)
         elif isinstance(record, AttachmentIndex) or scanned.opcode > Opcode.DATA_END:
-            self._writer.copy_record(self._scanner.blocks(scanned), record)
+            self._writer.copy_record(
+                self._reader.source.blocks(scanned.offset, scanned.end), record)
 
     def put_rest(self) -> None:
         """Write what is left: messages, and channels that only the summary tells."""

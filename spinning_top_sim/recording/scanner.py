@@ -5,9 +5,7 @@ Scans an MCAP file sequentially and skips damaged records.
 - A damaged record whose length leads to another record is skipped alone.  Elsewhere the scan goes
   on at the next record that the summary indexes, or that `RecordFinder` finds.
 - Schemas and channels of a summary with a right checksum go before those in the data section.
-- The checksum of the data section is taken over the records as they should be, where something
-  else tells that (magic, schemas, channels, message indexes, times of chunks).  If it is right
-  then, nothing was lost.
+- The checksum of the data section tells whether a file without any other damage is whole.
 - Records of unknown kinds are no damage: they belong to applications or to later versions of the
   format (MCAP specification, "Records").
 """
@@ -15,12 +13,12 @@ Scans an MCAP file sequentially and skips damaged records.
 from __future__ import annotations
 
 import bisect
+import contextlib
 import struct
-import zlib
 from array import array
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 from mcap.opcode import Opcode
@@ -61,11 +59,10 @@ class ScannedRecord:
     opcode: int             # above DATA_END: of an application, or of a later version of MCAP
     offset: int             # in the file
     end: int
-    # As it should be.  The index of an attachment; None for single messages, message indexes and
-    # unknown kinds.
+    # A schema or channel as the file has it elsewhere.  The index of an attachment; None for
+    # single messages, message indexes and unknown kinds.
     record: McapRecord | None = None
-    # The record as it should be, with its head and its extra fields; only what fits into memory.
-    raw: bytes = b''
+    raw: bytes = b''    # with head and extra fields; b'' for attachments and unknown kinds
     # Messages of known channels, of a chunk or a single one.
     contents: ChunkContents | None = None
 
@@ -99,7 +96,6 @@ class Scanner:
         self._metadata_bytes = 0
         self._losses: list[Loss] = []
         self._defects: list[str] = []
-        self._crc = zlib.crc32(MCAP0_MAGIC)     # over the records as they should be
         self._span: tuple[int, int] | None = None       # of the log times of whole messages
         # Messages by channel: whole ones, of damaged chunks, missing by the sequence numbers.
         self._found: Counter[int] = Counter()
@@ -129,21 +125,12 @@ class Scanner:
                 in_summary and scanned.opcode in (Opcode.SCHEMA, Opcode.CHANNEL))
             if in_summary:
                 continue
-            for block in self.blocks(scanned):
-                self._crc = zlib.crc32(block, self._crc)
             if scanned.contents is not None:
                 if scanned.opcode == Opcode.CHUNK:
                     offset = self._check_indexes(offset, scanned.contents.entries)
                 self._count(scanned.offset, scanned.contents)
             yield scanned
         self._check_end(offset)
-
-    def blocks(self, scanned: ScannedRecord) -> Iterator[bytes]:
-        """Yield a record as it should be, in blocks."""
-        if scanned.raw:
-            yield scanned.raw
-        else:
-            yield from self._source.blocks(scanned.offset, scanned.end)
 
     @property
     def found_late(self) -> bool:
@@ -203,7 +190,7 @@ class Scanner:
                 or (opcode in _SUMMARY_KINDS and (self._has_limit or extra))):
             raise DamagedError('it has no place there')
         if isinstance(record, Chunk):
-            return self._scan_chunk(ScannedRecord(opcode, offset, end, record, raw), record)
+            return ScannedRecord(opcode, offset, end, record, raw, self._open(offset, record))
         if isinstance(record, Metadata):
             self._metadata_bytes += len(raw)
             check_declared(self._metadata_bytes)
@@ -218,19 +205,16 @@ class Scanner:
         if extra and (self._ours or not self._finder.is_record(end)):
             raise DamagedError('its length is not that of its content')
 
-    def _scan_chunk(self, scanned: ScannedRecord, chunk: Chunk) -> ScannedRecord:
+    def _open(self, offset: int, chunk: Chunk) -> ChunkContents:
         contents = open_chunk(chunk, self._source.max_bytes)
-        declared = [self._declare(scanned.offset, record) for record in contents.declared]
+        declared = [self._declare(offset, record) for record in contents.declared]
         contents.right = declared == contents.declared and all(
             self._summary.knows(record.id) for record in declared if isinstance(record, Channel))
-        times = time_span(contents.entries)
-        if contents.entries and times != (chunk.message_start_time, chunk.message_end_time):
-            self._defects.append(f'the chunk at byte {scanned.offset} has wrong times in its head')
-            chunk = replace(chunk, message_start_time=times[0], message_end_time=times[1])
-            raw = scanned.raw[:HEAD.size] + _TIMES.pack(*times) + scanned.raw[
-                HEAD.size + _TIMES.size:]
-            scanned = replace(scanned, record=chunk, raw=raw)
-        return replace(scanned, contents=contents)
+        if contents.entries and time_span(contents.entries) != (
+                chunk.message_start_time, chunk.message_end_time):
+            self._defects.append(f'the chunk at byte {offset} has wrong times in its head')
+            contents.right = False
+        return contents
 
     def _scan_message(self, offset: int, raw: bytes) -> ScannedRecord:
         contents = break_up(raw)
@@ -294,53 +278,36 @@ class Scanner:
     def _check_indexes(self, offset: int, entries: Entries) -> int:
         """Compare the message indexes behind a chunk with it, and return where they end."""
         expected = message_indexes(entries)
-        for raw, channel_id, found in self._indexes(offset):
+        for begin, end, channel_id, found in self._indexes(offset):
             # The entries may be in any order, and a channel without messages may have an index.
-            if found and raw != expected.get(channel_id) and (
-                    sorted(found) != sorted(entries.get(channel_id, ()))):
-                if self._damaged_indexes_end(offset, expected):
-                    break
-                self._defects.append(f'the message index at byte {offset} is wrong')
-            self._crc = zlib.crc32(raw, self._crc)
+            wanted = entries.get(channel_id, array('Q'))
+            if found and found != wanted and sorted(found) != sorted(wanted):
+                self._defects.append(f'the message index at byte {begin} is wrong')
             expected.pop(channel_id, None)
-            offset += len(raw)
-        end = self._damaged_indexes_end(offset, expected)
-        if not end:
+            offset = end
+        # What is left of those expected is damaged, or was not written.
+        kind = self._source.read(offset, 1)
+        if not expected or (kind != _INDEX_KIND and self._finder.is_record(offset) and not any(
+                self._source.read(offset + 1, len(raw) - 1) == raw[1:]  # but for its kind
+                for raw in expected.values())):
+            return offset
+        end = offset + sum(map(len, expected.values()))
+        if end > self._limit and kind == _INDEX_KIND and not self._summary.closed:
+            end = self._limit
+        elif not self._finder.is_record(end):
             return offset
         self._defects.append(f'the message index at byte {offset} is wrong')
-        for raw in expected.values():
-            self._crc = zlib.crc32(raw, self._crc)
         return end
 
-    def _indexes(self, offset: int) -> Iterator[tuple[bytes, int, array[int]]]:
-        """Yield the message indexes that follow one another there: record, channel, entries."""
-        try:
-            while True:
-                opcode, end = self._source.head(offset, self._next_place(offset))
-                if opcode != Opcode.MESSAGE_INDEX:
-                    return
-                raw = self._source.raw(offset, end)
-                channel_id, entries, extra = parse_message_index(raw)
+    def _indexes(self, offset: int) -> Iterator[tuple[int, int, int, array[int]]]:
+        """Yield the message indexes that follow one another: begin, end, channel, entries."""
+        with contextlib.suppress(DamagedError):
+            while self._source.read(offset, 1) == _INDEX_KIND:
+                _, end = self._source.head(offset, self._next_place(offset))
+                channel_id, entries, extra = parse_message_index(self._source.raw(offset, end))
                 self._check_extra(extra, end)
-                yield raw, channel_id, entries
+                yield offset, end, channel_id, entries
                 offset = end
-        except DamagedError:
-            return
-
-    def _damaged_indexes_end(self, offset: int, expected: Mapping[int, bytes]) -> int:
-        """Return where the indexes that are expected there end, 0 if something else is there."""
-        if not expected:
-            return 0
-        kind = self._source.read(offset, 1)
-        if kind != _INDEX_KIND and self._finder.is_record(offset) and not any(
-                self._source.read(offset + 1, len(raw) - 1) == raw[1:]  # but for its kind
-                for raw in expected.values()):
-            return 0
-        end = offset + sum(map(len, expected.values()))
-        if end > self._limit and not self._summary.closed:
-            # Truncated within an index, which tells nothing of its own.
-            return self._limit if kind == _INDEX_KIND else 0
-        return end if self._finder.is_record(end) else 0
 
     # Damage
 
@@ -356,8 +323,8 @@ class Scanner:
                 loss = self._lose(offset, end, opcode, damage)
                 if loss.what == name_of(Opcode.CHUNK):
                     # Its indexes tell what it held.
-                    for raw, channel_id, entries in self._indexes(end):
-                        end += len(raw)
+                    for _, index_end, channel_id, entries in self._indexes(end):
+                        end = index_end
                         loss.messages = (loss.messages or 0) + len(entries) // 2
                         self._in_lost_chunks[channel_id] += len(entries) // 2
                 return end
@@ -401,20 +368,14 @@ class Scanner:
 
     def _check_end(self, offset: int) -> None:
         """Look at what ends the data section."""
+        end = self._source.record(offset, self._limit, DataEnd)
+        if end is not None and not self._losses and not self._defects and (
+                end.data_section_crc not in (0, self._source.crc(0, offset))):
+            self._losses.append(Loss(0, 0, 'something besides the messages',
+                                     'the checksum of the data section is wrong'))
         if self._summary.problem:
             self._defects.append(self._summary.problem)
-        try:
-            end = self._source.record(offset, self._limit)
-        except DamagedError:
-            end = None
-        if isinstance(end, DataEnd):
-            # A writer may have been wrong: its checksum is that of what it wrote.
-            if not self._losses and end.data_section_crc not in (0, self._crc) and (
-                    end.data_section_crc != self._source.crc(0, offset)):
-                self._losses.append(Loss(
-                    0, 0, 'something besides the messages',
-                    'the checksum of the data section is wrong'))
-        elif self._summary.closed:
+        if self._summary.closed and end is None:
             self._defects.append('the end of the data section is damaged')
         statistics = self._summary.statistics
         if statistics is not None and not self._losses and not self._unknown and (

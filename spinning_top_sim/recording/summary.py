@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -40,8 +40,9 @@ from spinning_top_sim.recording.records import (
 
 MAGIC_SIZE = len(MCAP0_MAGIC)
 
+_Record = TypeVar('_Record', bound=McapRecord)
 _FOOTER_SIZE = HEAD.size + 8 + 8 + 4
-_BLOCK = 1 << 20  # bytes read at a time where a record is not needed whole
+_BLOCK = 1 << 16  # bytes read at a time where a record is not needed whole
 _ATTACHMENT_HEAD = 1 << 16  # bytes; more than any name and media type
 
 
@@ -113,10 +114,14 @@ class McapSource:
         check_size(end - offset - HEAD.size, self.max_bytes)
         return self.read(offset, end - offset)
 
-    def record(self, offset: int, limit: int) -> McapRecord:
-        """Return the record there, of a kind that `parse` takes."""
-        _, end = self.head(offset, limit)
-        return parse(self.raw(offset, end))[0]
+    def record(self, offset: int, limit: int, kind: type[_Record]) -> _Record | None:
+        """Return the record there if it is whole and of that class, else None."""
+        with contextlib.suppress(DamagedError):
+            _, end = self.head(offset, limit)
+            record, _ = parse(self.raw(offset, end))
+            if isinstance(record, kind):
+                return record
+        return None
 
     def attachment(self, offset: int, end: int) -> tuple[AttachmentIndex, int]:
         """Return the index of the attachment there, and the offset of its checksum."""
@@ -200,11 +205,8 @@ def read_summary(source: McapSource) -> Summary:
     footer_offset = magic_offset - _FOOTER_SIZE
     if footer_offset < MAGIC_SIZE or source.read(magic_offset, MAGIC_SIZE) != MCAP0_MAGIC:
         return Summary(source.size, problem='the file does not end as an MCAP file ends')
-    try:
-        footer = source.record(footer_offset, magic_offset)
-    except DamagedError:
-        footer = None
-    if not isinstance(footer, Footer):
+    footer = source.record(footer_offset, magic_offset, Footer)
+    if footer is None:
         return Summary(source.size, problem='the footer is damaged')
     start, size = footer.summary_start, source.size - footer.summary_start
     if start == 0:
