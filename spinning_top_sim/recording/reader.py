@@ -89,9 +89,9 @@ class _Span(NamedTuple):
 _Index = tuple[list[_Span], dict[str, dict[str, str]]]
 
 
-class LogReader:
+class LogReader(contextlib.AbstractContextManager['LogReader']):
     """
-    An MCAP file, open for reading; also a context manager.
+    An MCAP file, open for reading.
 
     max_bytes : largest record, and largest uncompressed chunk, that is read into memory
 
@@ -114,11 +114,7 @@ class LogReader:
         self.profile, self.library = header.profile, header.library
 
     def close(self) -> None:
-        """Close the file."""
         self.source.close()
-
-    def __enter__(self) -> LogReader:
-        return self
 
     def __exit__(self, *exception: object) -> None:
         self.close()
@@ -192,8 +188,7 @@ class LogReader:
         """Yield what stands for the time at which a span begins, then its messages in order."""
         yield LogMessage('', span.start_ns, 0, 0, b'', -1)
         contents = self._read(span)
-        plain = contents.plain
-        held_bytes = len(plain) + _STREAM_BYTES
+        held_bytes = len(contents.plain) + _STREAM_BYTES
         self._held_bytes += held_bytes
         if self._held_bytes > 2 * self.source.max_bytes:
             raise LogError(f'cannot read {self.path}: the messages of several chunks overlap in '
@@ -203,7 +198,7 @@ class LogReader:
         for message in contents.messages(by_time=True):
             yield LogMessage(
                 channels[message.channel_id], message.log_time, message.publish_time,
-                message.sequence, bytes(plain[message.start:message.end]), message.channel_id)
+                message.sequence, message.data, message.channel_id)
         self._held_bytes -= held_bytes
 
     def scan(self) -> Scanner:
@@ -240,11 +235,11 @@ class LogReader:
     @functools.cached_property
     def _survey(self) -> tuple[_Index, Damage]:
         """What a scan of the whole file found, done at the first use."""
-        scanner = self.scan()
-        index = _scan_all(scanner)
-        if scanner.found_late:
+        for _ in range(2):
             scanner = self.scan()
             index = _scan_all(scanner)
+            if not scanner.found_late:
+                break
         return index, scanner.damage()
 
     def _read_header(self) -> Header:
@@ -273,7 +268,6 @@ class LogReader:
 
 
 def _scan_all(scanner: Scanner) -> _Index:
-    """Return what is found in a scan."""
     spans: list[_Span] = []
     metadata = {}
     run_end = 0     # of adjacent messages outside of chunks, the last span

@@ -16,7 +16,7 @@ from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 import lz4.frame  # type: ignore[import-untyped]
 import mcap.records
@@ -24,7 +24,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, McapRecord, Schema
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 
 from spinning_top_sim.recording.chunks import ENTRY_SIZE, INDEX_HEAD, MESSAGE, MESSAGE_FIELDS
 from spinning_top_sim.recording.mcap_writer import record_bytes
@@ -49,17 +49,6 @@ class TooLargeError(DamagedError):
     """A record may be right but is larger than what is read into memory."""
 
 
-class StoredMessage(NamedTuple):
-    """A message, with the place of its data in the bytes that hold it; times in ns."""
-
-    channel_id: int
-    sequence: int
-    log_time: int
-    publish_time: int
-    start: int
-    end: int
-
-
 @dataclass
 class ChunkContents:
     """
@@ -73,16 +62,19 @@ class ChunkContents:
     declared: list[Schema | Channel] = field(default_factory=list)
     right: bool = True      # may be copied as a whole
 
-    def messages(self, *, by_time: bool = False) -> Iterator[StoredMessage]:
+    def messages(self, *, by_time: bool = False) -> Iterator[Message]:
         """Yield the messages in file order, or by log time and equal ones in file order."""
+        plain = memoryview(self.plain)
         places = sorted(by_time * time << 64 | offset for numbers in self.entries.values()
                         for time, offset in zip(numbers[::2], numbers[1::2], strict=True))
         for place in places:
             offset = place & (1 << 64) - 1
             _, length, channel_id, sequence, log_time, publish_time = MESSAGE.unpack_from(
-                self.plain, offset)
-            yield StoredMessage(channel_id, sequence, log_time, publish_time,
-                                offset + MESSAGE.size, offset + HEAD.size + length)
+                plain, offset)
+            yield Message(
+                channel_id=channel_id, sequence=sequence, log_time=log_time,
+                publish_time=publish_time,
+                data=plain[offset + MESSAGE.size:offset + HEAD.size + length].tobytes())
 
 
 class StrictStream(ReadDataStream):

@@ -143,7 +143,7 @@ class _Copy:
         for message in contents.messages():
             if self._writer.add_message(
                     message.channel_id, message.sequence, message.log_time,
-                    message.publish_time, contents.plain[message.start:message.end]):
+                    message.publish_time, message.data):
                 self._writer.write_chunk()
 
     def _declare(self, record: Schema | Channel, raw: bytes = b'') -> None:

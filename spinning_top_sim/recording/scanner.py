@@ -87,8 +87,8 @@ class Scanner:
         for offset, opcode, length in summary.places:
             # Where neither kind nor length is right, the index is wrong and not the record.
             head = source.read(offset, HEAD.size)
-            if head[:1] == bytes([opcode]) or head[1:] == HEAD.pack(
-                    opcode, (length - HEAD.size) % (1 << 64))[1:]:
+            right = HEAD.pack(opcode, (length - HEAD.size) % (1 << 64))
+            if head[:1] == right[:1] or head[1:] == right[1:]:
                 self._places[offset] = opcode
         self._place_offsets = sorted(self._places)
         self._finder = RecordFinder(source, self._limit)
@@ -96,7 +96,7 @@ class Scanner:
         self._metadata_bytes = 0
         self._losses: list[Loss] = []
         self._defects: list[str] = []
-        self._span: tuple[int, int] | None = None       # of the log times of whole messages
+        self._start_ns, self._end_ns = 1 << 64, 0       # log times of whole messages
         # Messages by channel: whole ones, of damaged chunks, missing by the sequence numbers.
         self._found: Counter[int] = Counter()
         self._in_lost_chunks: Counter[int] = Counter()
@@ -153,9 +153,9 @@ class Scanner:
         missing: Counter[str] = Counter()
         for number, messages in sorted((+lost).items()):
             missing[self.channels[number].topic if self._summary.knows(number) else ''] += messages
-        start_ns, end_ns = self._span or (0, 0)
         return Damage(not self._summary.closed, tuple(losses), tuple(self._defects),
-                      dict(missing), statistics is not None, start_ns, end_ns)
+                      dict(missing), statistics is not None,
+                      self._start_ns if self._found else 0, self._end_ns)
 
     # Reading records: raises DamagedError
 
@@ -256,7 +256,7 @@ class Scanner:
                 loss = self._unknown.setdefault(number, Loss(
                     offset, 0, f'messages of channel {number}',
                     'the record of their channel or schema is lost', messages=0))
-                loss.bytes += message.end - message.start
+                loss.bytes += len(message.data)
                 loss.messages = (loss.messages or 0) + 1
             elif self._ours:
                 gap = (message.sequence - self._next_sequence.get(number, 0)) & 0xFFFFFFFF
@@ -269,9 +269,9 @@ class Scanner:
         for number, entries in contents.entries.items():
             self._found[number] += len(entries) // 2
         if contents.entries:
-            first, last = time_span(contents.entries)
-            begin, end = self._span or (first, last)
-            self._span = min(begin, first), max(end, last)
+            start_ns, end_ns = time_span(contents.entries)
+            self._start_ns = min(self._start_ns, start_ns)
+            self._end_ns = max(self._end_ns, end_ns)
 
     # Message indexes
 
@@ -314,11 +314,8 @@ class Scanner:
     def _skip(self, offset: int, damage: DamagedError) -> int:
         """Note what is damaged, and return where the scan goes on."""
         opcode = self._source.read(offset, 1)[0]
-        try:
+        with contextlib.suppress(DamagedError):
             _, end = self._source.head(offset, self._next_place(offset))
-        except DamagedError:
-            pass
-        else:
             if self._finder.is_record(end):
                 loss = self._lose(offset, end, opcode, damage)
                 if loss.what == name_of(Opcode.CHUNK):
@@ -328,10 +325,8 @@ class Scanner:
                         loss.messages = (loss.messages or 0) + len(entries) // 2
                         self._in_lost_chunks[channel_id] += len(entries) // 2
                 return end
-        if self._summary.indexes_all_chunks:
-            end = self._next_place(offset)
-        else:
-            end = self._finder.find(offset + 1)
+        end = (self._next_place(offset) if self._summary.indexes_all_chunks
+               else self._finder.find(offset + 1))
         if end == self._limit and not self._summary.closed:
             if self._is_redundant(offset, opcode):
                 return end

@@ -67,7 +67,6 @@ class McapSource:
         self.mode = stat.S_IMODE(status.st_mode)    # permission bits
 
     def close(self) -> None:
-        """Close the file."""
         self._file.close()
 
     @contextlib.contextmanager
@@ -75,8 +74,7 @@ class McapSource:
         try:
             yield
         except OSError as error:
-            raise LogError(
-                f'cannot read {self._path}: {error.strerror or error}') from error
+            raise LogError(f'cannot read {self._path}: {error.strerror or error}') from error
 
     def read(self, offset: int, length: int) -> bytes:
         """Return the bytes there, fewer where the file ends."""
