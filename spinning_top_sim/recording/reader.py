@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Chunk, Header, Metadata, Schema
+from mcap.records import Chunk, ChunkIndex, Header, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording.chunks import time_span
@@ -45,7 +45,6 @@ from spinning_top_sim.recording.summary import (
 )
 from spinning_top_sim.recording.writer import OUR_LIBRARY
 
-_CHUNK_HEAD = struct.Struct('<BQQQ')    # opcode, length, earliest and latest log time
 _FIRST_DATE = 10 ** 17       # [ns], in 1973
 _STREAM_BYTES = 1 << 12     # that an open chunk costs besides its content, about
 _RUN_BYTES = 1 << 20  # of messages outside of chunks that are read at a time
@@ -66,11 +65,11 @@ class LogTopic:
 
 
 class LogMessage(NamedTuple):
-    """A message of a log; times in ns."""
+    """A message of a log."""
 
     topic: str
-    log_time: int
-    publish_time: int
+    log_time: int           # [ns]
+    publish_time: int       # [ns]
     sequence: int
     data: bytes
     channel_id: int
@@ -128,14 +127,14 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     def topics(self) -> tuple[LogTopic, ...]:
         """The channels of the log, in the order of their ids."""
         self._index     # noqa: B018 - makes the channels known
-        schemas = {0: Schema(id=0, data=b'', encoding='', name=''), **self._summary.schemas}
+        no_schema = Schema(id=0, data=b'', encoding='', name='')
         return tuple(LogTopic(
             name=channel.topic, type_name=schema.name,
             schema=schema.data.decode(errors='replace'), schema_encoding=schema.encoding,
             encoding=channel.message_encoding, qos=qos_profiles(channel),
             metadata=channel.metadata, channel_id=number)
             for number, channel in sorted(self._summary.channels.items())
-            for schema in [schemas.get(channel.schema_id, schemas[0])])
+            for schema in [self._summary.schemas.get(channel.schema_id, no_schema)])
 
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
@@ -209,7 +208,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     def _index(self) -> _Index:
         """What the summary indexes, if that is all and right, else what a scan found."""
         if not (self._summary.is_complete
-                and all(map(self._leads_to_chunk, self._summary.chunks))):
+                and all(map(self._leads_to_chunk, self._summary.chunks.values()))):
             return self._survey[0]
         metadata = {}
         metadata_bytes = 0
@@ -224,13 +223,12 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                  if indexed_messages(chunk)]
         return spans, metadata
 
-    def _leads_to_chunk(self, offset: int) -> bool:
+    def _leads_to_chunk(self, index: ChunkIndex) -> bool:
         """Return whether the chunk there is the one that the summary tells of."""
-        index = self._summary.chunks[offset]
-        head = _CHUNK_HEAD.pack(
-            Opcode.CHUNK, (index.chunk_length - HEAD.size) % (1 << 64),
+        head = struct.pack(
+            '<BQQQ', Opcode.CHUNK, (index.chunk_length - HEAD.size) % (1 << 64),
             index.message_start_time, index.message_end_time)
-        return self.source.read(offset, len(head)) == head
+        return self.source.read(index.chunk_start_offset, len(head)) == head
 
     @functools.cached_property
     def _survey(self) -> tuple[_Index, Damage]:

@@ -78,12 +78,7 @@ class ChunkContents:
 
 
 class StrictStream(ReadDataStream):
-    """The content of a record; reading beyond its end raises EndOfFile."""
-
-    def __init__(self, raw: bytes) -> None:
-        stream = BytesIO(raw)
-        stream.seek(HEAD.size)
-        super().__init__(stream)
+    """Reading beyond the end raises EndOfFile."""
 
     def read(self, length: int) -> bytes:
         data: bytes = super().read(min(length, sys.maxsize))
@@ -123,8 +118,9 @@ def parse(raw: bytes) -> tuple[McapRecord, int]:
         raise DamagedError('there is no such kind of record')
     if record_class is not Chunk:
         check_declared(len(raw))
-    stream = StrictStream(raw)
+    stream = StrictStream(BytesIO(raw))
     try:
+        stream.read(HEAD.size)
         record: McapRecord = record_class.read(stream)  # type: ignore[attr-defined]
     except McapError:
         raise DamagedError('a length inside of it leads beyond its end') from None
@@ -134,7 +130,7 @@ def parse(raw: bytes) -> tuple[McapRecord, int]:
     if not isinstance(record, Chunk) and not raw.startswith(
             record_bytes(record)[HEAD.size:], HEAD.size):
         raise DamagedError('its length is not that of its content')
-    return record, len(raw) - HEAD.size - stream.count
+    return record, len(raw) - stream.count
 
 
 def parse_message_index(raw: bytes) -> tuple[int, array[int], int]:

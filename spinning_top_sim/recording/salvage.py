@@ -22,8 +22,6 @@ from spinning_top_sim.recording.records import ChunkContents
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA
 from spinning_top_sim.recording.scanner import ScannedRecord, Scanner
 
-_COMPRESSION = 'zstd'  # of messages that were in no chunk
-
 
 @dataclass(frozen=True)
 class Recovered:
@@ -46,8 +44,8 @@ def recover(
     output : appears when it is complete and on the disk, never before
     progress : told how many bytes of how many are done
 
-    Chunks and records of unknown kinds are copied as they are, messages outside of chunks are put
-    into some; message indexes, statistics, summary and the `rosbag2` record are made anew.
+    Right chunks and records of unknown kinds are copied as they are, other messages are put into
+    new chunks; message indexes, statistics, summary and the `rosbag2` record are made anew.
     Raises LogError, also if a file that was not closed holds no whole message.
     """
     output = Path(output)
@@ -80,9 +78,9 @@ def _recover(
     first = next(records, None)
     header = (first.raw if first is not None and isinstance(first.record, Header)
               else record_bytes(Header(reader.profile, reader.library)))
-    writer = McapWriter(draft, header=header, compression=_COMPRESSION)
+    writer = McapWriter(draft, header=header, compression='zstd')
     with writer.discarded_on_failure():
-        copy = _Copy(reader, scanner, writer)
+        copy = _Copy(scanner, writer)
         for scanned in filter(None, itertools.chain([first], records)):
             copy.put(scanned)
             progress(scanned.offset, reader.size)
@@ -103,15 +101,13 @@ def _recover(
 class _Copy:
     """Writes scanned records into a new file, as they are or as they should be."""
 
-    def __init__(self, reader: LogReader, scanner: Scanner, writer: McapWriter) -> None:
-        self._reader = reader
+    def __init__(self, scanner: Scanner, writer: McapWriter) -> None:
         self._scanner = scanner
         self._writer = writer
         self._declared: set[tuple[type, int]] = set()
         self.former_bag = ''  # the `rosbag2` record of the log
 
     def put(self, scanned: ScannedRecord) -> None:
-        """Write a record."""
         record = scanned.record
         if scanned.contents is not None:
             self._put_messages(scanned, scanned.contents)
@@ -123,7 +119,7 @@ class _Copy:
             self._writer.write(record, scanned.raw)
         elif isinstance(record, AttachmentIndex) or scanned.opcode > Opcode.DATA_END:
             self._writer.copy_record(
-                self._reader.source.blocks(scanned.offset, scanned.end), record)
+                self._scanner.source.blocks(scanned.offset, scanned.end), record)
 
     def put_rest(self) -> None:
         """Write what is left: messages, and channels that only the summary tells."""

@@ -45,7 +45,6 @@ from spinning_top_sim.recording.resync import RecordFinder
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA
 from spinning_top_sim.recording.summary import MAGIC_SIZE, McapSource, Summary
 
-_DATA_END_SIZE = HEAD.size + 4
 _TIMES = struct.Struct('<QQ')       # of a chunk, behind its head
 _SUMMARY_KINDS = (Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.METADATA_INDEX,
                   Opcode.ATTACHMENT_INDEX, Opcode.SUMMARY_OFFSET, Opcode.FOOTER)
@@ -76,7 +75,7 @@ class Scanner:
     """
 
     def __init__(self, source: McapSource, summary: Summary, *, ours: bool) -> None:
-        self._source = source
+        self.source = source
         self._summary = summary
         self._ours = ours
         self.schemas, self.channels = summary.schemas, summary.channels     # by id, known so far
@@ -105,12 +104,12 @@ class Scanner:
         self._unknown: dict[int, Loss] = {}             # messages by unknown channel
 
     def __iter__(self) -> Iterator[ScannedRecord]:
-        if self._source.read(0, MAGIC_SIZE) != MCAP0_MAGIC:
+        if self.source.read(0, MAGIC_SIZE) != MCAP0_MAGIC:
             self._defects.append('the first eight bytes are not those of an MCAP file')
         offset = MAGIC_SIZE
         in_summary = False      # whose beginning nothing told
-        # The last bytes before a summary can only be the end record.
-        while offset < self._limit - (_DATA_END_SIZE if self._has_limit else 0):
+        # The last bytes before a summary can only be the end record with its checksum.
+        while offset < self._limit - (HEAD.size + 4 if self._has_limit else 0):
             try:
                 scanned = self._scan(offset)
             except DamagedError as damage:
@@ -161,17 +160,17 @@ class Scanner:
 
     def _scan(self, offset: int) -> ScannedRecord | None:
         """Return the record there with all of its messages, None where the data section ends."""
-        opcode, end = self._source.head(offset, self._limit)
+        opcode, end = self.source.head(offset, self._limit)
         if self._places.get(offset, opcode) != opcode or end > self._next_place(offset):
             raise DamagedError('the summary tells of another record there')
-        check_size(end - offset - HEAD.size, self._source.max_bytes)
+        check_size(end - offset - HEAD.size, self.source.max_bytes)
         if opcode == Opcode.ATTACHMENT:
             return self._scan_attachment(offset, end)
         if opcode > Opcode.DATA_END:
             if self._ours:
                 raise DamagedError('there is no such kind of record')
             return ScannedRecord(opcode, offset, end)
-        raw = self._source.raw(offset, end)
+        raw = self.source.raw(offset, end)
         if opcode == Opcode.MESSAGE:
             return self._scan_message(offset, raw)
         if opcode == Opcode.MESSAGE_INDEX:
@@ -206,7 +205,7 @@ class Scanner:
             raise DamagedError('its length is not that of its content')
 
     def _open(self, offset: int, chunk: Chunk) -> ChunkContents:
-        contents = open_chunk(chunk, self._source.max_bytes)
+        contents = open_chunk(chunk, self.source.max_bytes)
         declared = [self._declare(offset, record) for record in contents.declared]
         contents.right = declared == contents.declared and all(
             self._summary.knows(record.id) for record in declared if isinstance(record, Channel))
@@ -222,15 +221,15 @@ class Scanner:
             raise DamagedError('all messages of the file are in chunks')
         end = offset + len(raw)
         # Nothing in a message proves its length but the record that follows, perhaps truncated.
-        if end < self._limit and not 0 < self._source.read(end, 1)[0] <= Opcode.DATA_END:
-            self._source.head(end, self._limit)
+        if end < self._limit and not 0 < self.source.read(end, 1)[0] <= Opcode.DATA_END:
+            self.source.head(end, self._limit)
         return ScannedRecord(Opcode.MESSAGE, offset, end, raw=raw, contents=contents)
 
     def _scan_attachment(self, offset: int, end: int) -> ScannedRecord:
-        index, crc_offset = self._source.attachment(offset, end)
+        index, crc_offset = self.source.attachment(offset, end)
         self._check_extra(end - crc_offset - 4, end)
-        crc = int.from_bytes(self._source.read(crc_offset, 4), 'little')
-        if crc not in (0, self._source.crc(offset + HEAD.size, crc_offset)):
+        crc = int.from_bytes(self.source.read(crc_offset, 4), 'little')
+        if crc not in (0, self.source.crc(offset + HEAD.size, crc_offset)):
             raise DamagedError('its checksum is wrong')
         return ScannedRecord(Opcode.ATTACHMENT, offset, end, index)
 
@@ -242,9 +241,8 @@ class Scanner:
             check_declared(self._summary.declared_bytes)
         right: Schema | Channel = known.setdefault(record.id, record)
         if right != record:
-            self._defects.append(
-                f'the {type(record).__name__.lower()} {record.id} at byte {offset} is not what '
-                'the file says elsewhere')
+            self._defects.append(f'the {type(record).__name__.lower()} {record.id} at byte '
+                                 f'{offset} is not what the file says elsewhere')
         return right
 
     def _count(self, offset: int, contents: ChunkContents) -> None:
@@ -286,9 +284,9 @@ class Scanner:
             expected.pop(channel_id, None)
             offset = end
         # What is left of those expected is damaged, or was not written.
-        kind = self._source.read(offset, 1)
+        kind = self.source.read(offset, 1)
         if not expected or (kind != _INDEX_KIND and self._finder.is_record(offset) and not any(
-                self._source.read(offset + 1, len(raw) - 1) == raw[1:]  # but for its kind
+                self.source.read(offset + 1, len(raw) - 1) == raw[1:]  # but for its kind
                 for raw in expected.values())):
             return offset
         end = offset + sum(map(len, expected.values()))
@@ -302,9 +300,9 @@ class Scanner:
     def _indexes(self, offset: int) -> Iterator[tuple[int, int, int, array[int]]]:
         """Yield the message indexes that follow one another: begin, end, channel, entries."""
         with contextlib.suppress(DamagedError):
-            while self._source.read(offset, 1) == _INDEX_KIND:
-                _, end = self._source.head(offset, self._next_place(offset))
-                channel_id, entries, extra = parse_message_index(self._source.raw(offset, end))
+            while self.source.read(offset, 1) == _INDEX_KIND:
+                _, end = self.source.head(offset, self._next_place(offset))
+                channel_id, entries, extra = parse_message_index(self.source.raw(offset, end))
                 self._check_extra(extra, end)
                 yield offset, end, channel_id, entries
                 offset = end
@@ -313,9 +311,9 @@ class Scanner:
 
     def _skip(self, offset: int, damage: DamagedError) -> int:
         """Note what is damaged, and return where the scan goes on."""
-        opcode = self._source.read(offset, 1)[0]
+        opcode = self.source.read(offset, 1)[0]
         with contextlib.suppress(DamagedError):
-            _, end = self._source.head(offset, self._next_place(offset))
+            _, end = self.source.head(offset, self._next_place(offset))
             if self._finder.is_record(end):
                 loss = self._lose(offset, end, opcode, damage)
                 if loss.what == name_of(Opcode.CHUNK):
@@ -343,7 +341,7 @@ class Scanner:
         if index is not None:
             loss.start_ns, loss.end_ns = index.message_start_time, index.message_end_time
         elif opcode == Opcode.CHUNK:
-            times = self._source.read(offset + HEAD.size, _TIMES.size)
+            times = self.source.read(offset + HEAD.size, _TIMES.size)
             start_ns, end_ns = _TIMES.unpack(times) if len(times) == _TIMES.size else (0, 0)
             if 0 < start_ns <= end_ns:
                 loss.start_ns, loss.end_ns = start_ns, end_ns
@@ -353,7 +351,7 @@ class Scanner:
         """Return whether a truncated record tells nothing of its own."""
         if opcode == Opcode.METADATA:
             name = record_bytes(Metadata(BAG_METADATA, {}))[HEAD.size:-4]
-            return name.startswith(self._source.read(offset + HEAD.size, len(name)))
+            return name.startswith(self.source.read(offset + HEAD.size, len(name)))
         return opcode == Opcode.DATA_END or opcode in _SUMMARY_KINDS
 
     def _next_place(self, offset: int) -> int:
@@ -362,10 +360,10 @@ class Scanner:
         return self._place_offsets[i] if i < len(self._place_offsets) else self._limit
 
     def _check_end(self, offset: int) -> None:
-        """Look at what ends the data section."""
-        end = self._source.record(offset, self._limit, DataEnd)
+        """Look at what ends the data section, and for what no record shows to be lost."""
+        end = self.source.record(offset, self._limit, DataEnd)
         if end is not None and not self._losses and not self._defects and (
-                end.data_section_crc not in (0, self._source.crc(0, offset))):
+                end.data_section_crc not in (0, self.source.crc(0, offset))):
             self._losses.append(Loss(0, 0, 'something besides the messages',
                                      'the checksum of the data section is wrong'))
         if self._summary.problem:
@@ -375,5 +373,4 @@ class Scanner:
         statistics = self._summary.statistics
         if statistics is not None and not self._losses and not self._unknown and (
                 statistics.message_count > self._found.total()):
-            self._losses.append(Loss(
-                0, 0, 'messages', 'the statistics count more than there are'))
+            self._losses.append(Loss(0, 0, 'messages', 'the statistics count more than there are'))

@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import stat
 import zlib
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -93,10 +95,8 @@ class McapSource:
 
     def crc(self, offset: int, end: int) -> int:
         """Return the checksum of a stretch of the file."""
-        crc = 0
-        for block in self.blocks(offset, end):
-            crc = zlib.crc32(block, crc)
-        return crc
+        return functools.reduce(
+            lambda crc, block: zlib.crc32(block, crc), self.blocks(offset, end), 0)
 
     def head(self, offset: int, limit: int) -> tuple[int, int]:
         """Return opcode and end of the record there, which ends before `limit`."""
@@ -108,7 +108,7 @@ class McapSource:
         raise DamagedError('no record can be read there')
 
     def raw(self, offset: int, end: int) -> bytes:
-        """Return the bytes of a record.  Raises TooLargeError."""
+        """Return the bytes of a record; raises TooLargeError."""
         check_size(end - offset - HEAD.size, self.max_bytes)
         return self.read(offset, end - offset)
 
@@ -123,15 +123,16 @@ class McapSource:
 
     def attachment(self, offset: int, end: int) -> tuple[AttachmentIndex, int]:
         """Return the index of the attachment there, and the offset of its checksum."""
-        stream = StrictStream(self.read(offset, min(end - offset, _ATTACHMENT_HEAD)))
+        stream = StrictStream(BytesIO(self.read(offset, min(end - offset, _ATTACHMENT_HEAD))))
         try:
+            stream.read(HEAD.size)
             index = AttachmentIndex(
                 offset=offset, length=end - offset, log_time=stream.read8(),
                 create_time=stream.read8(), name=stream.read_prefixed_string(),
                 media_type=stream.read_prefixed_string(), data_size=stream.read8())
         except (McapError, UnicodeDecodeError):
             raise DamagedError('its name or its type cannot be read') from None
-        crc_offset = offset + HEAD.size + stream.count + index.data_size
+        crc_offset = offset + stream.count + index.data_size
         if crc_offset + 4 > end:
             raise DamagedError('its length is not that of its content')
         return index, crc_offset
@@ -139,7 +140,7 @@ class McapSource:
 
 @dataclass
 class Summary:
-    """The summary section of a file, empty unless its checksum is right and it fits the file."""
+    """The summary section of a file; empty if it is damaged or missing."""
 
     data_limit: int         # no record of the data section ends behind this offset
     closed: bool = False    # the file ends with a footer and the closing magic
@@ -162,7 +163,6 @@ class Summary:
 
     @property
     def indexes_all_chunks(self) -> bool:
-        """Whether there is an index of every chunk."""
         return self.statistics is not None and self.statistics.chunk_count == len(self.chunks)
 
     @property
