@@ -159,14 +159,11 @@ def _publish(draft: Path, output: Path) -> None:
     """Give a file its name without taking that of another (FileExistsError)."""
     try:
         os.link(draft, output)
-    except FileExistsError:
-        raise
     except OSError:
-        # A file system without links: between the look and the renaming nothing protects.
+        # It exists, or a file system without links: then nothing protects until the renaming.
         if os.path.lexists(output):
             raise FileExistsError from None
         os.rename(draft, output)
-    else:
-        with contextlib.suppress(OSError):
-            draft.unlink()
+    with contextlib.suppress(OSError):
+        draft.unlink()
     sync_directory(output.parent)
