@@ -213,9 +213,11 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         metadata = {}
         metadata_bytes = 0
         for index in self._summary.metadata:
-            record = self.source.record(index.offset, self._summary.data_limit, Metadata)
             metadata_bytes += index.length
-            if record is not None and metadata_bytes <= MAX_DECLARED:
+            if metadata_bytes > MAX_DECLARED:
+                break
+            record = self.source.record(index.offset, self._summary.data_limit, Metadata)
+            if record is not None:
                 metadata[record.name] = record.metadata
         spans = [_Span(offset, offset + chunk.chunk_length, chunk.message_start_time,
                        chunk.message_end_time)
@@ -274,12 +276,11 @@ def _scan_all(scanner: Scanner) -> _Index:
             metadata[scanned.record.name] = scanned.record.metadata
         if scanned.contents is None or not scanned.contents.entries:
             continue
-        offset = scanned.offset
-        start_ns, end_ns = time_span(scanned.contents.entries)
-        if scanned.record is None and run_end == offset < spans[-1].offset + _RUN_BYTES:
+        span = _Span(scanned.offset, scanned.end, *time_span(scanned.contents.entries))
+        if scanned.record is None and run_end == span.offset < spans[-1].offset + _RUN_BYTES:
             run = spans.pop()
-            offset = run.offset
-            start_ns, end_ns = min(run.start_ns, start_ns), max(run.end_ns, end_ns)
-        spans.append(_Span(offset, scanned.end, start_ns, end_ns))
+            span = _Span(run.offset, span.end, min(run.start_ns, span.start_ns),
+                         max(run.end_ns, span.end_ns))
+        spans.append(span)
         run_end = scanned.end if scanned.record is None else 0
     return spans, metadata

@@ -56,10 +56,10 @@ class RecordFinder:
                 opcode, end = self._source.head(offset, self._limit)
             if opcode == Opcode.MESSAGE:
                 return end - offset >= HEAD.size + MESSAGE_FIELDS
+            if opcode in _NAME_OFFSETS:
+                return self._is_proven(opcode, offset, end)
             if opcode == Opcode.ATTACHMENT:
                 self._source.attachment(offset, end)
-            elif opcode in _NAME_OFFSETS:
-                return self._is_proven(opcode, offset, end)
             elif opcode == Opcode.MESSAGE_INDEX:
                 parse_message_index(self._source.raw(offset, end))
             else:
