@@ -51,17 +51,14 @@ class Damage:
 
     @property
     def lost_bytes(self) -> int:
-        """Bytes of the file that are not used."""
         return sum(loss.bytes for loss in self.losses)
 
     @property
     def lost_chunks(self) -> int:
-        """Chunks that are not used."""
         return sum(loss.what == 'chunk' for loss in self.losses)
 
     @property
     def missing_messages(self) -> int:
-        """Lost messages: exact if `missing_exactly`, else a lower bound."""
         return sum(self.missing.values())
 
     def lines(self) -> list[str]:
@@ -71,10 +68,9 @@ class Damage:
             sums = [count(self.lost_bytes, 'byte')]
             if self.lost_chunks:
                 sums.append(count(self.lost_chunks, 'chunk'))
-            if self.missing_exactly:
-                sums.append(count(self.missing_messages, 'message'))
-            elif self.missing_messages:
-                sums.append(f'at least {count(self.missing_messages, "message")}')
+            if self.missing_exactly or self.missing_messages:
+                least = '' if self.missing_exactly else 'at least '
+                sums.append(least + count(self.missing_messages, 'message'))
             else:
                 sums.append('an unknown number of messages')
             lines.append(f'lost: {", ".join(sums)}')

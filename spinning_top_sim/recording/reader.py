@@ -8,6 +8,7 @@ Memory holds the chunks that overlap in time: one in a log that was written in o
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import heapq
 import os
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Chunk, Header, Metadata, Schema
+from mcap.records import Chunk, ChunkIndex, Header, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording.chunks import time_span
@@ -28,10 +29,10 @@ from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.records import (
     HEAD,
     MAX_BYTES,
+    MAX_DECLARED,
     ChunkContents,
     DamagedError,
     break_up,
-    check_declared,
     open_chunk,
 )
 from spinning_top_sim.recording.rosbag2 import Qos, qos_profiles
@@ -44,7 +45,6 @@ from spinning_top_sim.recording.summary import (
 )
 from spinning_top_sim.recording.writer import OUR_LIBRARY
 
-_CHUNK_HEAD = struct.Struct('<BQQQ')    # opcode, length, earliest and latest log time
 _FIRST_DATE = 10 ** 17       # [ns], in 1973
 _STREAM_BYTES = 1 << 12     # that an open chunk costs besides its content, about
 _RUN_BYTES = 1 << 20  # of messages outside of chunks that are read at a time
@@ -65,32 +65,32 @@ class LogTopic:
 
 
 class LogMessage(NamedTuple):
-    """A message of a log; times in ns."""
+    """A message of a log."""
 
     topic: str
-    log_time: int
-    publish_time: int
+    log_time: int           # [ns]
+    publish_time: int       # [ns]
     sequence: int
     data: bytes
     channel_id: int
 
 
 class _Span(NamedTuple):
-    """A chunk, or adjacent messages outside of chunks, in the order of the log times."""
+    """A chunk, or adjacent messages outside of chunks."""
 
-    start_ns: int
     offset: int
     end: int        # offset
-    end_ns: int
+    start_ns: int   # the earliest log time
+    end_ns: int     # the latest
 
 
-# Where the messages are, and the metadata records by name.
+# Where the messages are, in file order, and the metadata records by name.
 _Index = tuple[list[_Span], dict[str, dict[str, str]]]
 
 
-class LogReader:
+class LogReader(contextlib.AbstractContextManager['LogReader']):
     """
-    An MCAP file, open for reading; also a context manager.
+    An MCAP file, open for reading.
 
     max_bytes : largest record, and largest uncompressed chunk, that is read into memory
 
@@ -113,11 +113,7 @@ class LogReader:
         self.profile, self.library = header.profile, header.library
 
     def close(self) -> None:
-        """Close the file."""
         self.source.close()
-
-    def __enter__(self) -> LogReader:
-        return self
 
     def __exit__(self, *exception: object) -> None:
         self.close()
@@ -131,14 +127,14 @@ class LogReader:
     def topics(self) -> tuple[LogTopic, ...]:
         """The channels of the log, in the order of their ids."""
         self._index     # noqa: B018 - makes the channels known
-        schemas = {0: Schema(id=0, data=b'', encoding='', name=''), **self._summary.schemas}
+        no_schema = Schema(id=0, data=b'', encoding='', name='')
         return tuple(LogTopic(
             name=channel.topic, type_name=schema.name,
             schema=schema.data.decode(errors='replace'), schema_encoding=schema.encoding,
             encoding=channel.message_encoding, qos=qos_profiles(channel),
             metadata=channel.metadata, channel_id=number)
             for number, channel in sorted(self._summary.channels.items())
-            for schema in [schemas.get(channel.schema_id, schemas[0])])
+            for schema in [self._summary.schemas.get(channel.schema_id, no_schema)])
 
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
@@ -159,7 +155,7 @@ class LogReader:
         """
         spans, _ = self._index
         dated = [span for span in spans if span.end_ns]
-        if dated and dated[0].start_ns > _FIRST_DATE:
+        if min((span.start_ns for span in dated), default=0) > _FIRST_DATE:
             spans = dated
         return (min((span.start_ns for span in spans), default=0),
                 max((span.end_ns for span in spans), default=0))
@@ -179,26 +175,11 @@ class LogReader:
         channels = {number: channel.topic for number, channel in self._summary.channels.items()
                     if (names is None or channel.topic in names) and self._summary.knows(number)}
         times = range(start or 0, 1 << 64 if end is None else end)
-        overlapping: list[_Span] = []
-        overlap_end = 0
-        for span in spans:
-            if span.end_ns < times.start or span.start_ns >= times.stop:
-                continue
-            if names is not None and self._is_without(span, channels):
-                continue
-            if span.start_ns > overlap_end:
-                yield from self._merge(overlapping, channels, times)
-                overlapping = []
-            overlapping.append(span)
-            overlap_end = max(overlap_end, span.end_ns)
-        yield from self._merge(overlapping, channels, times)
-
-    def _merge(self, spans: Iterable[_Span], channels: Mapping[int, str], times: range,
-               ) -> Iterator[LogMessage]:
-        """Yield messages of spans in order; a span is read when its time comes."""
-        spans = sorted(spans, key=attrgetter('offset'))
         self._held_bytes = 0
-        streams = [self._stream(span, channels) for span in spans]
+        # A span is read when its time comes.
+        streams = [self._stream(span, channels) for span in spans
+                   if span.end_ns >= times.start and span.start_ns < times.stop
+                   and not (names is not None and self._is_without(span, channels))]
         for message in heapq.merge(*streams, key=attrgetter('log_time')):
             if message.channel_id >= 0 and message.log_time in times:
                 yield message
@@ -207,17 +188,17 @@ class LogReader:
         """Yield what stands for the time at which a span begins, then its messages in order."""
         yield LogMessage('', span.start_ns, 0, 0, b'', -1)
         contents = self._read(span)
-        plain = contents.plain
-        held_bytes = len(plain) + _STREAM_BYTES
+        held_bytes = len(contents.plain) + _STREAM_BYTES
         self._held_bytes += held_bytes
         if self._held_bytes > 2 * self.source.max_bytes:
             raise LogError(f'cannot read {self.path}: the messages of several chunks overlap in '
                            f'time, and these have more than {2 * self.source.max_bytes} bytes')
         for channel_id in contents.entries.keys() - channels:
             del contents.entries[channel_id]
-        for channel_id, sequence, log_time, publish_time, begin, end in contents.sorted_messages():
-            yield LogMessage(channels[channel_id], log_time, publish_time, sequence,
-                             bytes(plain[begin:end]), channel_id)
+        for message in contents.messages(by_time=True):
+            yield LogMessage(
+                channels[message.channel_id], message.log_time, message.publish_time,
+                message.sequence, message.data, message.channel_id)
         self._held_bytes -= held_bytes
 
     def _is_without(self, span: _Span, channels: Mapping[int, str]) -> bool:
@@ -234,40 +215,38 @@ class LogReader:
     def _index(self) -> _Index:
         """What the summary indexes, if that is all and right, else what a scan found."""
         if not (self._summary.is_complete
-                and all(map(self._leads_to_chunk, self._summary.chunks))):
+                and all(map(self._leads_to_chunk, self._summary.chunks.values()))):
             return self._survey[0]
         metadata = {}
         metadata_bytes = 0
         for index in self._summary.metadata:
-            try:
-                metadata_bytes += index.length
-                check_declared(metadata_bytes)
-                record = self.source.record(index.offset, self._summary.data_limit)
-            except DamagedError:
-                continue
-            if isinstance(record, Metadata):
+            metadata_bytes += index.length
+            if metadata_bytes > MAX_DECLARED:
+                break
+            record = self.source.record(index.offset, self._summary.data_limit, Metadata)
+            if record is not None:
                 metadata[record.name] = record.metadata
-        spans = [_Span(chunk.message_start_time, offset, offset + chunk.chunk_length,
-                       chunk.message_end_time) for offset, chunk in self._summary.chunks.items()
+        spans = [_Span(offset, offset + chunk.chunk_length, chunk.message_start_time,
+                       chunk.message_end_time)
+                 for offset, chunk in sorted(self._summary.chunks.items())
                  if indexed_messages(chunk)]
-        return sorted(spans), metadata
+        return spans, metadata
 
-    def _leads_to_chunk(self, offset: int) -> bool:
+    def _leads_to_chunk(self, index: ChunkIndex) -> bool:
         """Return whether the chunk there is the one that the summary tells of."""
-        index = self._summary.chunks[offset]
-        head = _CHUNK_HEAD.pack(
-            Opcode.CHUNK, (index.chunk_length - HEAD.size) % (1 << 64),
+        head = struct.pack(
+            '<BQQQ', Opcode.CHUNK, (index.chunk_length - HEAD.size) % (1 << 64),
             index.message_start_time, index.message_end_time)
-        return self.source.read(offset, len(head)) == head
+        return self.source.read(index.chunk_start_offset, len(head)) == head
 
     @functools.cached_property
     def _survey(self) -> tuple[_Index, Damage]:
         """What a scan of the whole file found, done at the first use."""
-        scanner = self.scan()
-        index = _scan_all(scanner)
-        if scanner.found_late:
+        for _ in range(2):
             scanner = self.scan()
             index = _scan_all(scanner)
+            if not scanner.found_late:
+                break
         return index, scanner.damage()
 
     def _read_header(self) -> Header:
@@ -278,32 +257,24 @@ class LogReader:
         if magic != MCAP0_MAGIC and MCAP0_MAGIC.startswith(magic):
             raise LogError(
                 f'cannot read {self.path}: it ends after {self.size} bytes of an MCAP file')
-        try:
-            header = self.source.record(MAGIC_SIZE, self.size)
-        except DamagedError:
-            header = None
-        if isinstance(header, Header):
-            return header
-        if magic != MCAP0_MAGIC:
+        header = self.source.record(MAGIC_SIZE, self.size, Header)
+        if header is None and magic != MCAP0_MAGIC:
             raise LogError(f'cannot read {self.path}: it is no MCAP file')
-        return Header(profile='ros2', library='')
+        return header or Header(profile='ros2', library='')
 
     def _read(self, span: _Span) -> ChunkContents:
         """Return the messages of a span; none if it is damaged."""
-        try:
+        with contextlib.suppress(DamagedError):
             if self.source.read(span.offset, 1) == bytes([Opcode.MESSAGE]):
                 return break_up(self.source.read(span.offset, span.end - span.offset))
-            chunk = self.source.record(span.offset, span.end)
-            if isinstance(chunk, Chunk):
+            chunk = self.source.record(span.offset, span.end, Chunk)
+            if chunk is not None:
                 return open_chunk(chunk, self.source.max_bytes)
-        except DamagedError:
-            pass
         self.left_out += 1
         return ChunkContents(b'')
 
 
 def _scan_all(scanner: Scanner) -> _Index:
-    """Return what is found in a scan."""
     spans: list[_Span] = []
     metadata = {}
     run_end = 0     # of adjacent messages outside of chunks, the last span
@@ -312,12 +283,11 @@ def _scan_all(scanner: Scanner) -> _Index:
             metadata[scanned.record.name] = scanned.record.metadata
         if scanned.contents is None or not scanned.contents.entries:
             continue
-        offset = scanned.offset
-        start_ns, end_ns = time_span(scanned.contents.entries)
-        if scanned.record is None and run_end == offset < spans[-1].offset + _RUN_BYTES:
+        span = _Span(scanned.offset, scanned.end, *time_span(scanned.contents.entries))
+        if scanned.record is None and run_end == span.offset < spans[-1].offset + _RUN_BYTES:
             run = spans.pop()
-            offset = run.offset
-            start_ns, end_ns = min(run.start_ns, start_ns), max(run.end_ns, end_ns)
-        spans.append(_Span(start_ns, offset, scanned.end, end_ns))
+            span = _Span(run.offset, span.end, min(run.start_ns, span.start_ns),
+                         max(run.end_ns, span.end_ns))
+        spans.append(span)
         run_end = scanned.end if scanned.record is None else 0
-    return sorted(spans), metadata
+    return spans, metadata

@@ -9,15 +9,14 @@ later versions of the format may add fields (MCAP specification, "Records").
 
 from __future__ import annotations
 
-import itertools
 import struct
 import sys
 import zlib
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 import lz4.frame  # type: ignore[import-untyped]
 import mcap.records
@@ -25,7 +24,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, McapRecord, Schema
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 
 from spinning_top_sim.recording.chunks import ENTRY_SIZE, INDEX_HEAD, MESSAGE, MESSAGE_FIELDS
 from spinning_top_sim.recording.mcap_writer import record_bytes
@@ -50,17 +49,6 @@ class TooLargeError(DamagedError):
     """A record may be right but is larger than what is read into memory."""
 
 
-class StoredMessage(NamedTuple):
-    """A message, with the place of its data in the bytes that hold it; times in ns."""
-
-    channel_id: int
-    sequence: int
-    log_time: int
-    publish_time: int
-    start: int
-    end: int
-
-
 @dataclass
 class ChunkContents:
     """
@@ -72,40 +60,27 @@ class ChunkContents:
     plain: bytes | bytearray    # uncompressed
     entries: dict[int, array[int]] = field(default_factory=dict)    # of the message indexes
     declared: list[Schema | Channel] = field(default_factory=list)
-    in_time_order: bool = True
-    right: bool = True      # as a whole: all channels are known, and what they are elsewhere
+    right: bool = True      # may be copied as a whole
 
-    def messages(self) -> Iterator[StoredMessage]:
-        """Yield the messages in the order of the file."""
-        return self._messages_at(sorted(itertools.chain.from_iterable(
-            numbers[1::2] for numbers in self.entries.values())))
-
-    def sorted_messages(self) -> Iterator[StoredMessage]:
-        """Yield the messages in the order of their log times, equal ones in that of the file."""
-        if self.in_time_order:
-            return self.messages()
-        places = sorted(time << 64 | offset for numbers in self.entries.values()
+    def messages(self, *, by_time: bool = False) -> Iterator[Message]:
+        """Yield the messages in file order, or by log time and equal ones in file order."""
+        plain = memoryview(self.plain)
+        places = sorted(by_time * time << 64 | offset for numbers in self.entries.values()
                         for time, offset in zip(numbers[::2], numbers[1::2], strict=True))
-        return self._messages_at(place & (1 << 64) - 1 for place in places)
-
-    def _messages_at(self, offsets: Iterable[int]) -> Iterator[StoredMessage]:
-        plain, unpack = self.plain, MESSAGE.unpack_from
-        for offset in offsets:
-            _, length, channel_id, sequence, log_time, publish_time = unpack(plain, offset)
-            yield StoredMessage(channel_id, sequence, log_time, publish_time,
-                                offset + MESSAGE.size, offset + HEAD.size + length)
+        for place in places:
+            offset = place & (1 << 64) - 1
+            _, length, channel_id, sequence, log_time, publish_time = MESSAGE.unpack_from(
+                plain, offset)
+            yield Message(
+                channel_id=channel_id, sequence=sequence, log_time=log_time,
+                publish_time=publish_time,
+                data=plain[offset + MESSAGE.size:offset + HEAD.size + length].tobytes())
 
 
 class StrictStream(ReadDataStream):
-    """A stream of a record behind its head that gives what is asked for or raises EndOfFile."""
-
-    def __init__(self, raw: bytes) -> None:
-        stream = BytesIO(raw)
-        stream.seek(HEAD.size)
-        super().__init__(stream)
+    """Reading beyond the end raises EndOfFile."""
 
     def read(self, length: int) -> bytes:
-        """Return exactly `length` bytes."""
         data: bytes = super().read(min(length, sys.maxsize))
         if len(data) != length:
             raise EndOfFile()
@@ -113,7 +88,7 @@ class StrictStream(ReadDataStream):
 
 
 def check_size(size: int, max_bytes: int) -> None:
-    """Raise TooLargeError if a record or a chunk is not read into memory."""
+    """Raise TooLargeError for what is not read into memory."""
     if size > max_bytes:
         raise TooLargeError(f'its {size} bytes are more than max_bytes = {max_bytes}')
 
@@ -127,10 +102,9 @@ def check_declared(size: int) -> None:
 
 def name_of(opcode: int) -> str:
     """Return what a kind of record is called in reports."""
-    try:
+    if opcode in set(Opcode):
         return Opcode(opcode).name.lower().replace('_', ' ')
-    except ValueError:
-        return f'record of unknown kind {opcode:#04x}'
+    return f'record of unknown kind {opcode:#04x}'
 
 
 def parse(raw: bytes) -> tuple[McapRecord, int]:
@@ -144,8 +118,9 @@ def parse(raw: bytes) -> tuple[McapRecord, int]:
         raise DamagedError('there is no such kind of record')
     if record_class is not Chunk:
         check_declared(len(raw))
-    stream = StrictStream(raw)
+    stream = StrictStream(BytesIO(raw))
     try:
+        stream.read(HEAD.size)
         record: McapRecord = record_class.read(stream)  # type: ignore[attr-defined]
     except McapError:
         raise DamagedError('a length inside of it leads beyond its end') from None
@@ -155,7 +130,7 @@ def parse(raw: bytes) -> tuple[McapRecord, int]:
     if not isinstance(record, Chunk) and not raw.startswith(
             record_bytes(record)[HEAD.size:], HEAD.size):
         raise DamagedError('its length is not that of its content')
-    return record, len(raw) - HEAD.size - stream.count
+    return record, len(raw) - stream.count
 
 
 def parse_message_index(raw: bytes) -> tuple[int, array[int], int]:
@@ -184,10 +159,8 @@ def open_chunk(chunk: Chunk, max_bytes: int) -> ChunkContents:
 def break_up(plain: bytes | bytearray) -> ChunkContents:
     """Return the messages and declarations among records that stand one after the other."""
     contents = ChunkContents(plain)
-    entries = contents.entries
-    last_time = declared_bytes = 0
+    declared_bytes = offset = 0
     size = len(plain)
-    offset = 0
     while offset < size:
         if size - offset < HEAD.size:
             raise DamagedError('a record in it is truncated')
@@ -199,14 +172,9 @@ def break_up(plain: bytes | bytearray) -> ChunkContents:
             if length < MESSAGE_FIELDS:
                 raise DamagedError('a message is shorter than a message can be')
             _, _, channel_id, _, log_time, _ = MESSAGE.unpack_from(plain, offset)
-            numbers = entries.get(channel_id)
-            if numbers is None:
-                numbers = entries[channel_id] = array('Q')
-            numbers.append(log_time)
-            numbers.append(offset)
-            if log_time < last_time:
-                contents.in_time_order = False
-            last_time = log_time
+            if channel_id not in contents.entries:
+                contents.entries[channel_id] = array('Q')
+            contents.entries[channel_id].extend((log_time, offset))
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             declared_bytes += length
             check_declared(declared_bytes)
@@ -221,14 +189,12 @@ def _decompress(chunk: Chunk, max_bytes: int) -> bytes | bytearray:
     """Return the uncompressed bytes of all frames, never more than the chunk states."""
     size = chunk.uncompressed_size
     check_size(size, max_bytes)
-    stream: BinaryIO
-    if chunk.compression == '':
-        stream = BytesIO(chunk.data)
-    elif chunk.compression == 'zstd':
+    stream: BinaryIO = BytesIO(chunk.data)
+    if chunk.compression == 'zstd':
         stream = zstandard.ZstdDecompressor().stream_reader(chunk.data, read_across_frames=True)
     elif chunk.compression == 'lz4':
-        stream = lz4.frame.open(BytesIO(chunk.data))
-    else:
+        stream = lz4.frame.open(stream)
+    elif chunk.compression:
         raise DamagedError(f'its compression {chunk.compression[:20]!r} is unknown')
     plain = bytearray()
     try:

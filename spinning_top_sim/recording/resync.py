@@ -56,14 +56,14 @@ class RecordFinder:
                 opcode, end = self._source.head(offset, self._limit)
             if opcode == Opcode.MESSAGE:
                 return end - offset >= HEAD.size + MESSAGE_FIELDS
+            if opcode in _NAME_OFFSETS:
+                return self._is_proven(opcode, offset, end)
             if opcode == Opcode.ATTACHMENT:
                 self._source.attachment(offset, end)
-            elif opcode in _NAME_OFFSETS:
-                self._prove(opcode, offset, end)
             elif opcode == Opcode.MESSAGE_INDEX:
                 parse_message_index(self._source.raw(offset, end))
             else:
-                self._source.record(offset, end)
+                parse(self._source.raw(offset, end))
         except TooLargeError:
             return opcode == Opcode.CHUNK
         except DamagedError:
@@ -85,23 +85,23 @@ class RecordFinder:
             offset += _BLOCK
         return self._limit
 
-    def _prove(self, opcode: int, offset: int, end: int) -> None:
-        """Raise DamagedError unless it is a chunk, schema, channel or metadata."""
+    def _is_proven(self, opcode: int, offset: int, end: int) -> bool:
+        """Return whether it is a chunk, schema, channel or metadata; raises DamagedError."""
         # First what needs no more than a look: most candidates are none.
         start = offset + HEAD.size
         if not _looks_right(opcode, end - start, self._source.read(start, _LOOK_BYTES)):
-            raise DamagedError('its lengths do not fit')
+            return False
         self._effort -= end - start
         if self._effort < 0:
-            raise DamagedError('the file has candidates everywhere')
+            return False
         record, _ = parse(self._source.raw(offset, end))
-        if isinstance(record, Chunk):
-            self._unpacking -= record.uncompressed_size
-            if self._unpacking < 0:
-                raise DamagedError('the file has candidates everywhere')
-            contents = open_chunk(record, self._source.max_bytes)
-            if not contents.entries and not contents.declared:
-                raise DamagedError('it is empty')       # zeros in data look like that
+        if not isinstance(record, Chunk):
+            return True
+        self._unpacking -= record.uncompressed_size
+        if self._unpacking < 0:
+            return False
+        contents = open_chunk(record, self._source.max_bytes)
+        return bool(contents.entries or contents.declared)      # zeros look like an empty chunk
 
 
 def _looks_right(opcode: int, length: int, start: bytes) -> bool:

@@ -22,8 +22,6 @@ from spinning_top_sim.recording.records import ChunkContents
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA
 from spinning_top_sim.recording.scanner import ScannedRecord, Scanner
 
-_COMPRESSION = 'zstd'  # of messages that were in no chunk
-
 
 @dataclass(frozen=True)
 class Recovered:
@@ -46,8 +44,8 @@ def recover(
     output : appears when it is complete and on the disk, never before
     progress : told how many bytes of how many are done
 
-    Chunks and records of unknown kinds are copied as they are, messages outside of chunks are put
-    into some; message indexes, statistics, summary and the `rosbag2` record are made anew.
+    Right chunks and records of unknown kinds are copied as they are, other messages are put into
+    new chunks; message indexes, statistics, summary and the `rosbag2` record are made anew.
     Raises LogError, also if a file that was not closed holds no whole message.
     """
     output = Path(output)
@@ -80,7 +78,7 @@ def _recover(
     first = next(records, None)
     header = (first.raw if first is not None and isinstance(first.record, Header)
               else record_bytes(Header(reader.profile, reader.library)))
-    writer = McapWriter(draft, header=header, compression=_COMPRESSION)
+    writer = McapWriter(draft, header=header, compression='zstd')
     with writer.discarded_on_failure():
         copy = _Copy(scanner, writer)
         for scanned in filter(None, itertools.chain([first], records)):
@@ -110,7 +108,6 @@ class _Copy:
         self.former_bag = ''  # the `rosbag2` record of the log
 
     def put(self, scanned: ScannedRecord) -> None:
-        """Write a record."""
         record = scanned.record
         if scanned.contents is not None:
             self._put_messages(scanned, scanned.contents)
@@ -121,7 +118,8 @@ class _Copy:
         elif isinstance(record, Metadata):
             self._writer.write(record, scanned.raw)
         elif isinstance(record, AttachmentIndex) or scanned.opcode > Opcode.DATA_END:
-            self._writer.copy_record(self._scanner.blocks(scanned), record)
+            self._writer.copy_record(
+                self._scanner.source.blocks(scanned.offset, scanned.end), record)
 
     def put_rest(self) -> None:
         """Write what is left: messages, and channels that only the summary tells."""
@@ -139,9 +137,8 @@ class _Copy:
             self._writer.copy_chunk(scanned.record, contents.entries, scanned.raw)
             return
         for message in contents.messages():
-            self._writer.add_message(
-                message.channel_id, message.sequence, message.log_time, message.publish_time,
-                contents.plain[message.start:message.end])
+            self._writer.add_message(message.channel_id, message.sequence, message.log_time,
+                                     message.publish_time, message.data)
 
     def _declare(self, record: Schema | Channel, raw: bytes = b'') -> None:
         """Write a schema or channel outside of chunks, once, a schema before its channels."""
@@ -160,14 +157,11 @@ def _publish(draft: Path, output: Path) -> None:
     """Give a file its name without taking that of another (FileExistsError)."""
     try:
         os.link(draft, output)
-    except FileExistsError:
-        raise
     except OSError:
-        # A file system without links: between the look and the renaming nothing protects.
+        # It exists, or a file system without links: then nothing protects until the renaming.
         if os.path.lexists(output):
             raise FileExistsError from None
         os.rename(draft, output)
-    else:
-        with contextlib.suppress(OSError):
-            draft.unlink()
+    with contextlib.suppress(OSError):
+        draft.unlink()
     sync_directory(output.parent)

@@ -4,14 +4,16 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import stat
 import zlib
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -40,8 +42,9 @@ from spinning_top_sim.recording.records import (
 
 MAGIC_SIZE = len(MCAP0_MAGIC)
 
+_Record = TypeVar('_Record', bound=McapRecord)
 _FOOTER_SIZE = HEAD.size + 8 + 8 + 4
-_BLOCK = 1 << 20  # bytes read at a time where a record is not needed whole
+_BLOCK = 1 << 16  # bytes read at a time where a record is not needed whole
 _ATTACHMENT_HEAD = 1 << 16  # bytes; more than any name and media type
 
 
@@ -66,7 +69,6 @@ class McapSource:
         self.mode = stat.S_IMODE(status.st_mode)    # permission bits
 
     def close(self) -> None:
-        """Close the file."""
         self._file.close()
 
     @contextlib.contextmanager
@@ -74,8 +76,7 @@ class McapSource:
         try:
             yield
         except OSError as error:
-            raise LogError(
-                f'cannot read {self._path}: {error.strerror or error}') from error
+            raise LogError(f'cannot read {self._path}: {error.strerror or error}') from error
 
     def read(self, offset: int, length: int) -> bytes:
         """Return the bytes there, fewer where the file ends."""
@@ -94,10 +95,8 @@ class McapSource:
 
     def crc(self, offset: int, end: int) -> int:
         """Return the checksum of a stretch of the file."""
-        crc = 0
-        for block in self.blocks(offset, end):
-            crc = zlib.crc32(block, crc)
-        return crc
+        return functools.reduce(
+            lambda crc, block: zlib.crc32(block, crc), self.blocks(offset, end), 0)
 
     def head(self, offset: int, limit: int) -> tuple[int, int]:
         """Return opcode and end of the record there, which ends before `limit`."""
@@ -109,26 +108,31 @@ class McapSource:
         raise DamagedError('no record can be read there')
 
     def raw(self, offset: int, end: int) -> bytes:
-        """Return the bytes of a record.  Raises TooLargeError."""
+        """Return the bytes of a record; raises TooLargeError."""
         check_size(end - offset - HEAD.size, self.max_bytes)
         return self.read(offset, end - offset)
 
-    def record(self, offset: int, limit: int) -> McapRecord:
-        """Return the record there, of a kind that `parse` takes."""
-        _, end = self.head(offset, limit)
-        return parse(self.raw(offset, end))[0]
+    def record(self, offset: int, limit: int, kind: type[_Record]) -> _Record | None:
+        """Return the record there if it is whole and of that class, else None."""
+        with contextlib.suppress(DamagedError):
+            _, end = self.head(offset, limit)
+            record, _ = parse(self.raw(offset, end))
+            if isinstance(record, kind):
+                return record
+        return None
 
     def attachment(self, offset: int, end: int) -> tuple[AttachmentIndex, int]:
         """Return the index of the attachment there, and the offset of its checksum."""
-        stream = StrictStream(self.read(offset, min(end - offset, _ATTACHMENT_HEAD)))
+        stream = StrictStream(BytesIO(self.read(offset, min(end - offset, _ATTACHMENT_HEAD))))
         try:
+            stream.read(HEAD.size)
             index = AttachmentIndex(
                 offset=offset, length=end - offset, log_time=stream.read8(),
                 create_time=stream.read8(), name=stream.read_prefixed_string(),
                 media_type=stream.read_prefixed_string(), data_size=stream.read8())
         except (McapError, UnicodeDecodeError):
             raise DamagedError('its name or its type cannot be read') from None
-        crc_offset = offset + HEAD.size + stream.count + index.data_size
+        crc_offset = offset + stream.count + index.data_size
         if crc_offset + 4 > end:
             raise DamagedError('its length is not that of its content')
         return index, crc_offset
@@ -136,7 +140,7 @@ class McapSource:
 
 @dataclass
 class Summary:
-    """The summary section of a file, empty unless its checksum is right and it fits the file."""
+    """The summary section of a file; empty if it is damaged or missing."""
 
     data_limit: int         # no record of the data section ends behind this offset
     closed: bool = False    # the file ends with a footer and the closing magic
@@ -159,7 +163,6 @@ class Summary:
 
     @property
     def indexes_all_chunks(self) -> bool:
-        """Whether there is an index of every chunk."""
         return self.statistics is not None and self.statistics.chunk_count == len(self.chunks)
 
     @property
@@ -200,11 +203,8 @@ def read_summary(source: McapSource) -> Summary:
     footer_offset = magic_offset - _FOOTER_SIZE
     if footer_offset < MAGIC_SIZE or source.read(magic_offset, MAGIC_SIZE) != MCAP0_MAGIC:
         return Summary(source.size, problem='the file does not end as an MCAP file ends')
-    try:
-        footer = source.record(footer_offset, magic_offset)
-    except DamagedError:
-        footer = None
-    if not isinstance(footer, Footer):
+    footer = source.record(footer_offset, magic_offset, Footer)
+    if footer is None:
         return Summary(source.size, problem='the footer is damaged')
     start, size = footer.summary_start, source.size - footer.summary_start
     if start == 0:
