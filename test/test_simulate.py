@@ -266,7 +266,8 @@ def test_nothing_is_overwritten(tmp_path, capsys):
         assert path.read_text() == 'precious' and str(path) in capsys.readouterr().err
 
 
-def test_a_full_disk_leaves_a_readable_log(tmp_path):
+@pytest.mark.parametrize('method', ['exact', 'rk45'])
+def test_a_full_disk_leaves_a_readable_log(tmp_path, method):
     path = tmp_path / 'run.mcap'
 
     def small_files():
@@ -275,7 +276,7 @@ def test_a_full_disk_leaves_a_readable_log(tmp_path):
     run = subprocess.run(
         [sys.executable, '-c', 'import signal, sys\nsignal.signal(signal.SIGXFSZ, signal.SIG_IGN)'
          '\nfrom spinning_top_sim.tools.simulate import main\nsys.exit(main())',
-         '-o', path, '--duration', '200', '--quiet', '-p', 'solver.method:=exact'],
+         '-o', path, '--duration', '200', '--quiet', '-p', f'solver.method:={method}'],
         preexec_fn=small_files, capture_output=True, text=True, timeout=120, check=False)
     assert run.returncode == 1 and 'Traceback' not in run.stderr
     assert 'File too large' in run.stderr
