@@ -280,7 +280,9 @@ def test_a_change_of_the_rate_changes_the_noise_of_every_topic():
     simulation = simulate(NOISY)
     simulation.apply({'imu.rate': 50.0})
     for topic in ('imu/data_raw', 'imu/data'):
-        variances = doubles(stream(simulation, topic).template.encode_one(0), 24)[3:12:4]
+        message = stream(simulation, topic).template.encode_one(
+            0, np.zeros(4), np.zeros(3), np.zeros(3))
+        variances = doubles(message, 24)[3:12:4]
         assert variances == pytest.approx(3 * [1e-3 ** 2 * 50.0]), topic
 
 

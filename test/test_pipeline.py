@@ -554,3 +554,11 @@ def test_samples_that_are_too_late_and_not_recorded_are_not_computed():
     assert encoded['joint_states'].count == 101
     assert encoded['pose'].count == 51
     assert stream(simulation, 'pose').skipped == stream(simulation, 'joint_states').skipped == 50
+
+
+def test_what_streams_take_over_at_once_is_described_so():
+    """A run is computed again by the parameters that `Stream.at_once` names."""
+    at_once = {name for stream in simulate().streams for name in stream.at_once}
+    assert at_once == {name for name, parameter in parameters.BY_NAME.items()
+                       if name.endswith('.rate')}
+    assert all(parameters.BY_NAME[name].effect is parameters.Effect.NOW for name in at_once)

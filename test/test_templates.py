@@ -250,3 +250,9 @@ def test_imu_covariances_follow_rep_145(values, reading):
                                         variances[topic], strict=True):
             assert covariance == pytest.approx(
                 [variance if k % 4 == 0 else 0.0 for k in range(9)], rel=1e-12, abs=0.0), topic
+
+
+@pytest.mark.parametrize('fields', [(), ((np.zeros(1),),), ((np.zeros(1),) * 3,)])
+def test_a_field_that_lacks_a_column_or_has_one_too_many_is_refused(fields):
+    with pytest.raises(ValueError, match='zip'):
+        messages.float64_multi_array(('a', 'b')).encode(np.array([0]), *fields)

@@ -83,7 +83,7 @@ class RecordingSession:
     def _feed(self, write: Log | None, streams: Sequence[Stream] = ()) -> None:
         """Hand these streams, commands and events to `write` from now on."""
         self._pending, self._write = [], write
-        self._simulation.log_to(write or (lambda *_: None), streams)
+        self._simulation.log_to(write, streams)
 
     def stop(self, error: str | None = None) -> str | None:
         """Close the log, for this reason; return what it holds, or None if there is none."""

@@ -280,8 +280,9 @@ class Simulator(Node):
             if len(rest) < len(changes):
                 self._loop.command(values['spin.l3'], values['spin.lz'])
             if rest:
-                self._session.write_event('parameters', **{name: values[name] for name in rest})
-                self._simulation.apply(values)
+                changed = {name: values[name] for name in rest}
+                self._session.write_event('parameters', **changed)
+                self._simulation.apply(changed)
                 if any(name.endswith('.enabled') for name in rest):
                     self._outputs.open(self._simulation.streams, values)
                 if 'status_period' in rest:

@@ -101,12 +101,12 @@ class Template:
         rows = self._rows[:count]
         for at in self._stamps_at:
             rows[f'sec{at}'], rows[f'nanosec{at}'] = np.divmod(stamps_ns, NANOSECONDS)
-        for i, value in enumerate(values):
+        for i, value in zip(range(len(self._fields)), values, strict=True):
             field = rows[f'field{i}']
             if isinstance(value, np.ndarray):
                 field[:] = value
             else:
-                for column, numbers in enumerate(value):
+                for column, numbers in zip(range(field.shape[1]), value, strict=True):
                     field[:, column] = numbers
         return rows.view(np.uint8).reshape(count, len(self))
 

@@ -51,9 +51,14 @@ class Stream:
     def follow(self, segment: Segment) -> None:
         """Begin with the samples of a motion, or of the one after a command."""
 
-    def apply(self, values: Mapping[str, Any]) -> None:
-        """Take over those of these parameters that take effect at once."""
-        rate = values.get(f'{self.parameter}.rate')
+    @property
+    def at_once(self) -> tuple[str, ...]:
+        """Names of the parameters that `apply` takes over; a run is replayed by them."""
+        return (f'{self.parameter}.rate',)
+
+    def apply(self, changes: Mapping[str, Any]) -> None:
+        """Take over new values of parameters, of those in `at_once` that are among them."""
+        rate = changes.get(f'{self.parameter}.rate')
         if rate is not None and period_ns(rate) != self.period_ns:
             self.period_ns = period_ns(rate)
             self.on_change()

@@ -59,10 +59,14 @@ class ImuStream(Stream):
         self._frame_id, self._imu = values['imu.frame_id'], imu
         super().__init__(values, self._template(values['imu.rate']))
 
-    def apply(self, values: Mapping[str, Any]) -> None:
-        super().apply(values)
-        if 'imu.rate' in values:
-            self.template = self._template(values['imu.rate'])
+    @property
+    def at_once(self) -> tuple[str, ...]:
+        return (*super().at_once, 'imu.rate')
+
+    def apply(self, changes: Mapping[str, Any]) -> None:
+        super().apply(changes)
+        if 'imu.rate' in changes:
+            self.template = self._template(changes['imu.rate'])
             self.on_change()
 
     def _template(self, imu_rate: float) -> Template:

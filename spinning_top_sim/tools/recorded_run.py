@@ -197,9 +197,9 @@ def _rerun(run: RunDescription, end_ns: int,
         simulation.log_to(None, [stream for stream in simulation.streams
                                  if stream.topic in run.topics])
     yield simulation, Event('start', run.epoch_ns, 0, simulation.now_ns, {})
-    # Of the parameters only rates take effect at once.
+    at_once = {name for stream in simulation.streams for name in stream.at_once}
     acting = [event for event in run.events if event.name in ('command', 'reset')
-              or any(name.endswith('.rate') for name in event.details)]
+              or not at_once.isdisjoint(event.details)]
     for item in (*acting, None):
         now_ns = max(simulation.now_ns, 0)
         stop_ns = end_ns - simulation.epoch_ns if item is None else item.sent_ns
