@@ -148,6 +148,8 @@ clean:
 # it does not run.  An environment that make did not create is used as it is, and never removed.
 PROBE := import sys; print("Python %d.%d" % sys.version_info[:2]); sys.exit(sys.version_info < (3, 11))
 ASKED := $(filter command environment,$(firstword $(origin PYTHON)))
+# make would delete it when it is interrupted, and leave an environment that nobody made.
+.PRECIOUS: $(VENV)/.made
 $(VENV)/.made: FORCE
 	@there=$$('$(VENV)/bin/python' -c '$(PROBE)' 2>/dev/null) || there=; \
 	made=$$(cat '$@' 2>/dev/null) || made=; \

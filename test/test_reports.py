@@ -147,6 +147,21 @@ def test_the_status_line_fits_the_terminal_also_when_that_becomes_narrower(scree
     assert out.getvalue().split('\r\x1b[K') == ['', '123456 | 123456', '123456', '1234']
 
 
+def test_a_terminal_that_goes_away_is_none_any_more(screen, monkeypatch):
+    terminal, out = screen(80)
+
+    def gone(*_):
+        raise OSError(5, 'Input/output error')
+    monkeypatch.setattr(reports.os, 'get_terminal_size', gone)
+    terminal.show('one | two')
+    assert out.getvalue() == 'one | two\n'
+
+
+def test_a_closed_stdout_is_no_terminal(monkeypatch):
+    monkeypatch.setattr(reports.sys, 'stdout', None)
+    reports.Terminal().show('one | two')
+
+
 def test_nothing_stands_behind_the_status_line(screen):
     terminal, out = screen(80)
     terminal.show('one | two')

@@ -111,14 +111,14 @@ class Terminal:
     """Shows a line that overwrites itself, and whole ones where a launch or a file reads them."""
 
     def __init__(self) -> None:
-        self._columns = os.get_terminal_size(1).columns if sys.stdout.isatty() else 0
+        self._columns = _columns()
         self._open = False              # the cursor stands behind a line
 
     def show(self, line: str) -> None:
         """Show the newest line, on a terminal as many of its parts as fit."""
+        self._columns = self._columns and _columns()        # it may have gone meanwhile
         if self._columns:
-            self._columns = os.get_terminal_size(1).columns
-            while len(line) >= self._columns > 0 and ' | ' in line:
+            while len(line) >= self._columns and ' | ' in line:
                 line = line.rpartition(' | ')[0]
             self._write(f'\r\x1b[K{line[:max(self._columns - 1, 1)]}')
             self._open = True
@@ -145,3 +145,11 @@ class Terminal:
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, sys.stdout.fileno())
             os.close(nowhere)
+
+
+def _columns() -> int:
+    """Return the width of the terminal, 0 where there is none, or none any more."""
+    try:
+        return os.get_terminal_size(1).columns if sys.stdout.isatty() else 0
+    except (AttributeError, OSError):   # stdout is None where the shell has closed it
+        return 0
