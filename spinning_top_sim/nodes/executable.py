@@ -63,7 +63,7 @@ def run(name: str, argv: list[str],
         started = True
         # Python answers signals between waits; without a timeout, Jazzy's EventsExecutor hangs.
         while rclpy.ok() and not interrupts and not node.finished.done():
-            executor.spin_once(0.2)
+            executor.spin_once(0.05)
         return (node.finished.result() or 0) if node.finished.done() else 0
     except Exception as error:
         # A call that the end of the context interrupts may raise anything.
