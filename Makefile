@@ -81,9 +81,10 @@ check-scene:
 dependencies: $(VENV)/.deps-test $(VENV)/.package
 
 # `pytest`, not `python -m pytest`, so that the installed package is tested.  Tests of nodes wait
-# more than they compute: so there are more workers than processors.
+# more than they compute: so there are more workers than processors.  A worker that crashes is a
+# test that failed; pytest-xdist may wait for ever for the one that takes its place.
 test: dependencies
-	'$(VENV)/bin/pytest' -n $(WORKERS) $(TESTS) $(ARGS)
+	'$(VENV)/bin/pytest' -n $(WORKERS) --max-worker-restart=0 $(TESTS) $(ARGS)
 
 STRESS ?= 100000
 KILLS ?= 200

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip('rclpy')
 
 from geometry_msgs.msg import PoseStamped
-from helpers.node_harness import SimNode, wait_for
+from helpers.node_harness import DrivenClock, SimNode, wait_for
 from helpers.node_logs import (
     PERIODS_NS,
     QUIET,
@@ -30,7 +30,6 @@ from helpers.node_logs import (
 )
 from helpers.simulations import record
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.time import Time
 from rosbags.highlevel import AnyReader
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu
@@ -295,29 +294,20 @@ def test_a_follower_moves_with_the_clock_of_another_node(peer, diagnostics, tmp_
 
 def test_a_clock_that_steps_back_is_told_and_the_motion_goes_on(peer, tmp_path):
     """As when a log is played in a loop."""
-    publisher = peer.node.create_publisher(Clock, '/clock', 10)
-
-    def drive(begin_ns, until):
-        now_ns = begin_ns
-        def goes_on():
-            nonlocal now_ns
-            now_ns += 5_000_000
-            publisher.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
-            return until()
-        wait_for('samples', goes_on)
-
+    clock = DrivenClock(peer, 500 * SECOND)
     with SimNode(tmp_path, {**QUIET, 'use_sim_time': True}, namespace='/looped') as node:
         pose = peer.listen(node.topic('pose'), PoseStamped)
-        drive(500 * SECOND, lambda: len(pose.raw) > 100)
+        clock.drive('samples', lambda: len(pose.raw) > 100)
         count = len(pose.raw)
-        drive(100 * SECOND, lambda: len(pose.raw) > count + 100)
+        clock.now_ns = 100 * SECOND
+        clock.drive('samples', lambda: len(pose.raw) > count + 100)
         stamps = stamps_of(pose)
         assert (np.diff(stamps) > 0).all()
         assert stamps[0] >= 500 * SECOND
         wait_for('a warning', lambda: '/clock stepped back by 40' in node.err)
         peer.stop_listening(pose)
         assert_clean_end(node, node.end())
-    peer.node.destroy_publisher(publisher)
+    clock.stop()
 
 
 def test_two_sources_of_time_do_not_lock_each_other(peer, tmp_path):

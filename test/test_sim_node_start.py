@@ -6,12 +6,10 @@ import pytest
 pytest.importorskip('rclpy')
 
 from geometry_msgs.msg import PoseStamped
-from helpers.node_harness import SimNode, wait_for
+from helpers.node_harness import DrivenClock, SimNode, wait_for
 from helpers.node_logs import QUIET, TRACEBACK, assert_clean_end, the_log
 from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.time import Time
-from rosgraph_msgs.msg import Clock
 
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
@@ -156,17 +154,7 @@ def test_what_is_said_at_the_start_is_on_rosout_and_at_the_end_what_to_do_next(p
 
 def test_a_clock_that_has_not_begun_or_has_stopped_is_waited_for_aloud(
         peer, diagnostics, tmp_path):
-    publisher = peer.node.create_publisher(Clock, '/clock', 10)
-    now_ns = 1_000_000_000_000
-
-    def drive(until):
-        nonlocal now_ns
-        def goes_on():
-            nonlocal now_ns
-            now_ns += 5_000_000
-            publisher.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
-            return until()
-        wait_for('the node', goes_on)
+    clock = DrivenClock(peer, 1_000_000_000_000)
 
     def waits():
         status = diagnostics.wait_for(node, 'a warning', lambda s: s.level == b'\x01')
@@ -179,13 +167,14 @@ def test_a_clock_that_has_not_begun_or_has_stopped_is_waited_for_aloud(
         assert waits()
         assert node.err.count('waiting for /clock') == 1
         pose = peer.listen(node.topic('pose'), PoseStamped)
-        drive(lambda: len(pose.raw) > 50 and '/clock goes on' in node.err)
-        drive(lambda: diagnostics.statuses(node)[-1].level == b'\x00')
+        clock.drive('the motion', lambda: len(pose.raw) > 50 and '/clock goes on' in node.err)
+        clock.drive('no warning', lambda: diagnostics.statuses(node)[-1].level == b'\x00')
         assert waits()
         assert node.err.count('waiting for /clock') == 2
         count = len(pose.raw)
-        drive(lambda: len(pose.raw) > count + 50 and node.err.count('/clock goes on') == 2)
+        clock.drive('the motion', lambda: (
+            len(pose.raw) > count + 50 and node.err.count('/clock goes on') == 2))
         assert_clean_end(node, node.end())
     assert TRACEBACK not in node.err
     peer.stop_listening(pose)
-    peer.node.destroy_publisher(publisher)
+    clock.stop()

@@ -83,10 +83,10 @@ class Simulation:
         self._schedule = Schedule(streams, epoch_ns)
         self._begin(segment)
 
-    def apply(self, values: Mapping[str, Any]) -> None:
-        """Take over the parameters of streams that take effect at once; see `Stream.apply`."""
+    def apply(self, changes: Mapping[str, Any]) -> None:
+        """Take over new values of parameters that act on samples at once; see `Stream.at_once`."""
         for stream in self.streams:
-            stream.apply(values)
+            stream.apply(changes)
 
     def _begin(self, segment: Segment) -> None:
         self.segment = segment

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import array
 import contextlib
+import functools
 import itertools
 import json
 import os
@@ -36,6 +37,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
@@ -191,14 +194,27 @@ class Topic:
         return deserialize_message(self.raw[-1], self.kind)
 
 
+@functools.cache
+def _participant():
+    """
+    Return the context of all peers of this process, and a node that keeps it in DDS.
+
+    Without a node, the context's DDS participant would be destroyed with each peer: where others
+    come and go at the same time, that has ended in a segmentation fault in Fast DDS.
+    """
+    context = Context()
+    rclpy.init(context=context)
+    return context, Node('participant', context=context, enable_rosout=False,
+                         start_parameter_services=False)
+
+
 class Peer:
     """A node in the test's process, with a thread that listens."""
 
     def __init__(self, name='peer'):
-        self._context = Context()
-        rclpy.init(context=self._context)
-        self.node = Node(name, context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
+        context, _ = _participant()
+        self.node = Node(name, context=context)
+        self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self.node)
         self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
@@ -212,8 +228,8 @@ class Peer:
     def close(self):
         self._executor.shutdown()
         self._thread.join(PATIENCE_S)
+        assert not self._thread.is_alive(), 'the peer still listens'
         self.node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
 
     def __enter__(self):
         return self
@@ -337,6 +353,24 @@ class Diagnostics:
     def number(self, node, key):
         """Return the newest number of this name."""
         return float(numbers(self.wait_for(node, key, lambda _: True))[key])
+
+
+class DrivenClock:
+    """A /clock [ns] that goes on by 5 ms with every look at what is waited for."""
+
+    def __init__(self, peer, now_ns):
+        self._peer, self.now_ns = peer, now_ns
+        self._publisher = peer.node.create_publisher(Clock, '/clock', 10)
+
+    def drive(self, what, until):
+        def goes_on():
+            self.now_ns += 5_000_000
+            self._publisher.publish(Clock(clock=Time(nanoseconds=self.now_ns).to_msg()))
+            return until()
+        wait_for(what, goes_on)
+
+    def stop(self):
+        self._peer.node.destroy_publisher(self._publisher)
 
 
 def numbers(status):
