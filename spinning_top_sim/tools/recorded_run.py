@@ -79,7 +79,8 @@ def read_run_description(reader: LogReader) -> RunDescription:
         history = [Event('command', epoch_ns + t_ns, t_ns, t_ns, {'l3': l3, 'lz': lz})
                    for t_ns, l3, lz in json.loads(metadata['history'])]
         times_ns = [0, *(operator.index(event.t_ns) for event in history), max(begun_ns, 0)]
-        if times_ns != sorted(times_ns) or not 0 <= epoch_ns <= LATEST_NS - times_ns[-1]:
+        if times_ns != sorted(times_ns) or epoch_ns < 0 or (
+                epoch_ns + times_ns[-1] > min(LATEST_NS, reader.span[1] or LATEST_NS)):
             raise ValueError('times are out of order or too late')
         surroundings = {key: metadata[key] for key in ('version', 'platform', 'libraries')}
         topics = _topics(reader.topics, now)
