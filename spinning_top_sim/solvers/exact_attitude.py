@@ -22,13 +22,14 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.solvers.decimal_math import ONE, ZERO, pi, sinh_cosh
 from spinning_top_sim.solvers.nutation import QUARTER_PERIOD_ANGLE, NutationPhase
-from spinning_top_sim.solvers.rotations import STEP_ANGLE, Rotations
+from spinning_top_sim.solvers.rotations import STEP_ANGLE, Rotations, Scratch
 from spinning_top_sim.solvers.theta_series import Series
 from spinning_top_sim.solvers.theta_setup import Factor, ThetaMotion
 from spinning_top_sim.solvers.times import Times
 
 NEGLIGIBLE = Decimal('1e-18')           # beside the largest term
-BLOCK = 8192            # times evaluated together: temporaries stay in the cache
+BLOCK = 16384           # times evaluated together: temporaries stay in the cache
+_SCRATCH = Scratch()
 
 
 class AttitudeSeries:
@@ -75,36 +76,38 @@ class AttitudeSeries:
         return out
 
     def _fill(self, out: NDArray[np.float64], times: Times) -> None:
+        series, squares, (scale, product, *_) = _SCRATCH.rows(3, 4, len(times))
         if self._hyperbolic:
             y, sin, cos, flip = self._hyperbolic_phase(times)
             cosines, sines = self._rotations.cosines_and_sines(
                 times, self._drifts / STEP_ANGLE * y)
-            series = self._series(-sin * sin, sin, cos)
+            self._series(-sin * sin, sin, cos, series)
             for k in self._flipped:
                 series[k:k + 2] *= flip
         else:
             cosines, sines = (self._rotations.cosines_and_sines(times) if times.ns is None
                               else self._rotations.at_ns(times.ns))
-            series = self._series(sines[2] * sines[2], sines[2], cosines[2])
-        squares = series * series
-        scale = (squares[0] + squares[1]) + (squares[2] + squares[3])
-        series *= 1.0 / np.sqrt(scale)
+            self._series(sines[2] * sines[2], sines[2], cosines[2], series)
+        np.multiply(series, series, out=squares)
+        np.sqrt(np.add.reduce(squares, out=scale), out=scale)
+        series *= np.divide(1.0, scale, out=scale)
         for k in (0, 1):
             real, imag = series[2 * k], series[2 * k + 1]
-            np.subtract(real * cosines[k], imag * sines[k], out=out[2 * k])
-            np.add(real * sines[k], imag * cosines[k], out=out[2 * k + 1])
+            np.multiply(real, cosines[k], out=out[2 * k])
+            out[2 * k] -= np.multiply(imag, sines[k], out=product)
+            np.multiply(real, sines[k], out=out[2 * k + 1])
+            out[2 * k + 1] += np.multiply(imag, cosines[k], out=product)
 
-    def _series(self, xi: Column, sin: Column, cos: Column) -> NDArray[np.float64]:
-        """Return -s J and R of beta, s J and R of alpha, (4, n)."""
-        series: NDArray[np.float64] = self._coefficients[-1] * xi
+    def _series(self, xi: Column, sin: Column, cos: Column, out: NDArray[np.float64]) -> None:
+        """Fill in -s J and R of beta, s J and R of alpha, (4, n)."""
+        np.multiply(self._coefficients[-1], xi, out=out)
         for coefficient in self._coefficients[-2:0:-1]:
-            series += coefficient
-            series *= xi
-        series += self._coefficients[0]
+            out += coefficient
+            out *= xi
+        out += self._coefficients[0]
         for k, prefactor in enumerate(self._prefactors):
             for factor in ((), (cos,), (sin,), (sin, cos))[prefactor]:
-                series[k] *= factor
-        return series
+                out[k] *= factor
 
     def _hyperbolic_phase(self, times: Times) -> tuple[Column, Column, Column, Column]:
         """Return y in [-pi/2, pi/2], sinh x, cosh x and (-1)^(N/2), N even and nearest."""

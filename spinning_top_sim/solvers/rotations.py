@@ -3,14 +3,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import threading
+from collections.abc import Iterable, Sequence
 from decimal import Decimal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.solvers.decimal_math import ONE
-from spinning_top_sim.solvers.times import NANOSECONDS, Rate, Times, halves
+from spinning_top_sim.solvers.times import (
+    LARGEST_NS,
+    NANOSECONDS,
+    UNITS,
+    Rate,
+    Times,
+    Unit,
+    halves,
+)
 
 Rows = NDArray[np.float64]
 
@@ -20,7 +30,7 @@ STEP_ANGLE = 2.0 * np.pi / STEPS
 # Within so many turns the rest of an angle is rounded by less than 1e-16 rad.
 SHORT_TURNS = 2.0 ** 22
 # Grids of shorter steps have too many times in a second to keep.
-SHORTEST_STEP_NS, GRIDS_KEPT = 50_000, 16
+SHORTEST_STEP_NS, GRIDS_KEPT, SECONDS_KEPT = 50_000, 16, 60
 # 1.5 * 2^52: doubles of this size are whole numbers k + WHOLE; their last bits are those of k.
 WHOLE = 1.5 * 2.0 ** 52
 
@@ -36,6 +46,32 @@ def _table() -> tuple[Rows, Rows]:
 
 
 COSINES, SINES = _table()
+
+
+def _column(values: Iterable[Decimal]) -> Rows:
+    return np.array([[float(x)] for x in values])
+
+
+class Scratch(threading.local):
+    """
+    Memory for the temporaries of a block, which each thread keeps.
+
+    Fresh memory costs as much as the arithmetic in it: the C library returns arrays of this size
+    to the system, which clears every page again.
+    """
+
+    def __init__(self) -> None:
+        self._kept = np.empty(0)
+
+    def rows(self, *shape: int) -> Rows:
+        """Return an array of this shape, of any content; the next call returns the same memory."""
+        size = math.prod(shape)
+        if size > len(self._kept):
+            self._kept = np.empty(size)
+        return self._kept[:size].reshape(shape)
+
+
+_ANGLES, _PRODUCTS = Scratch(), Scratch()
 
 
 class Rotations:
@@ -54,23 +90,33 @@ class Rotations:
     """
 
     def __init__(self, angles: Sequence[tuple[Decimal, Decimal]]) -> None:
-        rows = []
-        for rate, start in angles:
-            per_ns, at_zero = rate * STEPS / 10 ** 9, start.remainder_near(ONE) * STEPS
-            rate_high, whole = halves(float(per_ns))[0], at_zero.to_integral_value()
-            rows.append((rate_high, float(per_ns - Decimal(rate_high)),
-                         WHOLE + float(whole), float(at_zero - whole)))
-        self._rate_high, self._rate_low, self._whole, self._start_rest = (
-            np.array(rows).T[:, :, np.newaxis])
+        starts = [start.remainder_near(ONE) * STEPS for _, start in angles]
+        whole = [start.to_integral_value() for start in starts]
+        self._whole = WHOLE + _column(whole)
+        self._start_rest = _column([a - b for a, b in zip(starts, whole, strict=True)])
         self._rates = [Rate(rate) for rate, _ in angles]
-        fastest = max(abs(rate.high) for rate in self._rates)
-        self._short_ns = SHORT_TURNS / fastest if fastest else np.inf
+        fastest = max(abs(rate) for rate, _ in angles)
+        # [steps], as halves of doubles and what they leave out, and the times up to which they
+        # are enough.
+        self._in: dict[Unit, tuple[Rows, Rows, float]] = {}
+        for unit, scale in UNITS.items():
+            exact = [rate * scale * STEPS for rate, _ in angles]
+            high = halves(_column(exact))[0]
+            low = _column(rate - Decimal(float(x))
+                          for rate, x in zip(exact, high[:, 0], strict=True))
+            self._in[unit] = high, low, SHORT_TURNS / max(float(fastest * scale), 1e-300)
         # By step and offset [ns]: `_within_second` of uniform grids.
         self._grids: dict[tuple[int, int], tuple[Rows, Rows]] = {}
+        # The first of the seconds that `_at_seconds` has computed, and what it found.
+        self._seconds = 0, np.empty((2, len(angles), 0))
 
     def cosines_and_sines(self, times: Times, added: Rows | float = 0.0) -> tuple[Rows, Rows]:
-        """Return cos and sin of the angles, (k, n) each, with `added` (k, n) [steps]."""
-        return self._of_steps(*self._in_steps(times, self._start_rest + added), self._whole)
+        """
+        Return cos and sin of the angles, (k, n) each, with `added` (k, n) [steps].
+
+        Their memory is used again by the next call in the same thread.
+        """
+        return self._of_steps(self._in_steps(times, self._start_rest + added), self._whole)
 
     def at_ns(self, ns: NDArray[np.int64] | range) -> tuple[Rows, Rows]:
         """
@@ -80,13 +126,14 @@ class Rotations:
         second.  A uniform grid that divides the second needs the latter once: it takes half the
         time of `cosines_and_sines`, and a value depends on its own time only.
         """
-        if self._short_ns < 1.0:        # a second has more turns than a double counts
+        if self._in['ns'][2] < 1.0:        # a second has more turns than a double counts
             return self.cosines_and_sines(Times.from_ns(ns))
         if isinstance(ns, range) and NANOSECONDS % ns.step == 0 and ns.step >= SHORTEST_STEP_NS:
             return self._on_grid(ns)
         times = np.asarray(ns, dtype=np.int64)
         seconds, inverse = np.unique(times // NANOSECONDS, return_inverse=True)
-        row_cosine, row_sine = (x.take(inverse, axis=1) for x in self._at_seconds(seconds))
+        row_cosine, row_sine = (x.take(inverse, axis=1) for x in self.cosines_and_sines(
+            Times.from_ns(seconds * NANOSECONDS)))
         cosine, sine = self._within_second(times % NANOSECONDS)
         return row_cosine * cosine - row_sine * sine, row_sine * cosine + row_cosine * sine
 
@@ -95,47 +142,82 @@ class Rotations:
         if key not in self._grids:
             while len(self._grids) >= GRIDS_KEPT:
                 del self._grids[next(iter(self._grids))]
-            self._grids[key] = self._within_second(np.arange(offset, NANOSECONDS, step))
-        first = grid.start // NANOSECONDS
-        seconds = np.arange(first, grid[-1] // NANOSECONDS + 1)
+            cosine, sine = self._within_second(np.arange(offset, NANOSECONDS, step))
+            self._grids[key] = cosine.copy(), sine.copy()
+        seconds = range(grid.start // NANOSECONDS, grid[-1] // NANOSECONDS + 1)
         row_cosine, row_sine = (x[:, :, np.newaxis] for x in self._at_seconds(seconds))
         cosine, sine = (x[:, np.newaxis, :] for x in self._grids[key])
-        begin = (grid.start - first * NANOSECONDS) // step
+        begin = (grid.start - seconds[0] * NANOSECONDS) // step
         part = slice(begin, begin + len(grid))
-        cosines = (row_cosine * cosine - row_sine * sine).reshape(len(self._whole), -1)
-        sines = (row_sine * cosine + row_cosine * sine).reshape(len(self._whole), -1)
-        return cosines[:, part], sines[:, part]
+        cosines, sines, product = _PRODUCTS.rows(
+            3, len(self._whole), len(seconds), NANOSECONDS // step)
+        np.multiply(row_cosine, cosine, out=cosines)
+        cosines -= np.multiply(row_sine, sine, out=product)
+        np.multiply(row_sine, cosine, out=sines)
+        sines += np.multiply(row_cosine, sine, out=product)
+        return (cosines.reshape(len(self._whole), -1)[:, part],
+                sines.reshape(len(self._whole), -1)[:, part])
 
-    def _at_seconds(self, seconds: NDArray[np.int64]) -> tuple[Rows, Rows]:
-        return self.cosines_and_sines(Times.from_ns(seconds * NANOSECONDS))
+    def _at_seconds(self, seconds: range) -> tuple[Rows, Rows]:
+        """Return cos and sin of the angles when these seconds begin; a minute is kept."""
+        first, rows = self._seconds
+        if not first <= seconds[0] <= seconds[-1] < first + rows.shape[2]:
+            first = seconds[0]
+            end = min(first + max(len(seconds), SECONDS_KEPT), LARGEST_NS // NANOSECONDS + 2)
+            rows = np.array(self.cosines_and_sines(
+                Times.from_ns(np.arange(first, end) * NANOSECONDS)))
+            self._seconds = first, rows
+        cosines, sines = rows[:, :, seconds[0] - first:][:, :, :len(seconds)]
+        return cosines, sines
 
     def _within_second(self, ns: NDArray[np.int64]) -> tuple[Rows, Rows]:
         """Return cos and sin of what the angles grow by in less than a second."""
-        return self._of_steps(*self._in_steps(Times.from_ns(ns), np.zeros_like(self._start_rest)),
+        return self._of_steps(self._in_steps(Times.from_ns(ns), np.zeros_like(self._start_rest)),
                               WHOLE)
 
-    def _of_steps(self, exact: Rows, rest: Rows, whole_start: Rows | float) -> tuple[Rows, Rows]:
+    def _in_steps(self, times: Times, start_rest: Rows) -> Rows:
         """
-        Return cos and sin of angles in steps; both arguments are overwritten.
+        Return `exact` and `rest` of the angles, without the whole steps at t = 0.
 
-        In place, as fresh memory costs as much as the sums.
+        They are the first two of six (k, n) to compute in.
+        """
+        work = _ANGLES.rows(6, len(self._whole), len(times))
+        exact, rest, product, *_ = work
+        rate_high, rate_low, short = self._in[times.unit]
+        time_high, time_low = times.halves
+        np.multiply(rate_high, time_high, out=exact)
+        np.multiply(rate_high, time_low + times.low, out=rest)
+        rest += np.multiply(rate_low, times.high, out=product)
+        rest += start_rest
+        if times.latest > short:
+            far = np.abs(times.high) > short
+            distant, start_rest = times[far], np.broadcast_to(start_rest, exact.shape)[:, far]
+            for k, rate in enumerate(self._rates):
+                turns, turns_rest = rate.fraction(distant)
+                exact[k, far] = STEPS * turns
+                rest[k, far] = STEPS * turns_rest + start_rest[k]
+        return work
+
+    def _of_steps(self, work: Rows, whole_start: Rows | float) -> tuple[Rows, Rows]:
+        """
+        Return cos and sin of angles in steps, of which `_in_steps` has returned `work`.
 
         whole_start : WHOLE and the whole steps of the angles at t = 0
         """
-        # Adding WHOLE rounds to whole steps, and taking it away again is exact.  `rest` may have
-        # whole steps too, so the last bits of both sums together are those of the step j.
-        step = exact + whole_start
-        remainder = exact
-        remainder -= step - whole_start
+        remainder, rest, step, table_cosine, table_sine, product = work
+        # Adding WHOLE rounds to whole steps, and taking it away again is exact; so is the
+        # difference to `exact`, which `remainder` begins with.
+        np.add(remainder, rest, out=step)
+        step += whole_start
+        remainder -= np.subtract(step, whole_start, out=product)
         remainder += rest
-        more_steps = remainder + WHOLE
-        remainder -= more_steps - WHOLE
         index = step.view(np.int64)
-        index += more_steps.view(np.int64)
         index &= STEPS - 1
-        table_cosine, table_sine = COSINES.take(index), SINES.take(index)
+        # Nothing is clipped; `take` copies unless it may clip.
+        COSINES.take(index, out=table_cosine, mode='clip')
+        SINES.take(index, out=table_sine, mode='clip')
         square = np.multiply(remainder, remainder, out=rest)
-        cosine = np.multiply(square, STEP_ANGLE ** 4 / 24.0, out=more_steps)
+        cosine = np.multiply(square, STEP_ANGLE ** 4 / 24.0, out=step)
         cosine -= STEP_ANGLE ** 2 / 2.0
         cosine *= square
         cosine += 1.0
@@ -143,23 +225,8 @@ class Rotations:
         sine += STEP_ANGLE
         sine *= remainder
         cosines = np.multiply(table_cosine, cosine, out=remainder)
-        cosines -= table_sine * sine
-        sines = np.multiply(table_sine, cosine, out=table_sine)
-        sines += np.multiply(table_cosine, sine, out=table_cosine)
+        cosines -= np.multiply(table_sine, sine, out=product)
+        table_sine *= cosine
+        sines = np.multiply(table_cosine, sine, out=sine)
+        sines += table_sine
         return cosines, sines
-
-    def _in_steps(self, times: Times, start_rest: Rows) -> tuple[Rows, Rows]:
-        """Return `exact` and `rest` of the angles, without the whole steps at t = 0."""
-        time_high, time_low = times.halves
-        exact = self._rate_high * time_high
-        rest = self._rate_high * (time_low + times.low)
-        rest += self._rate_low * times.high
-        rest += start_rest
-        far = np.abs(times.high) > self._short_ns
-        if far.any():
-            distant, start_rest = times[far], np.broadcast_to(start_rest, exact.shape)[:, far]
-            for k, rate in enumerate(self._rates):
-                turns, turns_rest = rate.fraction(distant)
-                exact[k, far] = STEPS * turns
-                rest[k, far] = STEPS * turns_rest + start_rest[k]
-        return exact, rest

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from decimal import Decimal
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,8 @@ from spinning_top_sim.physics.attitude import Column, Number
 from spinning_top_sim.solvers.decimal_math import double_double
 
 NANOSECONDS = 1_000_000_000
+Unit = Literal['s', 'ns']
+UNITS: dict[Unit, Decimal] = {'s': Decimal(1), 'ns': Decimal('1e-9')}
 # The largest time [ns] that is taken as an integer: the end of int64 lies a second behind it.
 LARGEST_NS = 2 ** 63 - NANOSECONDS
 # 2^27 + 1: the factor that splits a double into two halves (Dekker, Numer. Math. 18, 1971, 224).
@@ -28,7 +31,7 @@ def halves(x: Number) -> tuple[Number, Number]:
 
 class Times:
     """
-    Times since the start of a motion, as exact sums of two doubles [ns].
+    Times since the start of a motion, as exact sums of two doubles in the unit they come in.
 
     The sums are computed when they are first asked for: those of a block stay in the cache.
 
@@ -60,7 +63,7 @@ class Times:
 
     @property
     def latest(self) -> float:
-        """The largest time either way, as given: [ns] or [s]."""
+        """The largest time either way."""
         given = self._given
         if not len(given):
             return 0.0
@@ -68,14 +71,17 @@ class Times:
             return float(max(abs(given[0]), abs(given[-1])))
         return max(float(given.max()), -float(given.min()))
 
+    @property
+    def unit(self) -> Unit:
+        """Nanoseconds for integers, seconds for doubles."""
+        return 's' if self.ns is None else 'ns'
+
     @cached_property
     def _sums(self) -> tuple[Column, Column]:
-        """Nearest doubles, and what they leave out [ns]."""
+        """Nearest doubles, and what they leave out."""
         ns = self.ns
         if ns is None:
-            first, second = halves(self.seconds)
-            high = self.seconds * 1e9               # 1e9 has 21 bits
-            return high, (first * 1e9 - high) + second * 1e9
+            return self.seconds, np.broadcast_to(0.0, len(self))
         if isinstance(ns, range):       # `numpy.arange` takes its length from doubles
             ns = (ns.start if ns else 0) + ns.step * np.arange(len(ns), dtype=np.int64)
         if self.latest <= 2.0 ** 53:
@@ -87,12 +93,12 @@ class Times:
 
     @property
     def high(self) -> Column:
-        """Nearest doubles (n,) [ns]."""
+        """Nearest doubles (n,)."""
         return self._sums[0]
 
     @property
     def low(self) -> Column:
-        """What the nearest doubles leave out (n,) [ns]."""
+        """What the nearest doubles leave out (n,)."""
         return self._sums[1]
 
     @cached_property
@@ -124,15 +130,16 @@ class Rate:
     """A rate [1/s] as two doubles; its product with a time has no error that grows with it."""
 
     def __init__(self, per_second: Decimal) -> None:
-        self.high, self.low = double_double(per_second * Decimal('1e-9'))
-        self._first, self._second = halves(self.high)
+        self._in = {unit: double_double(per_second * scale) for unit, scale in UNITS.items()}
 
     def product(self, times: Times) -> tuple[Column, Column]:
         """Return rate * t as nearest doubles and what they leave out."""
+        rate_high, rate_low = self._in[times.unit]
+        r1, r2 = halves(rate_high)
         t1, t2 = times.halves
-        high = self.high * times.high
-        rest = ((self._first * t1 - high) + self._first * t2 + self._second * t1)
-        return high, (rest + self._second * t2) + (self.low * times.high + self.high * times.low)
+        high = rate_high * times.high
+        rest = ((r1 * t1 - high) + r1 * t2 + r2 * t1)
+        return high, (rest + r2 * t2) + (rate_low * times.high + rate_high * times.low)
 
     def fraction(self, times: Times) -> tuple[Column, Column]:
         """Return rate * t less whole numbers: doubles in [-1/2, 1/2] and small rests."""
