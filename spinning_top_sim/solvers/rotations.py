@@ -106,7 +106,7 @@ class Rotations:
                           for rate, x in zip(exact, high[:, 0], strict=True))
             self._in[unit] = high, low, SHORT_TURNS / max(float(fastest * scale), 1e-300)
         # By step and offset [ns]: `_within_second` of uniform grids.
-        self._grids: dict[tuple[int, int], tuple[Rows, Rows]] = {}
+        self._grids: dict[tuple[int, int], Rows] = {}
         # The first of the seconds that `_at_seconds` has computed, and what it found.
         self._seconds = 0, np.empty((2, len(angles), 0))
 
@@ -116,7 +116,7 @@ class Rotations:
 
         Their memory is used again by the next call in the same thread.
         """
-        return self._of_steps(self._in_steps(times, self._start_rest + added), self._whole)
+        return self._evaluate(times, self._start_rest + added, self._whole)
 
     def at_ns(self, ns: NDArray[np.int64] | range) -> tuple[Rows, Rows]:
         """
@@ -142,21 +142,20 @@ class Rotations:
         if key not in self._grids:
             while len(self._grids) >= GRIDS_KEPT:
                 del self._grids[next(iter(self._grids))]
-            cosine, sine = self._within_second(np.arange(offset, NANOSECONDS, step))
-            self._grids[key] = cosine.copy(), sine.copy()
+            self._grids[key] = np.array(self._within_second(np.arange(offset, NANOSECONDS, step)))
         seconds = range(grid.start // NANOSECONDS, grid[-1] // NANOSECONDS + 1)
         row_cosine, row_sine = (x[:, :, np.newaxis] for x in self._at_seconds(seconds))
         cosine, sine = (x[:, np.newaxis, :] for x in self._grids[key])
         begin = (grid.start - seconds[0] * NANOSECONDS) // step
         part = slice(begin, begin + len(grid))
-        cosines, sines, product = _PRODUCTS.rows(
-            3, len(self._whole), len(seconds), NANOSECONDS // step)
+        rows = _PRODUCTS.rows(3, len(self._whole), len(seconds), NANOSECONDS // step)
+        cosines, sines, product = rows
         np.multiply(row_cosine, cosine, out=cosines)
         cosines -= np.multiply(row_sine, sine, out=product)
         np.multiply(row_sine, cosine, out=sines)
         sines += np.multiply(row_cosine, sine, out=product)
-        return (cosines.reshape(len(self._whole), -1)[:, part],
-                sines.reshape(len(self._whole), -1)[:, part])
+        cosines, sines, _ = rows.reshape(3, len(self._whole), -1)[:, :, part]
+        return cosines, sines
 
     def _at_seconds(self, seconds: range) -> tuple[Rows, Rows]:
         """Return cos and sin of the angles when these seconds begin; a minute is kept."""
@@ -172,17 +171,18 @@ class Rotations:
 
     def _within_second(self, ns: NDArray[np.int64]) -> tuple[Rows, Rows]:
         """Return cos and sin of what the angles grow by in less than a second."""
-        return self._of_steps(self._in_steps(Times.from_ns(ns), np.zeros_like(self._start_rest)),
-                              WHOLE)
+        return self._evaluate(Times.from_ns(ns), np.zeros_like(self._start_rest), WHOLE)
 
-    def _in_steps(self, times: Times, start_rest: Rows) -> Rows:
+    def _evaluate(self, times: Times, start_rest: Rows, whole_start: Rows | float,
+                  ) -> tuple[Rows, Rows]:
         """
-        Return `exact` and `rest` of the angles, without the whole steps at t = 0.
+        Return cos and sin of rate times t plus a start, (k, n) each.
 
-        They are the first two of six (k, n) to compute in.
+        start_rest : [steps], (k, 1) or (k, n)
+        whole_start : WHOLE and the whole steps of the start, (k, 1)
         """
-        work = _ANGLES.rows(6, len(self._whole), len(times))
-        exact, rest, product, *_ = work
+        exact, rest, step, table_cosine, table_sine, product = _ANGLES.rows(
+            6, len(self._whole), len(times))
         rate_high, rate_low, short = self._in[times.unit]
         time_high, time_low = times.halves
         np.multiply(rate_high, time_high, out=exact)
@@ -196,20 +196,11 @@ class Rotations:
                 turns, turns_rest = rate.fraction(distant)
                 exact[k, far] = STEPS * turns
                 rest[k, far] = STEPS * turns_rest + start_rest[k]
-        return work
-
-    def _of_steps(self, work: Rows, whole_start: Rows | float) -> tuple[Rows, Rows]:
-        """
-        Return cos and sin of angles in steps, of which `_in_steps` has returned `work`.
-
-        whole_start : WHOLE and the whole steps of the angles at t = 0
-        """
-        remainder, rest, step, table_cosine, table_sine, product = work
-        # Adding WHOLE rounds to whole steps, and taking it away again is exact; so is the
-        # difference to `exact`, which `remainder` begins with.
-        np.add(remainder, rest, out=step)
+        # Adding WHOLE rounds to whole steps; taking it away again is exact, and so is the
+        # difference between these steps and `exact`.
+        np.add(exact, rest, out=step)
         step += whole_start
-        remainder -= np.subtract(step, whole_start, out=product)
+        remainder = np.subtract(exact, np.subtract(step, whole_start, out=product), out=exact)
         remainder += rest
         index = step.view(np.int64)
         index &= STEPS - 1
