@@ -155,7 +155,7 @@ def replayed(path):
         code = node.finished.result() if node.finished.done() else 'going on'
         node.destroy_node()
         return f'replay {code}'
-    except ValueError as error:
+    except (LogError, ValueError) as error:
         assert '\n' not in str(error), error
         return 'replay refused'
     finally:
