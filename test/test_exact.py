@@ -519,11 +519,10 @@ def test_a_second_of_a_motion_that_ends_within_it():
     """Its phases at the end of the second are no longer held."""
     solution = ExactSolution(UNIT, start(0.7, 0.6e16, l3=2e16, lz=0.6e16))
     assert solution.ns_limit < 10 ** 9
-    with np.errstate(all='raise'):
-        quaternion = solution.states(range(0, 100_000_000, 50_000)).quaternion
-    expected = solution.states_at_seconds(np.arange(5) * 5e-5).quaternion
+    quaternion = solution.states(range(-250_000, 250_001, 50_000)).quaternion
+    expected = solution.states_at_seconds(np.arange(-5, 6) * 5e-5).quaternion
     # Times in seconds are rounded: by 1e-20 s, in which it turns by 3e-4 rad.
-    assert np.abs(quaternion[:5] - expected).max() < 1e-3
+    assert np.abs(quaternion - expected).max() < 1e-3
 
 
 @pytest.mark.parametrize('t', [[math.nan], [0.0, math.inf], [-math.inf], [1e300]])
@@ -732,6 +731,19 @@ def test_cosines_and_sines_are_right_to_a_rounding(turns, direction, unit):
                 sine, cosine = sin_cos(2 * pi() * (angle - angle.to_integral_value()))
                 assert abs(Decimal(float(cosines[k, i])) - cosine) <= bound
                 assert abs(Decimal(float(sines[k, i])) - sine) <= bound
+
+
+def test_slow_angles_of_times_that_are_no_doubles():
+    rate, start = ANGLES[0]
+    with precision(60):
+        rotations = Rotations([(rate / 1000, start)])
+    for count in (2 ** 60 + 127, -2 ** 60 - 127):
+        cosines, sines = rotations.cosines_and_sines(Times.from_ns(np.array([count])))
+        with precision(60):
+            angle = rate / 1000 * count / 10 ** 9 + start
+            sine, cosine = sin_cos(2 * pi() * (angle - angle.to_integral_value()))
+            assert abs(Decimal(float(cosines[0, 0])) - cosine) <= Decimal('3e-16')
+            assert abs(Decimal(float(sines[0, 0])) - sine) <= Decimal('3e-16')
 
 
 def test_threads_share_a_solution():
