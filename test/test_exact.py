@@ -14,8 +14,8 @@ import pickle
 import random
 import subprocess
 import sys
+import threading
 import weakref
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from decimal import Context, Decimal, Inexact, localcontext
 from fractions import Fraction
@@ -39,6 +39,7 @@ from spinning_top_sim.solvers.decimal_math import (
     sinh_cosh,
 )
 from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.solvers.exact_attitude import AttitudeSeries
 from spinning_top_sim.solvers.rotations import Rotations
 from spinning_top_sim.solvers.theta_setup import _cubic_roots, set_up
 from spinning_top_sim.solvers.times import LARGEST_NS, Rate, Times
@@ -515,16 +516,6 @@ def test_a_grid_in_pieces_has_the_same_bits(name):
         assert solution.states(times[part]).quaternion.tobytes() == whole[part].tobytes()
 
 
-def test_a_second_of_a_motion_that_ends_within_it():
-    """Its phases at the end of the second are no longer held."""
-    solution = ExactSolution(UNIT, start(0.7, 0.6e16, l3=2e16, lz=0.6e16))
-    assert solution.ns_limit < 10 ** 9
-    quaternion = solution.states(range(-250_000, 250_001, 50_000)).quaternion
-    expected = solution.states_at_seconds(np.arange(-5, 6) * 5e-5).quaternion
-    # Times in seconds are rounded: by 1e-20 s, in which it turns by 3e-4 rad.
-    assert np.abs(quaternion - expected).max() < 1e-3
-
-
 @pytest.mark.parametrize('t', [[math.nan], [0.0, math.inf], [-math.inf], [1e300]])
 def test_times_that_are_none_are_refused(t):
     solution = ExactSolution(*REGIMES['looping'])
@@ -746,21 +737,38 @@ def test_slow_angles_of_times_that_are_no_doubles():
             assert abs(Decimal(float(sines[0, 0])) - sine) <= Decimal('3e-16')
 
 
-def test_threads_share_a_solution():
-    """Each has memory of its own for temporaries."""
-    top, start = TOP, State(theta=0.5, l3=0.05, lz=0.04)
-    times = [range(begin, begin + 200_000_000_000, 1_000_000) for begin in (0, 7_000_000_000)]
-    alone = [ExactSolution(top, start).states(one).rows_quaternion for one in times]
-    solution = ExactSolution(top, start)
-    interval = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    try:
-        with ThreadPoolExecutor(4) as pool:
-            both = list(pool.map(lambda one: solution.states(one).rows_quaternion, 8 * times))
-    finally:
-        sys.setswitchinterval(interval)
-    for one, other in zip(both, 8 * alone, strict=True):
-        assert np.array_equal(one, other)
+def test_threads_share_a_solution(monkeypatch):
+    """One in the midst of another's evaluation changes nothing of that."""
+    here, there = (Times.from_ns(range(begin, begin + 20 * 10 ** 9, 10 ** 6))
+                   for begin in (0, 7 * 10 ** 9))
+    alone = ExactSolution(*REGIMES['looping'])._series.quaternion(here)
+    series = ExactSolution(*REGIMES['looping'])._series
+    evaluate, this = AttitudeSeries._series, threading.current_thread()
+    others = []
+
+    def interrupted(*given):
+        if threading.current_thread() is this:
+            other = threading.Thread(target=lambda: others.append(series.quaternion(there)))
+            other.start()
+            other.join(60.0)
+        evaluate(*given)
+
+    monkeypatch.setattr(AttitudeSeries, '_series', interrupted)
+    assert series.quaternion(here).tobytes() == alone.tobytes()
+    assert others and not np.array_equal(others[0], alone)
+
+
+def test_angles_that_turn_more_often_in_a_second_than_a_double_counts():
+    rate, start = Decimal('8.7654321098765432e19'), Decimal('0.3')
+    with precision(60):
+        rotations = Rotations([(rate, start)])
+    times = range(-50_000, 50_001, 50_000)
+    cosines, _ = rotations.at_ns(times)
+    for count, found in zip(times, cosines[0], strict=True):
+        with precision(60):
+            angle = rate * count / 10 ** 9 + start
+            _, cosine = sin_cos(2 * pi() * (angle - angle.to_integral_value()))
+            assert abs(Decimal(float(found)) - cosine) <= Decimal('4e-16')
 
 
 def test_a_phase_keeps_its_fraction_of_a_turn():
