@@ -5,6 +5,7 @@ import fcntl
 import inspect
 import os
 import re
+import signal
 import subprocess
 import sys
 from importlib.metadata import PackageNotFoundError, distribution
@@ -286,3 +287,14 @@ def test_a_scene_holds_parameters_that_the_node_takes(scene):
         values.pop('use_sim_time', None)
         parameters.checked({name: value for name, value in values.items()
                             if not name.startswith('qos_overrides.')})
+
+
+@pytest.mark.parametrize('script', SCRIPTS, ids=lambda script: script.name)
+def test_ctrl_c_during_the_imports_of_a_script_leaves_no_traceback(script, tmp_path):
+    (tmp_path / NAME).mkdir()
+    (tmp_path / NAME / '__init__.py').write_text(
+        'import signal\nsignal.raise_signal(signal.SIGINT)\n')
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False,
+                          env={**os.environ, 'PYTHONPATH': str(tmp_path)})
+    assert done.returncode == -signal.SIGINT
+    assert done.stderr == done.stdout == ''

@@ -447,9 +447,10 @@ def test_names_and_qos_can_be_changed_as_usual(peer, tmp_path, strangers_log):
 def test_start_and_topics_choose_what_is_played(peer, tmp_path, strangers_log):
     path, wanted = strangers_log
     raw, node = play_all(peer, tmp_path, path, STRANGERS[:1], '--topics', '/chatter', '/nobody',
-                         '--start', '0.4', depth=20)
+                         'cmd_vel', '--start', '0.4', depth=20)
     assert_same(raw, [wanted[0][10:]])
-    assert 'the log has no topic /nobody' in node.err
+    assert 'the log has no topic /nobody\n' in node.err
+    assert 'the log has no topic cmd_vel; did you mean /robot/cmd_vel?' in node.err
     assert 'on 1 topics' in node.out
 
 
@@ -615,7 +616,8 @@ def test_what_cannot_be_played_is_one_line_and_exit_code_2(tmp_path, strangers_l
             ((text,), 'no MCAP'),
             ((path, '--topics', '/nobody'), '/chatter'),
             ((path, '--start', '99'), '1.180 s'),
-            ((path, '--rate', '0'), 'must be a number in [1e-06, 1e+09]')):
+            ((path, '--rate', '0'), 'argument -r/--rate: 0: must be a number in [1e-06, 1e+09]; '
+             '--start-paused begins with a pause')):
         with Replay(tmp_path / 'node', *options) as node:
             assert node.wait() == 2
         assert says in node.err.splitlines()[-1], node.err

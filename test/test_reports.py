@@ -4,6 +4,8 @@
 import io
 import math
 import os
+import shlex
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -65,6 +67,27 @@ def test_the_real_time_factor_is_measured_between_readings_that_are_apart(clock,
     assert factor() == 0.25
 
 
+def test_the_status_line_shows_the_speed_of_a_motion_that_has_run_all_the_time(clock, reported):
+    def shown(after=1.0):
+        clock.now += after
+        reported.report.diagnostics(Time(), 'top', 0.0)
+        line = reported.report.status_line()
+        return [part for part in line.split(' | ') if part.startswith('x')]
+
+    assert shown() == [] == shown()                     # paused, after a step
+    reported.loop.resume()
+    assert shown() == []
+    assert len(shown()) == 1
+    reported.loop.pause()
+    assert shown(after=0.0) == [] == shown()
+    reported.loop.resume()
+    assert shown() == []
+    assert len(shown()) == 1
+    reported.loop.reset(reported.simulation.values, 0)
+    assert shown() == []
+    assert len(shown()) == 1
+
+
 def test_the_worst_problem_is_the_level_and_the_message(reported):
     level, message, numbers = status_of(reported)
     assert (level, message) == (0, 'paused')
@@ -96,7 +119,7 @@ def test_the_worst_problem_is_the_level_and_the_message(reported):
 
 def test_the_status_line_and_what_is_told_of_a_new_motion(reported):
     told = reported.report.new_motion()
-    assert 'cusp' in told
+    assert 'cusp' in told and max(map(len, told.splitlines())) <= 80
     assert reported.report.new_motion() is None
     line = reported.report.status_line()
     assert line.startswith('t      1.25 s paused | ') and 'x' not in line.split()
@@ -108,11 +131,25 @@ def test_the_status_line_and_what_is_told_of_a_new_motion(reported):
     assert ' | log 1.2 MB | ' in reported.report.status_line()
     reported.simulation.streams[0].sent = 12
     assert ' | 12 messages | ' in reported.report.status_line()
-    reported.loop.waits_for_clock = True
+    reported.report.waits_for_clock = True
     assert ' waiting for /clock | ' in reported.report.status_line()
     assert status_of(reported)[:2] == (1, 'waiting for /clock')
     reported.loop.fail('at a pole')
     assert ' FAILED | ' in reported.report.status_line()
+
+
+@pytest.mark.parametrize('on_path', [False, True])
+def test_the_next_command_works_where_it_is_pasted(monkeypatch, tmp_path, on_path):
+    monkeypatch.setattr(reports.sys, 'executable', str(tmp_path / 'my bin/python'))
+    monkeypatch.setattr(reports.shutil, 'which', lambda _: '/bin/inspect' if on_path else None)
+    log = Path('/a b/run.mcap')
+    if not on_path:
+        assert reports.inspect_command(log).startswith('ros2 run spinning_top_sim inspect ')
+        (tmp_path / 'my bin').mkdir()
+        (tmp_path / 'my bin/inspect').touch()
+    program, *arguments = shlex.split(reports.inspect_command(log))
+    assert program == ('inspect' if on_path else str(tmp_path / 'my bin/inspect'))
+    assert arguments == [str(log), '--plot', 'top.png']
 
 
 class Screen(io.StringIO):

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a user of the node meets first: arguments, overrides, what it says, and clocks."""
 
+import shlex
+import shutil
+
 import pytest
 
 pytest.importorskip('rclpy')
@@ -41,10 +44,12 @@ def test_what_stands_behind_ros_args_and_rcl_does_not_know_is_refused_too(tmp_pa
 
 
 def test_the_version_and_the_help_are_printed_and_nothing_runs(tmp_path):
-    with SimNode(tmp_path, program=(*MODULE, '--version')) as node:
-        assert node.wait() == 0
-    name, version = node.out.split()
-    assert name == 'sim_node' and version[0].isdigit()
+    for expected in ('sim_node', 'replay_node'):
+        program = ('-m', f'spinning_top_sim.nodes.{expected}', '--version')
+        with SimNode(tmp_path, program=program) as node:
+            assert node.wait() == 0
+        name, version = node.out.split()
+        assert name == expected and version[0].isdigit()
     with SimNode(tmp_path, program=(*MODULE, '--help')) as node:
         assert node.wait() == 0
     for said in ('~/commands', '~/set_pause', '~/record', '~/step', '~/reset', '/diagnostics',
@@ -59,8 +64,8 @@ def write_scene(path, **values):
     return str(path)
 
 
-def test_the_command_line_wins_over_files_whatever_the_types_and_as_in_simulate(peer, tmp_path):
-    """Among the arguments of a process rcl takes an integer, and drops a double of that name."""
+def test_the_last_value_wins_whatever_the_types_and_as_in_simulate(peer, tmp_path):
+    """Of one name, rclpy takes an integer rather than a double that comes later."""
     file = write_scene(tmp_path / 'a.yaml', spin__l3=3, max_error=1, time_scale=2, imu__rate=250,
                        imu__lever_arm='[1, 2, 3]')
     given = ['spin.l3:=2.25', 'max_error:=1e-7', 'imu.rate:=0.4e3', 'top.mass:=1e0',
@@ -71,13 +76,46 @@ def test_the_command_line_wins_over_files_whatever_the_types_and_as_in_simulate(
     with LogReader(tmp_path / 'ours.mcap') as log:
         ours = read_run_description(log).now
     names = ('spin.l3', 'max_error', 'imu.rate', 'top.mass', 'time_scale')
-    for arguments in (['--params-file', file, *options], [*options, '--params-file', file]):
+    for arguments, expected in (
+            (['--params-file', file, *options], [2.25, 1e-7, 400.0, 1.0, 2.0, (0.0, 0.0, 1.0)]),
+            ([*options, '--params-file', file], [3.0, 1.0, 250.0, 1.0, 2.0, (1.0, 2.0, 3.0)])):
         with SimNode(tmp_path, QUIET, arguments=arguments) as node:
             found = peer.get(node, *names)
             (lever_arm,) = peer.get(node, 'imu.lever_arm')
             assert_clean_end(node, node.end())
-        assert found == [2.25, 1e-7, 400.0, 1.0, 2.0] == [ours[name] for name in names]
-        assert tuple(lever_arm) == (0.0, 0.0, 1.0) == tuple(ours['imu.lever_arm'])
+        assert [*found, tuple(lever_arm)] == expected
+        if arguments[0] == '--params-file':
+            assert found == [ours[name] for name in names]
+            assert tuple(ours['imu.lever_arm']) == tuple(lever_arm)
+
+
+def test_of_several_files_the_last_that_is_for_the_node_wins(peer, tmp_path):
+    one, two = (write_scene(tmp_path / f'{l3}.yaml', spin__l3=l3) for l3 in (2, 1.5))
+    other = tmp_path / 'other.yaml'
+    other.write_text('/last/other:\n  ros__parameters:\n    spin:\n      l3: 9\n'
+                     '/*/spinning_top:\n  ros__parameters:\n    spin:\n      l3: 7\n')
+    for given, expected in (((one, two), 1.5), ((two, one), 2.0), ((one, two, str(other)), 7.0),
+                            ((str(other), one, two), 1.5)):
+        arguments = [word for file in given for word in ('--params-file', file)]
+        with SimNode(tmp_path, QUIET, namespace='/last', arguments=arguments) as node:
+            assert peer.get(node, 'spin.l3') == [expected]
+            assert_clean_end(node, node.end())
+
+
+def test_a_node_runs_where_the_shell_has_closed_its_standard_streams(tmp_path):
+    node = SimNode(tmp_path, {'duration': 0.05, 'record.enabled': True, 'record.uri': 'run.mcap'})
+    node.command = ['sh', '-c', '"$@" >&- 2>&-', 'sh', *node.command]
+    with node:
+        assert node.wait() == 0
+    with LogReader(node.folder / 'run.mcap') as log:
+        assert log.whole
+
+
+def test_the_help_fits_80_columns(tmp_path):
+    for name in ('sim_node', 'replay_node'):
+        with SimNode(tmp_path, program=('-m', f'spinning_top_sim.nodes.{name}', '--help')) as node:
+            assert node.wait() == 0
+        assert [line for line in node.out.splitlines() if len(line) > 80] == []
 
 
 @pytest.fixture(scope='module')
@@ -148,7 +186,10 @@ def test_what_is_said_at_the_start_is_on_rosout_and_at_the_end_what_to_do_next(p
         assert_clean_end(node, node.end())
     assert subscription.topic_name == '/rosout'
     path = the_log(node.folder)
-    assert node.out.endswith(f'next: inspect {path} --plot top.png\n')
+    next_step = node.out.splitlines()[-1]
+    assert next_step.endswith(f'inspect {path} --plot top.png')
+    inspect = shlex.split(next_step.removeprefix('next: '))
+    assert shutil.which(inspect[0])
     assert '\x1b' not in node.out and '\r' not in node.out
 
 

@@ -234,7 +234,7 @@ def test_the_duration_ends_with_its_last_sample():
     run.ticks(100)
     assert run.loop.now_ns == 72_300_000
     assert run.stamps == grid(72_300_000)
-    assert run.loop.ended
+    assert run.loop.state is tick_loop.State.ENDED
 
 
 def test_what_is_too_late_is_recorded_but_not_published():
@@ -359,3 +359,28 @@ def test_a_command_comes_after_what_is_due():
     with pytest.raises(ValueError, match='nan'):
         run.loop.command(float('nan'), 1.0)
     assert run.loop.commands == run.told.count('command') == 1
+
+
+def test_a_pause_asked_for_during_a_failure_holds_after_the_reset():
+    run = started().ticks(4)
+    run.loop.fail('for a test')
+    run.loop.resume()
+    run.loop.start()
+    assert run.loop.state is tick_loop.State.FAILED
+    run.loop.pause()
+    assert run.loop.state is tick_loop.State.FAILED and run.loop.failure == 'for a test'
+    run.loop.reset(run.values, 0)
+    assert run.loop.state is tick_loop.State.PAUSED
+    assert run.loop.failure is None
+    run.loop.resume()
+    assert run.loop.state is tick_loop.State.RUNNING
+
+
+def test_nothing_leads_on_from_the_end():
+    run = started(duration=0.02).ticks(10)
+    for act in (run.loop.start, run.loop.pause, run.loop.resume,
+                lambda: run.loop.fail('for a test'), lambda: run.loop.reset(run.values, 0)):
+        act()
+        assert run.loop.state is tick_loop.State.ENDED
+    stamps = list(run.stamps)
+    assert run.ticks(5).stamps == stamps

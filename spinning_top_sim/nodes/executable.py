@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import re
 import signal
 import sys
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class RunnableNode(Protocol):
-    """A node that `start` has begin to work before the spin, and `stop` end in any state."""
+    """A node: `start` is called before the executor spins, `stop` afterwards in any case."""
 
     finished: Future                # completes with the exit code, None for 0
 
@@ -40,7 +41,13 @@ def run(name: str, argv: list[str],
     """
     # Nothing is open yet, and a KeyboardInterrupt in the midst of imports is easily lost.
     _handle(signal.SIGINT, lambda *_: _exit(130))
+    _open_standard_streams()
     try:
+        if '--version' in argv[1:]:
+            from spinning_top_sim.recording.provenance import version  # noqa: PLC0415
+
+            print(f'{name} {version("spinning_top_sim")}')
+            return 0
         make_node = prepare(argv)
         if make_node is None:
             return 0
@@ -63,7 +70,7 @@ def run(name: str, argv: list[str],
         started = True
         # Python answers signals between waits; without a timeout, Jazzy's EventsExecutor hangs.
         while rclpy.ok() and not interrupts and not node.finished.done():
-            executor.spin_once(0.05)
+            executor.spin_once(0.5)
         return (node.finished.result() or 0) if node.finished.done() else 0
     except Exception as error:
         # A call that the end of the context interrupts may raise anything.
@@ -77,6 +84,15 @@ def run(name: str, argv: list[str],
             node.destroy_node()
         rclpy.try_shutdown()
         _ignore_signals()       # rclpy has put back the handler that it had found
+
+
+def _open_standard_streams() -> None:
+    """Open what the shell has closed (2>&-): else the next file that is opened gets its number."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+    if sys.stderr is None:
+        sys.stderr = open(2, 'w')       # noqa: SIM115 - rclpy needs it to the end
 
 
 def _handle(number: signal.Signals, handler: Callable[[int, object], object]) -> None:
@@ -115,7 +131,8 @@ def _executor(node: RunnableNode) -> Executor:
         from rclpy.executors import SingleThreadedExecutor as Executor  # noqa: PLC0415
     executor = Executor()
     executor.add_node(cast('Node', node))
-    node.finished.add_done_callback(lambda _: executor.wake())
+    # A task ends `spin_once` at once, as `wake` does not.
+    node.finished.add_done_callback(lambda _: executor.create_task(lambda: None))
     gc.collect()
     gc.freeze()             # no full collection goes through what is there from the start
     gc.collect()            # finds nothing, so that the next full one comes soon

@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterable, Iterator
 
 Message = tuple[int, Callable[[bytes], object], bytes]      # time [ns], what sends it, CDR
 
+SLOWEST, FASTEST = 1e-6, 1e9    # of a playback: recorded over real time
+RATES = f'a number in [{SLOWEST:g}, {FASTEST:g}]'
 ROUND_GAP_NS = 10_000_000       # from the end of a round to the first message of the next
 LATE_NS = 10_000_000            # a message sent later than this is counted
 BATCH_BYTES, BATCH_MESSAGES, BATCHES = 256_000, 512, 16     # read ahead
@@ -53,13 +55,13 @@ class SimulatedClock:
 
 
 class FairLock:
-    """A lock in turn: an ordinary one stays with a thread that takes it again and again."""
+    """A lock that goes to a thread that waits, before the one that has it can take it again."""
 
     def __init__(self) -> None:
         self._lock, self._next = threading.Lock(), threading.Lock()
 
     def __enter__(self) -> None:
-        with self._next:        # held by the thread that is next
+        with self._next:        # one thread waits for `_lock`, the others for `_next`
             self._lock.acquire()
 
     def __exit__(self, *_: object) -> None:
@@ -68,19 +70,20 @@ class FairLock:
 
 class DeadlineThread(threading.Thread):
     """
-    Calls `tick` at absolute deadlines until it is stopped, and `idle` behind it where it asks so.
+    Calls `tick` at absolute deadlines until it is stopped; where that returns True, then `idle`.
 
     A late tick comes at once, and deadlines that have passed are skipped.
 
     grid : returns a deadline on the monotonic clock and the time between two [s]
-    failed : takes any error of these; the thread goes on
+    failed : takes an error that one of these raises; the thread goes on
     """
 
     LONGEST_SLEEP = 0.05    # [s], so that `stop` is quick
-    # `idle` is called after this share of the period: a thread woken by the tick is often put on
-    # the same core, because its waker will sleep soon.  At high rates there is no time for that.
+    # The thread sleeps for this share of the period between `tick` and `idle`, if that is long
+    # enough.  A tick wakes up the threads that send; they often run on the core of this one, and
+    # would wait for `idle`.
     NAP = 0.15
-    SHORTEST_NAP = 1e-4
+    SHORTEST_NAP = 1e-4     # [s]
 
     def __init__(self, tick: Callable[[], object], idle: Callable[[], object],
                  grid: Callable[[], tuple[float, float]],
@@ -88,31 +91,26 @@ class DeadlineThread(threading.Thread):
         super().__init__(name='simulation', daemon=True)
         self._tick, self._idle, self._grid, self._failed = tick, idle, grid, failed
         self._stopped = False
-        self._newest = 0                # number of the deadline of the newest tick
-        self._newest_grid: tuple[float, float] | None = None
 
     def run(self) -> None:
+        grid, newest = None, 0          # `newest`: number of the deadline of the newest tick
         while not self._stopped:
             try:
-                self._wait_and_tick()
+                before, grid = grid, self._grid()
+                origin, period = grid
+                passed = int((time.monotonic() - origin) // period)
+                newest = max(passed, newest + 1) if grid == before else passed + 1
+                deadline = origin + newest * period
+                while (left := deadline - time.monotonic()) > 0.0 and not self._stopped:
+                    time.sleep(min(left, self.LONGEST_SLEEP))
+                if not self._stopped and self._tick():
+                    nap = min(self.NAP * period, self.LONGEST_SLEEP)
+                    if nap >= self.SHORTEST_NAP:
+                        time.sleep(nap)
+                    self._idle()
             except Exception as error:
                 self._failed(error)
                 time.sleep(self.LONGEST_SLEEP)
-
-    def _wait_and_tick(self) -> None:
-        before, self._newest_grid = self._newest_grid, self._grid()
-        origin, period = self._newest_grid
-        passed = int((time.monotonic() - origin) // period)
-        self._newest = (max(passed, self._newest + 1) if self._newest_grid == before
-                        else passed + 1)
-        deadline = origin + self._newest * period
-        while (left := deadline - time.monotonic()) > 0.0 and not self._stopped:
-            time.sleep(min(left, self.LONGEST_SLEEP))
-        if not self._stopped and self._tick():
-            nap = min(self.NAP * period, self.LONGEST_SLEEP)
-            if nap >= self.SHORTEST_NAP:
-                time.sleep(nap)
-            self._idle()
 
     def stop(self) -> None:
         self._stopped = True
@@ -121,7 +119,7 @@ class DeadlineThread(threading.Thread):
 
 
 def rounds(read: Callable[[], Iterable[Message]], span_ns: int, loop: bool) -> Iterator[Message]:
-    """Yield the messages of a round, `span_ns` long, or those of round after round."""
+    """Yield the messages of a log that lasts `span_ns`, once or in endless repetition."""
     for number in itertools.count():
         shift = number * (span_ns + ROUND_GAP_NS)
         at_ns = None
@@ -132,7 +130,7 @@ def rounds(read: Callable[[], Iterable[Message]], span_ns: int, loop: bool) -> I
 
 
 class ReadAhead:
-    """Iterates over messages that a thread reads ahead, a bounded number; its error comes last."""
+    """Iterates over messages that a thread reads ahead; raises its error behind the last one."""
 
     def __init__(self, messages: Iterable[Message]) -> None:
         # Behind the batches comes the error, or None.
@@ -177,7 +175,7 @@ class ReadAhead:
 
 
 class Playback:
-    """Sends messages at their times, late ones at once, by a clock with pauses and a rate."""
+    """Sends messages at their times, late ones at once; can be paused, and has a rate."""
 
     def __init__(self, begin_ns: int, paused: bool = False) -> None:
         self._clock = SimulatedClock(time.monotonic_ns, 1.0)
@@ -203,7 +201,7 @@ class Playback:
                 return
 
     def _send_if_due(self, at_ns: int, send: Callable[[bytes], object], data: bytes) -> float:
-        """Send a message whose time has come; return how long others wait [ns], 0 if stopped."""
+        """Send a message if it is due; return the time left [ns], <= 0 if sent or stopped."""
         with self._lock:
             if self._stopped:
                 return 0.0

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from spinning_top_sim.nodes.pacing import FairLock
 from spinning_top_sim.recording.errors import RecordingError
@@ -22,16 +22,26 @@ if TYPE_CHECKING:
 MOST_PENDING = 20_000       # stamps whose messages wait for the file that is being opened
 
 Topic = tuple[str, str, dict[str, int]]     # full name, type, and offered QoS
-# What `provenance` takes.
-Run = tuple[Mapping[str, Any], int, int, tuple[tuple[int, float, float], ...], Mapping[str, Any]]
+
+
+class Run(NamedTuple):
+    """The arguments of `provenance`, which describes them."""
+
+    values: Mapping[str, Any]
+    epoch_ns: int
+    begun_ns: int
+    history: tuple[tuple[int, float, float], ...]
+    now: Mapping[str, Any]
 
 
 class RecordingSession:
     """
     Records a simulation into one log at a time.
 
-    Nothing waits for the disk while it holds the simulation's lock: while a log is being opened,
-    its messages are kept in memory.  `topics` returns those of streams, and then the journal's.
+    While a log is being opened, its messages are kept in memory: nothing waits for the disk while
+    it holds the simulation's lock.
+
+    topics : returns the topics of these streams, and behind them those of the journal
     """
 
     def __init__(self, simulation: Simulation, lock: FairLock,
@@ -47,9 +57,10 @@ class RecordingSession:
 
     def start(self, values: Mapping[str, Any]) -> Callable[[], str]:
         """
-        Keep in memory what is to be recorded from now on; return what opens the log for it.
+        Begin to record into memory; return a function that opens the log and moves it there.
 
-        That says to where, or raises RecordingError; then nothing is recorded.
+        The function returns a text with the path.  It raises RecordingError if the log cannot be
+        opened; then nothing is recorded.
         """
         if self._recorder is not None:
             path = self._recorder.path
@@ -58,8 +69,8 @@ class RecordingSession:
             simulation = self._simulation
             streams = journal.recorded_streams(simulation.streams, values)
             topics = self._topics(streams)
-            run = (simulation.values, simulation.epoch_ns, simulation.now_ns,
-                   tuple(simulation.history), values)
+            run = Run(simulation.values, simulation.epoch_ns, simulation.now_ns,
+                      tuple(simulation.history), values)
             self._journal_index = len(streams)
             self._feed(lambda *messages: self._pending.append(messages), streams)
             self.write_event('start')
@@ -81,7 +92,7 @@ class RecordingSession:
         return f'recording to {recorder.path}'
 
     def _feed(self, write: Log | None, streams: Sequence[Stream] = ()) -> None:
-        """Hand these streams, commands and events to `write` from now on."""
+        """Record these streams, commands and events with `write` from now on."""
         self._pending, self._write = [], write
         self._simulation.log_to(write, streams)
 
@@ -165,7 +176,7 @@ def _open_log(topics: Sequence[Topic], run: Run) -> McapRecorder:
     from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
     from spinning_top_sim.recording.writer import McapRecorder  # noqa: PLC0415
 
-    values, metadata = run[-1], provenance(*run)
+    values, metadata = run.now, provenance(*run)
     recorded = [RecordedTopic(*topic) for topic in topics]
     folder = path = Path(values['record.uri']).expanduser().absolute()
     if values['record.uri'].endswith('/'):

@@ -12,31 +12,34 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spinning_top_sim.nodes import executable
+from spinning_top_sim.nodes.pacing import FASTEST, RATES, SLOWEST
 
 if TYPE_CHECKING:
     from spinning_top_sim.nodes.replayer import Replayer
 
 DESCRIPTION = """\
-Publish the messages of a ROS 2 log (.mcap) with their recorded spacing, then end.
+Publish the messages of a ROS 2 log (.mcap) with their recorded spacing.
 
   ros2 run spinning_top_sim replay_node run.mcap
   ros2 run spinning_top_sim replay_node run.mcap --rate 0.5 --loop --clock
-  ros2 run spinning_top_sim replay_node run.mcap --ros-args -r /imu/data_raw:=/replayed/imu
+  ros2 run spinning_top_sim replay_node run.mcap --ros-args -r /pose:=/old/pose
 """
 
 EPILOG = """\
-Topics keep their recorded names, whatever the namespace of this node (`replay`); remapping with
-`--ros-args -r FROM:=TO` works on them. They have the recorded QoS, which the parameters
-`qos_overrides.<topic>.publisher.{history,depth,reliability}` override. A topic that cannot be
-published is named and left out. Messages go out in the order of their log times and with their
-recorded bytes, old stamps included; what is late is sent at once.
+Topics keep their recorded names, whatever the namespace of this node
+(`replay`); remapping with `--ros-args -r FROM:=TO` works on them. They have the
+recorded QoS, which the parameters
+`qos_overrides.<topic>.publisher.{history,depth,reliability}` override. A topic
+that cannot be published is named and left out. Messages go out in the order of
+their log times and with their recorded bytes, old stamps included; what is late
+is sent at once.
 
 while playing:
   ros2 service call /replay/set_pause std_srvs/srv/SetBool '{data: true}'
   ros2 param set /replay rate 2.0
 
-exit code: 0 played (also in part: topics left out, ended by a signal), 2 cannot be played, or is
-damaged inside
+exit code: 0 played (also in part: topics left out, ended by a signal),
+2 cannot be played, or is damaged inside
 """
 
 CLOCK_RATE = 40.0           # Hz, as `ros2 bag play` has it
@@ -63,7 +66,8 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add('file', type=Path, metavar='FILE', help='the log')
-    add('-r', '--rate', type=float, metavar='R',
+    add('--version', action='store_true', help='print the version, then end')
+    add('-r', '--rate', type=_rate, metavar='R',
         help='recorded over real time (default: the parameter `rate`, 1)')
     add('-l', '--loop', action='store_true', help='begin again at the end; --clock goes on')
     add('--start', type=_not_negative, default=0.0, metavar='S',
@@ -80,6 +84,14 @@ def _parser() -> argparse.ArgumentParser:
     add('--wait-for-subscribers', type=int, default=0, metavar='COUNT',
         help='wait until there are so many, over all topics')
     return parser
+
+
+def _rate(text: str) -> float:
+    with contextlib.suppress(ValueError):
+        if SLOWEST <= float(text) <= FASTEST:
+            return float(text)
+    raise argparse.ArgumentTypeError(f'{text}: must be {RATES}; '
+                                     '--start-paused begins with a pause')
 
 
 def _not_negative(text: str) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import difflib
 import importlib
 import os
 import re
@@ -29,16 +30,14 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import SetBool
 
-from spinning_top_sim.nodes import reports
+from spinning_top_sim.nodes import pacing, reports
 from spinning_top_sim.nodes.executable import one_line, wait_for_all_acked
-from spinning_top_sim.nodes.pacing import ROUND_GAP_NS, Message, Playback, ReadAhead, rounds
+from spinning_top_sim.nodes.pacing import Message, Playback, ReadAhead, rounds
 from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import DefinitionNotFoundError
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
 from spinning_top_sim.streams.cdr import NANOSECONDS
-
-SLOWEST, FASTEST = 1e-6, 1e9
 
 
 class Replayer(Node):
@@ -62,12 +61,12 @@ class Replayer(Node):
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self.declare_parameter('rate', 1.0, ParameterDescriptor(
             description='recorded over real time; a change takes effect at once',
-            additional_constraints=f'a number in [{SLOWEST:g}, {FASTEST:g}]', dynamic_typing=True))
+            additional_constraints=f'must be {pacing.RATES}', dynamic_typing=True))
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         if options.clock:
             clock = self.create_publisher(ClockMessage, '/clock', 10)
             self._senders.add(clock)
-            self.create_timer(1.0 / max(options.clock, SLOWEST), lambda: clock.publish(
+            self.create_timer(1.0 / max(options.clock, pacing.SLOWEST), lambda: clock.publish(
                 ClockMessage(clock=Time(nanoseconds=self._playback.now()).to_msg())), clock=steady)
         self.create_timer(1.0, self._show_status, clock=steady)
         self.create_service(SetBool, '~/set_pause', self._on_pause)
@@ -77,16 +76,18 @@ class Replayer(Node):
 
     @property
     def _log(self) -> Any:
-        """The logger; what it says does not stand behind the status line."""
+        """The logger; ends the status line first."""
         self._terminal.end()
         return self.get_logger()
 
     def _open_publishers(self) -> dict[int, Publisher]:
-        """Return the publishers by channel; warn of the topics that cannot be played."""
+        """Return a publisher for each channel; warn of the topics that cannot be played."""
         there = {channel.name for channel in self._reader.topics}
         wanted = set(self._options.topics) or there
         for name in sorted(wanted - there):
-            self._log.warning(f'the log has no topic {name}')
+            near = difflib.get_close_matches(name, there, 1)
+            hint = f'; did you mean {near[0]}?' if near else ''
+            self._log.warning(f'the log has no topic {name}{hint}')
         channels: dict[tuple[str, str], list[LogTopic]] = defaultdict(list)
         for channel in self._reader.topics:
             if channel.name in wanted:
@@ -130,9 +131,9 @@ class Replayer(Node):
 
     def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         for rate in [parameter.value for parameter in parameters if parameter.name == 'rate']:
-            if type(rate) not in {int, float} or not SLOWEST <= rate <= FASTEST:
-                return SetParametersResult(successful=False, reason=(
-                    f'rate = {rate!r}: must be a number in [{SLOWEST:g}, {FASTEST:g}]'))
+            if type(rate) not in {int, float} or not pacing.SLOWEST <= rate <= pacing.FASTEST:
+                return SetParametersResult(
+                    successful=False, reason=f'rate = {rate!r}: must be {pacing.RATES}')
             self._playback.set_rate(rate)
         return SetParametersResult(successful=True)
 
@@ -204,7 +205,7 @@ class Replayer(Node):
 
     def _position(self) -> str:
         number, within = divmod(self._playback.now() - self._begin_ns,
-                                self._span_ns + ROUND_GAP_NS)
+                                self._span_ns + pacing.ROUND_GAP_NS)
         at = self._options.start + min(within, self._span_ns) / NANOSECONDS
         percent = 100.0 * at / self._length_s if self._length_s else 100.0
         which = f' of round {number + 1}' if self._options.loop else ''

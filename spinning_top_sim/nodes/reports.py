@@ -5,15 +5,19 @@ from __future__ import annotations
 
 import math
 import os
+import shlex
+import shutil
 import sys
 import time
 from operator import itemgetter
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from std_msgs.msg import Header
 
+from spinning_top_sim.nodes.tick_loop import State
 from spinning_top_sim.streams.cdr import NANOSECONDS
 
 if TYPE_CHECKING:
@@ -29,8 +33,10 @@ class MotionReport:
         self._simulation, self._loop, self._session = simulation, loop, session
         self._speed = math.nan                  # simulated over real time, at the last reading
         self._read_at, self._read_ns = time.monotonic(), 0
+        self._interruptions, self._undisturbed = 0, False       # at and before the last reading
         self._described: object = None          # the motion that `_regime` names
         self._regime = ''
+        self.waits_for_clock = False            # whether /clock has stopped, or not begun
 
     def diagnostics(self, stamp: Time, name: str, max_error: float) -> DiagnosticArray:
         """Return the message for /diagnostics; without a `max_error` no error is computed."""
@@ -38,7 +44,7 @@ class MotionReport:
         error = simulation.orientation_error if max_error else math.nan
         states = (      # whether it is so, how bad that is, and what is said of it
             (True, DiagnosticStatus.OK, 'paused' if loop.paused else 'running'),
-            (loop.waits_for_clock, DiagnosticStatus.WARN, 'waiting for /clock'),
+            (self.waits_for_clock, DiagnosticStatus.WARN, 'waiting for /clock'),
             (self.overloaded, DiagnosticStatus.WARN, 'this machine cannot keep up'),
             (error > max_error > 0.0, DiagnosticStatus.WARN,
              f'orientation error {error:.3g} rad: more than max_error = {max_error:g} rad'),
@@ -80,6 +86,8 @@ class MotionReport:
             since_ns = self._read_ns if self._read_ns <= now_ns else 0
             self._speed = (now_ns - since_ns) / NANOSECONDS / elapsed
             self._read_at, self._read_ns = self._read_at + elapsed, now_ns
+            self._undisturbed = self._interruptions == self._loop.interruptions
+            self._interruptions = self._loop.interruptions
         return self._speed
 
     def new_motion(self) -> str | None:
@@ -90,25 +98,37 @@ class MotionReport:
         self._described = simulation.segment
         description = simulation.describe()
         self._regime = 'beyond doubles' if description is None else description.name
-        return None if description is None else str(description)
+        return None if description is None else '\n  '.join(
+            ['the motion:', *str(description).split('; ')])
 
     def status_line(self) -> str:
         """Return the line for the terminal, with the angle in degrees."""
         simulation, loop, size = self._simulation, self._loop, self._session.size
         theta, sent = math.degrees(float(simulation.state().theta[0])), self._total('sent')
-        flag = (' FAILED' if loop.failure else ' waiting for /clock' if loop.waits_for_clock
+        flag = (' FAILED' if loop.failure else ' waiting for /clock' if self.waits_for_clock
                 else ' paused' if loop.paused else '')
+        # The speed of an interval in which the motion ran all the time, as it still does.
+        runs = (self._undisturbed and self._interruptions == loop.interruptions
+                and loop.state is State.RUNNING)
         # The most important first: a terminal shows as many as fit.
         return ' | '.join([
             f't {loop.now_ns / NANOSECONDS:9.2f} s{flag}', self._regime, f'theta {theta:6.2f} deg',
-            *([] if math.isnan(self._speed) else [f'x{self._speed:.2f}']),
+            *([f'x{self._speed:.2f}'] if runs else []),
             *([f'log {size}'] if size else []),
             f'L3 {simulation.l3:.4g} Lz {simulation.lz:.4g}', f'{sent} messages' if sent
             else 'no subscribers yet', f'dE/E {simulation.energy_drift:+.0e}'])
 
 
+def inspect_command(log: Path) -> str:
+    """Return the command that inspects a log, to be pasted into this user's terminal."""
+    beside = Path(sys.executable).with_name('inspect')
+    program = ['inspect'] if shutil.which('inspect') else [str(beside)] if beside.exists() else [
+        'ros2', 'run', 'spinning_top_sim', 'inspect']
+    return shlex.join([*program, str(log), '--plot', 'top.png'])
+
+
 class Terminal:
-    """Shows a line that overwrites itself, and whole ones where a launch or a file reads them."""
+    """Shows a status line; on a terminal each one overwrites the one before."""
 
     def __init__(self) -> None:
         self._columns = _columns()

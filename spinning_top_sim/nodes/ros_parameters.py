@@ -6,10 +6,13 @@ from __future__ import annotations
 import array
 import contextlib
 import difflib
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
+import yaml
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
@@ -20,14 +23,36 @@ from spinning_top_sim.streams.parameters import Effect, Parameter
 SPIN = ('spin.l3', 'spin.lz')
 
 
-def overrides(argv: Sequence[str]) -> list[str]:
+def _given_twice(argv: Sequence[str], node_name: str) -> dict[str, object]:
     """
-    Return the `-p NAME:=VALUE` of a command line, as arguments for the node alone.
+    Return the last value of each parameter that a command line gives to a node more than once.
 
-    There they win.  Among those of the process, rcl drops a double that overrides an integer.
+    rcl keeps the last value of each type; of these, rclpy takes an integer rather than a double.
     """
-    return ['--ros-args', *(word for flag, rule in pairwise(argv) if flag in {'-p', '--param'}
-                            for word in (flag, rule))]
+    given: dict[str, list[object]] = {}
+    for flag, text in pairwise(argv):
+        if flag == '--params-file':
+            tree = yaml.safe_load(Path(text).read_bytes())
+        elif flag in {'-p', '--param'}:
+            rule, _, shown = text.partition(':=')
+            node, _, name = rule.rpartition(':')
+            tree = {node or '/**': {'ros__parameters': {name: yaml.safe_load(shown)}}}
+        else:
+            continue
+        for keys, value in _leaves(tree):
+            nodes, _, name = '/'.join(keys).partition('/ros__parameters/')
+            pattern = re.escape(f'/{nodes.lstrip("/")}').replace(r'/\*\*', r'(/\w+)*')
+            if re.fullmatch(pattern.replace(r'\*', r'\w+'), node_name):
+                given.setdefault(name.replace('/', '.'), []).append(value)
+    return {name: values[-1] for name, values in given.items() if len(values) > 1}
+
+
+def _leaves(tree: Mapping[object, object]) -> Iterator[tuple[list[str], object]]:
+    for key, below in tree.items():
+        if isinstance(below, Mapping):
+            yield from (([str(key).rstrip('/'), *keys], value) for keys, value in _leaves(below))
+        else:
+            yield [str(key)], below
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
@@ -52,14 +77,16 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     return result
 
 
-def declare(node: Node) -> dict[str, Any]:
+def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
     """
     Declare the table, warn of unknown parameters; return the start values or raise ValueError.
+
+    Where the command line `argv` gives a parameter more than once, the last value holds.
 
     The node was made with `automatically_declare_parameters_from_overrides`, the public way to
     learn of overrides that nobody declares.
     """
-    given = {}
+    given, given_twice = {}, _given_twice(argv, node.get_fully_qualified_name())
     for name in node.get_parameters_by_prefix(''):
         value = node.get_parameter(name).value
         if name == 'use_sim_time' and not isinstance(value, bool):
@@ -67,6 +94,7 @@ def declare(node: Node) -> dict[str, Any]:
         if name in {'use_sim_time', 'start_type_description_service'}:
             continue        # rclpy declares these itself
         if name in parameters.BY_NAME:
+            value = _with_doubles(name, given_twice.get(name, value))
             given[name] = list(value) if isinstance(value, array.array) else value
         elif not name.startswith('qos_overrides.'):
             near = difflib.get_close_matches(name, parameters.BY_NAME, 1)
@@ -85,16 +113,19 @@ def declare(node: Node) -> dict[str, Any]:
 
 def with_doubles(given: Sequence[RosParameter]) -> list[RosParameter]:
     """Make doubles where the table has some: of integers, and of texts, as YAML 1.1 has 1e-9."""
-    result = []
-    for one in given:
-        row, value = parameters.BY_NAME.get(one.name), one.value
-        if row is not None and row.is_double:
-            value = _as_double(value)
-        elif row is not None and isinstance(value, list | array.array):
-            of_doubles = isinstance(row.default, tuple) and isinstance(row.default[0], float)
-            value = [_as_double(item) if of_doubles else item for item in value]
-        result.append(one if value is one.value else RosParameter(one.name, value=value))
-    return result
+    values = [_with_doubles(one.name, one.value) for one in given]
+    return [one if value is one.value else RosParameter(one.name, value=value)
+            for one, value in zip(given, values, strict=True)]
+
+
+def _with_doubles(name: str, value: Any) -> Any:
+    row = parameters.BY_NAME.get(name)
+    if row is not None and row.is_double:
+        return _as_double(value)
+    if row is not None and isinstance(value, list | array.array):
+        of_doubles = isinstance(row.default, tuple) and isinstance(row.default[0], float)
+        return [_as_double(item) if of_doubles else item for item in value]
+    return value
 
 
 def _as_double(value: object) -> object:
@@ -109,8 +140,8 @@ def changed(values: Mapping[str, Any], changes: Mapping[str, Any],
     for name, value in changes.items():
         if value is None:
             raise ValueError(f'{name}: cannot be unset while the node runs')
-    # A reset goes back to the start state with `start_spin`, so these are checked together.  The
-    # present spin belongs to the present state: whether there is such a motion shows the command.
+    # `start_spin` is checked, as a reset combines it with the other parameters.  The present spin
+    # goes with the present state; `TickLoop.command` refuses one that is not possible there.
     checked = parameters.checked({**values, **changes, **start_spin})
     return {**checked, **{name: parameters.BY_NAME[name].check(changes.get(name, values[name]))
                           for name in SPIN}}

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+import textwrap
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -12,16 +13,18 @@ from spinning_top_sim.nodes import executable
 if TYPE_CHECKING:
     from spinning_top_sim.nodes.simulator import Simulator
 
-USAGE = """usage: sim_node [--help] [--version] [--ros-args -p NAME:=VALUE --params-file FILE ...]
+USAGE = """usage: sim_node [--help] [--version]
+                [--ros-args -p NAME:=VALUE --params-file FILE ...]
 
-Simulate the heavy symmetric top in real time, in namespace and with parameters as usual:
+Simulate the heavy symmetric top in real time.  Of several values for a
+parameter, in files or not, the last one on the command line holds.
 
   ros2 run spinning_top_sim sim_node
-  ros2 run spinning_top_sim sim_node --ros-args --params-file config/looping.yaml
-  ros2 run spinning_top_sim sim_node --ros-args -p spin.l3:=2.0 -p record.enabled:=true
+  ros2 run spinning_top_sim sim_node --ros-args --params-file looping.yaml
+  ros2 run spinning_top_sim sim_node --ros-args -p spin.l3:=2.0
 
-Subscribes to:
-  ~/commands (std_msgs/Float64MultiArray: [L3, Lz] in kg m^2/s); ~ is /spinning_top
+~ is /spinning_top.  Subscribes to:
+  ~/commands (std_msgs/Float64MultiArray: [L3, Lz] in kg m^2/s)
 Services:
   ~/set_pause, ~/record (std_srvs/SetBool); ~/step, ~/reset (std_srvs/Trigger)
 Publishes, where enabled:
@@ -44,18 +47,17 @@ def _prepare(argv: list[str]) -> Callable[[], Simulator] | None:
         for parameter in parameters.TABLE:
             default = parameter.default
             shown = list(default) if isinstance(default, tuple) else default
-            print(f'  {parameter.name}  (default {"unset" if shown is None else shown})\n'
-                  f'      {parameter.describe()}')
-        return None
-    if '--version' in argv[1:]:
-        from spinning_top_sim.recording.provenance import version  # noqa: PLC0415
-        print(f'sim_node {version("spinning_top_sim")}')
+            print(f'  {parameter.name}  (default {"unset" if shown is None else shown})')
+            print(textwrap.fill(parameter.describe(), 80, initial_indent=6 * ' ',
+                                subsequent_indent=6 * ' '))
         return None
     from rclpy.utilities import remove_ros_args  # noqa: PLC0415
 
     try:
         stray = ' '.join(remove_ros_args(argv)[1:])
-    except RuntimeError as error:       # rcl does not know what stands behind --ros-args
+    except RuntimeError as error:
+        if not str(error).startswith('['):      # else these are words behind --ros-args
+            raise
         stray = executable.one_line(error)
     if stray:
         raise ValueError(f'{stray!r} is not expected here; the form is: sim_node --ros-args '

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import itertools
 import sys
 import time
 import traceback
@@ -29,7 +30,7 @@ from spinning_top_sim.nodes.executable import wait_for_all_acked
 from spinning_top_sim.nodes.pacing import DeadlineThread, FairLock
 from spinning_top_sim.nodes.recording_session import RecordingSession, Topic
 from spinning_top_sim.nodes.ros_parameters import SPIN
-from spinning_top_sim.nodes.tick_loop import TickLoop, next_epoch
+from spinning_top_sim.nodes.tick_loop import State, TickLoop, next_epoch
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -37,6 +38,7 @@ from spinning_top_sim.streams.parameters import Effect
 from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.streams.stream import Stream
 
+NAMES_PERIOD = 10           # reports from one look for a node of the same name to the next
 CLOCK_PATIENCE_S = 2.0      # a followed /clock that stands for longer is said to have stopped
 
 
@@ -95,13 +97,12 @@ class Simulator(Node):
     """
 
     def __init__(self, argv: Sequence[str] = ()) -> None:
-        super().__init__('spinning_top', cli_args=ros_parameters.overrides(argv),
-                         automatically_declare_parameters_from_overrides=True)
+        super().__init__('spinning_top', automatically_declare_parameters_from_overrides=True)
         self.finished: Future = Future()        # completes after `duration`
         self._terminal = reports.Terminal()
-        values = ros_parameters.declare(self)
+        values = ros_parameters.declare(self, argv)
         simulation = self._simulation = Simulation(values)
-        # A reset goes back to this; an unset spin.lz is the cusp of the tilt that there is then.
+        # For `~/reset`.  An unset spin.lz stays unset: a reset computes it from initial.theta.
         self._start_spin = {name: values[name] for name in SPIN}
         self._values = {**values, 'spin.lz': simulation.lz}
         self._resetting = False
@@ -128,6 +129,7 @@ class Simulator(Node):
                                 ('step', Trigger, self._step), ('reset', Trigger, self._reset),
                                 ('record', SetBool, self._record)):
             self.create_service(kind, f'~/{name}', functools.partial(self._serve, act))
+        self._reports = itertools.count()
         self._steady_timer(1.0, self._publish_diagnostics)
         self._status_timer: Timer | None = None
         self._set_status_period(values['status_period'])
@@ -139,7 +141,7 @@ class Simulator(Node):
 
     @property
     def _log(self) -> Any:
-        """The logger; what it says does not stand behind the status line."""
+        """The logger; ends the status line first."""
         self._terminal.end()
         return self.get_logger()
 
@@ -195,16 +197,16 @@ class Simulator(Node):
                 self._log.error(f'not recording: {error}')
 
     def _watch_clock(self) -> None:
-        """Say that the /clock that is followed has stopped, or not begun, and that it goes on."""
+        """Warn when the followed /clock stops or has not begun; say when it goes on."""
         date_ns, now = self._date_ns(), time.monotonic()
         if date_ns != self._clock_seen[0]:
             self._clock_seen = date_ns, now
         waits = self._follows and (date_ns == 0 or now > self._clock_seen[1] + CLOCK_PATIENCE_S)
-        if waits and not self._loop.waits_for_clock:
+        if waits and not self._report.waits_for_clock:
             self._log.warning('waiting for /clock (use_sim_time is set)')
-        elif self._loop.waits_for_clock and not waits:
+        elif self._report.waits_for_clock and not waits:
             self._log.info('/clock goes on')
-        self._loop.waits_for_clock = waits
+        self._report.waits_for_clock = waits
 
     def stop(self) -> None:
         """End the motion and close the recording; safe whatever state the context is in."""
@@ -214,12 +216,12 @@ class Simulator(Node):
         if summary:
             self._terminal.tell(summary)
             if self._session.path.exists():
-                self._terminal.tell(f'next: inspect {self._session.path} --plot top.png')
+                self._terminal.tell(f'next: {reports.inspect_command(self._session.path)}')
 
     def _tick(self) -> bool:
         with self._lock:
             wants_idle = self._loop.tick()
-        if self._loop.ended and not self.finished.done():
+        if self._loop.state is State.ENDED and not self.finished.done():
             wait_for_all_acked(self._outputs.by_topic.values(), 1.0)
             self.finished.set_result(None)
         return wants_idle
@@ -249,7 +251,7 @@ class Simulator(Node):
             return False, f'{type(error).__name__}: {error}'
 
     def _on_command(self, message: Float64MultiArray) -> None:
-        """Set both parameters of the spin, as a command is a change of these."""
+        """Treat a command as a change of the parameters spin.l3 and spin.lz."""
         if len(message.data) == len(SPIN):
             reason = self.set_parameters_atomically([
                 Parameter(name, value=message.data[k]) for k, name in enumerate(SPIN)]).reason
@@ -271,6 +273,10 @@ class Simulator(Node):
         successful, reason = self._outcome(self._change, changes)
         if not (successful or changes.keys().isdisjoint(SPIN)):
             self._loop.rejected_commands += 1
+        if 'both together' in reason:
+            reason += (f', as by: ros2 topic pub --once {self.resolve_topic_name("~/commands")} '
+                       "std_msgs/msg/Float64MultiArray '{data: [L3, Lz]}', or by the service "
+                       f'{self.get_fully_qualified_name()}/set_parameters_atomically')
         return SetParametersResult(successful=successful, reason=reason)
 
     def _change(self, changes: dict[str, Any]) -> None:
@@ -300,7 +306,7 @@ class Simulator(Node):
         return response
 
     def _check_started(self) -> None:
-        if not self._loop.started:
+        if not self._pacer.is_alive():
             raise RuntimeError(self._loop.failure or 'waiting for /clock (use_sim_time is set)')
 
     def _set_pause(self, request: SetBool.Request) -> str:
@@ -344,11 +350,12 @@ class Simulator(Node):
         if self._session.warning:
             self._log.warning(
                 f'recording: {self._session.warning}', throttle_duration_sec=10.0)
-        names = self.get_node_names_and_namespaces()
-        if names.count((self.get_name(), self.get_namespace())) > 1:
-            self._log.warning(
-                f'there is another node {self.get_fully_qualified_name()}: give one of them a '
-                'namespace, with --ros-args -r __ns:=/NAME', once=True)
+        if next(self._reports) % NAMES_PERIOD == 1:
+            names = self.get_node_names_and_namespaces()
+            if names.count((self.get_name(), self.get_namespace())) > 1:
+                self._log.warning(
+                    f'there is another node {self.get_fully_qualified_name()}: give one of them a '
+                    'namespace, with --ros-args -r __ns:=/NAME', once=True)
         if self._report.overloaded:
             self._log.warning(
                 'this machine cannot keep up with these rates: live topics skip samples, or the '

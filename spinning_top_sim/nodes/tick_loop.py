@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from enum import Enum
 from typing import Any
 
 from spinning_top_sim.nodes.pacing import SimulatedClock
@@ -39,17 +40,40 @@ def next_epoch(date_ns: int) -> int:
     return -(-date_ns // EPOCH_GRID_NS) * EPOCH_GRID_NS
 
 
+class State(Enum):
+    """
+    What a `TickLoop` does; simulated time runs in RUNNING only.
+
+        WAITING --start--> RUNNING --duration--> ENDED
+                           |     ^
+                     pause |     | resume
+                           v     |
+                           PAUSED
+
+    `fail` leads to FAILED, and `reset` from there to RUNNING, or to PAUSED if a pause is asked
+    for, as `start` does.  ENDED is final.
+    """
+
+    WAITING = 'waiting for the start'
+    RUNNING = 'running'
+    PAUSED = 'paused'
+    FAILED = 'failed'
+    ENDED = 'all samples of `duration` are sent'
+
+
 class TickLoop:
     """
     Moves a simulation along with a clock; calls from several threads need a lock around them.
 
-    A tick sends all samples that are due and find room in the recording: none depends on how ticks
-    fall.
+    A tick sends all samples that are due and find room in the recording, so what is sent does not
+    depend on when ticks come.
 
     update_subscribers : sets `publish` of each stream that has subscribers
     tell : takes a text for the log, and whether the motion has failed
     source : returns the time that simulated time follows [ns]
     steady : returns steady time [ns]; decides which ticks are late and how long one may work
+
+    grid : steady time of a tick, just after samples are due, and the time between ticks [s]
     """
 
     def __init__(self, simulation: Simulation, values: Mapping[str, Any],
@@ -59,16 +83,16 @@ class TickLoop:
                  steady: Callable[[], int] = time.monotonic_ns) -> None:
         self.late_ticks = self.skipped_ticks = self.slipped_ns = 0      # since the start
         self.commands = self.rejected_commands = 0
-        self.started = self.ended = False       # `ended`: all samples of `duration` are sent
-        self.paused: bool = values['start_paused']
+        self.state = State.WAITING
+        self.paused: bool = values['start_paused']      # asked for; a failure does not change it
         self.failure: str | None = None         # why the motion stands still until `reset`
-        self.waits_for_clock = False            # whether the source has stopped, or not begun
+        self.interruptions = 0                  # changes of the state, and resets
         self._simulation, self._recording = simulation, recording
         self._update_subscribers, self._tell = update_subscribers, tell
         self._steady, self._is_steady = steady, source is steady
         self._clock = SimulatedClock(source, values['time_scale'])
         self._subscribers_due_ns = 0            # on the steady clock
-        self._computing = False                 # whether a look-ahead is being computed
+        self._block_unfinished = False          # `idle` goes on with a block of samples
         self.set_pace(values)
 
     @property
@@ -78,37 +102,43 @@ class TickLoop:
 
     @property
     def time_text(self) -> str:
-        """Simulated time, exact, for people."""
+        """The simulated time for the user, with all its digits."""
         seconds, nanoseconds = divmod(self.now_ns, NANOSECONDS)
         return f'at t = {seconds}.{nanoseconds:09d} s'
 
     def start(self) -> None:
-        """Let simulated time run from 0 on, unless the motion is paused."""
-        self.started = True
-        self._sync_clock()
+        """Let simulated time run from 0 on, unless the motion is paused or has failed."""
+        if self.state is State.WAITING:
+            self._run_or_pause()
 
-    def _sync_clock(self) -> None:
-        """Let time go on from where samples are sent up to, or stand there if it is held."""
-        self._fast_until_ns, self._late_from_ns = -1, NEVER_NS
-        self._clock.set(self.now_ns, running=self.started and not (
-            self.ended or self.paused or self.failure))
+    def _run_or_pause(self) -> None:
+        self._enter(State.PAUSED if self.paused else State.RUNNING)
 
-    @property
-    def grid(self) -> tuple[float, float]:
-        """Steady time of a tick, just after samples are due, and from tick to tick [s]."""
+    def _enter(self, state: State) -> None:
+        """Change the state; time runs, or stands, from where all samples are sent."""
+        if self.state not in {state, State.ENDED}:
+            self.state = state
+            self.interruptions += 1
+        self._clock.set(self.now_ns, running=self.state is State.RUNNING)
+        self._pace_ticks()
+
+    def _pace_ticks(self) -> None:
+        """Set when ticks come; the next one is a slow one, and not late."""
         origin_ns = self._clock.when(0) if self._is_steady else None
-        return (origin_ns or 0) / NANOSECONDS, self._tick_period_ns / NANOSECONDS
+        self.grid = (origin_ns or 0) / NANOSECONDS, self._tick_period_ns / NANOSECONDS
+        self._late_from_ns = NEVER_NS           # on the steady clock: a tick from then on is late
+        self._fast_until_ns = -1                # ticks before this simulated time are fast
 
     def tick(self) -> bool:
         """Send what is due; return whether `idle` has something to do before the next tick."""
-        steady_ns, late_from_ns = self._steady(), self._late_from_ns
+        steady_ns, due_ns, late_from_ns = self._steady(), self._clock.now(), self._late_from_ns
         self._late_from_ns = steady_ns + self._late_after_ns
-        due_ns = self._clock.now()
-        # The fast path touches little memory: after a rest, little of it is in the caches.
+        # A fast tick only sends computed samples.  It touches little memory, as the processor's
+        # caches hold little of it after a sleep.
         if (self._simulation.now_ns <= due_ns < self._fast_until_ns and steady_ns <= late_from_ns
                 and self._simulation.send_ready(due_ns)):
-            return self._computing
-        if not self._clock.running:
+            return self._block_unfinished
+        if self.state is not State.RUNNING:
             return False
         if steady_ns > late_from_ns:
             self.late_ticks += 1
@@ -118,43 +148,40 @@ class TickLoop:
             self._update_subscribers()
             self._subscribers_due_ns = steady_ns + SUBSCRIBERS_PERIOD_NS
         due_ns = self._advance()
-        simulation = self._simulation
-        if simulation.now_ns >= self._duration_ns:
-            self.ended = True
-            self._sync_clock()
+        if self._simulation.now_ns >= self._duration_ns:
+            self._enter(State.ENDED)
             return False
-        self._set_fast_until()
-        return simulation.now_ns >= due_ns and (
-            self._computing or due_ns >= simulation.ready_ns - self._ahead_ns)
+        return self._plan_fast_ticks() and self._simulation.now_ns >= due_ns
 
     def idle(self) -> None:
         """Compute some of the samples that are due next, until about the next tick."""
         simulation = self._simulation
-        self._computing = not simulation.prepare(
+        self._block_unfinished = not simulation.prepare(
             simulation.now_ns + self._ahead_ns, int(BUSY_SHARE * self._tick_period_ns))
-        self._set_fast_until()
+        self._plan_fast_ticks()
 
-    def _set_fast_until(self) -> None:
-        """Ticks before this simulated time take the fast path."""
+    def _plan_fast_ticks(self) -> bool:
+        """Set until when ticks are fast; return whether `idle` has a block to compute."""
         simulation = self._simulation
-        if self._clock.running:
+        block_due_ns = -1 if self._block_unfinished else simulation.ready_ns - self._ahead_ns
+        if self.state is State.RUNNING:
             self._fast_until_ns = min(
                 simulation.now_ns + int(SUBSCRIBERS_PERIOD_NS * self._time_scale),
-                self._duration_ns,
-                NEVER_NS if self._computing else simulation.ready_ns - self._ahead_ns)
+                self._duration_ns, NEVER_NS if self._block_unfinished else block_due_ns)
+        return simulation.now_ns >= block_due_ns
 
     def _advance(self) -> int:
         """Send what is due, or what one tick has time for; return the simulated time due [ns]."""
         simulation, has_room = self._simulation, self._recording.has_room
         due_ns = self._clock.now()
         target_ns = min(due_ns, self._duration_ns)
-        if not self._clock.running:
+        if self.state is not State.RUNNING:
             return target_ns
         if due_ns < simulation.now_ns:          # as where a log is played in a loop
             back_s = (simulation.now_ns - due_ns) / self._time_scale / NANOSECONDS
             self._tell(f'/clock stepped back by {back_s:g} s: the motion and its stamps go on '
                        'from where they are', False)
-            self._sync_clock()
+            self._enter(State.RUNNING)
             return simulation.now_ns
         publish_from_ns = target_ns - int(LATEST_NS * self._time_scale)
         if simulation.epoch_ns + target_ns > LAST_STAMP_NS:
@@ -170,20 +197,21 @@ class TickLoop:
         lag_ns = target_ns - simulation.now_ns
         if not arrived and lag_ns > LONGEST_LAG_NS * self._time_scale:
             self.slipped_ns += lag_ns
-            self._sync_clock()
+            self._enter(State.RUNNING)
         return target_ns
 
     def pause(self) -> None:
         """Send what is due, then hold the motion; does nothing when paused already."""
         self._advance()
         self.paused = True
-        self._sync_clock()
+        if self.state is State.RUNNING:
+            self._enter(State.PAUSED)
 
     def resume(self) -> None:
         """Let simulated time run on from where it was held, without catching up."""
-        if self.paused:
-            self.paused = False
-            self._sync_clock()
+        self.paused = False
+        if self.state is State.PAUSED:
+            self._enter(State.RUNNING)
 
     def step(self, count: int, dt: float) -> None:
         """Move a paused motion on by count x dt [s], rounded to 1 ns, or raise RuntimeError."""
@@ -203,7 +231,7 @@ class TickLoop:
             self._simulation.advance(min(target_ns, last_ns), give_way=give_way)
         except IntegrationError as error:
             self.fail(str(error))
-        self._sync_clock()
+        self._enter(self.state)
         if self.failure:
             raise RuntimeError(self.failure)
         if self.now_ns == last_ns:
@@ -233,15 +261,16 @@ class TickLoop:
         simulation.restart(values)
         simulation.epoch_ns = epoch_ns
         self.failure = None
+        self.interruptions += 1
         self.set_pace(values)           # which a failed change has left half done
-        self._sync_clock()
+        self._run_or_pause()
         self._recording.write_event('reset', sent_ns, epoch_ns=simulation.epoch_ns,
                                     parameters=values)
 
     def fail(self, reason: str) -> None:
         """Hold the motion until `reset`."""
         self.failure = reason
-        self._sync_clock()
+        self._enter(State.FAILED)
         self._tell(f'{reason}; the motion stands still until ~/reset', True)
 
     def set_pace(self, values: Mapping[str, Any]) -> None:
@@ -252,6 +281,5 @@ class TickLoop:
         self._late_after_ns = round(1.5 * self._tick_period_ns)
         self._ahead_ns = round(self._time_scale * max(
             1.5 * self._tick_period_ns, min(TICKS_AHEAD * self._tick_period_ns, AHEAD_NS)))
-        self._late_from_ns = NEVER_NS           # on the steady clock
-        self._fast_until_ns = -1                # simulated time until which ticks are fast
         self._clock.set_scale(self._time_scale)
+        self._pace_ticks()
