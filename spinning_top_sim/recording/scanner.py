@@ -42,23 +42,12 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, DataEnd, Header, McapRecord, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
+from spinning_top_sim.recording import records
 from spinning_top_sim.recording.chunks import Entries, message_indexes, time_span
 from spinning_top_sim.recording.damage import Damage, Loss
 from spinning_top_sim.recording.mcap_writer import record_bytes
 from spinning_top_sim.recording.message_counts import MessageCounts
-from spinning_top_sim.recording.records import (
-    HEAD,
-    ChunkContents,
-    DamagedError,
-    TooLargeError,
-    break_up,
-    check_declared,
-    check_size,
-    name_of,
-    open_chunk,
-    parse,
-    parse_message_index,
-)
+from spinning_top_sim.recording.records import HEAD, ChunkContents, DamagedError, TooLargeError
 from spinning_top_sim.recording.resync import RecordFinder
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA
 from spinning_top_sim.recording.summary import MAGIC_SIZE, McapSource, Summary
@@ -166,7 +155,7 @@ class Scanner:
         opcode, end = self.source.head(offset, self._limit)
         if self._indexed.get(offset, opcode) != opcode or end > self._next_indexed(offset):
             raise DamagedError('the summary tells of another record there')
-        check_size(end - offset - HEAD.size, self.source.max_bytes)
+        records.check_size(end - offset - HEAD.size, self.source.max_bytes)
         if opcode == Opcode.ATTACHMENT:
             return self._read_attachment(offset, end)
         if opcode > Opcode.DATA_END:
@@ -177,12 +166,12 @@ class Scanner:
         if opcode == Opcode.MESSAGE:
             return self._read_message(offset, raw)
         if opcode == Opcode.MESSAGE_INDEX:      # not behind its chunk
-            _, entries, extra = parse_message_index(raw)
+            _, entries, extra = records.parse_message_index(raw)
             self._check_extra(extra, end)
             if entries:
                 self._defects.append(f'the message index at byte {offset} is wrong')
             return ScannedRecord(opcode, offset, end, raw=raw)
-        record, extra = parse(raw)
+        record, extra = records.parse(raw)
         self._check_extra(extra, end)
         if isinstance(record, DataEnd) and (
                 end == self._limit if self._limit_is_end else not extra):
@@ -195,7 +184,7 @@ class Scanner:
             return ScannedRecord(opcode, offset, end, record, raw, self._open(offset, record))
         if isinstance(record, Metadata):
             self._metadata_bytes += len(raw)
-            check_declared(self._metadata_bytes)
+            records.check_declared(self._metadata_bytes)
         elif isinstance(record, Schema | Channel):
             known = self._declare(offset, record)
             if known != record:
@@ -211,7 +200,7 @@ class Scanner:
         return ScannedRecord(Opcode.ATTACHMENT, offset, end, index)
 
     def _read_message(self, offset: int, raw: bytes) -> ScannedRecord:
-        contents = break_up(raw)
+        contents = records.break_up(raw)
         if self._all_in_chunks:
             raise DamagedError('all messages of the file are in chunks')
         end = offset + len(raw)
@@ -221,7 +210,7 @@ class Scanner:
         return ScannedRecord(Opcode.MESSAGE, offset, end, raw=raw, contents=contents)
 
     def _open(self, offset: int, chunk: Chunk) -> ChunkContents:
-        contents = open_chunk(chunk, self.source.max_bytes)
+        contents = records.open_chunk(chunk, self.source.max_bytes)
         declared = [self._declare(offset, record) for record in contents.declared]
         contents.right = declared == contents.declared and all(
             self._summary.knows(record.id) for record in declared if isinstance(record, Channel))
@@ -236,7 +225,7 @@ class Scanner:
         known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
         if record.id not in known:
             self._summary.declared_bytes += len(record_bytes(record))
-            check_declared(self._summary.declared_bytes)
+            records.check_declared(self._summary.declared_bytes)
         right: Schema | Channel = known.setdefault(record.id, record)
         if right != record:
             self._defects.append(f'the {type(record).__name__.lower()} {record.id} at byte '
@@ -279,7 +268,8 @@ class Scanner:
         with contextlib.suppress(DamagedError):
             while self.source.read(offset, 1) == _INDEX_KIND:
                 _, end = self.source.head(offset, self._next_indexed(offset))
-                channel_id, entries, extra = parse_message_index(self.source.raw(offset, end))
+                channel_id, entries, extra = records.parse_message_index(
+                    self.source.raw(offset, end))
                 self._check_extra(extra, end)
                 yield offset, end, channel_id, entries
                 offset = end
@@ -301,7 +291,7 @@ class Scanner:
                     damage = DamagedError('the file ends within it')
 
         index = self._summary.chunks.get(offset)
-        what = name_of(opcode if index is None else Opcode.CHUNK)
+        what = records.name_of(opcode if index is None else Opcode.CHUNK)
         loss = Loss(offset, end - offset, what, str(damage),
                     refused=isinstance(damage, TooLargeError))
         self._losses.append(loss)
@@ -313,7 +303,7 @@ class Scanner:
                     self.source.read(offset + HEAD.size, _CHUNK_TIMES.size))
                 if 0 < start_ns <= end_ns:
                     loss.start_ns, loss.end_ns = start_ns, end_ns
-        if length_is_right and what == name_of(Opcode.CHUNK):
+        if length_is_right and what == records.name_of(Opcode.CHUNK):
             # Its indexes tell what it held.
             for _, index_end, channel_id, entries in self._indexes(end):
                 end = index_end
