@@ -2,23 +2,25 @@
 """
 Scans the data section of an MCAP file from record to record, around what is damaged.
 
-What is not used is a loss; what is wrong but known from elsewhere in the file is a defect:
+A *loss* is a part that is not used.  A *defect* is wrong, but known from elsewhere in the file.
 
-what the file has                                    what `damage` tells  what is kept
----------------------------------------------------  -------------------  ------------------------
-first eight bytes that are not MCAP's                defect               all
-two declarations of one schema or channel            defect               the summary's, or first
-a chunk with wrong times in its head                 defect               its messages
-a message index that is damaged or wrong             defect               its chunk
-no summary that can be used, though one was written  defect               all
-a damaged end of the data section before a footer    defect               all
-a damaged record, or one that has no place there     loss                 all others
-a record larger than `max_bytes`                     loss, refused        all others
-messages of a channel that nothing declares          loss, counted        all others
-the end of the file within a record                  loss                 all before
-the same within what only repeats something          truncated            all before
-nothing of these, but a wrong checksum               loss of 0 bytes      all
-fewer messages than its statistics count, no loss    loss of 0 bytes      all
+found by        what the file has                                  told as          what is kept
+--------------  -------------------------------------------------  ---------------  -------------
+__iter__        first eight bytes that are not MCAP's              defect           all
+_declare        two different declarations of a schema or channel  defect           the first
+_open_chunk     a chunk with wrong times in its head               defect           its messages
+_check_indexes  a message index that is damaged or wrong           defect           its chunk
+_skip           a damaged record, or one that has no place there   loss             all others
+_skip           a record that is larger than `max_bytes`           loss, refused    all others
+_skip           the end of the file within a record                loss             all before
+_skip           the same in bag metadata, data end or summary      truncated        all before
+MessageCounts   messages of a channel that nothing declares        loss, counted    all others
+_check_end      an end of the file or a summary that is damaged    defect           all
+_check_end      no data end before a whole footer                  defect           all
+_check_end      a wrong checksum of a section without all these    loss of 0 bytes  all
+_check_end      fewer messages than the statistics count, no loss  loss of 0 bytes  all
+
+Schemas and channels of a usable summary come before those in the data section.
 
 Behind a damaged record the scan goes on where its length leads, if another record is there.
 Otherwise it goes on at the next record that the summary indexes, if this has all chunks, or at
@@ -88,9 +90,8 @@ class Scanner:
         self._ours = ours
         self.schemas, self.channels = summary.schemas, summary.channels     # by id, known so far
         self._all_in_chunks = ours or summary.indexes_all_messages
-        # The data section ends there; with a problem, it may end before.
         self._limit = summary.data_limit
-        self._limit_is_end = not summary.problem
+        self._limit_is_end = not summary.problem    # of the data section, else of the file
         self._finder = RecordFinder(source, self._limit)
         self._indexed: dict[int, int] = {}      # opcodes by offset, of records in the summary
         for offset, opcode, length in summary.places:
@@ -111,7 +112,9 @@ class Scanner:
         if self.source.read(0, MAGIC_SIZE) != MCAP0_MAGIC:
             self._defects.append('the first eight bytes are not those of an MCAP file')
         offset = MAGIC_SIZE
-        in_summary = False      # behind a data end that is damaged
+        # Behind a data end that is damaged: the records of a summary are not yielded, and damage
+        # among them ends the scan.
+        in_summary = False
         # The last bytes before a known end can only be the data end.
         while offset < self._limit - (_DATA_END_SIZE if self._limit_is_end else 0):
             try:
@@ -181,7 +184,8 @@ class Scanner:
                 or (opcode in _SUMMARY_KINDS and (self._limit_is_end or extra))):
             raise DamagedError('it has no place there')
         if isinstance(record, Chunk):
-            return ScannedRecord(opcode, offset, end, record, raw, self._open(offset, record))
+            contents = self._open_chunk(offset, record)
+            return ScannedRecord(opcode, offset, end, record, raw, contents)
         if isinstance(record, Metadata):
             self._metadata_bytes += len(raw)
             records.check_declared(self._metadata_bytes)
@@ -209,7 +213,7 @@ class Scanner:
             self.source.head(end, self._limit)
         return ScannedRecord(Opcode.MESSAGE, offset, end, raw=raw, contents=contents)
 
-    def _open(self, offset: int, chunk: Chunk) -> ChunkContents:
+    def _open_chunk(self, offset: int, chunk: Chunk) -> ChunkContents:
         contents = records.open_chunk(chunk, self.source.max_bytes)
         declared = [self._declare(offset, record) for record in contents.declared]
         contents.right = declared == contents.declared and all(

@@ -71,13 +71,12 @@ def progress(what: str, total: float, unit: str, *, quiet: bool = False,
         yield lambda done: None
         return
     if not sys.stderr.isatty():
-        next_s = time.monotonic() + LINE_EVERY_S
+        told_s = time.monotonic()
 
         def show(done: float) -> None:
-            nonlocal next_s
-            now_s = time.monotonic()
-            if now_s >= next_s:
-                next_s = now_s + LINE_EVERY_S
+            nonlocal told_s
+            if time.monotonic() - told_s >= LINE_EVERY_S:
+                told_s = time.monotonic()
                 print_line(f'{what} {min(done / total, 1.0):.0%}', sys.stderr)
 
         yield show
