@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers from samples of the attitude alone: nutation, mean rates, constants of the motion."""
+"""Measures a motion from samples alone, as arrays; `survey` chooses which of a log these are."""
 
 from __future__ import annotations
 
