@@ -12,6 +12,7 @@ import re
 import struct
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -423,6 +424,22 @@ def test_another_machine_is_warned_of(stepped, capsys, monkeypatch):
     verdict = verified(capsys, stepped)
     assert verdict['identical']
     assert len(verdict['warnings']) == 1 and 'abacus' in verdict['warnings'][0]
+
+
+def test_a_long_verification_tells_how_far_it_is_without_a_terminal(
+        columns, capsys, monkeypatch):
+    def told_if_a_look_takes(seconds):
+        looks = itertools.count()
+        monkeypatch.setattr(cli, 'time', SimpleNamespace(
+            monotonic=lambda: seconds * next(looks)))
+        return [told(capsys, columns, '--verify', *more)[2] for more in ((), ('--json',))]
+
+    long, silent = told_if_a_look_takes(6.0)
+    percents = [int(number) for number in re.findall(r'^verified (\d+)%$', long, re.MULTILINE)]
+    assert len(percents) == long.count('\n') > 2
+    assert percents == sorted(percents) and 0 < percents[0] < percents[-1] <= 100
+    assert silent == ''
+    assert told_if_a_look_takes(1e-6) == ['', '']
 
 
 def test_live_logs_verify(tmp_path, capsys):

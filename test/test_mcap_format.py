@@ -52,7 +52,7 @@ from test_recover import (
     write_stranger,
 )
 
-from spinning_top_sim.recording import resync
+from spinning_top_sim.recording import records
 from spinning_top_sim.recording.mcap_writer import record_bytes
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.summary import McapSource
@@ -610,8 +610,8 @@ def test_a_record_of_many_gigabytes_is_not_read(tmp_path, kind):
 def test_the_search_behind_damage_unpacks_a_limited_amount(tmp_path, monkeypatch):
     """Chunks that are small and unpack to much, each with a wrong checksum."""
     unpacked = []
-    ordinary = resync.open_chunk
-    monkeypatch.setattr(resync, 'open_chunk', lambda chunk, max_bytes: (
+    ordinary = records.open_chunk
+    monkeypatch.setattr(records, 'open_chunk', lambda chunk, max_bytes: (
         unpacked.append(chunk.uncompressed_size), ordinary(chunk, max_bytes))[1])
     plain = bytearray(zstd_chunk(message(5, bytes(1_000_000))))
     plain[9 + 24] ^= 1

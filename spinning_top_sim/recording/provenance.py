@@ -11,23 +11,24 @@ from importlib import metadata
 from typing import Any
 
 
-def provenance(values: Mapping[str, Any], epoch_ns: int, begun_ns: int,
+def provenance(values_at_start: Mapping[str, Any], epoch_ns: int, begun_ns: int,
                history: Iterable[tuple[int, float, float]],
-               now: Mapping[str, Any]) -> dict[str, str]:
+               values_at_recording: Mapping[str, Any]) -> dict[str, str]:
     """
     Return the `spinning_top_sim` metadata record.
 
-    values : parameters at the start of the motion (the last reset)
+    values_at_start : parameters at the start of the motion (the last reset)
     epoch_ns : stamp of t = 0
     begun_ns : simulated time at which the recording begins
     history : commands applied before, as (t_ns, l3, lz)
-    now : parameters as they are, with later changes
+    values_at_recording : parameters when the recording begins, with later changes
     """
     return {
         'format': '1',      # version of these keys
-        'parameters': json.dumps(dict(values), default=list, sort_keys=True),
-        'parameters_now': json.dumps(dict(now), default=list, sort_keys=True),
-        'seed': str(values['seed']),
+        'parameters': json.dumps(dict(values_at_start), default=list, sort_keys=True),
+        'parameters_now': json.dumps(
+            dict(values_at_recording), default=list, sort_keys=True),
+        'seed': str(values_at_start['seed']),
         'epoch_ns': str(epoch_ns),
         'begun_ns': str(begun_ns),
         'history': json.dumps(list(history)),

@@ -23,18 +23,11 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk, ChunkIndex, Header, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
+from spinning_top_sim.recording import records
 from spinning_top_sim.recording.chunks import time_span
 from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.errors import LogError
-from spinning_top_sim.recording.records import (
-    HEAD,
-    MAX_BYTES,
-    MAX_DECLARED,
-    ChunkContents,
-    DamagedError,
-    break_up,
-    open_chunk,
-)
+from spinning_top_sim.recording.records import HEAD, ChunkContents, DamagedError
 from spinning_top_sim.recording.rosbag2 import Qos, qos_profiles
 from spinning_top_sim.recording.scanner import Scanner
 from spinning_top_sim.recording.summary import (
@@ -99,7 +92,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     is no MCAP file, or cannot be read, raises LogError.
     """
 
-    def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> None:
+    def __init__(self, path: str | os.PathLike[str], max_bytes: int = records.MAX_BYTES) -> None:
         self.path = Path(path)
         self.left_out = 0       # damaged chunks that `messages` has skipped
         self.source = McapSource(self.path, max_bytes)
@@ -221,7 +214,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         metadata_bytes = 0
         for index in self._summary.metadata:
             metadata_bytes += index.length
-            if metadata_bytes > MAX_DECLARED:
+            if metadata_bytes > records.MAX_DECLARED:
                 break
             record = self.source.record(index.offset, self._summary.data_limit, Metadata)
             if record is not None:
@@ -266,10 +259,10 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         """Return the messages of a span; none if it is damaged."""
         with contextlib.suppress(DamagedError):
             if self.source.read(span.offset, 1) == bytes([Opcode.MESSAGE]):
-                return break_up(self.source.read(span.offset, span.end - span.offset))
+                return records.break_up(self.source.read(span.offset, span.end - span.offset))
             chunk = self.source.record(span.offset, span.end, Chunk)
             if chunk is not None:
-                return open_chunk(chunk, self.source.max_bytes)
+                return records.open_chunk(chunk, self.source.max_bytes)
         self.left_out += 1
         return ChunkContents(b'')
 

@@ -8,16 +8,9 @@ import re
 from mcap.opcode import Opcode
 from mcap.records import Chunk
 
+from spinning_top_sim.recording import records
 from spinning_top_sim.recording.chunks import MESSAGE_FIELDS
-from spinning_top_sim.recording.records import (
-    HEAD,
-    MAX_DECLARED,
-    DamagedError,
-    TooLargeError,
-    open_chunk,
-    parse,
-    parse_message_index,
-)
+from spinning_top_sim.recording.records import HEAD, DamagedError, TooLargeError
 from spinning_top_sim.recording.summary import McapSource
 
 # What may begin a chunk, a schema, a channel or metadata: opcode and a length below 2^40.
@@ -61,9 +54,9 @@ class RecordFinder:
             if opcode == Opcode.ATTACHMENT:
                 self._source.attachment(offset, end)
             elif opcode == Opcode.MESSAGE_INDEX:
-                parse_message_index(self._source.raw(offset, end))
+                records.parse_message_index(self._source.raw(offset, end))
             else:
-                parse(self._source.raw(offset, end))
+                records.parse(self._source.raw(offset, end))
         except TooLargeError:
             return opcode == Opcode.CHUNK
         except DamagedError:
@@ -94,13 +87,13 @@ class RecordFinder:
         self._effort -= end - start
         if self._effort < 0:
             return False
-        record, _ = parse(self._source.raw(offset, end))
+        record, _ = records.parse(self._source.raw(offset, end))
         if not isinstance(record, Chunk):
             return True
         self._unpacking -= record.uncompressed_size
         if self._unpacking < 0:
             return False
-        contents = open_chunk(record, self._source.max_bytes)
+        contents = records.open_chunk(record, self._source.max_bytes)
         return bool(contents.entries or contents.declared)      # zeros look like an empty chunk
 
 
@@ -112,4 +105,4 @@ def _looks_right(opcode: int, length: int, start: bytes) -> bool:
         data_start = name_start + name_size + 8
         data_size = int.from_bytes(start[data_start - 8:data_start], 'little')
         return 0 <= length - data_start - data_size <= _MAX_EXTRA
-    return 0 < name_size < _MAX_NAME and length <= MAX_DECLARED
+    return 0 < name_size < _MAX_NAME and length <= records.MAX_DECLARED

@@ -128,7 +128,9 @@ def bag_metadata_yaml(
                     'name': channel.topic,
                     'type': type_name,
                     'serialization_format': channel.message_encoding,
-                    'offered_qos_profiles': [_named(qos) for qos in qos_profiles(channel)],
+                    'offered_qos_profiles': [
+                        {key: _POLICY_NAMES[key][value] if key in _POLICY_NAMES else value
+                         for key, value in qos.items()} for qos in qos_profiles(channel)],
                     'type_description_hash': channel.metadata.get('topic_type_hash', '')},
                  'message_count': messages} for channel, type_name, messages in topics],
             'compression_format': '',
@@ -139,12 +141,6 @@ def bag_metadata_yaml(
         _block(former, 'custom_data') or 'custom_data: ~',
         _block(former, 'ros_distro')
         or _dump({'ros_distro': os.environ.get('ROS_DISTRO') or 'jazzy'})))
-
-
-def _named(profile: Qos) -> Qos:
-    """Return a profile with its policies by name."""
-    return {key: _POLICY_NAMES[key][value] if key in _POLICY_NAMES else value
-            for key, value in profile.items()}
 
 
 def _block(text: str, key: str) -> str:

@@ -86,7 +86,12 @@ def _recover(
             progress(scanned.offset, reader.size)
         if scanner.found_late:
             raise _FoundLateError
-        copy.put_rest()
+        writer.write_chunk()
+        # What only the summary tells
+        for schema in scanner.schemas.values():
+            copy.declare(schema)
+        for channel in scanner.channels.values():
+            copy.declare(channel)
         messages = sum(writer.message_counts.values())
         if not messages and not reader.whole:
             raise LogError(f'nothing to save in {reader.path}: there is no whole message in it')
@@ -112,7 +117,7 @@ class _Copy:
         if scanned.contents is not None:
             self._put_messages(scanned, scanned.contents)
         elif isinstance(record, Schema | Channel):
-            self._declare(record, scanned.raw)
+            self.declare(record, scanned.raw)
         elif isinstance(record, Metadata) and record.name == BAG_METADATA:
             self.former_bag = record.metadata.get('serialized_metadata', '')
         elif isinstance(record, Metadata):
@@ -121,17 +126,9 @@ class _Copy:
             self._writer.copy_record(
                 self._scanner.source.blocks(scanned.offset, scanned.end), record)
 
-    def put_rest(self) -> None:
-        """Write what is left: messages, and channels that only the summary tells."""
-        self._writer.write_chunk()
-        for schema in self._scanner.schemas.values():
-            self._declare(schema)
-        for channel in self._scanner.channels.values():
-            self._declare(channel)
-
     def _put_messages(self, scanned: ScannedRecord, contents: ChunkContents) -> None:
         for channel_id in contents.entries:
-            self._declare(self._scanner.channels[channel_id])
+            self.declare(self._scanner.channels[channel_id])
         if isinstance(scanned.record, Chunk) and contents.right:
             self._writer.write_chunk()  # what came before stays before
             self._writer.copy_chunk(scanned.record, contents.entries, scanned.raw)
@@ -140,7 +137,7 @@ class _Copy:
             self._writer.add_message(message.channel_id, message.sequence, message.log_time,
                                      message.publish_time, message.data)
 
-    def _declare(self, record: Schema | Channel, raw: bytes = b'') -> None:
+    def declare(self, record: Schema | Channel, raw: bytes = b'') -> None:
         """Write a schema or channel outside of chunks, once, a schema before its channels."""
         key = type(record), record.id
         if key in self._declared:
@@ -148,7 +145,7 @@ class _Copy:
         if isinstance(record, Channel) and record.schema_id:
             if record.schema_id not in self._scanner.schemas:
                 return      # no reader takes a channel without its schema
-            self._declare(self._scanner.schemas[record.schema_id])
+            self.declare(self._scanner.schemas[record.schema_id])
         self._writer.write(record, raw)
         self._declared.add(key)
 

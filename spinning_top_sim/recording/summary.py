@@ -29,16 +29,10 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
+from spinning_top_sim.recording import records
 from spinning_top_sim.recording.chunks import ENTRY_SIZE, INDEX_HEAD
 from spinning_top_sim.recording.errors import LogError
-from spinning_top_sim.recording.records import (
-    HEAD,
-    DamagedError,
-    StrictStream,
-    check_declared,
-    check_size,
-    parse,
-)
+from spinning_top_sim.recording.records import HEAD, DamagedError
 
 MAGIC_SIZE = len(MCAP0_MAGIC)
 
@@ -109,21 +103,22 @@ class McapSource:
 
     def raw(self, offset: int, end: int) -> bytes:
         """Return the bytes of a record; raises TooLargeError."""
-        check_size(end - offset - HEAD.size, self.max_bytes)
+        records.check_size(end - offset - HEAD.size, self.max_bytes)
         return self.read(offset, end - offset)
 
     def record(self, offset: int, limit: int, kind: type[_Record]) -> _Record | None:
         """Return the record there if it is whole and of that class, else None."""
         with contextlib.suppress(DamagedError):
             _, end = self.head(offset, limit)
-            record, _ = parse(self.raw(offset, end))
+            record, _ = records.parse(self.raw(offset, end))
             if isinstance(record, kind):
                 return record
         return None
 
     def attachment(self, offset: int, end: int) -> tuple[AttachmentIndex, int]:
         """Return the index of the attachment there, and the offset of its checksum."""
-        stream = StrictStream(BytesIO(self.read(offset, min(end - offset, _ATTACHMENT_HEAD))))
+        stream = records.StrictStream(BytesIO(
+            self.read(offset, min(end - offset, _ATTACHMENT_HEAD))))
         try:
             stream.read(HEAD.size)
             index = AttachmentIndex(
@@ -212,7 +207,7 @@ def read_summary(source: McapSource) -> Summary:
     try:
         if not MAGIC_SIZE <= start <= footer_offset:
             raise DamagedError('the footer does not lead to it')
-        check_size(size, source.max_bytes)
+        records.check_size(size, source.max_bytes)
         if footer.summary_crc not in (0, source.crc(start, magic_offset - 4)):
             raise DamagedError('its checksum is wrong')
         return _read_section(source, start, footer_offset)
@@ -229,9 +224,9 @@ def _read_section(source: McapSource, start: int, end: int) -> Summary:
         opcode, record_end = source.head(offset, end)
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             declared_bytes += record_end - offset
-            check_declared(declared_bytes)
+            records.check_declared(declared_bytes)
         if opcode <= Opcode.DATA_END:
-            record, _ = parse(source.raw(offset, record_end))
+            record, _ = records.parse(source.raw(offset, record_end))
             found[type(record)].append(record)
         offset = record_end
     summary = Summary(

@@ -33,7 +33,6 @@ except ImportError as error:
     raise RecordingError(
         f'recording needs the Python package mcap with zstandard and lz4: {error}') from error
 
-COMPRESSIONS = ('zstd', 'lz4', 'none')
 METADATA_NAME = 'spinning_top_sim'
 OUR_LIBRARY = 'spinning_top_sim '   # what the header of our files begins with
 QUEUE_BYTES = 32_000_000            # where a recording has no more room, see `McapRecorder.room`
@@ -56,7 +55,6 @@ class RecordingSummary:
     lost: int               # handed over after the recording stopped, or when it failed
     longest_flush: float    # that brought the file to the disk [s]
     error: str | None       # why the recording stopped early
-    indexed: bool           # whether the file has its summary; ordinary readers refuse it without
 
     @property
     def messages(self) -> int:
@@ -82,8 +80,6 @@ class McapRecorder:
 
         max_loss : most wall time whose messages a SIGKILL or a power loss may take [s], > 0
         """
-        if not 0.0 < max_loss <= threading.TIMEOUT_MAX:
-            raise ValueError(f'max_loss = {max_loss!r} s: must be > 0 and finite')
         self.path = Path(path)
         self._file = create_file(self.path, topics, metadata, compression=compression,
                                  min_free_bytes=min_free_bytes)
@@ -98,7 +94,6 @@ class McapRecorder:
         self._bytes_in = self._bytes_out = 0    # of the queue, ever
         self._offered = 0              # messages handed over, ever
         self._accepting = True
-        self._indexed = False
         self._longest_flush = 0.0
         self._on_disk = time.monotonic(), 0     # what came by this time; bytes out of the queue
         self._sync_error: Exception | None = None
@@ -145,7 +140,7 @@ class McapRecorder:
         return RecordingSummary(
             path=self.path, bytes=self._file.size, counts=counts,
             queued=missing if running else 0, lost=0 if running else missing,
-            longest_flush=self._longest_flush, error=self.error, indexed=self._indexed)
+            longest_flush=self._longest_flush, error=self.error)
 
     def write(self, topic_index: int, log_time_ns: int, data: bytes) -> None:
         """Hand over one message; see `write_all`."""
@@ -207,7 +202,6 @@ class McapRecorder:
                 if self._syncing is not None:
                     self._syncing.join()
                 self._file.finish()
-                self._indexed = True
 
     def _record(self) -> None:
         """Write what is queued, flush in time, finish when asked to."""
@@ -228,7 +222,6 @@ class McapRecorder:
                 self._file.check_disk(self._min_free_bytes)
                 if closing:
                     self._file.finish()
-                    self._indexed = True
                     return
                 self._begin_sync(now)
             self._wake.wait(max(0.0, next_flush - time.monotonic()))
@@ -274,19 +267,15 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
 
     topics : all stand before the first chunk, so that a truncated file tells them in any case
     metadata : the `spinning_top_sim` record at the head of the file
-    compression : one of COMPRESSIONS
+    compression : 'zstd', 'lz4' or 'none'
     min_free_bytes : a recording stops if the disk has less left than this, >= 0
 
-    Raises ValueError for an argument out of range, RecordingError naming path or type.
+    Raises ValueError for a topic that is listed twice, RecordingError naming path or type.
     """
     names = [topic.name for topic in topics]
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f'topic {name!r} is listed twice: once is allowed')
-    if compression not in COMPRESSIONS:
-        raise ValueError(f'compression = {compression!r}: must be one of {COMPRESSIONS}')
-    if min_free_bytes < 0:
-        raise ValueError(f'min_free_bytes = {min_free_bytes!r}: must be >= 0')
     definitions = {
         name: find_definition(name) for name in dict.fromkeys(topic.type_name for topic in topics)}
     try:

@@ -262,6 +262,10 @@ class Simulation:
             self.now_ns = max(self.now_ns, until_ns)
             segment.release(self.now_ns)
 
+    def skip_to(self, t_ns: int) -> None:
+        """Take every sample up to this time as sent, and none later; only for offline use."""
+        self.now_ns = t_ns
+
     # ----------------------------------------------------------------------------- commands
 
     def command(self, l3: float, lz: float) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers from samples of the attitude alone: nutation, mean rates, constants of the motion."""
+"""Measures a motion from samples alone, as arrays; `survey` chooses which of a log these are."""
 
 from __future__ import annotations
 
@@ -24,15 +24,10 @@ Number = TypeVar('Number', np.float64, np.complex128)
 # is sin(pi/10)^24 of its amplitude.
 POINTS = 24
 LEAST_SAMPLES = 9.0         # in a nutation, for an interpolation as good as the data
-# A tilt that changes less than this is at rest: rounding would decide the results [rad].
-RESTS = 1e-9
-# Largest difference between the rate in the data and that of the polynomial, relative to the
-# largest rate.
-RATE_TOLERANCE = 1e-3
-# Largest step of an angle that can be unwrapped safely [rad].
-LARGEST_STEP = 2.5
-# Relative difference from a special motion below which measured numbers are taken for it.
-SNAP = 1e-9
+RESTS = 1e-9                # a tilt that changes less is at rest: rounding would decide [rad]
+RATE_TOLERANCE = 1e-3       # of the rates: from those in the data to those of the polynomial
+LARGEST_STEP = 2.5          # of an angle that can be unwrapped safely [rad]
+SNAP = 1e-9                 # relative distance from a special motion that is taken for it
 
 
 class Attitudes:

@@ -8,6 +8,7 @@ import contextlib
 import os
 import shutil
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TextIO
 
@@ -16,6 +17,7 @@ FAILED = 1
 INTERRUPTED = 130
 
 TEXT_WIDTH = 118            # without a terminal
+LINE_EVERY_S = 10.0         # of progress, without a terminal
 GAP = '  '                  # before each column of a table
 
 
@@ -60,9 +62,24 @@ def print_line(text: str, file: TextIO | None = None) -> None:
 @contextlib.contextmanager
 def progress(what: str, total: float, unit: str, *, quiet: bool = False,
              ) -> Iterator[Callable[[float], None]]:
-    """Show a bar on a terminal, nothing elsewhere; yield what takes the amount done so far."""
-    if quiet or not total > 0.0 or not sys.stderr.isatty():
+    """
+    Show a bar on a terminal, and elsewhere a line from time to time.
+
+    Yields what takes the amount done so far.
+    """
+    if quiet or not total > 0.0:
         yield lambda done: None
+        return
+    if not sys.stderr.isatty():
+        told_s = time.monotonic()
+
+        def show(done: float) -> None:
+            nonlocal told_s
+            if time.monotonic() - told_s >= LINE_EVERY_S:
+                told_s = time.monotonic()
+                print_line(f'{what} {min(done / total, 1.0):.0%}', sys.stderr)
+
+        yield show
         return
     try:
         from tqdm import tqdm  # noqa: PLC0415 - a system may lack it

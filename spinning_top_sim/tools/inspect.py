@@ -128,8 +128,8 @@ def _as_json(found: Survey, verdict: Verdict | None) -> object:
         'ours': run is not None, 'why_not_ours': found.foreign_reason or None,
         'notes': found.notes,
         'run': run and {
-            'parameters': run.values, 'seed': run.values['seed'], 'epoch_ns': run.epoch_ns,
-            'begun_ns': run.begun_ns, **run.surroundings},
+            'parameters': run.values_at_start, 'seed': run.values_at_start['seed'],
+            'epoch_ns': run.epoch_ns, 'begun_ns': run.begun_ns, **run.surroundings},
         'events': [
             {'event': event.name, 'stamp_ns': event.stamp_ns, 't_ns': event.t_ns, **event.details}
             for event in (run.events if run else ())],
@@ -162,10 +162,11 @@ def _as_text(found: Survey, verdict: Verdict | None) -> Iterator[str]:
         yield f'not recorded by spinning_top_sim: {found.foreign_reason}'
         yield from _topics(found)
         return
-    solver = run.values['solver.method']
+    values = run.values_at_start
+    solver = values['solver.method']
     if solver != 'exact':
-        solver += f" ({run.values['solver.equations']}, rtol {run.values['solver.rtol']:g})"
-    yield f'spinning_top_sim {run.surroundings["version"]}, {solver}, seed {run.values["seed"]}'
+        solver += f" ({values['solver.equations']}, rtol {values['solver.rtol']:g})"
+    yield f'spinning_top_sim {run.surroundings["version"]}, {solver}, seed {values["seed"]}'
     yield from _topics(found)
     counts = Counter(event.name for event in run.events)
     yield ('no journal: commands and resets are unknown' if run.events_topic is None else

@@ -52,8 +52,9 @@ class Event:
 class RunDescription:
     """The run of a log, by its metadata and journal."""
 
-    values: Mapping[str, Any]             # checked parameters when the motion began
-    now: Mapping[str, Any]                # and when the recording began
+    # Checked parameters at the start of the motion, and at the begin of the recording
+    values_at_start: Mapping[str, Any]
+    values_at_recording: Mapping[str, Any]
     epoch_ns: int                         # stamp of t = 0 [ns]
     begun_ns: int                         # simulated time at which the recording began [ns]
     history: Sequence[Event]              # commands before that
@@ -73,8 +74,8 @@ def read_run_description(reader: LogReader) -> RunDescription:
         raise ForeignLogError('it was not recorded by spinning_top_sim: it has no metadata '
                               f'{METADATA_NAME!r}')
     try:
-        values, now = (parameters.checked(json.loads(metadata[key]))
-                       for key in ('parameters', 'parameters_now'))
+        at_start, at_recording = (parameters.checked(json.loads(metadata[key]))
+                                  for key in ('parameters', 'parameters_now'))
         epoch_ns, begun_ns = int(metadata['epoch_ns']), int(metadata['begun_ns'])
         history = [Event('command', epoch_ns + t_ns, t_ns, t_ns, {'l3': l3, 'lz': lz})
                    for t_ns, l3, lz in json.loads(metadata['history'])]
@@ -83,7 +84,7 @@ def read_run_description(reader: LogReader) -> RunDescription:
                 epoch_ns + times_ns[-1] > min(LATEST_NS, reader.span[1] or LATEST_NS)):
             raise ValueError('times are out of order or too late')
         surroundings = {key: metadata[key] for key in ('version', 'platform', 'libraries')}
-        topics = _topics(reader.topics, now)
+        topics = _topics(reader.topics, at_recording)
     except ODD as error:
         raise ForeignLogError(
             f'its metadata {METADATA_NAME!r} cannot be used: {reason_of(error)}') from error
@@ -103,8 +104,8 @@ def read_run_description(reader: LogReader) -> RunDescription:
             events.append(event)
         except ODD as error:
             broken.append((message.log_time, reason_of(error)))
-    return RunDescription(values, now, epoch_ns, begun_ns, history, surroundings, topics,
-                          commands_topic, events_topic, events, broken, reader.size)
+    return RunDescription(at_start, at_recording, epoch_ns, begun_ns, history, surroundings,
+                          topics, commands_topic, events_topic, events, broken, reader.size)
 
 
 def reason_of(error: Exception) -> str:
@@ -113,11 +114,11 @@ def reason_of(error: Exception) -> str:
     return text if len(text) <= MOST_TEXT else f'{text[:MOST_TEXT]}...'
 
 
-def _topics(topics: Sequence[LogTopic], now: Mapping[str, Any]) -> dict[str, str]:
+def _topics(topics: Sequence[LogTopic], values: Mapping[str, Any]) -> dict[str, str]:
     """Return the topic in the log of each stream and of the parts of the journal."""
-    every = all_streams(now)
+    every = all_streams(values)
     recorded = [*((stream.topic, stream.type_name)
-                  for stream in journal.recorded_streams(every, now)), *journal.TOPICS]
+                  for stream in journal.recorded_streams(every, values)), *journal.TOPICS]
     # As the log was written they have this order, whatever they were remapped to.  In a log that
     # was put together anew they are known by the ends of their names.
     if [topic.type_name for topic in topics] == [type_name for _, type_name in recorded]:
@@ -172,7 +173,7 @@ def rerun(run: RunDescription, end_ns: int,
 
 def _rerun(run: RunDescription, end_ns: int,
            send: TakeRows | None) -> Iterator[tuple[Simulation, Event | None]]:
-    simulation = Simulation(run.values, run.epoch_ns)
+    simulation = Simulation(run.values_at_start, run.epoch_ns)
     most_steps = LEAST_STEPS + STEPS_A_BYTE * run.log_bytes
     samples_left = LEAST_SAMPLES + SAMPLES_A_BYTE * run.log_bytes
 
@@ -186,18 +187,22 @@ def _rerun(run: RunDescription, end_ns: int,
             raise DepartureError(f'over {most_steps} integration steps are too many for a log of '
                                  f'{run.log_bytes} bytes')
 
+    # 1. Before the recording: the motion and its commands, no samples.
     for event in run.history:
         reach(event.t_ns)
         _apply(simulation, event)
     if send is not None:
         reach(run.begun_ns)
-    # -1: commands before the first sample.
-    simulation.now_ns = -1 if run.begun_ns < 0 else max(run.begun_ns, simulation.now_ns)
-    simulation.apply(run.now)
+
+    # 2. The recording begins, with the parameters and the streams of this moment.
+    simulation.skip_to(max(run.begun_ns, -1))
+    simulation.apply(run.values_at_recording)
     if send is not None:
         simulation.log_to(None, [stream for stream in simulation.streams
                                  if stream.topic in run.topics])
     yield simulation, Event('start', run.epoch_ns, 0, simulation.now_ns, {})
+
+    # 3. The journal: samples up to each event that acts on them, and up to the end.
     at_once = {name for stream in simulation.streams for name in stream.at_once}
     acting = [event for event in run.events if event.name in ('command', 'reset')
               or not at_once.isdisjoint(event.details)]
@@ -213,7 +218,7 @@ def _rerun(run: RunDescription, end_ns: int,
             # Without samples states are only needed where a command finds them.
             if send is not None or (reached is not None and reached.name == 'command'):
                 reach(target_ns)
-            simulation.now_ns = target_ns
+            simulation.skip_to(target_ns)
             if reached is not None:
                 _apply(simulation, reached)
             yield simulation, reached

@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is in a log, and how accurate that is, from one pass through its messages in blocks."""
+"""
+What is in a log, and how accurate that is.
+
+`_follow_run` computes the motions of the run.  `_analyse` compares each block of messages with
+the motion that it is of, in one pass.  Then `_count` looks for gaps in each topic, and `_measure`
+measures each motion from the samples of its source.
+"""
 
 from __future__ import annotations
 
@@ -84,12 +90,20 @@ class Series:
 
 
 @dataclass
+class Section:
+    """A part of a motion with the same rates: the samples later than begin_ns, up to end_ns."""
+
+    begin_ns: int                         # log times [ns]
+    end_ns: int
+    epoch_ns: int                         # stamp of t = 0 [ns]
+    periods_ns: dict[str, int]            # of the streams, by topic of the log
+
+
+@dataclass
 class Motion:
     """One motion of the top, from the start, a command or a reset to the next."""
 
     cause: str                            # start, command or reset
-    begin_ns: int                         # log times [ns]
-    end_ns: int
     origin_ns: int                        # log time of the t = 0 of `segment` [ns]
     segment: Segment                      # its constants and its exact solution
     exact: Description | None             # None where the closed form cannot hold it
@@ -98,18 +112,17 @@ class Motion:
     imu: Imu
     # Of the source: log times (n,) [ns], and `Attitudes.rows`
     samples: list[tuple[Stamps, Reals]] = field(default_factory=list)
+    sections: list[Section] = field(default_factory=list)
     measured: Measured | None = None      # the numbers of `exact` from these samples
     regime: str | None = None             # name of the motion by them
 
+    @property
+    def begin_ns(self) -> int:
+        return self.sections[0].begin_ns
 
-@dataclass
-class Section:
-    """A part of a motion with the same rates: the samples later than begin_ns, up to end_ns."""
-
-    begin_ns: int                         # log times [ns]
-    end_ns: int
-    epoch_ns: int                         # stamp of t = 0 [ns]
-    periods_ns: dict[str, int]            # of the streams, by topic of the log
+    @property
+    def end_ns(self) -> int:
+        return self.sections[-1].end_ns
 
 
 @dataclass
@@ -148,10 +161,9 @@ def survey(reader: LogReader) -> Survey:
     found = Survey(reader.path, damage, reader.whole and not damage.truncated and damage.lossless,
                    damage.end_ns, {topic.name: TopicReport(topic.type_name)
                                    for topic in reader.topics})
-    sections: list[Section] = []
     try:
         found.run = recorded_run.read_run_description(reader)
-        sections = _find_sections(found, found.run)
+        _follow_run(found, found.run)
     except recorded_run.ForeignLogError as error:
         found.foreign_reason = str(error)
     ends_ns = [motion.end_ns for motion in found.motions[:-1]]
@@ -161,51 +173,50 @@ def survey(reader: LogReader) -> Survey:
         for topic, group in itertools.groupby(block, attrgetter('topic')):
             samples = list(group)
             blocks_ns[topic].append(_stamps(samples))
-            if sections and topic in sections[0].periods_ns:
+            if found.motions and found.topics[topic].stream is not None:
                 for number, part in itertools.groupby(
                         samples, lambda sample: bisect_left(ends_ns, sample.log_time)):
                     _analyse(found, found.motions[number], topic, list(part))
     stamps_ns = {topic: np.concatenate(blocks_ns[topic]) for topic in found.topics}
+    sections = [section for motion in found.motions for section in motion.sections]
     if sections:        # the last entry of the journal may be later than the last sample
         last = sections[-1]
-        found.end_ns = last.end_ns = found.motions[-1].end_ns = max(
-            last.begin_ns, *(int(stamps_ns[topic].max(initial=0)) for topic in last.periods_ns), 0)
+        found.end_ns = last.end_ns = max(last.begin_ns, 0, *(
+            int(stamps_ns[topic].max(initial=0)) for topic in last.periods_ns))
     for topic, report in found.topics.items():
-        _count(report, stamps_ns[topic], [(section, section.periods_ns[topic])
-                                          for section in sections if topic in section.periods_ns])
+        _count(report, stamps_ns[topic], sections if report.stream is not None else (), topic)
     for motion in found.motions:
         _measure(found, motion)
     return found
 
 
-def _find_sections(found: Survey, run: RunDescription) -> list[Section]:
-    """Return the sections of a run, and note its motions and why it cannot be followed on."""
-    sections: list[Section] = []
+def _follow_run(found: Survey, run: RunDescription) -> None:
+    """Note the motions of a run, and why it cannot be followed on."""
     for name, topic in run.topics.items():
         found.topics[topic].stream = name
+    motions = found.motions
     try:
         for simulation, event in recorded_run.rerun(run, found.damage.end_ns):
             if event is None:
                 continue
-            if sections:
-                sections[-1].end_ns = found.motions[-1].end_ns = (
-                    sections[-1].epoch_ns + event.sent_ns)
+            if motions:
+                last = motions[-1].sections[-1]
+                last.end_ns = last.epoch_ns + event.sent_ns
             begin_ns = simulation.epoch_ns + simulation.now_ns
             streams = {run.topics[stream.topic]: stream for stream in simulation.streams
                        if stream.topic in run.topics}
             if event.name != 'parameters':
-                exact = simulation.describe() if len(found.motions) < MOST_EXACT else None
-                found.motions.append(Motion(
-                    event.name, begin_ns, begin_ns,
-                    simulation.epoch_ns + simulation.segment.start_ns, simulation.segment, exact,
-                    _source(run, streams, exact), streams, Imu(simulation.values)))
-            sections.append(Section(begin_ns, begin_ns, simulation.epoch_ns, {
+                exact = simulation.describe() if len(motions) < MOST_EXACT else None
+                motions.append(Motion(
+                    event.name, simulation.epoch_ns + simulation.segment.start_ns,
+                    simulation.segment, exact, _source(run, streams, exact), streams,
+                    Imu(simulation.values)))
+            motions[-1].sections.append(Section(begin_ns, begin_ns, simulation.epoch_ns, {
                 topic: stream.period_ns for topic, stream in streams.items()}))
     except (recorded_run.DepartureError, *ODD) as error:
         found.notes.append(f'the run cannot be followed beyond here: {reason_of(error)}')
-    if len(found.motions) > MOST_EXACT:
+    if len(motions) > MOST_EXACT:
         found.notes.append(f'only the first {MOST_EXACT} motions are compared with the exact one')
-    return sections
 
 
 def _source(run: RunDescription, streams: Mapping[str, Stream],
@@ -251,7 +262,7 @@ def _analyse(found: Survey, motion: Motion, topic: str, samples: list[LogMessage
             data.stamps_ns, angle_between(data.quaternion, truth))
 
 
-def _count(report: TopicReport, stamps_ns: Stamps, sections: Sequence[tuple[Section, int]],
+def _count(report: TopicReport, stamps_ns: Stamps, sections: Sequence[Section], topic: str,
            ) -> None:
     """Count a topic's messages, and compare those of a stream with the grid of each section."""
     report.count = len(stamps_ns)
@@ -259,8 +270,8 @@ def _count(report: TopicReport, stamps_ns: Stamps, sections: Sequence[tuple[Sect
         report.longest_step_ns = int(np.max(np.diff(stamps_ns)))
         duration_ns = int(stamps_ns[-1] - stamps_ns[0])
         report.rate = (report.count - 1) / duration_ns * 1e9 if duration_ns else None
-    for section, period_ns in sections:
-        epoch_ns = section.epoch_ns
+    for section in sections:
+        epoch_ns, period_ns = section.epoch_ns, section.periods_ns[topic]
         end = int(np.searchsorted(stamps_ns, section.end_ns, 'right'))
         here, stamps_ns = stamps_ns[:end], stamps_ns[end:]
         first, last = ((at_ns - epoch_ns) // period_ns
