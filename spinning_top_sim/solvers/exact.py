@@ -62,7 +62,7 @@ class ExactSolution:
     """
 
     steps = evaluations = 0
-    latest_ns = LARGEST_NS
+    reached_ns = LARGEST_NS
 
     def __init__(self, top: Top, start: State) -> None:
         self.top = top
@@ -147,14 +147,16 @@ class ExactSolution:
             separatrix_distance=self.m1,
             gyroscopic_ratio=start.l3 * start.l3 / weight if weight else math.inf)
 
-    # ------------------------------------------------------------------------- evaluation
+    # --------------------------------------------------- evaluation, see `Propagator`
 
     def reach(self, ns: int, max_steps: int | None = None) -> bool:
-        """Return True: there are no steps to take."""
-        return True
+        return True                     # there are no steps to take
 
     def release(self, before_ns: int) -> None:
-        """Do nothing: there are no steps to forget."""
+        pass                            # nor to forget
+
+    def exact_solution(self) -> ExactSolution:
+        return self
 
     def states(self, times_ns: NDArray[np.int64] | range) -> States:
         """
