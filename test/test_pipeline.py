@@ -234,7 +234,12 @@ def test_equilibria_and_free_motion_take_no_steps():
 
 @pytest.mark.parametrize('ahead', [False, True])
 def test_ticks_leave_nothing_behind(ahead):
-    """Blocks of memory in use do not become more, whoever listens, however long it runs."""
+    """
+    Blocks of memory in use do not become more, whoever listens, however long it runs.
+
+    The interpreter's and numpy's own caches take blocks too, up to some 150 and then no more: how
+    fast depends on what ran before in the process.  What a tick leaves behind, every round shows.
+    """
     simulation = simulate(imu__rate=1000.0, pose__rate=1000.0, joint_states__rate=1000.0)
     for one in simulation.streams:
         one.publish = len
@@ -249,8 +254,8 @@ def test_ticks_leave_nothing_behind(ahead):
         return sys.getallocatedblocks()
 
     run(1000)
-    before = run(512)
-    assert run(1536) - before < 100
+    in_use = [run(512) for _ in range(9)]
+    assert min(np.diff(in_use)) < 16
 
 
 def test_a_tick_allocates_little():
