@@ -39,18 +39,13 @@ class ExactSolution:
 
     theta goes smoothly through a pole that is passed exactly (and out of [0, pi]), phi and psi are
     unwrapped, the quaternion's sign is continuous.  On every motion each of them is within 5e-15,
-    relative to the value or to its start where these are larger than 1.  See F. Klein,
-    A. Sommerfeld, *Ueber die Theorie des Kreisels*, ch. VI, and `theta_setup`.
-
-    Parameters
-    ----------
-    top : Top
-    start : State, or a `ContinuedState`, whose theta may be any real number
+    relative to the value or to its start where these are larger than 1.  Symbols and sources are
+    those of `theta_setup`.
 
     Attributes
     ----------
     top : Top
-    start : the same start with theta in [0, pi]
+    start : State with theta in [0, pi]; a `ContinuedState` is taken, whose theta may be any number
     nutation_period : [s], None if theta is constant
     mean_precession_rate, mean_spin_rate : [rad/s], over a nutation
     theta_min, theta_max : [rad], of theta folded into [0, pi]

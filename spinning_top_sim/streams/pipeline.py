@@ -56,7 +56,7 @@ class Simulation:
 
     values, top : checked parameters of the run, and the top that they describe
     streams : every stream; the caller sets `publish` of each, and records them with `log_to`
-    now_ns : simulated time up to which every sample has been sent (-1: not even that of t = 0)
+    now_ns : every sample up to here is sent (-1: not even that of t = 0)
     l3, lz : as last commanded [kg m^2/s]
     history : applied commands since the start as (t_ns, l3, lz)
     segment : the motion since the last command

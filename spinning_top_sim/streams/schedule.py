@@ -51,8 +51,6 @@ class Delivery:
     published : (publish, place of the message, stream) of the streams with subscribers
     """
 
-    __slots__ = ('log_indices', 'logged', 'published', 'size')
-
     def __init__(self, streams: Sequence[Stream]) -> None:
         logged = [k for k, stream in enumerate(streams) if stream.log_index is not None]
         self.log_indices = tuple(stream.log_index for stream in streams
