@@ -27,7 +27,8 @@ from helpers.simulations import (
 from spinning_top_sim import solve
 from spinning_top_sim.solvers import exact, rk45
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.streams import parameters
+from spinning_top_sim.solvers.propagator import Propagator
+from spinning_top_sim.streams import parameters, pipeline
 from spinning_top_sim.streams.schedule import MOST_PIECES, STEPS_IN_A_PIECE
 
 PERIOD_NS = 10 * MILLISECOND        # of most streams
@@ -230,6 +231,38 @@ def test_equilibria_and_free_motion_take_no_steps():
         record(simulation)
         simulation.advance(SECOND)
         assert simulation.steps == simulation.evaluations == 0, values
+
+
+@pytest.mark.parametrize('method', ['rk45', 'exact'])
+def test_a_solver_needs_the_members_of_the_protocol_and_no_others(method, monkeypatch):
+    """Nobody asks what kind of solver it is: a foreign one with these members does as well."""
+    members = {name for name in (*vars(Propagator), *Propagator.__annotations__)
+               if not name.startswith('_')}
+
+    class Foreign:
+        def __init__(self, solver):
+            self._solver = solver
+
+        def __getattr__(self, name):
+            assert name in members, name
+            return 10 ** 16 if name == 'ns_limit' and limited else getattr(self._solver, name)
+
+    expected_of = simulate(solver__method=method)
+    topics = [one.topic for one in expected_of.streams if one.topic != '~/invariants']
+    expected = record(expected_of, *topics)
+    expected_of.advance(SECOND)
+    propagate = pipeline.propagate
+    monkeypatch.setattr(pipeline, 'propagate', lambda *args, **more: Foreign(
+        propagate(*args, **more)))
+    limited = False
+    simulation = simulate(solver__method=method)
+    taken = record(simulation, *topics)
+    simulation.advance(SECOND)
+    assert taken == expected
+    assert simulation.orientation_error <= 1e-9 and simulation.describe().name == 'cusps'
+    limited = True
+    with pytest.raises(ValueError, match='turns too fast'):
+        simulate(solver__method=method)
 
 
 @pytest.mark.parametrize('ahead', [False, True])
