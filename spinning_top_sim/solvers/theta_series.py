@@ -196,7 +196,7 @@ class ThetaForm:
         return minus, plus
 
     def log_slope(self, a: Decimal) -> Decimal:
-        """tau(a) = d/da log theta2(ia), to full precision: it sets the mean rates."""
+        """d/da log theta2(i pi a/(2K)), to full precision: it sets the mean rates."""
         # Every term that reaches the working precision.
         digits_per_square = -self.nome.adjusted() - 1           # at least 1
         form = replace(self, terms=2 + math.isqrt(getcontext().prec // digits_per_square))

@@ -12,12 +12,12 @@ times a uniform rotation, so that a state costs the same at every t:
     m, m1       (u2 - u1)/(u3 - u1) and 1 - m;  quarter periods K = K(m), K' = K(m1)
     w           u = u1 + (u2 - u1) sn^2(chi), where chi grows at the rate w [DLMF 22.2]
     Z = N + 2y/pi   the phase chi/K in quarter periods: N whole, |y| <= pi/4
-    ia, K + ib  the chi at which alpha and beta vanish [DLMF 19.25(v)]
+    ia, K + ib  the chi at which alpha and beta vanish [DLMF 19.25(v)];  v0 = i pi a/(2K)
     s           the sign of Lz + L3 for alpha, of Lz - L3 for beta; 0: a pole is passed exactly
-    R + i s J   of alpha i s theta1(v) at even N (u near u1) and theta2(v) at odd N (u near u2),
-                v = y - i s pi a/(2K); of beta, with b for a, the other way round [DLMF 20.2]
+    R + i s J   of alpha i s theta1(y - s v0) at even N (u near u1), theta2(y - s v0) at odd N (u
+                near u2); of beta, with b for a, the other way round [DLMF 20.2]
     D           theta4(y) at even N, theta3(y) at odd N;  R, J, D up to constant factors
-    r, c        mean rate, with s w (pi/(2K) - d/da log theta2(ia)) in it, and phase at t = 0
+    r, c        mean rate, with s w (pi/(2K) - d/da log theta2(v0)) in it, and phase at t = 0
     kappa       -1: r t has s pi/2 a quarter period, evenly; r t - s y has them where N steps.
                 In the imaginary form a/K' - 1, as it splits off exp(i s y a/K').
 
