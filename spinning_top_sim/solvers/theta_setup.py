@@ -189,11 +189,7 @@ def _upside_down(motion: ThetaMotion) -> ThetaMotion:
 
 
 class _Given(NamedTuple):
-    """
-    A top with P >= 0 and its start.
-
-    sin and cos of theta0/2 stand for theta0, so that nothing cancels at either pole.
-    """
+    """A top with P >= 0 and its start; theta0 as in `nutation_cubic`."""
 
     lambda1: Decimal
     l3: Decimal
