@@ -413,7 +413,7 @@ def looping_motion():
 def test_steps_are_read_until_they_are_released():
     motion = looping_motion()
     assert motion.reach(60 * SECOND)
-    assert motion.latest_ns >= 60 * SECOND
+    assert motion.reached_ns >= 60 * SECOND
     steps = motion.steps
     before = motion.states(range(0, 60 * SECOND, SECOND))
     motion.release(30 * SECOND)
@@ -431,7 +431,7 @@ def test_steps_are_read_until_they_are_released():
 def test_a_limited_number_of_steps_is_taken_and_goes_on_later():
     motion, other = looping_motion(), looping_motion()
     assert not motion.reach(60 * SECOND, 10)
-    assert motion.steps == 10 and motion.latest_ns < 60 * SECOND
+    assert motion.steps == 10 and motion.reached_ns < 60 * SECOND
     while not motion.reach(60 * SECOND, 10):
         pass
     assert other.reach(60 * SECOND)
@@ -452,7 +452,7 @@ def test_the_begin_and_the_end_of_a_step_belong_to_it():
     step_ns = SECOND // 512                     # a binary fraction: such a sum is exact
     motion._integrator._next_step = 1.0 / 512.0
     motion.reach(step_ns)
-    assert motion.latest_ns == step_ns
+    assert motion.reached_ns == step_ns
     end = motion.states(range(step_ns, step_ns + 1)).quaternion
     assert motion.steps == 1
     motion.reach(4 * step_ns)

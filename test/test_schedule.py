@@ -47,7 +47,7 @@ def test_blocks_begin_small_and_double():
         found = []
         for _ in range(number):
             before = len(schedule.ready)
-            assert schedule.prepare(-1, max(schedule.computed_ns, 0))
+            assert schedule.prepare(-1, max(schedule.ready_ns, 0))
             found.append(len(schedule.ready) - before)
         return found
 
@@ -63,7 +63,7 @@ def test_a_block_does_not_reach_too_far_ahead():
     schedule, _ = schedule_of('~/invariants', invariants__rate=5.0)
     assert schedule.prepare(-1, 0)
     assert times_of(schedule) == [0, 200 * MILLISECOND]
-    assert schedule.ready[-1][0] <= LONGEST_BLOCK_NS < schedule.computed_ns == 400 * MILLISECOND
+    assert schedule.ready[-1][0] <= LONGEST_BLOCK_NS < schedule.ready_ns == 400 * MILLISECOND
 
 
 def test_a_block_at_once_has_what_is_asked_for_and_is_bounded():
@@ -93,8 +93,8 @@ def test_samples_of_one_instant_are_together_with_their_sinks():
 
 def test_without_sinks_nothing_is_ever_due():
     schedule, simulation = schedule_of()
-    schedule.update(-1)
-    assert schedule.computed_ns == NEVER_NS
+    schedule.next_due(-1)
+    assert schedule.ready_ns == NEVER_NS
     states = states_of(simulation)
     assert schedule.prepare(-1, 60 * SECOND)
     assert not schedule.ready and states.count == 0

@@ -45,7 +45,7 @@ ERROR = tuple(fifth - fourth
 # Hairer et al. eq. (4.13): aim a little below the tolerance and change the step within limits.
 SAFETY = 0.9
 SHRINK, GROW = 0.2, 5.0
-# Of rates above, and of steps beyond, doubles do not hold the powers.
+# Doubles do not hold the powers of faster rates or longer steps.
 FASTEST_RATE, LONGEST_STEP = 1e100, 1e100       # [rad/s], [s]
 # A step of fewer units in the last place of t is a collapse, not progress.
 SMALLEST_STEP_ULPS = 16
@@ -57,12 +57,14 @@ class IntegrationError(RuntimeError):
 
 class Equations(ABC):
     """
-    Equations of motion y' = f(y) in some chart, with what the step control needs to know.
+    Equations of motion y' = f(y), with what the step control needs.
 
-    name, is_complex : of the equations; whether the unknowns are complex numbers
+    name : as it stands in error messages
+    is_complex : whether the unknowns are complex numbers
     start : the unknowns at t = 0
-    tolerance, fastest_rate : error of a step and rate of change [1/s], for the first step
-    derivative : takes the unknowns one by one; returns y'
+    tolerance, fastest_rate : relative error of a step, and a bound on |y'|/|y| [1/s]: the first
+        step's length comes from these two
+    derivative : f; takes the unknowns one by one
     """
 
     name: str

@@ -2,11 +2,6 @@
 """
 Equations (29)-(32) of "Analysis of Symmetric Spinning Top" (2023), to the letter, for study.
 
-    d theta/dt  = theta'
-    d theta'/dt = phi'^2 sin cos - (lambda3/lambda1)(psi' + phi' cos) phi' sin + (P/lambda1) sin
-    d phi/dt    = (Lz - L3 cos)/(lambda1 sin^2)
-    d psi/dt    = L3/lambda3 - phi' cos
-
 They are singular where the axis is vertical, and near there wrong without a sign of it: cos(theta)
 rounds towards 1, Lz - L3 cos(theta) loses its digits, or a step leaps over the pole, and phi and
 psi drift off while every error estimate is small.  So these equations stop with an error there.
@@ -33,7 +28,7 @@ ADVICE = "use the regular equations (equations = 'transport') or method = 'exact
 
 
 class EulerEquations(Equations):
-    """The equations above for one top and one motion."""
+    """The equations for one top and one motion."""
 
     name = 'euler'
     is_complex = False
@@ -48,7 +43,7 @@ class EulerEquations(Equations):
             + abs(start.l3) / top.lambda3 + math.sqrt(abs(top.gravity_torque) / top.lambda1))
 
     def derivative(self, theta: float, theta_dot: float, phi: float, psi: float) -> Vector:
-        """Return (theta', theta'', phi', psi').  Raises IntegrationError near a pole."""
+        """Return (theta', theta'', phi', psi'), eqs. (29)-(32); IntegrationError near a pole."""
         sine, cosine = math.sin(theta), math.cos(theta)
         if not abs(sine) > SMALLEST_SINE:
             raise IntegrationError(

@@ -39,18 +39,13 @@ class ExactSolution:
 
     theta goes smoothly through a pole that is passed exactly (and out of [0, pi]), phi and psi are
     unwrapped, the quaternion's sign is continuous.  On every motion each of them is within 5e-15,
-    relative to the value or to its start where these are larger than 1.  See F. Klein,
-    A. Sommerfeld, *Ueber die Theorie des Kreisels*, ch. VI, and `theta_setup`.
-
-    Parameters
-    ----------
-    top : Top
-    start : State, or a `ContinuedState`, whose theta may be any real number
+    relative to the value or to its start where these are larger than 1.  Symbols and sources are
+    those of `theta_setup`.
 
     Attributes
     ----------
     top : Top
-    start : the same start with theta in [0, pi]
+    start : State with theta in [0, pi]; a `ContinuedState` is taken, whose theta may be any number
     nutation_period : [s], None if theta is constant
     mean_precession_rate, mean_spin_rate : [rad/s], over a nutation
     theta_min, theta_max : [rad], of theta folded into [0, pi]
@@ -62,7 +57,7 @@ class ExactSolution:
     """
 
     steps = evaluations = 0
-    latest_ns = LARGEST_NS
+    reached_ns = LARGEST_NS
 
     def __init__(self, top: Top, start: State) -> None:
         self.top = top
@@ -147,14 +142,16 @@ class ExactSolution:
             separatrix_distance=self.m1,
             gyroscopic_ratio=start.l3 * start.l3 / weight if weight else math.inf)
 
-    # ------------------------------------------------------------------------- evaluation
+    # --------------------------------------------------- evaluation, see `Propagator`
 
     def reach(self, ns: int, max_steps: int | None = None) -> bool:
-        """Return True: there are no steps to take."""
-        return True
+        return True                     # there are no steps to take
 
     def release(self, before_ns: int) -> None:
-        """Do nothing: there are no steps to forget."""
+        pass                            # nor to forget
+
+    def exact_solution(self) -> ExactSolution:
+        return self
 
     def states(self, times_ns: NDArray[np.int64] | range) -> States:
         """

@@ -31,11 +31,10 @@ MOST = Decimal('1e290')
 
 class NutationColumns(NamedTuple):
     """
-    Where the axis is at n times, (n,) each.
+    The nutation at n times, (n,) each; the symbols are those of `theta_setup`.
 
-    alpha, beta : cos(theta/2) D and sin(theta/2) D with a common D > 0, signed where a pole is
-        passed exactly
-    alpha_argument, beta_argument : what the nutation adds to the rotations of alpha and beta [rad]
+    alpha, beta : |alpha| D and |beta| D; signed, not absolute, where s = 0
+    alpha_argument, beta_argument : arguments of (R + i s J) exp(i s kappa y) [rad]
     theta_dot : [rad/s]
     half_theta : theta/2, continued through the poles [rad]
     """
@@ -49,7 +48,7 @@ class NutationColumns(NamedTuple):
 
 
 class _FactorSeries:
-    """Alpha or beta over even or odd quarter periods, in doubles."""
+    """R and J of alpha or beta at even or at odd N, in doubles."""
 
     def __init__(self, name: str, factor: Factor, odd: int) -> None:
         series = factor.odd if odd else factor.even
@@ -75,7 +74,7 @@ class _FactorSeries:
 
 
 class _Quarter:
-    """Both factors and cos(theta)' over even or odd quarter periods."""
+    """Alpha, beta and cos(theta)' at even or at odd N."""
 
     def __init__(self, motion: ThetaMotion, odd: int) -> None:
         self._alpha = _FactorSeries('alpha', motion.alpha, odd)
@@ -88,11 +87,7 @@ class _Quarter:
         self._imaginary, self._stretch = motion.imaginary, float(motion.stretch)
 
     def at(self, y: Column, flip: Column) -> tuple[Column, ...]:
-        """
-        Return alpha, beta, their arguments and theta' at the phase y, |y| <= pi/4.
-
-        flip : (-1)^floor(N/2) of the quarter period N
-        """
+        """Return the first 5 of `NutationColumns` at y, |y| <= pi/4; flip: (-1)^floor(N/2)."""
         if self._imaginary:
             s = np.sinh(y * self._stretch)
             xi = -s * s

@@ -1,20 +1,74 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The choice among the methods that move a state in time."""
+"""
+What every solver has, and the choice among them.
+
+A new solver is a class with the members of `Propagator`, a name in METHODS, and a branch in
+`propagate` that makes it.
+"""
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.regimes import axis_rests
+from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.nutation import MOST
-from spinning_top_sim.solvers.rk45 import EulerMotion, SteppedMotion, TransportMotion
+from spinning_top_sim.solvers.rk45 import EulerMotion, TransportMotion
 
 METHODS = ('rk45', 'exact')
 EQUATIONS = ('transport', 'euler')
-# A motion that begins at t = 0, read in blocks of times.
-Propagator = ExactSolution | SteppedMotion
+
+
+class Propagator(Protocol):
+    """
+    A motion from its start at t = 0; every time counts from there.
+
+    top, start : what moves, and from where
+    """
+
+    top: Top
+    start: State
+
+    @property
+    def steps(self) -> int:
+        """Integration steps taken so far."""
+
+    @property
+    def evaluations(self) -> int:
+        """Evaluations of the right-hand side so far."""
+
+    @property
+    def reached_ns(self) -> int:
+        """The last time that `states` can give without further steps [ns]."""
+
+    @property
+    def ns_limit(self) -> int:
+        """The last time that the solver can give at all [ns]."""
+
+    def reach(self, ns: int, max_steps: int | None = None) -> bool:
+        """
+        Take steps up to a time [ns]; return False if `max_steps` were too few.
+
+        Raises IntegrationError if the equations cannot go on.
+        """
+
+    def release(self, before_ns: int) -> None:
+        """Forget the steps that only states before this time [ns] need."""
+
+    def states(self, times_ns: NDArray[np.int64] | range) -> States:
+        """Return the states at ascending times (n,) [ns] that are reached and not released."""
+
+    def states_at_seconds(self, t: Column) -> States:
+        """Return the states at ascending times (n,) [s], for `solve`: steps are taken here."""
+
+    def exact_solution(self) -> ExactSolution | None:
+        """Return the closed form of the same motion; None where doubles cannot hold it."""
 
 
 def propagate(top: Top, start: State, *, method: str, equations: str = 'transport',

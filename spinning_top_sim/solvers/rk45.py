@@ -24,24 +24,25 @@ from spinning_top_sim.solvers.dormand_prince import (
     Rows,
 )
 from spinning_top_sim.solvers.euler_equations import EulerEquations
+from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.times import NANOSECONDS, Times
 from spinning_top_sim.solvers.transport import TransportEquations, Unknowns
 from spinning_top_sim.solvers.unwrap import PhaseUnwrapper
 
 # A time that so many steps of the present size do not reach is refused: minutes of work.
 MOST_STEPS = 1e7
-# Steps that are kept to be read together; more would only take memory.
+# Steps that `states_at_seconds` takes and reads together; more would only take memory.
 STEPS_TOGETHER = 256
 
 
 class SteppedMotion(ABC):
     """
-    A motion by the steps of some equations, read in blocks of times.
+    A motion by the steps of some equations, read in blocks of times; see `Propagator`.
 
     top, start : what moves, and from where at t = 0
-    steps, evaluations : integration steps taken, evaluations of the right-hand side
-    latest_ns : the last nanosecond that can be read without further steps
     """
+
+    ns_limit = 2 ** 63 - 1              # steps go on for ever
 
     def __init__(self, top: Top, start: State, equations: Equations) -> None:
         self.top, self.start, self._equations = top, start, equations
@@ -58,13 +59,12 @@ class SteppedMotion(ABC):
         return self._integrator.evaluations
 
     @property
-    def latest_ns(self) -> int:
+    def reached_ns(self) -> int:
         end = self._kept[-1].t1
         ns = math.floor(end * NANOSECONDS)
         return ns if ns / NANOSECONDS <= end else ns - 1
 
     def reach(self, ns: int, max_steps: int | None = None) -> bool:
-        """Take steps up to `ns`; return False if `max_steps` were too few."""
         taken = 0
         while self._kept[-1].t1 < ns / NANOSECONDS:
             if taken == max_steps:
@@ -74,7 +74,6 @@ class SteppedMotion(ABC):
         return True
 
     def release(self, before_ns: int) -> None:
-        """Forget the steps that only states before this time need."""
         self._forget(bisect_left(self._kept, before_ns / NANOSECONDS, hi=len(self._kept) - 1,
                                  key=attrgetter('t1')))
 
@@ -83,14 +82,15 @@ class SteppedMotion(ABC):
         del self._kept[:count]
 
     def states(self, times_ns: NDArray[np.int64] | range) -> States:
-        """Return the states at ascending integer nanoseconds (n,); see `states_at_seconds`."""
         return self.states_at_seconds(Times.from_ns(times_ns).seconds)
 
     def states_at_seconds(self, t: Column) -> States:
         """
         Return the states at ascending times t (n,) [s].
 
-        Steps before the last time may be forgotten on the way.
+        After `reach` all steps to the last time are kept.  Those that are missing are taken here,
+        STEPS_TOGETHER at a time, and forgotten once the times in them are computed: `solve` reads
+        a motion of any length once, forwards, in bounded memory.
         Raises ValueError if a time lies before the steps that are kept, and IntegrationError if
         the steps cannot go on to the last time, or it is too many of them away.
         """
@@ -129,6 +129,12 @@ class SteppedMotion(ABC):
     def _phases_at(self, steps: NDArray[np.int64]) -> Rows:
         """Return what else is known at the begins of these of the steps that are kept: nothing."""
         return np.empty((0, len(steps)))
+
+    def exact_solution(self) -> ExactSolution | None:
+        try:
+            return ExactSolution(self.top, self.start)
+        except ValueError:
+            return None
 
     @abstractmethod
     def _states_of(self, t: Column, unknowns: Rows) -> States:

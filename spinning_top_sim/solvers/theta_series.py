@@ -2,10 +2,10 @@
 """
 Jacobi's theta functions as short series, in long decimals.
 
-theta1..theta4 of y with nome q = exp(-pi K'/K), or after Jacobi's imaginary transformation with
-nome q' = exp(-pi K/K') and hyperbolic functions of x = y K/K' (DLMF 20.2, 20.7(viii)).  One of the
-nomes is at most exp(-pi), so that four terms reach 1e-21.  Each series has one prefactor
-and, beside it, a polynomial in sin^2 y, which is what is evaluated in doubles.
+theta1..theta4 of y in the real form, with nome q = exp(-pi K'/K) [DLMF 20.2], or in the imaginary
+form, after Jacobi's transformation, with nome q' = exp(-pi K/K') and hyperbolic functions of
+x = y K/K' [DLMF 20.7(viii)].  The smaller nome is at most exp(-pi): four terms reach 1e-21.
+Each series is a prefactor times a polynomial in sin^2 y, which is what is evaluated in doubles.
 """
 
 from __future__ import annotations
@@ -95,8 +95,7 @@ def _alternating(weights: Iterable[Decimal]) -> tuple[Decimal, ...]:
 @dataclass(frozen=True)
 class ThetaForm:
     """
-    The theta series in the real form (nome q, circular functions of y) or in the imaginary form
-    (Jacobi's transformation [DLMF 20.7(viii)]: nome q', hyperbolic functions of x = y K/K').
+    The theta series in the real or in the imaginary form.
 
     Positive constants that all series of a Cayley-Klein parameter share are left out.
     """
@@ -197,7 +196,7 @@ class ThetaForm:
         return minus, plus
 
     def log_slope(self, a: Decimal) -> Decimal:
-        """tau(a) = d/da log theta2(ia), to full precision: it sets the mean rates."""
+        """d/da log theta2(i pi a/(2K)), to full precision: it sets the mean rates."""
         # Every term that reaches the working precision.
         digits_per_square = -self.nome.adjusted() - 1           # at least 1
         form = replace(self, terms=2 + math.isqrt(getcontext().prec // digits_per_square))

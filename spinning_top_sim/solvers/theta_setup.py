@@ -2,25 +2,36 @@
 """
 The heavy symmetric top in Klein's theta functions: everything that is done once for a trajectory.
 
-With u = cos(theta) and P = M g R the nutation obeys u'^2 = (2P/lambda1)(u-u1)(u2-u)(u3-u), and the
-Cayley-Klein parameters
+The Cayley-Klein parameters are each a theta function of the nutation's phase over a common one,
+times a uniform rotation, so that a state costs the same at every t:
 
-    alpha = w + iz = cos(theta/2) exp(i(phi+psi)/2)
-    beta  = y - ix = sin(theta/2) exp(i(phi-psi)/2)
+    alpha = cos(theta/2) exp(i(phi+psi)/2) = (R + i s J)(y)/D(y) exp i(r t + c + s kappa y)
+    beta  = sin(theta/2) exp(i(phi-psi)/2) = the same with R, J, s, r, c, kappa of its own
 
-are each a theta function of the nutation's phase over a common one, times a uniform rotation:
+    u, P        cos(theta) and M g R;  u'^2 = (2P/lambda1)(u - u1)(u2 - u)(u3 - u)
+    m, m1       (u2 - u1)/(u3 - u1) and 1 - m;  quarter periods K = K(m), K' = K(m1)
+    w           u = u1 + (u2 - u1) sn^2(chi), where chi grows at the rate w [DLMF 22.2]
+    Z = N + 2y/pi   the phase chi/K in quarter periods: N whole, |y| <= pi/4
+    ia, K + ib  the chi at which alpha and beta vanish [DLMF 19.25(v)];  v0 = i pi a/(2K)
+    s           the sign of Lz + L3 for alpha, of Lz - L3 for beta; 0: a pole is passed exactly
+    R + i s J   of alpha i s theta1(y - s v0) at even N (u near u1), theta2(y - s v0) at odd N (u
+                near u2); of beta, with b for a, the other way round [DLMF 20.2]
+    D           theta4(y) at even N, theta3(y) at odd N;  R, J, D up to constant factors
+    r, c        mean rate, with s w (pi/(2K) - d/da log theta2(v0)) in it, and phase at t = 0
+    kappa       -1: r t has s pi/2 a quarter period, evenly; r t - s y has them where N steps.
+                In the imaginary form a/K' - 1, as it splits off exp(i s y a/K').
 
-    alpha = (R + i s J)(y)/D(y) exp i(rate t + phase + s kappa y),   R + i s J ~ theta(y - i s a)
-
-(F. Klein, A. Sommerfeld, Ueber die Theorie des Kreisels, ch. VI;  E. T. Whittaker, Analytical
-Dynamics, ch. VI;  theta functions, nome and quarter periods K, K' as in DLMF ch. 20 and 22, R_F
-as in DLMF ch. 19: https://dlmf.nist.gov).  So a state costs the same at every t.  The phase
-is counted in quarter periods, Z = N + 2y/pi with N whole and |y| <= pi/4: over even N (u near u1)
-alpha is theta1 and beta theta2, over odd N (u near u2) the other way round.
+    1  nutation_cubic     (top, state) -> coefficients of u'^2 in u - u0
+    2  _cubic_roots       -> u1, u2, u3, and with them m, m1, w
+    3  _Poles             -> a and b, by Carlson's R_F [DLMF 19.16]
+    4  ThetaForm.of       -> K, K' and the theta series, in the real or the imaginary form
+    5  _Roots.start_phase  -> N and y at t = 0
+    6  factor             -> alpha, beta: R, J, r, c, kappa; `_resting` where theta is constant
 
 The work is done in long decimals, 60 digits and more if two roots of the cubic are close, because
 everything that cancels, cancels here: close to a pole, to the separatrix, to steady precession.
-What comes out are coefficients, frequencies and phases for evaluation in doubles.
+(F. Klein, A. Sommerfeld, *Ueber die Theorie des Kreisels*, ch. VI;  E. T. Whittaker, *Analytical
+Dynamics*, ch. VI;  DLMF: https://dlmf.nist.gov, ch. 19, 20 and 22)
 """
 
 from __future__ import annotations
@@ -59,10 +70,10 @@ class _RootsTooCloseError(ArithmeticError):
 
 @dataclass(frozen=True)
 class FactorSeries:
-    """The factor R + i s J of alpha or beta over even or over odd quarter periods."""
+    """R + i s J of alpha or beta at even or at odd N."""
 
     real: Series
-    imag: Series | None = None  # None: the factor is real, it goes through zero or is a dn
+    imag: Series | None = None  # None: alpha or beta goes through zero, or is a dn
 
     @property
     def has_zero(self) -> bool:
@@ -77,15 +88,14 @@ class FactorSeries:
 @dataclass(frozen=True)
 class Factor:
     """
-    Alpha or beta: (R + i s J)/D exp i(rate t + phase + drift y).
+    Alpha or beta: (R + i s J)/D exp i(r t + c + s kappa y).
 
-    sense: s = +1 or -1, the sign of Lz + L3 (alpha) or Lz - L3 (beta).  0: a pole is passed
-    exactly, the series are real, and signed by `sign` and by (-1)^floor(N/2) if it `crosses`.
+    With s = 0 the series are real, and signed by `sign` and, if it `crosses`, by (-1)^floor(N/2).
     """
 
-    sense: int
-    rate: Decimal               # [rad/s]
-    phase_turns: Decimal        # [turns]
+    sense: int                  # s
+    rate: Decimal               # r [rad/s]
+    phase_turns: Decimal        # c [turns]
     start_argument: Decimal     # of (R + i s J) exp(i drift y) at t = 0 [rad]
     drift: Decimal              # s kappa
     crosses: bool
@@ -110,9 +120,9 @@ class ThetaMotion:
     imaginary: bool             # the form of `even` and `odd` of the factors
     stretch: Decimal            # x = stretch y in the imaginary form
     quarter_rate: Decimal       # quarter periods per second, w/K
-    quarter0: int               # phase at t = 0 in quarter periods: whole part,
-    offset0: Decimal            # and a rest in [-1/2, 1/2], accurate relative to itself
-    u_dot: tuple[Decimal, Decimal]      # u' = u_dot u_dot_series(2y)/D^4 over even and odd N
+    quarter0: int               # N at t = 0,
+    offset0: Decimal            # and 2y/pi, accurate relative to itself
+    u_dot: tuple[Decimal, Decimal]      # u' = u_dot u_dot_series(2y)/D^4 at even and odd N
     u_dot_series: Series
     # (i, j) if both poles are passed: theta/2 then follows (pi/2)(i + j Z)
     planar_rotation: tuple[int, int] | None
@@ -123,13 +133,12 @@ class ThetaMotion:
 
 def set_up(top: Top, start: State) -> ThetaMotion:
     """
-    Find the theta functions of the motion through `start` at t = 0.
+    Return alpha and beta of the motion through `start` at t = 0.
 
     Top and State are taken as exact doubles, and P as the exact product M g R.  The precision is
     doubled until the closest roots of the cubic are told apart.  They are never equal: on the
     separatrix, or in steady precession with theta' != 0, cos(theta0) would be algebraic, and no
-    double but 0 has an algebraic cosine.
-    Raises ValueError if the motion is out of reach even so.
+    double but 0 has an algebraic cosine.  Raises ValueError beyond MOST_DIGITS.
     """
     digits = FIRST_DIGITS
     while digits <= MOST_DIGITS:
@@ -146,6 +155,7 @@ def set_up(top: Top, start: State) -> ThetaMotion:
 
 
 def _set_up(top: Top, start: State) -> ThetaMotion:
+    """Return alpha and beta to the present precision; with P < 0, from the top upside down."""
     torque = Decimal(top.mass) * Decimal(top.gravity) * Decimal(top.com_distance)
     # Rounded now (+): a sum rounds its result, and -L3 must cancel Lz = L3 to the last digit.
     theta, theta_dot, l3, lz = (
@@ -168,7 +178,7 @@ def _set_up(top: Top, start: State) -> ThetaMotion:
 
 
 def _upside_down(motion: ThetaMotion) -> ThetaMotion:
-    """Exchange alpha and beta, and all that goes with them: theta -> pi - theta."""
+    """Return the motion with theta -> pi - theta: alpha and beta exchanged."""
     low, high = motion.theta_bounds
     even, odd = motion.u_dot
     line = motion.planar_rotation
@@ -179,11 +189,7 @@ def _upside_down(motion: ThetaMotion) -> ThetaMotion:
 
 
 class _Given(NamedTuple):
-    """
-    A top with P >= 0 and its start.
-
-    sin and cos of theta0/2 stand for theta0, so that nothing cancels at either pole.
-    """
+    """A top with P >= 0 and its start; theta0 as in `nutation_cubic`."""
 
     lambda1: Decimal
     l3: Decimal
@@ -198,9 +204,9 @@ class _Given(NamedTuple):
 
 def _resting(given: _Given) -> ThetaMotion:
     """
-    Equilibrium of the nutation: sleeping, hanging, steady precession, no motion at all.
+    Return alpha = cos(theta/2) exp i(r t + c), and beta so, where theta is constant.
 
-    theta is constant; (phi + psi)' and (phi - psi)' have one pole each, where a 0/0 term is 0.
+    (phi + psi)' and (phi - psi)', twice r, have one pole each, where a 0/0 term is 0.
     """
     def factor(size: Decimal, spin: Decimal, momentum: Decimal, turns: Decimal) -> Factor:
         rate = spin / 2 + (momentum / (4 * given.lambda1 * size ** 2) if momentum else 0)
@@ -217,7 +223,7 @@ def _resting(given: _Given) -> ThetaMotion:
 
 
 class _Roots(NamedTuple):
-    """The roots y1 <= 0 <= y2 <= y3 of u'^2 in y = u - u0, and distances that do not cancel."""
+    """u1, u2 and u3 less u0, y1 <= 0 <= y2 <= y3, and distances that do not cancel."""
 
     y1: Decimal
     y2: Decimal
@@ -239,10 +245,9 @@ class _Roots(NamedTuple):
 
     def start_phase(self, falling: bool, K: Decimal) -> tuple[int, Decimal]:
         """
-        Return the phase at t = 0 in quarter periods, as the nearest whole number and the rest.
+        Return N and 2y/pi at t = 0, negative while u falls.
 
-        u = u1 + (u2 - u1) sn^2, so the phase is negative while u falls.  From
-        F = sn R_F(cn^2, dn^2, 1) [DLMF 19.25.5], or the same from the quarter period K with
+        From chi = sn R_F(cn^2, dn^2, 1) [DLMF 19.25.5], or K - chi the same way with
         sn(K - chi) = cn/dn.
         """
         sense = -1 if falling else 1
@@ -283,6 +288,7 @@ def _isolated_root(a2: Decimal, a1: Decimal, a0: Decimal) -> tuple[Decimal, int]
 
 
 def _cubic_roots(f0: Decimal, f1: Decimal, f2: Decimal, f3: Decimal) -> _Roots:
+    """Return u1 - u0, u2 - u0 and u3 - u0, the roots of f0 + f1 y + f2 y^2 + f3 y^3."""
     a2, a1, a0 = f2 / f3, f1 / f3, f0 / f3
     if not f0:                                  # turning point, cusp or pole: y = 0 is a root
         low, high, gap = _quadratic_roots(-a2, a1)
@@ -311,10 +317,9 @@ def _check_roots(roots: _Roots, a0: Decimal, a1: Decimal, a2: Decimal) -> None:
 
 class _Poles:
     """
-    Where the poles are, seen from the swing.
+    a and b, and the distances of u1 and u2 from the poles u = -1 and u = 1.
 
-    Distances of its ends u1 and u2 from u = -1 and u = 1, and the phases at which alpha and beta
-    vanish: i a and K + i b [DLMF 19.25(v)].  b is None if u3 = 1 exactly, where beta is a dn.
+    b is None if u3 = 1 exactly: beta then is a dn and has no zero.
 
     No subtraction cancels: u'^2 at u = -1 and u = 1 is -((Lz +- L3)/lambda1)^2, so the product of
     three distances is known, and the smallest of them needs no difference.
@@ -342,11 +347,12 @@ class _Poles:
 
 
 def _nutating(given: _Given, cubic: tuple[Decimal, Decimal, Decimal, Decimal]) -> ThetaMotion:
+    """Return alpha and beta of a motion whose theta swings."""
     f0, f1, f2, f3 = cubic
     f3 = f3 or NO_GRAVITY * abs(f2)
     roots = _cubic_roots(f0, f1, f2, f3)
     _check_roots(roots, f0 / f3, f1 / f3, f2 / f3)
-    w = (f3 * roots.gap31 / 4).sqrt()           # of sn(w t)
+    w = (f3 * roots.gap31 / 4).sqrt()
     poles = _Poles(given, roots, f3)
     form = ThetaForm.of(roots.m, roots.m1)
     full_form = form.real() if roots.m1 >= FULL_CIRCLE_M1 else None
@@ -355,7 +361,8 @@ def _nutating(given: _Given, cubic: tuple[Decimal, Decimal, Decimal, Decimal]) -
 
     def factor(is_beta: bool, momentum: Decimal, spin: Decimal, zero: Decimal | None,
                distance: Decimal, turns: Decimal, derivative: Decimal) -> Factor:
-        # distance: 2 |alpha|^2 or 2 |beta|^2 where it is largest;  derivative: of the modulus.
+        # zero: a or b;  distance: 2 |alpha|^2 or 2 |beta|^2 where it is largest;  derivative: of
+        # the modulus at t = 0.
         s, size = int(momentum.compare(ZERO)), (distance / 2).sqrt()
         rate = spin / 2 + momentum / (2 * given.lambda1 * distance)
         pole = form.K_prime if zero is None else zero
@@ -388,10 +395,9 @@ def _nutating(given: _Given, cubic: tuple[Decimal, Decimal, Decimal, Decimal]) -
 def _factor_series(form: ThetaForm, is_beta: bool, s: int, zero: Decimal | None, size: Decimal,
                    ) -> tuple[FactorSeries, FactorSeries]:
     """
-    Return alpha, or beta, over even and over odd quarter periods.
+    Return R and J of alpha or beta at even and at odd N, scaled to the largest modulus `size`.
 
-    It is theta1 at one end of the swing and theta2 at the other, of y - i s zero; size is its
-    modulus there.  Through a pole exactly (s = 0) they are real, without a zero a dn.
+    zero : a or b.  Where it is None, they are a dn; where s = 0, they are real.
     """
     if zero is None:
         theta1, theta2 = FactorSeries(form.theta(4)), FactorSeries(form.theta(3))
@@ -409,7 +415,7 @@ def _factor_series(form: ThetaForm, is_beta: bool, s: int, zero: Decimal | None,
 
 def _at_start(form: ThetaForm, series: tuple[FactorSeries, FactorSeries], quarters: int,
               y: Decimal, s: int, derivative: Decimal) -> tuple[Decimal, int]:
-    """Return the argument of R + i s J at t = 0 [rad] and, if it is real, its sign."""
+    """Return the argument of R + i s J at t = 0 [rad] and, where s = 0, its sign."""
     here, point = series[quarters % 2], form.point(y)
     real = here.real(*point)
     if here.imag is not None:

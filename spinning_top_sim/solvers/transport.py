@@ -67,8 +67,8 @@ class TransportEquations(Equations):
     Attributes
     ----------
     spin_rate : chi [rad/s]
-    uniform_rates : of the phase of alpha in the frame that is stepped, and in the body [rad/s];
-        they differ by chi/2, and those of beta are the opposite (see `unwrap`)
+    uniform_rates : rate of the uniform part of alpha's phase (see `unwrap`), in the frame that is
+        stepped and in the body [rad/s].  They differ by chi/2.  Those of beta have the other sign.
     """
 
     name = 'transport'

@@ -2,14 +2,17 @@
 """
 Unwrapped angles of a stepped motion, from the phases of the Cayley-Klein parameters.
 
-phi + psi and phi - psi are twice the phases of alpha and beta.  Each phase is the sum of a uniform
-part, +-Omega t/2 with Omega = L3/lambda3 - L3/lambda1, and of a part that turns one way only: that
-of alpha at the rate (Lz + L3)/(4 lambda1 cos^2(theta/2)), that of beta at the rate
-(Lz - L3)/(4 lambda1 sin^2(theta/2)).  A step turns it by little more than half a turn at most,
-however close by a pole it passes.  So the phase of a sample is the first one ahead of that at the
-begin of its step, among the values that arctan2 leaves open.  If Lz + L3 or Lz - L3 is 0, alpha or
-beta only has the uniform part: it moves on a line through zero, and where the axis goes through
-that pole its modulus changes sign.
+phi + psi and phi - psi are twice the phases of alpha and beta, with the rates
+
+    alpha:   Omega/2 + (Lz + L3)/(4 lambda1 cos^2(theta/2)),   Omega = L3/lambda3 - L3/lambda1,
+    beta:   -Omega/2 + (Lz - L3)/(4 lambda1 sin^2(theta/2)).
+
+The first term is the uniform part.  The second never changes its sign, and turns the phase by
+little more than half a turn in a step, however near a pole the step passes.  So the phase of a
+sample is, of all arctan2(..) + 2 pi k, the first one ahead of the phase at the begin of its step.
+
+If Lz + L3 or Lz - L3 is 0, alpha or beta has the uniform part alone.  It then moves on a line
+through zero, and its modulus changes sign where the axis passes that pole.
 """
 
 from __future__ import annotations
@@ -94,7 +97,7 @@ class PhaseUnwrapper:
     """
     The phases of alpha and beta of a motion at the begins of its steps.
 
-    uniform_rate : of the phase of alpha in the frame that is stepped, less in that of beta [rad/s]
+    uniform_rate : of alpha's phase in the frame that is stepped; minus that of beta's [rad/s]
 
     Attributes
     ----------

@@ -50,8 +50,8 @@ def event(name: str, t_ns: int, sent_ns: int, **details: object) -> bytes:
     """
     Return an event at the simulated time `t_ns` as it is logged: std_msgs/String of JSON.
 
-    sent_ns : up to there all samples had been sent (-1: not even that of t = 0), of the motion
-        that a reset ended [ns]
+    sent_ns : simulated time up to which samples had been sent before the event [ns], -1 for
+        none.  A reset puts t back to 0: there it is a time of the motion that ended.
     """
     return messages.string(json.dumps(
         {'event': name, 't_ns': t_ns, 'sent_ns': sent_ns, **details}, default=list))

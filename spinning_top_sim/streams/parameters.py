@@ -12,7 +12,7 @@ import contextlib
 import enum
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -51,7 +51,7 @@ class Parameter:
     above: float | None = None
     smallest: float | None = None
     choices: tuple[str, ...] = ()
-    effect: Effect = Effect.NOW
+    effect: Effect = field(kw_only=True)
 
     @property
     def is_double(self) -> bool:
@@ -132,16 +132,16 @@ LARGEST = 1e30
 # The longest time of anything [s], three years.
 LONGEST = 1e8
 
-# Parameters that a running node does not take over at once.
+_at_once = partial(Parameter, effect=Effect.NOW)
 _at_reset = partial(Parameter, effect=Effect.RESET)
 _at_start = partial(Parameter, effect=Effect.START)
 _at_recording = partial(Parameter, effect=Effect.RECORDING)
 
 
 def _stream(name: str, rate: float, enabled: bool, text: str) -> tuple[Parameter, Parameter]:
-    return (Parameter(f'{name}.enabled', enabled, f'Whether there is {text}; a recording keeps '
+    return (_at_once(f'{name}.enabled', enabled, f'Whether there is {text}; a recording keeps '
                       'the streams that it began with'),
-            Parameter(f'{name}.rate', rate, f'Rate of {text}', 'Hz', 1e-6, HIGHEST_RATE))
+            _at_once(f'{name}.rate', rate, f'Rate of {text}', 'Hz', 1e-6, HIGHEST_RATE))
 
 
 def _axes(kind: str, unit: str, walk_unit: str) -> list[Parameter]:
@@ -170,21 +170,21 @@ TABLE: tuple[Parameter, ...] = (
     _at_reset('initial.phi', 0.0, 'Precession angle at the start', 'rad', -1e12, 1e12),
     _at_reset('initial.psi', 0.0, 'Spin angle at the start', 'rad', -1e12, 1e12),
     # These two without a range: the motion decides what is too fast.
-    Parameter('spin.l3', 1.6, 'Angular momentum along the axis; a change is a command',
+    _at_once('spin.l3', 1.6, 'Angular momentum along the axis; a change is a command',
               'kg m^2/s'),
-    Parameter('spin.lz', None, 'Angular momentum along the vertical; a change is a command',
+    _at_once('spin.lz', None, 'Angular momentum along the vertical; a change is a command',
               'kg m^2/s'),
     _at_reset('solver.method', 'rk45', 'Dormand-Prince steps or the closed form', choices=METHODS),
     _at_reset('solver.equations', 'transport', "rk45: regular form, or the paper's to the letter",
               choices=EQUATIONS),
     _at_reset('solver.rtol', 1e-11, 'rk45: relative tolerance of a step', '', 1e-14, 1e-2),
     _at_reset('solver.atol', 1e-12, 'rk45: absolute tolerance of a step', '', 0.0, 1e-2),
-    Parameter('max_error', 1e-6, 'rk45: warn in /diagnostics when the orientation is further '
+    _at_once('max_error', 1e-6, 'rk45: warn in /diagnostics when the orientation is further '
               'from the exact solution; 0 = do not look', 'rad', 0.0, 1e6),
     _at_start('pacing', 'timer', 'Without effect, and accepted for older files: a thread with '
               'absolute deadlines makes the ticks', choices=('timer', 'thread')),
-    Parameter('tick_rate', 200.0, 'How often due samples are sent', 'Hz', 1e-2, HIGHEST_RATE),
-    Parameter('time_scale', 1.0, 'Simulated over real time', '', 1e-6, 1e6),
+    _at_once('tick_rate', 200.0, 'How often due samples are sent', 'Hz', 1e-2, HIGHEST_RATE),
+    _at_once('time_scale', 1.0, 'Simulated over real time', '', 1e-6, 1e6),
     _at_start('start_paused', False, 'Wait for ~/set_pause or ~/step'),
     _at_start('publish_clock', False, 'Publish /clock (the same as clock.enabled)'),
     _at_start('world_frame', 'world', 'Frame of the pivot, z up'),
@@ -202,7 +202,7 @@ TABLE: tuple[Parameter, ...] = (
               's', 0.0, 3600.0),
     _at_reset('markers.trace_points', 200, 'Points of the trace, evenly spaced in time', '', 1,
               10_000),
-    Parameter('duration', 0.0, 'End after this much simulated time, 0 = never', 's', 0.0,
+    _at_once('duration', 0.0, 'End after this much simulated time, 0 = never', 's', 0.0,
               LONGEST, smallest=1e-9),
     _at_start('record.enabled', False, 'Record from the start'),
     _at_recording('record.uri', '', 'File or folder of a recording; empty: '
@@ -215,9 +215,9 @@ TABLE: tuple[Parameter, ...] = (
                   choices=('zstd', 'lz4', 'none')),
     _at_recording('record.min_free_bytes', 100_000_000, 'Stop recording when the disk has less '
                   'free', 'bytes', 0, 2 ** 62),
-    Parameter('step.count', 1, 'Steps of one ~/step', '', 1, 1_000_000),
-    Parameter('step.dt', 0.01, 'Simulated time of one step', 's', 1e-6, 1e3),
-    Parameter('status_period', 1.0, 'Of the status line on the terminal, 0 = none', 's', 0.0,
+    _at_once('step.count', 1, 'Steps of one ~/step', '', 1, 1_000_000),
+    _at_once('step.dt', 0.01, 'Simulated time of one step', 's', 1e-6, 1e3),
+    _at_once('status_period', 1.0, 'Of the status line on the terminal, 0 = none', 's', 0.0,
               LONGEST, smallest=0.01),
 )
 BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in TABLE}

@@ -1,5 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulation, the same live and offline; times are integer nanoseconds since the start."""
+"""
+The simulation, the same live and offline.
+
+Times are integer nanoseconds since the start.  Three of them move on, each with an owner:
+
+    0 ------ now_ns ---------- reached_ns ---- ready_ns ------> t
+      sent            computed               |   first sample that is neither
+
+    now_ns      Simulation  samples up to here are sent; none after it
+    ready_ns    Schedule    samples before here are sent or computed
+    reached_ns  Segment     the solver has stepped up to here; it may be on either side of ready_ns
+                Propagator  the same, since the start of its motion
+
+A tick moves `now_ns` to the time that is due; `prepare` moves the other two ahead of it.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +29,7 @@ from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.solvers.exact import MOST_TURNS, ExactSolution
+from spinning_top_sim.solvers.exact import MOST_TURNS
 from spinning_top_sim.solvers.propagator import propagate
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -42,7 +56,7 @@ class Simulation:
 
     values, top : checked parameters of the run, and the top that they describe
     streams : every stream; the caller sets `publish` of each, and records them with `log_to`
-    now_ns : simulated time up to which every sample has been sent (-1: not even that of t = 0)
+    now_ns : every sample up to here is sent (-1: not even that of t = 0)
     l3, lz : as last commanded [kg m^2/s]
     history : applied commands since the start as (t_ns, l3, lz)
     segment : the motion since the last command
@@ -173,12 +187,9 @@ class Simulation:
         schedule, segment = self._schedule, self.segment
         ready = schedule.ready
         moved = False
-        while True:
-            schedule.update(self.now_ns)
-            due_ns = ready[0][0] if ready else schedule.computed_ns
-            if due_ns > target_ns and target_ns <= segment.reached_ns:
-                self.now_ns = max(self.now_ns, target_ns)
-                return True
+        # Invariant: all samples up to `now_ns` are sent; the next one is due later, at `due_ns`.
+        while ((due_ns := schedule.next_due(self.now_ns)) <= target_ns
+               or segment.reached_ns < target_ns):
             if moved and give_way():
                 return False
             moved = True
@@ -186,9 +197,11 @@ class Simulation:
                 schedule.compute(self.now_ns, target_ns)
             if ready and due_ns <= target_ns:
                 self._send(ready.popleft(), due_ns >= publish_from_ns)
-            else:               # there were only steps to take
+            else:               # the steps do not reach a sample yet, or none is due
                 self.now_ns = max(self.now_ns, min(segment.reached_ns, due_ns - 1, target_ns))
                 segment.release(self.now_ns)
+        self.now_ns = max(self.now_ns, target_ns)
+        return True
 
     def send_ready(self, target_ns: int) -> bool:
         """
@@ -197,7 +210,7 @@ class Simulation:
         The fast path of a tick touches little: after a rest little is in the processor's caches.
         """
         schedule = self._schedule
-        if target_ns >= schedule.computed_ns or target_ns > self.segment.reached_ns:
+        if target_ns >= schedule.ready_ns or target_ns > self.segment.reached_ns:
             return False
         ready = schedule.ready
         while ready and ready[0][0] <= target_ns:
@@ -209,7 +222,7 @@ class Simulation:
     @property
     def ready_ns(self) -> int:
         """Every sample before this time is sent or computed [ns]."""
-        return self._schedule.computed_ns
+        return self._schedule.ready_ns
 
     def prepare(self, until_ns: int, budget_ns: int | None = None) -> bool:
         """Compute ahead what is due up to `until_ns`; see `Schedule.prepare`."""
@@ -306,7 +319,7 @@ def _segment(top: Top, start: State, start_ns: int, values: Mapping[str, Any]) -
             raise ValueError(f'the energy would be {segment.energy!r} J')
         if not segment.reach(start_ns + 1, FIRST_STEPS):
             raise ValueError(f'it turns too fast: over {FIRST_STEPS} steps a nanosecond')
-        if ((isinstance(solver, ExactSolution) and solver.ns_limit < SHORTEST_RUN_NS)
+        if (solver.ns_limit < SHORTEST_RUN_NS
                 or abs(start.l3) / top.lambda3 > math.tau * MOST_RATE):
             raise ValueError(f'it turns too fast: at most {MOST_RATE:.2g} turns a second')
     except (ArithmeticError, RuntimeError, ValueError) as error:

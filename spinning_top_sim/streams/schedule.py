@@ -51,8 +51,6 @@ class Delivery:
     published : (publish, place of the message, stream) of the streams with subscribers
     """
 
-    __slots__ = ('log_indices', 'logged', 'published', 'size')
-
     def __init__(self, streams: Sequence[Stream]) -> None:
         logged = [k for k, stream in enumerate(streams) if stream.log_index is not None]
         self.log_indices = tuple(stream.log_index for stream in streams
@@ -71,11 +69,13 @@ class Schedule:
     """
     The messages of the streams of one run, in order of time.
 
-    What is sent does not depend on when it is computed.  `follow` comes first.
+    What is sent does not depend on when it is computed.  `follow` comes first.  The methods take
+    `now_ns`, the simulated time up to which everything is sent.
 
     epoch_ns : stamp of t = 0 [ns]; after a change, call `invalidate`
     ready : instants that are computed and not yet sent
-    computed_ns : every sample before this simulated time is sent or in `ready` [ns]
+    ready_ns : every sample before this simulated time is sent or in `ready` [ns]; -1 when
+        what is computed has been dropped
     """
 
     def __init__(self, streams: Sequence[Stream], epoch_ns: int) -> None:
@@ -90,43 +90,42 @@ class Schedule:
         self.invalidate()
 
     def invalidate(self) -> None:
-        """Drop what is computed ahead, as it does not come next any more."""
+        """Drop what is computed ahead: the motion, the sinks, the rates or the stamps changed."""
         self.ready.clear()
         self._work: Iterator[None] | None = None
-        self.computed_ns = -1
+        self.ready_ns = -1
         self._block = SMALLEST_BLOCK
 
-    def update(self, now_ns: int) -> None:
+    def next_due(self, now_ns: int) -> int:
         """
-        Begin anew after `now_ns` if nothing is computed beyond it: see which streams have sinks.
+        Return the time of the first sample that is not sent [ns].
 
-        Then `computed_ns` is the time of the first sample that is not computed.
+        After `invalidate` the schedule begins anew here, with the streams that now have sinks and
+        their first samples after `now_ns`.
         """
-        if self.computed_ns <= now_ns:
+        if self.ready_ns < 0:
             self._active = [stream for stream in self._streams if stream.has_sinks]
-            # The first sample of each that is not computed.
+            # Of each active stream, the first sample that is not computed.
             self._next_ns = [stream.first_after(now_ns) for stream in self._active]
             self._shortest_ns = min((stream.period_ns for stream in self._active),
                                     default=NEVER_NS)
             self._deliveries: dict[tuple[int, ...], Delivery] = {}      # by places in `_active`
-            self.ready.clear()
-            self._work = None
-            self.computed_ns = min(self._next_ns, default=NEVER_NS)
+            self.ready_ns = min(self._next_ns, default=NEVER_NS)
+        return self.ready[0][0] if self.ready else self.ready_ns
 
     def prepare(self, now_ns: int, until_ns: int, budget_ns: int | None = None) -> bool:
         """
         Compute a block if there are samples due up to `until_ns` that are not computed.
 
-        Everything is sent up to `now_ns`.  Where a block takes longer than `budget_ns`, return
-        False: the next call goes on there.
+        Return False if the block takes longer than `budget_ns`: the next call goes on there.
         """
         if self._work is None:
-            self.update(now_ns)
-            if self.computed_ns > until_ns:
+            self.next_due(now_ns)
+            if self.ready_ns > until_ns:
                 return True
             span_ns = min((self._block - 1) * self._shortest_ns, LONGEST_BLOCK_NS)
             self._block = min(2 * self._block, LARGEST_BLOCK)
-            self._work = self._pieces(now_ns, max(until_ns, self.computed_ns + span_ns))
+            self._work = self._pieces(now_ns, max(until_ns, self.ready_ns + span_ns))
         # Deferred: `compute` raises the error when it is called for that time.
         with contextlib.suppress(IntegrationError):
             return self._go_on(None if budget_ns is None else time.monotonic_ns() + budget_ns)
@@ -139,8 +138,8 @@ class Schedule:
         Raises IntegrationError if the equations, or stamps, do not go on from `now_ns`.
         """
         if self._work is None:
-            self.update(now_ns)
-            check_stamp(self.epoch_ns + min(self.computed_ns, until_ns))
+            self.next_due(now_ns)
+            check_stamp(self.epoch_ns + min(self.ready_ns, until_ns))
             self._work = self._pieces(now_ns, until_ns)
         self._go_on(None)
 
@@ -160,7 +159,7 @@ class Schedule:
     def _pieces(self, now_ns: int, until_ns: int) -> Iterator[None]:
         """Compute a block, as far as the steps allow, in pieces of some 0.1 to 0.3 ms."""
         segment = self._segment
-        until_ns = min(until_ns, self.computed_ns + (LARGEST_BLOCK - 1) * self._shortest_ns,
+        until_ns = min(until_ns, self.ready_ns + (LARGEST_BLOCK - 1) * self._shortest_ns,
                        LAST_STAMP_NS - self.epoch_ns)
         segment.release(now_ns)
         try:
@@ -196,7 +195,7 @@ class Schedule:
             self.ready.append((t_ns, self._deliveries[key], messages))
         self._next_ns = [first_ns + len(times) * times.step
                          for first_ns, times in zip(self._next_ns, blocks, strict=True)]
-        self.computed_ns = min(self._next_ns, default=NEVER_NS)
+        self.ready_ns = min(self._next_ns, default=NEVER_NS)
 
 
 def offline_block_ns(streams: Iterable[Stream]) -> int:

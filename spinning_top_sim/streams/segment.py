@@ -27,33 +27,27 @@ class Segment:
     A motion from its start, or from a command, until the next command, in simulated time.
 
     solver : its t = 0 is `start_ns`; only the segment lets it step
-    reached_ns : simulated time up to which no further steps are needed [ns]
+    reached_ns, end_ns : simulated times up to which no further steps are needed, and up to which
+        the solver goes at all [ns]
     energy, l3, lz : constants of the motion, as it began
     """
 
     def __init__(self, solver: Propagator, start: State, start_ns: int) -> None:
         self.solver, self.start, self.start_ns = solver, start, start_ns
-        # Steps go on for ever, the closed form does not.
-        self._solver_end_ns = (solver.ns_limit if isinstance(solver, ExactSolution)
-                               else 2 ** 63 - 1)
-        self.reached_ns = start_ns + min(solver.latest_ns, self._solver_end_ns)
+        self.end_ns = start_ns + solver.ns_limit
+        self.reached_ns = min(start_ns + solver.reached_ns, self.end_ns)
         first = solver.states(range(1))
         self.energy, self.l3, self.lz = float(first.energy[0]), start.l3, start.lz
 
     @cached_property
     def exact(self) -> ExactSolution | None:
         """
-        The exact solution of the same motion; None for a motion that it cannot hold for so long.
+        The exact solution of the same motion; None where it ends before SHORTEST_RUN_NS.
 
         Its set-up takes milliseconds, and may be done in another thread than the simulation's.
         """
-        if isinstance(self.solver, ExactSolution):
-            return self.solver
-        try:
-            exact = ExactSolution(self.solver.top, self.start)
-        except ValueError:
-            return None
-        return exact if exact.ns_limit >= SHORTEST_RUN_NS else None
+        exact = self.solver.exact_solution()
+        return exact if exact and exact.ns_limit >= SHORTEST_RUN_NS else None
 
     def reach(self, t_ns: int, max_steps: int) -> bool:
         """
@@ -64,8 +58,8 @@ class Segment:
         try:
             arrived = self.solver.reach(t_ns - self.start_ns, max_steps)
         finally:
-            self.reached_ns = self.start_ns + min(self.solver.latest_ns, self._solver_end_ns)
-        if t_ns > self.start_ns + self._solver_end_ns:
+            self.reached_ns = min(self.start_ns + self.solver.reached_ns, self.end_ns)
+        if t_ns > self.end_ns:
             raise IntegrationError(f'the closed form ends at t = {self.reached_ns / 10 ** 9:.9g} '
                                    's, where a phase of the motion reaches 2^52 turns')
         return arrived
