@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the launch files share: robot_state_publisher and RViz."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

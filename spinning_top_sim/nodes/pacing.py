@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """When ticks and recorded messages are due, without ROS: clocks, a fair lock, threads."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import math

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `replay`: publishes the messages of a log with their recorded spacing."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import difflib

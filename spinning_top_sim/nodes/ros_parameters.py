@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The parameter table as ROS parameters: descriptors, start values, and checked changes."""
 
-from __future__ import annotations
-
 import array
 import contextlib
 import difflib

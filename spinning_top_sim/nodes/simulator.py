@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `spinning_top`: wires a `Simulation` to topics, services and parameters."""
 
-from __future__ import annotations
-
 import functools
 import importlib
 import itertools

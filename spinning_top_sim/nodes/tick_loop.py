@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a tick does: which samples are sent now, in real time, without ROS and without waiting."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from enum import Enum

@@ -13,8 +13,6 @@ quaternions.  They use elementwise real arithmetic only, so that a value does no
 other values in its column.
 """
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 import numpy as np

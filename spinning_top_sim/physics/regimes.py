@@ -8,8 +8,6 @@ the swing the tip draws loops, outside it waves, at its end cusps (Goldstein, *C
 Mechanics*, 3rd ed., sect. 5.7; Klein & Sommerfeld, *Theorie des Kreisels*, ch. IV).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from decimal import Decimal

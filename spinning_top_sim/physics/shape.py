@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a top looks like: the solid cylinder that has its mass and moments of inertia."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

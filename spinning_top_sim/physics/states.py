@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """States of a top at many times, as columns that are computed when they are first asked for."""
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

@@ -7,8 +7,6 @@ ZYZ (Taylor, *Classical Mechanics*, sect. 10.9): body to space is Rz(phi) Ry(the
 the precession, theta the tilt from the upward vertical, psi the spin about the symmetry axis.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 

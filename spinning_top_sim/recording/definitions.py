@@ -6,8 +6,6 @@ A log carries its own schemas so that it can be read where the packages are miss
 that of rosbag2's LocalMessageDefinitionSource (rosbag2_cpp, jazzy), byte for byte.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import json

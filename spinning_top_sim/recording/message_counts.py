@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Counts the messages that a scan of a log finds, and those that the log has lost."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 from spinning_top_sim.recording.chunks import time_span

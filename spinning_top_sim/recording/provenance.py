@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a log says about the run it holds: enough to compute the run again."""
 
-from __future__ import annotations
-
 import json
 import platform
 import sys

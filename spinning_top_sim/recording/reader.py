@@ -6,8 +6,6 @@ Everything that is provably whole is read (see `scanner.py`), and `damage` repor
 Memory holds the chunks that overlap in time: one in a log that was written in order.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import heapq

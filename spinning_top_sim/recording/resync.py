@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finds where records begin in a file that does not tell it."""
 
-from __future__ import annotations
-
 import re
 
 from mcap.opcode import Opcode

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes what is whole of a damaged log into a new, indexed one."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import os

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bytes of an MCAP file that may be damaged, and the summary section at its end."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import os

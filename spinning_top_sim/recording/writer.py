@@ -7,8 +7,6 @@ writes them, at least every half `max_loss`, so that a SIGKILL takes no more.  A
 to the disk meanwhile; `possible_loss` tells what a power loss would take.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import os

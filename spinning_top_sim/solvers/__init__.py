@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """How a state moves in time, a file per method.  numpy at most; no ROS, no I/O."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -7,8 +7,6 @@ its result (small arguments included).  The standard library offers sqrt, exp an
 here.  DLMF is the Digital Library of Mathematical Functions, https://dlmf.nist.gov.
 """
 
-from __future__ import annotations
-
 import math
 from contextlib import AbstractContextManager
 from decimal import Context, Decimal, getcontext, localcontext

@@ -9,8 +9,6 @@ Hermite polynomial through the value and two derivatives at both ends: its error
 that of a step, where the usual 4th-order continuous extension would spoil the step's accuracy.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from abc import ABC, abstractmethod

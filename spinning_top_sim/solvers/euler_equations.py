@@ -7,8 +7,6 @@ rounds towards 1, Lz - L3 cos(theta) loses its digits, or a step leaps over the 
 psi drift off while every error estimate is small.  So these equations stop with an error there.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -12,8 +12,6 @@ An attitude is i beta = x + iy = (-s J + i R) exp(i rotation) over D, and i conj
 (s J + i R) exp(-i rotation) over D, with the R, J, s and rotation of beta and of alpha.
 """
 
-from __future__ import annotations
-
 from decimal import Decimal
 
 import numpy as np

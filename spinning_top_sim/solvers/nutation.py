@@ -6,8 +6,6 @@ The phase of the nutation is counted from the nearest quarter period, where the 
 short polynomials; even and odd quarter periods have series of their own (`theta_setup`).
 """
 
-from __future__ import annotations
-
 import math
 from decimal import Decimal
 from typing import NamedTuple

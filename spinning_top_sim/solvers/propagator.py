@@ -6,8 +6,6 @@ A new solver is a class with the members of `Propagator`, a name in METHODS, and
 `propagate` that makes it.
 """
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A motion by Dormand-Prince steps, read between its steps at any number of times."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from bisect import bisect_left

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cosines and sines of angles that grow linearly with time, the same bits in any block."""
 
-from __future__ import annotations
-
 import math
 import threading
 from collections.abc import Iterable, Sequence

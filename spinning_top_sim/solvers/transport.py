@@ -20,8 +20,6 @@ The invariants |q| = 1, L.e3 = L3 and the energy are restored after each step an
 (projection, Hairer, Lubich & Wanner, *Geometric Numerical Integration*, sect. IV.4).
 """
 
-from __future__ import annotations
-
 import cmath
 import math
 from collections.abc import Callable

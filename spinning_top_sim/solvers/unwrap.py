@@ -15,8 +15,6 @@ If Lz + L3 or Lz - L3 is 0, alpha or beta has the uniform part alone.  It then m
 through zero, and its modulus changes sign where the axis passes that pole.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

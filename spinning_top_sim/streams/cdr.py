@@ -8,8 +8,6 @@ length with the closing NUL, a sequence its element count, then the elements.  P
 equal messages are equal bytes.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 

@@ -6,8 +6,6 @@ The errors follow kalibr's model, with its names and units.  Conventions: REP-14
 accelerometer reads +g upwards), REP-103 (x, y, z right-handed), URDF roll-pitch-yaw.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable, Mapping

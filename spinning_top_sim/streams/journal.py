@@ -5,8 +5,6 @@ What a log holds besides the streams: the commands and events that shaped the ru
 With the parameters in the log's metadata they are enough to compute every message again.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The top and the trace of its tip as markers for Foxglove and RViz."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence

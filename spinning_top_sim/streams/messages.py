@@ -6,8 +6,6 @@ Fields stand in the order of the installed .msg definitions (ROS 2 Jazzy, common
 a test compares every template with what rclpy serializes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from spinning_top_sim.streams.cdr import CdrWriter, Template

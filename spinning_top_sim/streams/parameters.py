@@ -6,8 +6,6 @@ One table serves the node (descriptors, validation), the command line and the do
 The defaults are the cusp scene: a bicycle wheel on a pivot, spun about its axis and let go.
 """
 
-from __future__ import annotations
-
 import contextlib
 import enum
 import math

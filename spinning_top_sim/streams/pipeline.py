@@ -15,8 +15,6 @@ Times are integer nanoseconds since the start.  Three of them move on, each with
 A tick moves `now_ns` to the time that is due; `prepare` moves the other two ahead of it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which samples are due when; their messages are computed in blocks, ahead of their time."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections import deque

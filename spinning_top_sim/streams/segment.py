@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A motion between two commands, and the exact solution that it is compared with."""
 
-from __future__ import annotations
-
 import math
 from functools import cached_property
 

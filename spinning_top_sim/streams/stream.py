@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every stream has: a topic, a message type, a rate, sinks, and how states become bytes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The streams.  What a new one needs is said in docs/architecture.md."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the executables share: exit codes, errors in one line, progress, and tables of text."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import os

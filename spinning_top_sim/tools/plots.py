@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures of a top: the tip's path on the sphere, a page about a log, an animation."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

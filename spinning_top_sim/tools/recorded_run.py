@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The run of a log: what metadata and journal say about it, and how it is computed again."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import operator

@@ -13,8 +13,6 @@ exit codes:
   130  interrupted: nothing was written
 """
 
-from __future__ import annotations
-
 import argparse
 import signal
 import sys

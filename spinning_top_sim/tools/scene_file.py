@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reads ROS 2 parameter files and assignments (NAME:=VALUE) without ROS."""
 
-from __future__ import annotations
-
 import difflib
 import re
 from collections.abc import Iterator, Mapping

@@ -7,8 +7,6 @@ the motion that it is of, in one pass.  Then `_count` looks for gaps in each top
 measures each motion from the samples of its source.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from bisect import bisect_left

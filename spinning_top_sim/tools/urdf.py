@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The robot description of a scene: urdf/spinning_top.urdf.xacro with the scene's parameters."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

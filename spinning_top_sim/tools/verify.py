@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Computes a log's run again and compares every message, byte for byte."""
 
-from __future__ import annotations
-
 import math
 import re
 import struct
