@@ -595,6 +595,17 @@ def test_wrong_arguments_are_2(capsys):
     assert ended.value.code == 2
 
 
+@pytest.mark.parametrize(('option', 'name', 'endings'), [
+    ('--plot', 'page', '.png or .pdf or .svg'), ('--plot', 'page.xyz', '.png or .pdf or .svg'),
+    ('--animate', 'top.mp4', '.gif'), ('--animate', 'top', '.gif')])
+def test_a_picture_whose_name_has_another_ending_is_refused(
+        stepped, tmp_path, capsys, option, name, endings):
+    with pytest.raises(SystemExit, match='2'):
+        inspect.main([str(stepped), option, str(tmp_path / name)])
+    assert f'{name}: must end in {endings}\n' in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize('streams', [['imu'], ['invariants'], ['pose']])
 def test_says_what_it_cannot_tell(tmp_path, capsys, streams):
     path = log_of(tmp_path / 'run.mcap', '--duration', 2, '-p', f'record.streams:={streams}')

@@ -155,9 +155,9 @@ def test_every_script_is_installed_as_data_and_as_a_command(setup_py):
     assert set(commands) == names
     assert set(dict(setup_py.data_files)[f'lib/{NAME}']) == {f'scripts/{name}' for name in names}
     for name, target in commands.items():
-        module = target.removesuffix(':main')
+        module, function = target.split(':')
         assert (ROOT / f'{module.replace(".", "/")}.py').is_file()
-        assert f'from {module} import main\n' in (ROOT / 'scripts' / name).read_text()
+        assert f'from {module} import {function}\n' in (ROOT / 'scripts' / name).read_text()
 
 
 @pytest.mark.parametrize('script', SCRIPTS, ids=lambda path: path.name)
@@ -178,6 +178,20 @@ def test_a_script_helps_and_does_nothing(script, tmp_path):
     assert done.stdout.startswith(f'usage: {script.name} ')
     assert len(done.stdout.splitlines()) > 8
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize('name', ['simulate', 'inspect', 'recover'])
+def test_ctrl_c_during_the_imports_of_a_tool_is_quiet(name):
+    code = ('import runpy, signal, sys\n'
+            'class Interrupted:\n'
+            '    def find_spec(self, name, path=None, target=None):\n'
+            "        if name == 'spinning_top_sim.recording.errors':\n"
+            '            signal.raise_signal(signal.SIGINT)\n'
+            'sys.meta_path.insert(0, Interrupted())\n'
+            f'runpy.run_path({str(ROOT / "scripts" / name)!r}, run_name="__main__")')
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                          timeout=60, check=False, env={**os.environ, 'PYTHONPATH': str(ROOT)})
+    assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
 
 
 @pytest.mark.parametrize('script', SCRIPTS, ids=lambda path: path.name)

@@ -56,7 +56,7 @@ def test_what_turns_too_fast_is_refused_at_the_start_at_a_reset_and_by_simulate(
     log = tmp_path / 'run.mcap'
     arguments = [part for name, value in values.items() if name in (*given, 'solver.method')
                  for part in ('-p', f'{name}:={value}')]
-    assert main(['-o', str(log), '--duration', '1', '--quiet', *arguments]) == 1
+    assert main(['-o', str(log), '--duration', '1', '--quiet', *arguments]) == 2
     assert 'no motion from' in capsys.readouterr().err
     assert not log.exists()
 
@@ -127,7 +127,7 @@ def test_a_run_offline_whose_stamps_would_end_is_refused_before(tmp_path, capsys
             Simulation(parameters.checked({'duration': 1.0}), epoch_ns)
     for epoch in ('2147483647.5', '-3', '1e300', 'nan'):
         log = tmp_path / 'run.mcap'
-        assert main(['-o', str(log), '--duration', '1', '--quiet', '--epoch', epoch]) == 1
+        assert main(['-o', str(log), '--duration', '1', '--quiet', '--epoch', epoch]) == 2
         assert 'must be from 0 to 2147483648 s' in capsys.readouterr().err
         assert not log.exists()
 

@@ -1,28 +1,50 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the executables share: exit codes, errors in one line, progress, and tables of text."""
+"""What the tools share: their start, exit codes, errors in one line, progress, and tables."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib
 import os
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import TextIO
 
 OK = 0
 FAILED = 1
+WRONG_USAGE = 2             # as argparse has it
 INTERRUPTED = 130
 
 TEXT_WIDTH = 118            # without a terminal
 GAP = '  '                  # before each column of a table
 
 
+class UsageError(Exception):
+    """Arguments that are refused before anything is done."""
+
+
+def _start(name: str) -> int:
+    """Import a tool and run it; return its exit code, also if Ctrl-C interrupts the imports."""
+    try:
+        return importlib.import_module(f'spinning_top_sim.tools.{name}').main()
+    except KeyboardInterrupt:
+        return INTERRUPTED
+
+
+# The executables.
+simulate, inspect, recover = (partial(_start, name) for name in ('simulate', 'inspect', 'recover'))
+
+
 def run(name: str, help_text: str | None, argv: Sequence[str] | None,
         add_arguments: Callable[[argparse.ArgumentParser], object],
         command: Callable[[argparse.Namespace], int], errors: tuple[type[Exception], ...]) -> int:
     """Run a command; return its code, FAILED after one of `errors`, INTERRUPTED after Ctrl-C."""
+    # A closed stream is None, and a file that is opened would take its place.
+    sys.stdout = sys.stdout or open(os.devnull, 'w')    # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, 'w')    # noqa: SIM115
     parser = argparse.ArgumentParser(prog=name, description=help_text,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     add_arguments(parser)
@@ -35,15 +57,30 @@ def run(name: str, help_text: str | None, argv: Sequence[str] | None,
         # The reader of the output, such as a pager, has ended.  Python flushes it once more.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
+    except UsageError as error:
+        print_line(f'{name}: {error}', sys.stderr)
+        return WRONG_USAGE
     except errors as error:
-        what = str(error)
-        if isinstance(error, OSError) and error.filename is not None:
-            what = f'{error.filename}: {error.strerror}'
-        print_line(f'{name}: {what}', sys.stderr)
+        print_line(f'{name}: {_reason(error)}', sys.stderr)
         return FAILED
     except KeyboardInterrupt:
         print_line(f'{name}: interrupted', sys.stderr)
         return INTERRUPTED
+
+
+@contextlib.contextmanager
+def usage_errors() -> Iterator[None]:
+    """Raise UsageError for what is refused within, and for files that cannot be read."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        raise UsageError(_reason(error)) from error
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, OSError) and error.filename is not None:
+        return f'{error.filename}: {error.strerror}'
+    return str(error)
 
 
 def printable(text: str) -> str:
