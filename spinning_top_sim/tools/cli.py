@@ -22,10 +22,6 @@ TEXT_WIDTH = 118            # without a terminal
 GAP = '  '                  # before each column of a table
 
 
-class UsageError(Exception):
-    """Arguments that are refused before anything is done."""
-
-
 def _start(name: str) -> int:
     """Import a tool and run it; return its exit code, also if Ctrl-C interrupts the imports."""
     try:
@@ -41,7 +37,12 @@ simulate, inspect, recover = (partial(_start, name) for name in ('simulate', 'in
 def run(name: str, help_text: str | None, argv: Sequence[str] | None,
         add_arguments: Callable[[argparse.ArgumentParser], object],
         command: Callable[[argparse.Namespace], int], errors: tuple[type[Exception], ...]) -> int:
-    """Run a command; return its code, FAILED after one of `errors`, INTERRUPTED after Ctrl-C."""
+    """
+    Run a command; return its exit code.
+
+    That is INTERRUPTED after Ctrl-C, and after one of `errors` FAILED; after a ValueError among
+    them, which wrong arguments raise, WRONG_USAGE.
+    """
     # A closed stream is None, and a file that is opened would take its place.
     sys.stdout = sys.stdout or open(os.devnull, 'w')    # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, 'w')    # noqa: SIM115
@@ -57,30 +58,15 @@ def run(name: str, help_text: str | None, argv: Sequence[str] | None,
         # The reader of the output, such as a pager, has ended.  Python flushes it once more.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
-    except UsageError as error:
-        print_line(f'{name}: {error}', sys.stderr)
-        return WRONG_USAGE
     except errors as error:
-        print_line(f'{name}: {_reason(error)}', sys.stderr)
-        return FAILED
+        what = str(error)
+        if isinstance(error, OSError) and error.filename is not None:
+            what = f'{error.filename}: {error.strerror}'
+        print_line(f'{name}: {what}', sys.stderr)
+        return WRONG_USAGE if isinstance(error, ValueError) else FAILED
     except KeyboardInterrupt:
         print_line(f'{name}: interrupted', sys.stderr)
         return INTERRUPTED
-
-
-@contextlib.contextmanager
-def usage_errors() -> Iterator[None]:
-    """Raise UsageError for what is refused within, and for files that cannot be read."""
-    try:
-        yield
-    except (ValueError, OSError) as error:
-        raise UsageError(_reason(error)) from error
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, OSError) and error.filename is not None:
-        return f'{error.filename}: {error.strerror}'
-    return str(error)
 
 
 def printable(text: str) -> str:

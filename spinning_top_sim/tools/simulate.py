@@ -5,7 +5,7 @@ or a table of the true states (CSV, Parquet).
 
 exit codes:
   0    done
-  1    the run cannot be written, or ends early; the reason is printed
+  1    a file cannot be read or written, or the run ends early
   2    wrong arguments or parameters; no file is made
   130  interrupted; the log holds what was computed before
 """
@@ -85,16 +85,15 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     output: Path = arguments.output
     file_format = arguments.format or output.suffix[1:]
-    with cli.usage_errors():
-        if file_format not in FORMATS:
-            raise ValueError(f'{output}: the name must end in .{", .".join(FORMATS)}, or --format '
-                             'be given')
-        if not 0.0 <= arguments.epoch <= 2.0 ** 31:
-            raise ValueError(f'--epoch {arguments.epoch!r}: must be from 0 to {2 ** 31} s')
-        values = _parameters(arguments)
-        simulation = Simulation(values, round(arguments.epoch * NANOSECONDS))
-        stops = _parse_stops(arguments.command, round(values['duration'] * NANOSECONDS),
-                             simulation.top)
+    if file_format not in FORMATS:
+        raise ValueError(f'{output}: the name must end in .{", .".join(FORMATS)}, or --format be '
+                         'given')
+    if not 0.0 <= arguments.epoch <= 2.0 ** 31:
+        raise ValueError(f'--epoch {arguments.epoch!r}: must be from 0 to {2 ** 31} s')
+    values = _parameters(arguments)
+    simulation = Simulation(values, round(arguments.epoch * NANOSECONDS))
+    stops = _parse_stops(arguments.command, round(values['duration'] * NANOSECONDS),
+                         simulation.top)
     with cli.progress('simulated', values['duration'], 's', quiet=arguments.quiet) as show:
         if file_format == 'mcap':
             summary = _write_log(output, simulation, stops, show, arguments.namespace)
@@ -150,13 +149,13 @@ def _parse_stops(commands: Sequence[str], duration_ns: int, top: Top) -> list[St
 
 
 def _command(simulation: Simulation, l3: float, lz: float) -> None:
-    """Apply a command.  Raises ValueError where the state that is reached cannot take it."""
+    """Apply a command.  Raises IntegrationError where the state then cannot take it."""
     try:
         simulation.command(l3, lz)
     except ValueError as error:
         t = simulation.now_ns / NANOSECONDS
-        raise ValueError(f'--command {t!r}:{l3!r}:{lz!r}: {error}; the file holds the run up to '
-                         f't = {t!r} s') from error
+        raise IntegrationError(f'--command {t!r}:{l3!r}:{lz!r}: {error}; the file holds the run '
+                               f'up to t = {t!r} s') from error
 
 
 def _write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
@@ -284,13 +283,13 @@ def _write_csv(path: Path, blocks: Iterable[NDArray[np.float64]]) -> None:
 
 
 def _write_parquet(path: Path, blocks: Iterable[NDArray[np.float64]]) -> None:
-    """Write a Parquet file.  Raises ValueError, and makes no file, where pyarrow is missing."""
+    """Write a Parquet file.  Raises RecordingError, and makes no file, without pyarrow."""
     try:
         import pyarrow as pa  # noqa: PLC0415
         from pyarrow import parquet  # noqa: PLC0415
     except ImportError as error:
-        raise ValueError("parquet needs pyarrow: pip install 'spinning_top_sim[parquet]' "
-                         f'({error})') from error
+        raise RecordingError("parquet needs pyarrow: pip install 'spinning_top_sim[parquet]' "
+                             f'({error})') from error
     schema = pa.schema([(name, pa.float64()) for name in UNITS])
     with open(path, 'xb') as file, parquet.ParquetWriter(file, schema) as writer:
         for rows in blocks:
