@@ -259,6 +259,23 @@ def test_make_run_names_the_scenes_where_there_is_none_of_a_name():
         assert f'There is no scene "{scene}"' in made.stderr and 'looping' in made.stderr
 
 
+@pytest.mark.parametrize('scene', ['imu/bmi088', 'config/imu/bmi088.yaml',
+                                   str(ROOT / 'config/imu/bmi088.yaml')])
+def test_make_run_takes_no_imu_for_a_scene(scene):
+    made = subprocess.run(['make', 'run', f'SCENE={scene}'], cwd=ROOT, check=False,
+                          capture_output=True, text=True, timeout=60)
+    assert made.returncode == 2 and 'Creating' not in made.stdout
+    assert 'bmi088.yaml is no scene but an IMU' in made.stderr and 'looping' in made.stderr
+    assert "ARGS='--params-file " in made.stderr
+
+
+def test_make_help_fits_into_80_columns_and_names_every_scene():
+    told = subprocess.run(['make', 'help'], cwd=ROOT, check=True, capture_output=True, text=True,
+                          timeout=60).stdout
+    assert max(map(len, told.splitlines())) <= 80
+    assert {path.stem for path in SCENES} <= set(told.split())
+
+
 def test_a_second_make_run_waits_while_the_first_installs():
     with (ROOT / 'Makefile').open() as makefile:
         fcntl.flock(makefile, fcntl.LOCK_EX)
