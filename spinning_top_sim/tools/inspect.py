@@ -19,8 +19,9 @@ import json
 import math
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -55,22 +56,20 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('log', type=Path, help='an MCAP file, of this package or any other')
-    add('--plot', type=_picture('.png', '.pdf', '.svg'), metavar='FILE',
+    add('--plot', type=partial(_picture, ('.png', '.pdf', '.svg')), metavar='FILE',
         help='draw a page of figures (.png, .pdf, .svg); needs matplotlib')
-    add('--animate', type=_picture('.gif'), metavar='GIF',
+    add('--animate', type=partial(_picture, ('.gif',)), metavar='GIF',
         help='draw the turning top; needs matplotlib')
     add('--verify', action='store_true',
         help='compute the run again and compare every message byte for byte')
     add('--json', action='store_true', help='print everything as JSON')
 
 
-def _picture(*endings: str) -> Callable[[str], Path]:
-    """Return what makes a path of a name with one of these endings."""
-    def path(name: str) -> Path:
-        if Path(name).suffix.lower() not in endings:
-            raise argparse.ArgumentTypeError(f'{name}: must end in {" or ".join(endings)}')
-        return Path(name)
-    return path
+def _picture(endings: tuple[str, ...], name: str) -> Path:
+    """Return the path of a picture.  Raises ArgumentTypeError for another ending than these."""
+    if Path(name).suffix.lower() not in endings:
+        raise argparse.ArgumentTypeError(f'{name}: must end in {" or ".join(endings)}')
+    return Path(name)
 
 
 def _run(arguments: argparse.Namespace) -> int:

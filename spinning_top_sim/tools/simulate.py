@@ -98,7 +98,10 @@ def _run(arguments: argparse.Namespace) -> int:
         if file_format == 'mcap':
             summary = _write_log(output, simulation, stops, show, arguments.namespace)
         else:
-            summary = _write_table(output, file_format, simulation, stops, show)
+            period_ns = max(1, round(NANOSECONDS / values['pose.rate']))
+            write = _write_csv if file_format == 'csv' else _write_parquet
+            write(output, _rows(simulation, period_ns, stops, show))
+            summary = f'{stops[-1][0] // period_ns + 1} rows of {", ".join(UNITS)}'
     if not arguments.quiet:
         cli.print_line(f'{output}: {summary}')
     return cli.OK
@@ -135,14 +138,11 @@ def _parse_stops(commands: Sequence[str], duration_ns: int, top: Top) -> list[St
         if not 0 <= at_ns <= duration_ns:
             raise ValueError(f'--command {text}: T must be from 0 to the end of the run, '
                              f'{duration_ns / NANOSECONDS:g} s')
-        if not (math.isfinite(l3) and math.isfinite(lz)):
-            raise ValueError(f'--command {text}: L3 and LZ must be finite')
-        if abs(l3) / top.lambda3 > math.tau * MOST_RATE:
-            raise ValueError(f'--command {text}: it turns too fast: at most {MOST_RATE:.2g} turns '
-                             'a second')
         # At any tilt the momentum across the axis is at least sqrt(Lz^2 - L3^2).
-        if (abs(lz) - abs(l3)) * (abs(lz) + abs(l3)) / top.lambda1 == math.inf:
-            raise ValueError(f'--command {text}: the energy is beyond what doubles hold')
+        least_energy = (abs(lz) - abs(l3)) * (abs(lz) + abs(l3)) / (2.0 * top.lambda1)
+        if not (abs(l3) / top.lambda3 <= math.tau * MOST_RATE and least_energy < math.inf):
+            raise ValueError(f'--command {text}: L3 and LZ must be finite, as must be the energy, '
+                             f'and the spin at most {MOST_RATE:.2g} turns a second')
         stops.append((at_ns, (l3, lz)))
     # The sort is stable: commands at the same time keep their order.
     return [*sorted(stops, key=lambda stop: stop[0]), (duration_ns, None)]
@@ -241,23 +241,13 @@ class _LogWriter:
             self._file.finish()
 
 
-def _write_table(path: Path, file_format: str, simulation: Simulation, stops: Sequence[Stop],
-                 show: Callable[[float], object]) -> str:
-    """
-    Simulate a run into a new table of states, on the grid of `pose.rate`; return what it holds.
-
-    file_format : 'csv' or 'parquet'
-    stops, show : see `_write_log`
-    """
-    period_ns = max(1, round(NANOSECONDS / simulation.values['pose.rate']))
-    blocks = _rows(simulation, period_ns, stops, show)
-    (_write_csv if file_format == 'csv' else _write_parquet)(path, blocks)
-    return f'{stops[-1][0] // period_ns + 1} rows of {", ".join(UNITS)}'
-
-
 def _rows(simulation: Simulation, period_ns: int, stops: Sequence[Stop],
           show: Callable[[float], object]) -> Iterator[NDArray[np.float64]]:
-    """Yield blocks (columns, n) of the table.  A command changes the rows after its time."""
+    """
+    Yield blocks (columns, n) of the table of states.  A command changes the rows after its time.
+
+    stops, show : see `_write_log`
+    """
     next_ns = 0
     for target_ns, momenta in offline_targets(0, stops, ROWS_AT_ONCE * period_ns):
         times = range(next_ns, target_ns + 1, period_ns)
