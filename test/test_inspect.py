@@ -589,6 +589,17 @@ def test_a_reader_that_leaves_is_no_error(stepped):
     assert run.wait(60) == 0
 
 
+@pytest.mark.parametrize('tool', ['inspect', 'recover'])
+def test_a_full_output_is_told_in_a_line(stepped, tmp_path, tool):
+    option = ['-o', tmp_path / 'whole.mcap'] if tool == 'recover' else []
+    with open('/dev/full', 'w') as full:
+        run = subprocess.run(
+            [sys.executable, '-m', f'spinning_top_sim.tools.{tool}', stepped, *option],
+            stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+    assert run.returncode == 1
+    assert run.stderr == f'{tool}: [Errno 28] No space left on device\n'
+
+
 def test_wrong_arguments_are_2(capsys):
     with pytest.raises(SystemExit) as ended:
         inspect.main(['--no-such-thing'])

@@ -50,7 +50,7 @@ ROWS = (('nutation period [s]', 'nutation_period', 1.0),
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('inspect', __doc__, argv, _add_arguments, _run, (LogError,))
+    return cli.run('inspect', __doc__, argv, _add_arguments, _run, (LogError, OSError))
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
