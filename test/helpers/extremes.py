@@ -26,18 +26,19 @@ STRINGS = ('', 'x', 'world', '/', '~', 'a/b', 'a b', '\u00e9', '\x1b[31m', 'all'
 
 def parameter_sets(seed: int, allowed: bool = False) -> dict[str, object]:
     """
-    Return a few, or all, parameters at extreme values, by name.
+    Return some parameters at extreme values, by name.
 
-    Most values are in the range of their parameter, at its ends as often as not.  Nothing is set
-    that writes files.
+    Most are in the range of their parameter, at its ends as often as not.  Nothing is set that
+    writes files.
 
-    allowed : only values that the table allows
+    allowed : only values that the table allows, and now and then all parameters
     """
     random_ = random.Random(seed)
     settable = [row for row in parameters.TABLE if not row.name.startswith('record.')]
-    chosen = random_.sample(settable, random_.choice((1, 1, 1, 2, 3, 5, 8, len(settable))))
-    return {row.name: (_any_value if not allowed and random_.random() < 0.2 else _value)(
-        random_, row) for row in chosen}
+    counts = (1, 2, 3, 5, 10, len(settable)) if allowed else (1, 1, 1, 2, 3, 5, 8)
+    chosen = random_.sample(settable, random_.choice(counts))
+    value = _allowed_value if allowed else _value
+    return {row.name: value(random_, row) for row in chosen}
 
 
 def number(random_: random.Random, row: Parameter) -> float | int:
@@ -86,8 +87,7 @@ def actions(seed: int) -> list[tuple[str, object]]:
     return found
 
 
-def _value(random_: random.Random, row: Parameter) -> object:
-    """Return an allowed value."""
+def _allowed_value(random_: random.Random, row: Parameter) -> object:
     default = row.default
     if row.choices:
         return random_.choice(row.choices)
@@ -98,10 +98,10 @@ def _value(random_: random.Random, row: Parameter) -> object:
     return default if isinstance(default, str | tuple) else number(random_, row)
 
 
-def _any_value(random_: random.Random, row: Parameter) -> object:
-    """Return a value of the right type as a rule, in any range."""
+def _value(random_: random.Random, row: Parameter) -> object:
+    """Return a value of the right type as a rule."""
     default = row.default
-    if random_.random() < 0.25:
+    if random_.random() < 0.05:
         return random_.choice((True, 'text', 1, 1.5, [1.0], ['a'], [], random_.choice(NOT_FINITE)))
     if isinstance(default, tuple):
         if isinstance(default[0], str):
@@ -111,7 +111,13 @@ def _any_value(random_: random.Random, row: Parameter) -> object:
         return random_.random() < 0.5
     if isinstance(default, str):
         return random_.choice(row.choices or STRINGS)
-    return random_.choice(INTEGERS) if isinstance(default, int) else _double(random_)
+    bounds = [bound for bound in (row.minimum, row.maximum, row.above) if bound is not None]
+    if isinstance(default, int):
+        return random_.choice([*INTEGERS, *map(int, bounds)])
+    if bounds and random_.random() < 0.3:
+        return random_.choice([float(bound) for bound in bounds])
+    value = _double(random_)
+    return abs(value) if bounds and random_.random() < 0.9 else value
 
 
 def _double(random_: random.Random) -> float:
