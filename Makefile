@@ -40,25 +40,27 @@ SOURCES := $(shell find setup.py setup.cfg package.xml config launch resource rv
     ! -name '.*' ! -name '*~' -print 2>/dev/null)
 
 help:
-	@echo 'make run     simulate the scene config/SCENE.yaml until Ctrl-C and record into $(LOGS)/'
-	@echo '             SCENE=$(SCENE)  (one of: $(SCENES))'
-	@echo '             ARGS=...  more arguments, such as ARGS="-p time_scale:=0.5 -r __ns:=/top"'
-	@echo 'make test    run the tests;  TESTS=... selects some, ARGS=... is passed to pytest, which has'
-	@echo '             WORKERS=$(WORKERS) processes (0: none but its own, as ARGS=--pdb wants)'
-	@echo 'make stress  kill 200 recording nodes (KILLS=...), try random logs, parameters, commands,'
-	@echo '             service calls and disk faults (each SECONDS=600), then 100 000 random tops'
-	@echo '             (STRESS=...) with both solvers; takes two hours'
-	@echo 'make performance  measure node, start-up, a long run, solvers and simulate, and write'
-	@echo '             docs/performance.md; takes an hour and a half, in the environment'
-	@echo '             .venv-benchmark'
-	@echo 'make benchmark  the same, and accuracy, stability and cost compared with other programs,'
-	@echo '             attitude filters and the noise of the IMU; takes three hours'
+	@echo 'make run     simulate a scene until Ctrl-C and record into $(LOGS)/'
+	@echo '             SCENE=$(SCENE), the path of a parameter file or one of'
+	@echo '$(SCENES)' | fold -s -w 65 | sed 's/^/             /'
+	@echo '             ARGS=... adds arguments, such as ARGS="-p time_scale:=0.5"'
+	@echo 'make test    run the tests; TESTS=... selects some, ARGS=... goes to pytest,'
+	@echo '             which has WORKERS=$(WORKERS) processes (0: its own, for ARGS=--pdb)'
+	@echo 'make stress  kill 200 recording nodes (KILLS=...), try random logs, parameters,'
+	@echo '             commands, service calls and disk faults (each SECONDS=600), then'
+	@echo '             100 000 random tops (STRESS=...) with both solvers; two hours'
+	@echo 'make performance'
+	@echo '             measure node, start-up, a long run, solvers and simulate, and write'
+	@echo '             docs/performance.md; an hour and a half, in .venv-benchmark'
+	@echo 'make benchmark'
+	@echo '             the same, and compare accuracy, stability and cost with other'
+	@echo '             programs, attitude filters and the noise of the IMU; three hours'
 	@echo 'make docs    write the interface page, the plain URDF and the pictures'
 	@echo 'make lint    run ruff and mypy'
-	@echo 'make build   build with colcon in a temporary workspace, then test the installation'
+	@echo 'make build   build with colcon in a temporary workspace, test the installation'
 	@echo 'make clean   remove $(VENV) and caches, but no logs'
 	@echo
-	@echo 'PYTHON=$(PYTHON)  interpreter, 3.11 or newer;  VENV=$(VENV)  virtual environment'
+	@echo 'PYTHON=$(PYTHON)  interpreter, 3.11 or newer;  VENV=$(VENV)  environment'
 
 # A name, or the path of a parameter file.
 SCENE_FILE = $(or $(wildcard $(filter %.yaml,$(SCENE))),config/$(SCENE).yaml)
@@ -66,7 +68,7 @@ SCENE_FILE = $(or $(wildcard $(filter %.yaml,$(SCENE))),config/$(SCENE).yaml)
 # One installs at a time: a second `make run` waits here, and finds everything installed.
 run: export ROS_DOMAIN_ID := $(RUN_DOMAIN_ID)
 run: check-scene
-	@flock Makefile $(MAKE) --no-print-directory '$(VENV)/.deps-plot' '$(VENV)/.package'
+	@flock Makefile $(MAKE) --silent --no-print-directory '$(VENV)/.deps-plot' '$(VENV)/.package'
 	@mkdir -p '$(LOGS)'
 	@echo 'Scene $(SCENE), recording into $(LOGS)/, until Ctrl-C. To listen from another terminal of'
 	@echo 'this machine:  export ROS_DOMAIN_ID=$(RUN_DOMAIN_ID)' \
@@ -74,7 +76,12 @@ run: check-scene
 	@exec '$(VENV)/bin/sim_node' --ros-args --params-file '$(SCENE_FILE)' \
 	    -p record.enabled:=true -p 'record.uri:=$(LOGS)/' $(ARGS)
 
+# A preset of an IMU goes on top of a scene; alone it would run the default parameters.
 check-scene:
+	@case '$(abspath $(SCENE_FILE))' in */config/imu/*) \
+	    echo '$(SCENE_FILE) is no scene but an IMU: add it to one of $(SCENES):' \
+	        "make run SCENE=cusp ARGS='--params-file $(SCENE_FILE)'" >&2; exit 2;; \
+	esac
 	@test -f '$(SCENE_FILE)' || { \
 	    echo 'There is no scene "$(SCENE)" ($(SCENE_FILE)). There are: $(SCENES)' >&2; exit 2; }
 

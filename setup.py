@@ -7,15 +7,15 @@ from setuptools import find_packages, setup
 
 NAME = 'spinning_top_sim'
 
-# Executable: the module whose main() it runs; main() returns the exit code.
+# Executable: the function that it runs, which returns the exit code.
 # `ros2 run` looks in lib/<package>, where pip installs no console scripts.  Therefore each
 # executable has a file in scripts/ as well, which pip and colcon install there as data.
 EXECUTABLES = {
-    'sim_node': 'spinning_top_sim.nodes.sim_node',
-    'replay_node': 'spinning_top_sim.nodes.replay_node',
-    'simulate': 'spinning_top_sim.tools.simulate',
-    'recover': 'spinning_top_sim.tools.recover',
-    'inspect': 'spinning_top_sim.tools.inspect',
+    'sim_node': 'spinning_top_sim.nodes.sim_node:main',
+    'replay_node': 'spinning_top_sim.nodes.replay_node:main',
+    'simulate': 'spinning_top_sim.tools.cli:simulate',
+    'recover': 'spinning_top_sim.tools.cli:recover',
+    'inspect': 'spinning_top_sim.tools.cli:inspect',
 }
 
 DATA_FILES = {
@@ -40,7 +40,7 @@ setup(
     packages=find_packages(include=[NAME, f'{NAME}.*']),
     data_files=[(folder, sorted(files)) for folder, files in DATA_FILES.items() if files],
     entry_points={'console_scripts': [
-        f'{name} = {module}:main' for name, module in EXECUTABLES.items()]},
+        f'{name} = {function}' for name, function in EXECUTABLES.items()]},
     zip_safe=True,
     # rclpy and the message packages come from ROS (package.xml), or from the extra `ros` on a
     # machine without ROS.

@@ -1,16 +1,18 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """
-Attitude filters beside the truth: from `imu/data_raw`, compared with `pose`, live or from a log.
+Compare attitude filters, fed from `imu/data_raw`, with the true `pose`, live or
+from a log:
 
-  python examples/attitude_filter.py run.mcap --filter vqf madgwick ekf --plot out.png
+  python examples/attitude_filter.py run.mcap --filter vqf madgwick ekf
   python examples/attitude_filter.py --duration 60 --ros-args -r __ns:=/top
 
-Needs `pip install 'spinning_top_sim[examples]'`.  Frames: x, y, z right-handed, z of the world up
-(REP-103); a resting accelerometer reads +g upwards (REP-145); attitudes are q(world <- IMU).  The
-pose is the body's, so the mounting of the IMU (`imu.rpy`) must be known: a log has it, live it is
---rpy.  An IMU without a magnetometer knows no heading: tilt is compared as it is, heading from the
-end of --settle on.
+Needs `pip install 'spinning_top_sim[examples]'`.  Frames: x, y, z right-handed,
+z of the world up (REP-103); a resting accelerometer reads +g upwards (REP-145);
+attitudes are q(world <- IMU).  The pose is the body's, so the mounting of the
+IMU (`imu.rpy`) must be known: a log has it, live it is --rpy.  An IMU without a
+magnetometer knows no heading: tilt is compared as it is, heading from the end
+of --settle on.  The exit code is 1 where nothing could be compared.
 """
 
 from __future__ import annotations
@@ -139,9 +141,11 @@ class Comparison:
         self._last: tuple[int, np.ndarray, np.ndarray]
         self._estimates: dict[int, Rotation] = {}
         self._truths: dict[int, Rotation] = {}
+        self._missing = [IMU_TOPIC, POSE_TOPIC]
 
     def imu(self, stamp_ns: int, rates: Sequence[float], force: Sequence[float]) -> None:
         """Take a sample: rates [rad/s] and specific force [m/s^2]."""
+        self._came(IMU_TOPIC)
         sample = stamp_ns, np.array(rates, dtype=float), np.array(force, dtype=float)
         if self._period_ns:
             self._advance(sample)
@@ -156,8 +160,13 @@ class Comparison:
 
     def pose(self, stamp_ns: int, attitude: Sequence[float]) -> None:
         """Take the body's true attitude, x, y, z, w."""
+        self._came(POSE_TOPIC)
         self._truths[stamp_ns] = Rotation.from_quat(attitude) * self._mounting
         self._match(stamp_ns)
+
+    def _came(self, topic: str) -> None:
+        if topic in self._missing:
+            self._missing.remove(topic)
 
     def _start(self, sample: tuple[int, np.ndarray, np.ndarray]) -> None:
         self._step = FILTERS[self.name](self._period_ns / NANOSECONDS)
@@ -200,6 +209,8 @@ class Comparison:
 
     def summary(self, settle: float) -> Summary:
         """Return the errors after `settle` seconds.  Raises ValueError where there are none."""
+        if self._missing:
+            raise ValueError(f'{self.name}: no message of {" and ".join(self._missing)} has come')
         if not self.errors:
             raise ValueError(f'{self.name}: no sample of {IMU_TOPIC} had the stamp of a '
                              f'{POSE_TOPIC}')
@@ -326,8 +337,8 @@ def plot(path: Path, comparisons: Sequence[Comparison], settle: float) -> None:
 
 # -------------------------------------------------------------------------------------------- live
 
-def make_node(arguments: argparse.Namespace) -> Any:
-    """Return the node; its `finished` completes after --duration with the exit code."""
+def make_node(comparisons: Sequence[Comparison], duration: float) -> Any:
+    """Return a node that feeds filters; `finished` completes after this much of stamps [s]."""
     from geometry_msgs.msg import PoseStamped
     from rclpy.node import Node
     from rclpy.qos import QoSProfile
@@ -340,8 +351,6 @@ def make_node(arguments: argparse.Namespace) -> Any:
         def __init__(self) -> None:
             super().__init__('attitude_filter')
             self.finished: Future = Future()
-            self._comparisons = [Comparison(name, arguments.rpy or (0.0, 0.0, 0.0))
-                                 for name in arguments.filter]
             self._reported_ns = 0
             # Deep: a sample lost is lost for the filter.
             profile = QoSProfile(depth=1000)
@@ -356,23 +365,23 @@ def make_node(arguments: argparse.Namespace) -> Any:
         def _take(self, message: Any) -> None:
             if self.finished.done():
                 return
-            for comparison in self._comparisons:
+            for comparison in comparisons:
                 take(comparison, message)
-            errors = self._comparisons[0].errors
+            errors = comparisons[0].errors
             if not errors:
                 return
             first_ns, last_ns = errors[0].stamp_ns, errors[-1].stamp_ns
             if last_ns - self._reported_ns >= REPORT_NS:
                 self._reported_ns = last_ns
-                for comparison in filter(lambda one: one.errors, self._comparisons):
+                for comparison in filter(lambda one: one.errors, comparisons):
                     self.get_logger().info(
                         f'{comparison.name} at {(last_ns - first_ns) / NANOSECONDS:.2f} s: tilt '
                         f'error {math.degrees(comparison.errors[-1].tilt):.3g} deg')
-            if arguments.duration and last_ns - first_ns >= arguments.duration * NANOSECONDS:
+            if duration and last_ns - first_ns >= duration * NANOSECONDS:
                 self.finished.set_result(0)
 
         def stop(self) -> None:
-            report(self._comparisons, arguments)
+            """Hold nothing that must be closed."""
 
     return AttitudeFilter()
 
@@ -403,7 +412,11 @@ def main(argv: list[str] | None = None) -> int:
         parser.error(f'--duration {arguments.duration:g} must be more than --settle '
                      f'{arguments.settle:g}: errors count from then on')
     if arguments.log is None:
-        return executable.run('attitude_filter', argv, lambda _: lambda: make_node(arguments))
+        comparisons = [Comparison(name, arguments.rpy or (0.0, 0.0, 0.0))
+                       for name in arguments.filter]
+        code = executable.run('attitude_filter', argv,
+                              lambda _: lambda: make_node(comparisons, arguments.duration))
+        return code or (0 if report(comparisons, arguments) else 1)
     from spinning_top_sim.recording.errors import LogError
     try:
         comparisons = compare(arguments.log, arguments.filter, arguments.namespace, arguments.rpy)

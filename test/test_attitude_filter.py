@@ -129,8 +129,15 @@ def test_after_a_long_gap_or_a_step_back_the_filter_starts_anew(example):
 
 
 def test_nothing_to_compare_is_said(example, logs, capsys):
+    comparison = example.Comparison('vqf')
+    with pytest.raises(ValueError, match='vqf: no message of imu/data_raw and pose has come'):
+        comparison.summary(1.0)
+    comparison.imu(0, (0.0, 0.0, 1.0), (0.0, 0.0, 9.8))
+    with pytest.raises(ValueError, match='no message of pose has come'):
+        comparison.summary(1.0)
+    comparison.pose(1, (0.0, 0.0, 0.0, 1.0))
     with pytest.raises(ValueError, match='no sample of imu/data_raw had the stamp of a pose'):
-        example.Comparison('vqf').summary(1.0)
+        comparison.summary(1.0)
     assert example.main(['it', str(logs['noise']), '--settle', '40']) == 1
     assert '--settle 40' in capsys.readouterr().err
     assert example.main(['it', str(logs['noise']), '--namespace', 'other']) == 1
@@ -185,6 +192,23 @@ def test_live_it_ends_by_sigint_and_tells(example, tmp_path):
         assert node.end(signal.SIGINT) == 0
     assert 'heading drift' in node.out
     assert 'Traceback' not in node.err
+
+
+def test_live_without_a_simulator_it_says_that_nothing_came(tmp_path):
+    from helpers.node_harness import SimNode, wait_for
+
+    with SimNode(tmp_path, namespace='/alone', program=[str(EXAMPLE)]) as node:
+        wait_for('the start', lambda: 'waiting for /alone/imu/data_raw' in node.err)
+        assert node.end(signal.SIGINT) == 1
+    assert 'vqf: no message of imu/data_raw and pose has come' in node.err
+    assert 'Traceback' not in node.err
+
+
+def test_its_help_fits_into_80_columns(example, capsys, monkeypatch):
+    monkeypatch.setenv('COLUMNS', '80')
+    with pytest.raises(SystemExit, match='0'):
+        example.main(['attitude_filter', '--help'])
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
 
 
 @pytest.mark.parametrize(('arguments', 'says'), [

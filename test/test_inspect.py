@@ -606,10 +606,32 @@ def test_a_reader_that_leaves_is_no_error(stepped):
     assert run.wait(60) == 0
 
 
+@pytest.mark.parametrize('tool', ['inspect', 'recover'])
+def test_a_full_output_is_told_in_a_line(stepped, tmp_path, tool):
+    option = ['-o', tmp_path / 'whole.mcap'] if tool == 'recover' else []
+    with open('/dev/full', 'w') as full:
+        run = subprocess.run(
+            [sys.executable, '-m', f'spinning_top_sim.tools.{tool}', stepped, *option],
+            stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+    assert run.returncode == 1
+    assert run.stderr == f'{tool}: [Errno 28] No space left on device\n'
+
+
 def test_wrong_arguments_are_2(capsys):
     with pytest.raises(SystemExit) as ended:
         inspect.main(['--no-such-thing'])
     assert ended.value.code == 2
+
+
+@pytest.mark.parametrize(('option', 'name', 'endings'), [
+    ('--plot', 'page', '.png or .pdf or .svg'), ('--plot', 'page.xyz', '.png or .pdf or .svg'),
+    ('--animate', 'top.mp4', '.gif'), ('--animate', 'top', '.gif')])
+def test_a_picture_whose_name_has_another_ending_is_refused(
+        stepped, tmp_path, capsys, option, name, endings):
+    with pytest.raises(SystemExit, match='2'):
+        inspect.main([str(stepped), option, str(tmp_path / name)])
+    assert f'{name}: must end in {endings}\n' in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize('streams', [['imu'], ['invariants'], ['pose']])

@@ -156,9 +156,9 @@ def test_every_script_is_installed_as_data_and_as_a_command(setup_py):
     assert set(commands) == names
     assert set(dict(setup_py.data_files)[f'lib/{NAME}']) == {f'scripts/{name}' for name in names}
     for name, target in commands.items():
-        module = target.removesuffix(':main')
+        module, function = target.split(':')
         assert (ROOT / f'{module.replace(".", "/")}.py').is_file()
-        assert f'from {module} import main\n' in (ROOT / 'scripts' / name).read_text()
+        assert f'from {module} import {function}\n' in (ROOT / 'scripts' / name).read_text()
 
 
 @pytest.mark.parametrize('script', SCRIPTS, ids=lambda path: path.name)
@@ -179,6 +179,20 @@ def test_a_script_helps_and_does_nothing(script, tmp_path):
     assert done.stdout.startswith(f'usage: {script.name} ')
     assert len(done.stdout.splitlines()) > 8
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize('name', ['simulate', 'inspect', 'recover'])
+def test_ctrl_c_during_the_imports_of_a_tool_is_quiet(name):
+    code = ('import runpy, signal, sys\n'
+            'class Interrupted:\n'
+            '    def find_spec(self, name, path=None, target=None):\n'
+            "        if name == 'spinning_top_sim.recording.errors':\n"
+            '            signal.raise_signal(signal.SIGINT)\n'
+            'sys.meta_path.insert(0, Interrupted())\n'
+            f'runpy.run_path({str(ROOT / "scripts" / name)!r}, run_name="__main__")')
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                          timeout=60, check=False, env={**os.environ, 'PYTHONPATH': str(ROOT)})
+    assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
 
 
 @pytest.mark.parametrize('script', SCRIPTS, ids=lambda path: path.name)
@@ -244,6 +258,23 @@ def test_make_run_names_the_scenes_where_there_is_none_of_a_name():
                               capture_output=True, text=True, timeout=60)
         assert made.returncode == 2
         assert f'There is no scene "{scene}"' in made.stderr and 'looping' in made.stderr
+
+
+@pytest.mark.parametrize('scene', ['imu/bmi088', 'config/imu/bmi088.yaml',
+                                   str(ROOT / 'config/imu/bmi088.yaml')])
+def test_make_run_takes_no_imu_for_a_scene(scene):
+    made = subprocess.run(['make', 'run', f'SCENE={scene}'], cwd=ROOT, check=False,
+                          capture_output=True, text=True, timeout=60)
+    assert made.returncode == 2 and 'Creating' not in made.stdout
+    assert 'bmi088.yaml is no scene but an IMU' in made.stderr and 'looping' in made.stderr
+    assert "ARGS='--params-file " in made.stderr
+
+
+def test_make_help_fits_into_80_columns_and_names_every_scene():
+    told = subprocess.run(['make', 'help'], cwd=ROOT, check=True, capture_output=True, text=True,
+                          timeout=60).stdout
+    assert max(map(len, told.splitlines())) <= 80
+    assert {path.stem for path in SCENES} <= set(told.split())
 
 
 def test_a_second_make_run_waits_while_the_first_installs():

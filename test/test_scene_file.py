@@ -114,7 +114,7 @@ def test_an_unknown_name_is_refused_with_a_likely_one(tmp_path, capsys):
     output = tmp_path / 'run.mcap'
     for arguments, source in ((['--params', str(path)], str(path)),
                               (['-p', 'spin.l33:=1.0'], 'spin.l33:=1.0')):
-        assert main(['-o', str(output), '--duration', '1', *arguments]) == 1
+        assert main(['-o', str(output), '--duration', '1', *arguments]) == 2
         assert capsys.readouterr().err == (
             f'simulate: {source}: there is no parameter spin.l33; did you mean spin.l3?\n')
     assert not output.exists()

@@ -143,11 +143,16 @@ def test_a_table_of_the_truth(tmp_path):
     assert table == pytest.approx(np.loadtxt(exact, delimiter=',', skiprows=1), abs=1e-9)
 
 
-def test_parquet(tmp_path):
+@pytest.fixture
+def parquet():
     try:
         from pyarrow import parquet
     except ImportError as error:        # absent, or made for another NumPy
         pytest.skip(str(error))
+    return parquet
+
+
+def test_parquet(tmp_path, parquet):
     path = simulate(tmp_path / 'truth.parquet', '--duration', 1)
     table = parquet.read_table(path)
     assert table.num_rows == 101 and table.column_names[:2] == ['t', 'theta']
@@ -195,15 +200,53 @@ def events_of(log):
     (['--duration', '1', '--epoch=-3'], '--epoch -3'),
     (['--duration', '10', '--epoch', '2147483640'], '2038'),
     (['--duration', '1e300'], 'must be'), (['--duration', '3e9'], 'must be'),
-    (['--duration', '1', '--params', '/nowhere.yaml'], '/nowhere.yaml'),
     (['--duration', '1', '--command', '1:2'], '--command 1:2'),
     (['--duration', '1', '--command=-1:2:2'], '--command -1:2:2'),
     (['--duration', '1', '--command', '1.000000001:2:1.5'], 'end of the run, 1 s'),
     (['--duration', '1', '--command', 'nan:2:1.5'], '--command nan:2:1.5'),
     (['--duration', '1', '-p', 'spin.l3:=[1'], 'spin.l3:=[1 is not YAML'),
-    (['--duration', '1', '-p', 'initial.theta:=0.0', '--command', '0.5:2.0:1.0'], 'at a pole'),
+    (['--duration', '1', '--command', '0.5:nan:2'], '--command 0.5:nan:2: L3 and LZ must be fin'),
+    (['--duration', '1', '--command', '0.5:2:-inf'], 'L3 and LZ must be finite'),
+    (['--duration', '1', '--command', '0.5:1e20:1'], '--command 0.5:1e20:1: L3 and LZ must'),
+    (['--duration', '1', '--command', '0.5:1:1e300'], 'as must be the energy'),
     (['--duration', '1', '-p', 'initial.theta:=0.0', '-p', 'solver.equations:=euler'],
      'transport'),
+    (['--duration', '1', '-p', 'spin.l3:=1e20'], 'no motion from'),
+])
+def test_wrong_arguments_are_told_in_a_line_and_leave_no_file(
+        tmp_path, capsys, arguments, message):
+    for name in ('run.mcap', 'run.csv'):
+        assert main(['-o', str(tmp_path / name), '--quiet', *arguments]) == 2
+        error = capsys.readouterr().err
+        assert message in error and error.count('\n') == 1 and 'Traceback' not in error
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(('arguments', 'message'), [
+    (['-p', 'initial.theta:=0.0', '-p', 'solver.method:=exact', '--command', '0.5:2.0:1.0'],
+     'simulate: --command 0.5:2.0:1.0: lz = 1.0 kg m^2/s with l3 = 2.0: the axis is at a pole'),
+    (['-p', 'solver.method:=exact', '--command', '0.5:1.0:1e18'],
+     'simulate: --command 0.5:1.0:1e+18: no motion from')])
+@pytest.mark.parametrize('name', ['run.mcap', 'run.csv', 'run.parquet'])
+def test_a_command_that_the_state_refuses_ends_the_run_there(
+        request, tmp_path, capsys, name, arguments, message):
+    table = request.getfixturevalue('parquet') if name == 'run.parquet' else None
+    path = tmp_path / name
+    assert main(['-o', str(path), '--quiet', '--duration', '1', *arguments]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(message) and error.count('\n') == 1
+    assert error.endswith('; the file holds the run up to t = 0.5 s\n')
+    if name == 'run.mcap':
+        log, _ = read(path)
+        assert max(log['/pose']) == 500_000_000
+    elif name == 'run.csv':
+        assert np.loadtxt(path, delimiter=',', skiprows=1)[-1, 0] == 0.5
+    else:
+        assert table.read_table(path)['t'].to_pylist()[-1] == 0.5
+
+
+@pytest.mark.parametrize(('arguments', 'message'), [
+    (['--duration', '1', '--params', '/nowhere.yaml'], 'simulate: /nowhere.yaml: No such file'),
     (['--duration', '1', '-o', '/nowhere/run.mcap'],
      'simulate: cannot record to /nowhere/run.mcap: there is no directory /nowhere\n'),
     (['--duration', '1', '-o', '/proc/run.mcap'],
@@ -231,13 +274,13 @@ def test_a_params_file_that_is_no_yaml_or_of_another_node(tmp_path, capsys):
                           ('[1, 2]', 'no parameters for the node spinning_top')):
         broken.write_text(text)
         assert main(['-o', str(tmp_path / 'r.mcap'), '--params', str(broken), '--duration', '1',
-                     '--quiet']) == 1
+                     '--quiet']) == 2
         assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('name', ['run', 'run.bag', 'run.mcap.zst', 'run.CSV', '.mcap', 'run.'])
 def test_an_unknown_extension_is_refused(tmp_path, capsys, name):
-    assert main(['-o', str(tmp_path / name), '--duration', '1', '--quiet']) == 1
+    assert main(['-o', str(tmp_path / name), '--duration', '1', '--quiet']) == 2
     error = capsys.readouterr().err
     assert name in error and '.mcap, .csv, .parquet' in error
     assert list(tmp_path.iterdir()) == []
@@ -254,8 +297,23 @@ def test_an_unknown_extension_is_refused(tmp_path, capsys, name):
 def test_what_is_refused_leaves_no_file(tmp_path, monkeypatch, arguments):
     monkeypatch.setitem(sys.modules, 'pyarrow', None)
     monkeypatch.chdir(tmp_path)
-    assert main([*arguments, '--duration', '1', '--quiet']) == 1
+    assert main([*arguments, '--duration', '1', '--quiet']) in (1, 2)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_parquet_without_pyarrow_names_the_extra(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'pyarrow', None)
+    assert main(['-o', str(tmp_path / 'run.parquet'), '--duration', '1', '--quiet']) == 1
+    assert "pip install 'spinning_top_sim[parquet]'" in capsys.readouterr().err
+
+
+def test_it_runs_without_standard_streams(tmp_path):
+    path = tmp_path / 'run.csv'
+    run = subprocess.run(
+        ['bash', '-c', '"$0" -m spinning_top_sim.tools.simulate -o "$1" --duration 1 >&- 2>&-',
+         sys.executable, path], timeout=60, check=False)
+    assert run.returncode == 0
+    assert len(np.loadtxt(path, delimiter=',', skiprows=1)) == 101
 
 
 def test_nothing_is_overwritten(tmp_path, capsys):

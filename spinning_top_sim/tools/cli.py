@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the executables share: exit codes, errors in one line, progress, and tables of text."""
+"""What the tools share: their start, exit codes, errors in one line, progress, and tables."""
 
 import argparse
 import contextlib
+import importlib
 import os
 import shutil
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import TextIO
 
 OK = 0
 FAILED = 1
+WRONG_USAGE = 2             # as argparse has it
 INTERRUPTED = 130
 
 TEXT_WIDTH = 118            # without a terminal
@@ -19,10 +22,30 @@ LINE_EVERY_S = 10.0         # of progress, without a terminal
 GAP = '  '                  # before each column of a table
 
 
+def _start(name: str) -> int:
+    """Import a tool and run it; return its exit code, also if Ctrl-C interrupts the imports."""
+    try:
+        return importlib.import_module(f'spinning_top_sim.tools.{name}').main()
+    except KeyboardInterrupt:
+        return INTERRUPTED
+
+
+# The executables.
+simulate, inspect, recover = (partial(_start, name) for name in ('simulate', 'inspect', 'recover'))
+
+
 def run(name: str, help_text: str | None, argv: Sequence[str] | None,
         add_arguments: Callable[[argparse.ArgumentParser], object],
         command: Callable[[argparse.Namespace], int], errors: tuple[type[Exception], ...]) -> int:
-    """Run a command; return its code, FAILED after one of `errors`, INTERRUPTED after Ctrl-C."""
+    """
+    Run a command; return its exit code.
+
+    That is INTERRUPTED after Ctrl-C, and after one of `errors` FAILED; after a ValueError among
+    them, which wrong arguments raise, WRONG_USAGE.
+    """
+    # A closed stream is None, and a file that is opened would take its place.
+    sys.stdout = sys.stdout or open(os.devnull, 'w')    # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, 'w')    # noqa: SIM115
     parser = argparse.ArgumentParser(prog=name, description=help_text,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     add_arguments(parser)
@@ -40,7 +63,7 @@ def run(name: str, help_text: str | None, argv: Sequence[str] | None,
         if isinstance(error, OSError) and error.filename is not None:
             what = f'{error.filename}: {error.strerror}'
         print_line(f'{name}: {what}', sys.stderr)
-        return FAILED
+        return WRONG_USAGE if isinstance(error, ValueError) else FAILED
     except KeyboardInterrupt:
         print_line(f'{name}: interrupted', sys.stderr)
         return INTERRUPTED

@@ -21,6 +21,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,18 +50,26 @@ ROWS = (('nutation period [s]', 'nutation_period', 1.0),
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('inspect', __doc__, argv, _add_arguments, _run, (LogError,))
+    return cli.run('inspect', __doc__, argv, _add_arguments, _run, (LogError, OSError))
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('log', type=Path, help='an MCAP file, of this package or any other')
-    add('--plot', type=Path, metavar='FILE',
+    add('--plot', type=partial(_picture, ('.png', '.pdf', '.svg')), metavar='FILE',
         help='draw a page of figures (.png, .pdf, .svg); needs matplotlib')
-    add('--animate', type=Path, metavar='GIF', help='draw the turning top; needs matplotlib')
+    add('--animate', type=partial(_picture, ('.gif',)), metavar='GIF',
+        help='draw the turning top; needs matplotlib')
     add('--verify', action='store_true',
         help='compute the run again and compare every message byte for byte')
     add('--json', action='store_true', help='print everything as JSON')
+
+
+def _picture(endings: tuple[str, ...], name: str) -> Path:
+    """Return the path of a picture.  Raises ArgumentTypeError for another ending than these."""
+    if Path(name).suffix.lower() not in endings:
+        raise argparse.ArgumentTypeError(f'{name}: must end in {" or ".join(endings)}')
+    return Path(name)
 
 
 def _run(arguments: argparse.Namespace) -> int:

@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # An exception, so that the unfinished output is removed.
     previous = signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     try:
-        return cli.run('recover', __doc__, argv, _add_arguments, _run, (LogError,))
+        return cli.run('recover', __doc__, argv, _add_arguments, _run, (LogError, OSError))
     finally:
         signal.signal(signal.SIGTERM, previous)
 

@@ -5,8 +5,8 @@ or a table of the true states (CSV, Parquet).
 
 exit codes:
   0    done
-  1    the run cannot be simulated or written; the reason is printed
-  2    wrong arguments
+  1    a file cannot be read or written, or the run ends early
+  2    wrong arguments or parameters; no file is made
   130  interrupted; the log holds what was computed before
 """
 
@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import math
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,13 +30,14 @@ from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.pipeline import MOST_RATE, Simulation
 from spinning_top_sim.streams.schedule import offline_block_ns, offline_targets
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools import cli
 from spinning_top_sim.tools.scene_file import is_of_ros, parse_assignment, read_scene
 
 if TYPE_CHECKING:
+    from spinning_top_sim.physics.top import Top
     from spinning_top_sim.recording.mcap_writer import McapWriter
 
 FORMATS = ('mcap', 'csv', 'parquet')
@@ -81,28 +83,32 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    values = _parameters(arguments)
-    if not 0.0 <= arguments.epoch <= 2.0 ** 31:
-        raise ValueError(f'--epoch {arguments.epoch!r}: must be from 0 to {2 ** 31} s')
-    stops = parse_stops(arguments.command, round(values['duration'] * NANOSECONDS))
     output: Path = arguments.output
     file_format = arguments.format or output.suffix[1:]
     if file_format not in FORMATS:
         raise ValueError(f'{output}: the name must end in .{", .".join(FORMATS)}, or --format be '
                          'given')
+    if not 0.0 <= arguments.epoch <= 2.0 ** 31:
+        raise ValueError(f'--epoch {arguments.epoch!r}: must be from 0 to {2 ** 31} s')
+    values = _parameters(arguments)
+    simulation = Simulation(values, round(arguments.epoch * NANOSECONDS))
+    stops = _parse_stops(arguments.command, round(values['duration'] * NANOSECONDS),
+                         simulation.top)
     with cli.progress('simulated', values['duration'], 's', quiet=arguments.quiet) as show:
         if file_format == 'mcap':
-            summary = write_log(output, values, stops, show,
-                                round(arguments.epoch * NANOSECONDS), arguments.namespace)
+            summary = _write_log(output, simulation, stops, show, arguments.namespace)
         else:
-            summary = write_table(output, file_format, values, stops, show)
+            period_ns = max(1, round(NANOSECONDS / values['pose.rate']))
+            write = _write_csv if file_format == 'csv' else _write_parquet
+            write(output, _rows(simulation, period_ns, stops, show))
+            summary = f'{stops[-1][0] // period_ns + 1} rows of {", ".join(UNITS)}'
     if not arguments.quiet:
         cli.print_line(f'{output}: {summary}')
     return cli.OK
 
 
 def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the checked parameters of the command line.  Raises ValueError."""
+    """Return the checked parameters of the command line.  Raises ValueError or OSError."""
     given: dict[str, object] = {}
     for path in arguments.params:
         given.update(read_scene(path))
@@ -116,8 +122,12 @@ def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
     return values
 
 
-def parse_stops(commands: Sequence[str], duration_ns: int) -> list[Stop]:
-    """Return the commands (T:L3:LZ) in the order of their application, and the end of the run."""
+def _parse_stops(commands: Sequence[str], duration_ns: int, top: Top) -> list[Stop]:
+    """
+    Return the commands (T:L3:LZ) in the order of their application, and the end of the run.
+
+    Raises ValueError for a command that no state of the top could take.
+    """
     stops: list[Stop] = []
     for text in commands:
         try:
@@ -128,13 +138,28 @@ def parse_stops(commands: Sequence[str], duration_ns: int) -> list[Stop]:
         if not 0 <= at_ns <= duration_ns:
             raise ValueError(f'--command {text}: T must be from 0 to the end of the run, '
                              f'{duration_ns / NANOSECONDS:g} s')
+        # At any tilt the momentum across the axis is at least sqrt(Lz^2 - L3^2).
+        least_energy = (abs(lz) - abs(l3)) * (abs(lz) + abs(l3)) / (2.0 * top.lambda1)
+        if not (abs(l3) / top.lambda3 <= math.tau * MOST_RATE and least_energy < math.inf):
+            raise ValueError(f'--command {text}: L3 and LZ must be finite, as must be the energy, '
+                             f'and the spin at most {MOST_RATE:.2g} turns a second')
         stops.append((at_ns, (l3, lz)))
     # The sort is stable: commands at the same time keep their order.
     return [*sorted(stops, key=lambda stop: stop[0]), (duration_ns, None)]
 
 
-def write_log(path: Path, values: Mapping[str, Any], stops: Sequence[Stop],
-              show: Callable[[float], object], epoch_ns: int, namespace: str) -> str:
+def _command(simulation: Simulation, l3: float, lz: float) -> None:
+    """Apply a command.  Raises IntegrationError where the state then cannot take it."""
+    try:
+        simulation.command(l3, lz)
+    except ValueError as error:
+        t = simulation.now_ns / NANOSECONDS
+        raise IntegrationError(f'--command {t!r}:{l3!r}:{lz!r}: {error}; the file holds the run '
+                               f'up to t = {t!r} s') from error
+
+
+def _write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
+               show: Callable[[float], object], namespace: str) -> str:
     """
     Simulate a run into a new log; return the number of messages and the size of the file.
 
@@ -142,11 +167,10 @@ def write_log(path: Path, values: Mapping[str, Any], stops: Sequence[Stop],
 
     stops : in ascending order of time, the last one is the end of the run
     show : takes the simulated time reached [s]
-    epoch_ns : stamp of t = 0 [ns]
     """
     from spinning_top_sim.recording.writer import create_file  # noqa: PLC0415 - needs mcap
 
-    simulation = Simulation(values, epoch_ns)
+    values, epoch_ns = simulation.values, simulation.epoch_ns
     streams = journal.recorded_streams(simulation.streams, values)
     topics = [RecordedTopic(journal.resolve_topic(name, namespace), type_name)
               for name, type_name in (*((stream.topic, stream.type_name) for stream in streams),
@@ -163,7 +187,7 @@ def write_log(path: Path, values: Mapping[str, Any], stops: Sequence[Stop],
             finally:                # also what was computed before the motion could not go on
                 writer.write_blocks()
             if momenta is not None:
-                simulation.command(*momenta)
+                _command(simulation, *momenta)
                 t_ns, l3, lz = simulation.history[-1]
                 writer.write(events_topic, epoch_ns + t_ns, journal.event(
                     'command', t_ns, simulation.now_ns, l3=l3, lz=lz))
@@ -173,7 +197,13 @@ def write_log(path: Path, values: Mapping[str, Any], stops: Sequence[Stop],
 
 
 class _LogWriter:
-    """Writes a log in a thread: compression and the file system leave Python to others."""
+    """
+    Writes a log in a thread: compression and the file system leave Python to others.
+
+    The blocks of all streams up to one time become one chunk, which one thread compresses and
+    writes while the next blocks are computed.  At most one chunk is on its way, and everything
+    else waits for it: the order in the file is that of the calls, however threads are scheduled.
+    """
 
     def __init__(self, file: McapWriter, streams: Sequence[Stream]) -> None:
         self._file, self._streams = file, streams
@@ -211,24 +241,13 @@ class _LogWriter:
             self._file.finish()
 
 
-def write_table(path: Path, file_format: str, values: Mapping[str, Any], stops: Sequence[Stop],
-                show: Callable[[float], object]) -> str:
-    """
-    Simulate a run into a new table of states, on the grid of `pose.rate`; return what it holds.
-
-    file_format : 'csv' or 'parquet'
-    stops, show : see `write_log`
-    """
-    period_ns = max(1, round(NANOSECONDS / values['pose.rate']))
-    # Before there is a file: there may be no motion.
-    blocks = _rows(Simulation(values), period_ns, stops, show)
-    (_write_csv if file_format == 'csv' else _write_parquet)(path, blocks)
-    return f'{stops[-1][0] // period_ns + 1} rows of {", ".join(UNITS)}'
-
-
 def _rows(simulation: Simulation, period_ns: int, stops: Sequence[Stop],
           show: Callable[[float], object]) -> Iterator[NDArray[np.float64]]:
-    """Yield blocks (columns, n) of the table.  A command changes the rows after its time."""
+    """
+    Yield blocks (columns, n) of the table of states.  A command changes the rows after its time.
+
+    stops, show : see `_write_log`
+    """
     next_ns = 0
     for target_ns, momenta in offline_targets(0, stops, ROWS_AT_ONCE * period_ns):
         times = range(next_ns, target_ns + 1, period_ns)
@@ -241,7 +260,7 @@ def _rows(simulation: Simulation, period_ns: int, stops: Sequence[Stop],
             next_ns = times[-1] + period_ns
         simulation.advance(target_ns)
         if momenta is not None:
-            simulation.command(*momenta)
+            _command(simulation, *momenta)
         show(target_ns / NANOSECONDS)
 
 
@@ -254,12 +273,13 @@ def _write_csv(path: Path, blocks: Iterable[NDArray[np.float64]]) -> None:
 
 
 def _write_parquet(path: Path, blocks: Iterable[NDArray[np.float64]]) -> None:
-    """Write a Parquet file.  Raises ValueError, and makes no file, where pyarrow is missing."""
+    """Write a Parquet file.  Raises RecordingError, and makes no file, without pyarrow."""
     try:
         import pyarrow as pa  # noqa: PLC0415
         from pyarrow import parquet  # noqa: PLC0415
     except ImportError as error:
-        raise ValueError(f'parquet needs the Python package pyarrow: {error}') from error
+        raise RecordingError("parquet needs pyarrow: pip install 'spinning_top_sim[parquet]' "
+                             f'({error})') from error
     schema = pa.schema([(name, pa.float64()) for name in UNITS])
     with open(path, 'xb') as file, parquet.ParquetWriter(file, schema) as writer:
         for rows in blocks:

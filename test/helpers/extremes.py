@@ -8,6 +8,7 @@ it, or refuse it in one clear line.
 
 from __future__ import annotations
 
+import math
 import random
 import sys
 
@@ -23,17 +24,39 @@ INTEGERS = (0, 1, -1, 2, 14, 1000, 2 ** 31 - 1, 2 ** 31, 2 ** 53 + 1, 2 ** 63 - 
 STRINGS = ('', 'x', 'world', '/', '~', 'a/b', 'a b', '\u00e9', '\x1b[31m', 'all', 'x' * 300, '..')
 
 
-def parameter_sets(seed: int) -> dict[str, object]:
+def parameter_sets(seed: int, allowed: bool = False) -> dict[str, object]:
     """
-    Return one to eight parameters at extreme values, by name.
+    Return some parameters at extreme values, by name.
 
     Most are in the range of their parameter, at its ends as often as not.  Nothing is set that
     writes files.
+
+    allowed : only values that the table allows, and now and then all parameters
     """
     random_ = random.Random(seed)
     settable = [row for row in parameters.TABLE if not row.name.startswith('record.')]
-    chosen = random_.sample(settable, random_.choice((1, 1, 1, 2, 3, 5, 8)))
-    return {row.name: _value(random_, row) for row in chosen}
+    counts = (1, 2, 3, 5, 10, len(settable)) if allowed else (1, 1, 1, 2, 3, 5, 8)
+    chosen = random_.sample(settable, random_.choice(counts))
+    value = _allowed_value if allowed else _value
+    return {row.name: value(random_, row) for row in chosen}
+
+
+def number(random_: random.Random, row: Parameter) -> float | int:
+    """Return an allowed number: an end of the range, the default, or of any magnitude."""
+    low = row.minimum if row.minimum is not None else (
+        -LARGEST if row.above is None else math.nextafter(row.above, 1.0))
+    high = LARGEST if row.maximum is None else row.maximum
+    size = row.smallest or 0.0
+    wanted = random_.choice((low, high, _default(row), _double(random_), _double(random_),
+                             random_.uniform(-10.0, 10.0)))
+    if low >= 0.0:
+        wanted = abs(wanted)
+    chosen = min(max(wanted if abs(wanted) >= size else 0.0, low), high)
+    return int(chosen) if isinstance(row.default, int) else chosen
+
+
+def _default(row: Parameter) -> float:
+    return row.default if isinstance(row.default, int | float) else 1.0
 
 
 def commands(seed: int) -> list[list[float]]:
@@ -62,6 +85,17 @@ def actions(seed: int) -> list[tuple[str, object]]:
             'wait': lambda seed=inner: (seed % 100) / 1000.0,
         }.get(kind, lambda: None)()))
     return found
+
+
+def _allowed_value(random_: random.Random, row: Parameter) -> object:
+    default = row.default
+    if row.choices:
+        return random_.choice(row.choices)
+    if isinstance(default, bool):
+        return random_.random() < 0.5
+    if isinstance(default, tuple) and isinstance(default[0], float):
+        return [number(random_, row) for _ in default]
+    return default if isinstance(default, str | tuple) else number(random_, row)
 
 
 def _value(random_: random.Random, row: Parameter) -> object:
