@@ -320,12 +320,13 @@ def test_a_scene_holds_parameters_that_the_node_takes(scene):
                             if not name.startswith('qos_overrides.')})
 
 
-@pytest.mark.parametrize('script', SCRIPTS, ids=lambda script: script.name)
-def test_ctrl_c_during_the_imports_of_a_script_leaves_no_traceback(script, tmp_path):
+@pytest.mark.parametrize('name', ['sim_node', 'replay_node'])
+def test_ctrl_c_during_the_imports_of_a_node_is_quiet(name, tmp_path):
     (tmp_path / NAME).mkdir()
     (tmp_path / NAME / '__init__.py').write_text(
         'import signal\nsignal.raise_signal(signal.SIGINT)\n')
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False,
+    done = subprocess.run([sys.executable, ROOT / 'scripts' / name], capture_output=True,
+                          text=True, check=False, timeout=60,
                           env={**os.environ, 'PYTHONPATH': str(tmp_path)})
     assert done.returncode == -signal.SIGINT
     assert done.stderr == done.stdout == ''
