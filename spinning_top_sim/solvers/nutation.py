@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column, Number
-from spinning_top_sim.solvers.decimal_math import ZERO, double_double
+from spinning_top_sim.solvers.decimal_math import double_double
 from spinning_top_sim.solvers.theta_series import TERMS, Series
 from spinning_top_sim.solvers.theta_setup import Factor, ThetaMotion
 from spinning_top_sim.solvers.times import Rate, Times
@@ -50,10 +50,9 @@ class _FactorSeries:
 
     def __init__(self, name: str, factor: Factor, odd: int) -> None:
         series = factor.odd if odd else factor.even
-        imag = series.imag or Series('cos even', (ZERO,))
         self.real = _coefficients(series.real.scaled(Decimal(factor.sign)), name)
-        self.imag = _coefficients(imag)
-        self._real_prefactor, self._imag_prefactor = series.real.prefactor, imag.prefactor
+        self.imag = _coefficients(series.imag)
+        self._prefactors = series.real.prefactor, series.imag.prefactor
         self._sense, self._drift = factor.sense, float(factor.drift)
         self._crosses, self.has_zero = factor.crosses, series.has_zero
 
@@ -63,10 +62,10 @@ class _FactorSeries:
         polynomial = _horner(self.real, xi)
         if self._crosses:
             polynomial = flip * polynomial
-        real = prefactors[self._real_prefactor] * polynomial
+        real = prefactors[self._prefactors[0]] * polynomial
         if not self._sense:
             return real, 0.0 * y, polynomial if self.has_zero else real
-        imag = prefactors[self._imag_prefactor] * _horner(self.imag, xi)
+        imag = prefactors[self._prefactors[1]] * _horner(self.imag, xi)
         modulus = np.hypot(real, imag)          # its square may be too small for a double
         return modulus, self._drift * y + self._sense * np.arctan2(imag, real), modulus
 
