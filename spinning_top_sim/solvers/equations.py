@@ -60,6 +60,9 @@ class TransportEquations(Equations):
 
     rtol, atol : tolerated error of a step; the unknowns are scaled to 1, so the two add up
     carried_share : c/L3
+
+    Attributes
+    ----------
     spin_rate : chi [rad/s]
     uniform_rates : rate of the uniform part of alpha's phase (see `unwrap`), in the frame that is
         stepped and in the body [rad/s].  They differ by chi/2.  Those of beta have the other sign.

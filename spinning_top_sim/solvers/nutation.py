@@ -52,7 +52,7 @@ class _FactorSeries:
         series = factor.odd if odd else factor.even
         self.real = _coefficients(series.real.scaled(Decimal(factor.sign)), name)
         self.imag = _coefficients(series.imag)
-        self._prefactors = series.real.prefactor, series.imag.prefactor
+        self._real_prefactor, self._imag_prefactor = series.real.prefactor, series.imag.prefactor
         self._sense, self._drift = factor.sense, float(factor.drift)
         self._crosses, self.has_zero = factor.crosses, series.has_zero
 
@@ -62,10 +62,10 @@ class _FactorSeries:
         polynomial = _horner(self.real, xi)
         if self._crosses:
             polynomial = flip * polynomial
-        real = prefactors[self._prefactors[0]] * polynomial
+        real = prefactors[self._real_prefactor] * polynomial
         if not self._sense:
             return real, 0.0 * y, polynomial if self.has_zero else real
-        imag = prefactors[self._prefactors[1]] * _horner(self.imag, xi)
+        imag = prefactors[self._imag_prefactor] * _horner(self.imag, xi)
         modulus = np.hypot(real, imag)          # its square may be too small for a double
         return modulus, self._drift * y + self._sense * np.arctan2(imag, real), modulus
 
@@ -135,11 +135,7 @@ class NutationPhase:
 
 
 class Nutation:
-    """
-    The nutation of one motion.
-
-    Raises ValueError if an amplitude or a rate is out of the range in which doubles hold it.
-    """
+    """The nutation of one motion; ValueError if doubles cannot hold an amplitude or a rate."""
 
     def __init__(self, motion: ThetaMotion, start_theta: float) -> None:
         # Even and odd quarter periods.
