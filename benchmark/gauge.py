@@ -5,7 +5,7 @@ Measure the choice of c in the transport equations, the projection and the dense
     PYTHONPATH=. python benchmark/gauge.py
 
 The tables have the evaluations for a given error over c/L3
-(spinning_top_sim/solvers/transport.py), the errors with and without projection onto the
+(spinning_top_sim/solvers/equations.py), the errors with and without projection onto the
 invariants, and the errors at the ends of steps and between them.
 """
 
@@ -20,7 +20,7 @@ from cases import CUSP, HEAVY_TOP, LOOPING, NEAR_POLE, SLOW, TOY_60, TOY_200, Ca
 from peers import angles_between
 
 from spinning_top_sim.solvers.dormand_prince import Integrator, Interpolants, Step
-from spinning_top_sim.solvers.transport import TransportEquations, Unknowns
+from spinning_top_sim.solvers.equations import TransportEquations, Unknowns
 
 CASES = (CUSP, TOY_60, TOY_200, LOOPING, SLOW, NEAR_POLE, HEAVY_TOP)
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)

@@ -77,8 +77,8 @@ class Equations(ABC):
         """Return y'' from y and y': rows of components (k, n), real and imaginary parts apart."""
 
     @abstractmethod
-    def error(self, y: Vector, y_new: Vector, difference: Vector) -> float:
-        """Return the largest error estimate over what is tolerated: a step passes at <= 1."""
+    def errors(self, y: Vector, y_new: Vector, difference: Vector) -> tuple[float, ...]:
+        """Return each error estimate over what is tolerated: a step passes if all are <= 1."""
 
     def accepted(self, y: Vector, y_new: Vector) -> Vector:
         """
@@ -87,11 +87,6 @@ class Equations(ABC):
         Raises IntegrationError if it cannot be trusted.
         """
         return y_new
-
-
-def largest(errors: Sequence[float]) -> float:
-    """Return the largest error, infinity if one is no number: `max` may pass over a NaN."""
-    return max(errors) if sum(errors) < math.inf else math.inf
 
 
 StepFunction = Callable[..., tuple[Vector, Vector, Vector]]
@@ -175,8 +170,9 @@ class Integrator:
                     f'({equations.name} equations)')
             y_new, derivative_new, difference = self._step(equations.derivative, h, y, derivative)
             self.evaluations += 6
-            error = equations.error(y, y_new, difference)
-            # An infinite one shrinks the step until that collapses.
+            errors = equations.errors(y, y_new, difference)
+            # `max` may pass over a NaN.  An infinite error shrinks the step until that collapses.
+            error = max(errors) if sum(errors) < math.inf else math.inf
             factor = max(SHRINK, SAFETY * error ** -0.2) if error else GROW
             if error <= 1.0:
                 break

@@ -44,7 +44,6 @@ class ExactSolution:
 
     Attributes
     ----------
-    top : Top
     start : State with theta in [0, pi]; a `ContinuedState` is taken, whose theta may be any number
     nutation_period : [s], None if theta is constant
     mean_precession_rate, mean_spin_rate : [rad/s], over a nutation
@@ -53,7 +52,7 @@ class ExactSolution:
     time_limit, ns_limit : the farthest time either way [s], [ns]
 
     Raises ValueError for motions whose constants doubles cannot hold, and, from every evaluation,
-    for times at which a phase exceeds 2^52 turns.
+    for times that are not of the kind that it takes or beyond the limits.
     """
 
     steps = evaluations = 0
@@ -142,8 +141,6 @@ class ExactSolution:
             separatrix_distance=self.m1,
             gyroscopic_ratio=start.l3 * start.l3 / weight if weight else math.inf)
 
-    # --------------------------------------------------- evaluation, see `Propagator`
-
     def reach(self, ns: int, max_steps: int | None = None) -> bool:
         return True                     # there are no steps to take
 
@@ -154,19 +151,11 @@ class ExactSolution:
         return self
 
     def states(self, times_ns: NDArray[np.int64] | range) -> States:
-        """
-        Return the states at integer nanoseconds (n,) after the start, in any order, of any sign.
-
-        Raises ValueError if `times_ns` is not of that kind, or a time is too far away.
-        """
+        """Return the states at integer nanoseconds (n,), in any order and of any sign."""
         return self._states(Times.from_ns(times_ns), self.ns_limit, 'ns')
 
     def states_at_seconds(self, t: Column) -> States:
-        """
-        Return the states at t (n,) [s] after the start, in any order and of any sign.
-
-        Raises ValueError if a time is not finite or too far away.
-        """
+        """Return the states at t (n,) [s], in any order and of any sign."""
         return self._states(Times.from_seconds(t), self.time_limit, 's')
 
     def _states(self, times: Times, limit: float, unit: str) -> States:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column
-from spinning_top_sim.solvers.decimal_math import ONE, ZERO, pi, sinh_cosh
+from spinning_top_sim.solvers.decimal_math import ONE, pi, sinh_cosh
 from spinning_top_sim.solvers.nutation import QUARTER_PERIOD_ANGLE, NutationPhase
 from spinning_top_sim.solvers.rotations import STEP_ANGLE, Rotations, Scratch
 from spinning_top_sim.solvers.theta_series import Series
@@ -121,8 +121,7 @@ class AttitudeSeries:
 def _real_and_imaginary(factor: Factor, sense: Decimal) -> tuple[Series, Series]:
     """Return `sense` times s J, and R, of a factor about even quarter periods."""
     branch = factor.full_circle or factor.even
-    imag = branch.imag or Series('cos even', (ZERO,))
-    return imag.scaled(sense * factor.sense), branch.real.scaled(Decimal(factor.sign))
+    return branch.imag.scaled(sense * factor.sense), branch.real.scaled(Decimal(factor.sign))
 
 
 def _polynomial(series: Series, largest_xi: Decimal) -> list[float]:

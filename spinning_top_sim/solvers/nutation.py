@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column, Number
-from spinning_top_sim.solvers.decimal_math import ZERO, double_double
+from spinning_top_sim.solvers.decimal_math import double_double
 from spinning_top_sim.solvers.theta_series import TERMS, Series
 from spinning_top_sim.solvers.theta_setup import Factor, ThetaMotion
 from spinning_top_sim.solvers.times import Rate, Times
@@ -50,10 +50,9 @@ class _FactorSeries:
 
     def __init__(self, name: str, factor: Factor, odd: int) -> None:
         series = factor.odd if odd else factor.even
-        imag = series.imag or Series('cos even', (ZERO,))
         self.real = _coefficients(series.real.scaled(Decimal(factor.sign)), name)
-        self.imag = _coefficients(imag)
-        self._real_prefactor, self._imag_prefactor = series.real.prefactor, imag.prefactor
+        self.imag = _coefficients(series.imag)
+        self._real_prefactor, self._imag_prefactor = series.real.prefactor, series.imag.prefactor
         self._sense, self._drift = factor.sense, float(factor.drift)
         self._crosses, self.has_zero = factor.crosses, series.has_zero
 
@@ -136,11 +135,7 @@ class NutationPhase:
 
 
 class Nutation:
-    """
-    The nutation of one motion.
-
-    Raises ValueError if an amplitude or a rate is out of the range in which doubles hold it.
-    """
+    """The nutation of one motion; ValueError if doubles cannot hold an amplitude or a rate."""
 
     def __init__(self, motion: ThetaMotion, start_theta: float) -> None:
         # Even and odd quarter periods.

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What every solver has, and the choice among them.
+What every solver has, the choice among them, and `solve`, which reads a motion at given times.
 
 A new solver is a class with the members of `Propagator`, a name in METHODS, and a branch in
 `propagate` that makes it.
@@ -9,7 +9,7 @@ A new solver is a class with the members of `Propagator`, a name in METHODS, and
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.regimes import axis_rests
@@ -72,13 +72,11 @@ class Propagator(Protocol):
 def propagate(top: Top, start: State, *, method: str, equations: str = 'transport',
               rtol: float = 1e-11, atol: float = 1e-12) -> Propagator:
     """
-    Return the motion that begins at `start`.
+    Return the motion that begins at `start`; `solve` explains the settings.
 
-    method : 'exact', the closed form, or 'rk45', Dormand-Prince steps.  Motions without torque
-        or nutation take no steps: 'rk45' hands them to the closed form too.
-    equations : of the steps, 'transport' (regular everywhere) or 'euler' (for study)
-    rtol, atol : tolerated error of a step.  The transport equations scale their unknowns to 1, so
-        there the two add up; the Euler equations tolerate atol + rtol |angle|.
+    Motions without torque or nutation take no steps: 'rk45' hands them to the closed form too.
+    The transport equations scale their unknowns to 1 and tolerate atol + rtol; the Euler equations
+    tolerate atol + rtol |angle|.
 
     Raises ValueError for a bad setting, or a motion that doubles cannot hold, and IntegrationError
     if the Euler equations cannot start.
@@ -116,3 +114,47 @@ def _stepped(top: Top, start: State, equations: str, rtol: float, atol: float) -
         except ValueError:      # beyond its range, steps go on
             pass
     return TransportMotion(top, start, rtol, atol)
+
+
+def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: float = 1e-11,
+          atol: float | None = None, equations: str = 'transport') -> States:
+    """
+    Return the motion of a top that is in the state `start` at t = 0, at the times t.
+
+    Parameters
+    ----------
+    t : (n,) times [s]: in any order and of any sign for 'exact', from 0 on and never decreasing
+        for 'rk45'
+    method : 'exact', the closed form, or 'rk45', Dormand-Prince steps
+    rtol, atol : tolerated error of a step; atol is rtol/10 by default
+    equations : of the steps: 'transport', regular everywhere, or 'euler', to the letter of the
+        paper, for study
+
+    Returns
+    -------
+    States, whose columns are computed when they are first asked for
+
+    Raises
+    ------
+    ValueError : naming the argument, its value and what is allowed
+    IntegrationError : where the 'euler' equations cannot go on
+    """
+    try:
+        given = np.asarray(t)
+        if given.dtype.kind in 'cmM':           # complex, timedelta64, datetime64
+            raise TypeError(f'{given.dtype} is no number of seconds')
+        times = given.astype(np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f't = {t!r}: must be (n,) numbers, in s') from error
+    if times.ndim != 1:
+        raise ValueError(f't has shape {times.shape}: must be (n,)')
+    for at in np.flatnonzero(~np.isfinite(times))[:1]:
+        raise ValueError(f't[{at}] = {times[at]} s: must be finite')
+    motion = propagate(top, start, method=method, equations=equations, rtol=rtol,
+                       atol=0.1 * rtol if atol is None else atol)
+    if method == 'rk45':
+        before = np.concatenate(([0.0], times[:-1]))
+        for at in np.flatnonzero(times < before)[:1]:
+            raise ValueError(f't[{at}] = {times[at]} s after {before[at]} s: must not decrease '
+                             "with method = 'rk45'")
+    return motion.states_at_seconds(times)

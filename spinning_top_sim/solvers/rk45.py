@@ -14,17 +14,11 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.dormand_prince import (
-    Equations,
-    IntegrationError,
-    Integrator,
-    Interpolants,
-    Rows,
-)
-from spinning_top_sim.solvers.euler_equations import EulerEquations
+from spinning_top_sim.solvers import dormand_prince
+from spinning_top_sim.solvers.dormand_prince import Equations, IntegrationError, Rows
+from spinning_top_sim.solvers.equations import EulerEquations, TransportEquations, Unknowns
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.times import NANOSECONDS, Times
-from spinning_top_sim.solvers.transport import TransportEquations, Unknowns
 from spinning_top_sim.solvers.unwrap import PhaseUnwrapper
 
 # A time that so many steps of the present size do not reach is refused: minutes of work.
@@ -34,17 +28,13 @@ STEPS_TOGETHER = 256
 
 
 class SteppedMotion(ABC):
-    """
-    A motion by the steps of some equations, read in blocks of times; see `Propagator`.
-
-    top, start : what moves, and from where at t = 0
-    """
+    """A motion by the steps of some equations, read in blocks of times; see `Propagator`."""
 
     ns_limit = 2 ** 63 - 1              # steps go on for ever
 
     def __init__(self, top: Top, start: State, equations: Equations) -> None:
         self.top, self.start, self._equations = top, start, equations
-        self._integrator = Integrator(equations)
+        self._integrator = dormand_prince.Integrator(equations)
         # The steps that can still be read, in order.
         self._kept = [self._integrator.newest]
 
@@ -76,7 +66,6 @@ class SteppedMotion(ABC):
                                  key=attrgetter('t1')))
 
     def _forget(self, count: int) -> None:
-        """Forget the oldest steps."""
         del self._kept[:count]
 
     def states(self, times_ns: NDArray[np.int64] | range) -> States:
@@ -86,9 +75,8 @@ class SteppedMotion(ABC):
         """
         Return the states at ascending times t (n,) [s].
 
-        After `reach` all steps to the last time are kept.  Those that are missing are taken here,
-        STEPS_TOGETHER at a time, and forgotten once the times in them are computed: `solve` reads
-        a motion of any length once, forwards, in bounded memory.
+        Missing steps are taken here, STEPS_TOGETHER at a time, and forgotten once the times in
+        them are computed: `solve` reads a motion of any length in bounded memory.
         Raises ValueError if a time lies before the steps that are kept, and IntegrationError if
         the steps cannot go on to the last time, or it is too many of them away.
         """
@@ -99,8 +87,12 @@ class SteppedMotion(ABC):
         while begin < len(t):
             while self._kept[-1].t1 < t[-1] and len(self._kept) < STEPS_TOGETHER:
                 self._kept.append(self._integrator.step())
-            self._refuse_beyond(t[-1])
-            end = int(np.searchsorted(t, self._kept[-1].t1, 'right'))
+            oldest, newest = self._kept[0], self._kept[-1]
+            length = (newest.t1 - oldest.t0) / len(self._kept)
+            if t[-1] - newest.t1 > MOST_STEPS * length:
+                raise IntegrationError(f't = {t[-1]:.9g} s is more than {MOST_STEPS:.0e} steps of '
+                                       f"{length:.3g} s away: use method = 'exact'")
+            end = int(np.searchsorted(t, newest.t1, 'right'))
             if end > begin:
                 parts.append(self._unknowns(t[begin:end]))
                 begin = end
@@ -109,19 +101,11 @@ class SteppedMotion(ABC):
         unknowns = np.concatenate(parts, axis=1) if parts else self._unknowns(t[:0])
         return self._states_of(t.copy(), unknowns)
 
-    def _refuse_beyond(self, t: float) -> None:
-        """Raise IntegrationError if a time [s] takes too many steps as long as those kept."""
-        oldest, newest = self._kept[0], self._kept[-1]
-        length = (newest.t1 - oldest.t0) / len(self._kept)
-        if t - newest.t1 > MOST_STEPS * length:
-            raise IntegrationError(f't = {t:.9g} s is more than {MOST_STEPS:.0e} steps of '
-                                   f"{length:.3g} s away: use method = 'exact'")
-
     def _unknowns(self, t: Column) -> Rows:
         """Return the rows that `_states_of` needs at times [s] within the steps that are kept."""
         steps = np.array([step.t1 for step in self._kept]).searchsorted(t)
         first, last = (int(steps[0]), int(steps[-1])) if len(t) else (0, 0)
-        interpolants = Interpolants(self._kept[first:last + 1], self._equations)
+        interpolants = dormand_prince.Interpolants(self._kept[first:last + 1], self._equations)
         return np.concatenate((interpolants.at(steps - first, t), self._phases_at(steps)))
 
     def _phases_at(self, steps: NDArray[np.int64]) -> Rows:
@@ -140,7 +124,7 @@ class SteppedMotion(ABC):
 
 
 class EulerMotion(SteppedMotion):
-    """A motion by equations (29)-(32) to the letter, for study."""
+    """A motion by `EulerEquations`, for study."""
 
     def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
         super().__init__(top, start, EulerEquations(top, start, rtol, atol))

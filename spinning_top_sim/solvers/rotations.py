@@ -10,15 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.solvers.decimal_math import ONE
-from spinning_top_sim.solvers.times import (
-    LARGEST_NS,
-    NANOSECONDS,
-    UNITS,
-    Rate,
-    Times,
-    Unit,
-    halves,
-)
+from spinning_top_sim.solvers.times import LARGEST_NS, NANOSECONDS, UNITS, Rate, Times, halves
 
 Rows = NDArray[np.float64]
 
@@ -96,7 +88,7 @@ class Rotations:
         fastest = max(abs(rate) for rate, _ in angles)
         # [steps], as halves of doubles and what they leave out, and the times up to which they
         # are enough.
-        self._in: dict[Unit, tuple[Rows, Rows, float]] = {}
+        self._in: dict[str, tuple[Rows, Rows, float]] = {}
         for unit, scale in UNITS.items():
             exact = [rate * scale * STEPS for rate, _ in angles]
             high = halves(_column(exact))[0]

@@ -54,7 +54,7 @@ class Series:
 
     @property
     def multiples(self) -> range:
-        """The numbers n."""
+        """The n of the terms."""
         return range(self.kind.endswith('odd'), 2 * len(self.weights), 2)
 
     @property
@@ -70,16 +70,12 @@ class Series:
         return value * (ONE, cos, sin, sin * cos)[self.prefactor]
 
     def scaled(self, scale: Decimal) -> Series:
-        """Return the series times a constant."""
         return Series(self.kind, tuple(scale * weight for weight in self.weights))
 
 
 def _multiple_angles(kind: str) -> Iterator[list[int]]:
-    """
-    Yield the polynomials in xi = sin^2 y that cos n y or sin n y are, less the common prefactor.
-
-    From f(n+2) = (2 - 4 xi) f(n) - f(n-2) [DLMF 4.21(iii)].
-    """
+    """Yield cos n y or sin n y, less the common prefactor, as polynomials in xi = sin^2 y."""
+    # f(n+2) = (2 - 4 xi) f(n) - f(n-2) [DLMF 4.21(iii)].
     before, now = {'cos odd': ([1], [1]), 'sin odd': ([-1], [1]),
                    'cos even': ([1, -2], [1]), 'sin even': ([-2], [0])}[kind]
     while True:
@@ -147,11 +143,8 @@ class ThetaForm:
         return 4 * self.nome.sqrt() if self.imaginary else ONE
 
     def slopes_of_sn2(self) -> tuple[Decimal, Decimal]:
-        """
-        Return c with d(sn^2 chi)/dchi = 2 sn cn dn = c theta1(2y)/D(y)^4, over even and odd N.
-
-        By duplication [DLMF 20.7.10] and the quotients of DLMF 22.2.
-        """
+        """Return c with d(sn^2 chi)/dchi = 2 sn cn dn = c theta1(2y)/D(y)^4 at even and odd N."""
+        # By duplication [DLMF 20.7.10] and the quotients of DLMF 22.2.
         theta2, theta3, theta4 = (self.theta(number).at_zero for number in (2, 3, 4))
         if not self.imaginary:
             even = theta3 * theta4 ** 3 / theta2
@@ -178,11 +171,8 @@ class ThetaForm:
                      for k in (0, 1))
 
     def _growing_weights(self, a: Decimal) -> tuple[list[Decimal], list[Decimal]]:
-        """
-        Return 2 q^(k(k+1)) exp(-A) times sinh, and cosh, of (2k+1) A, with A = pi a/(2K).
-
-        Over exp((2k+1) A) times q^(k^2) g^k with g = q exp(2A) <= 1: no large numbers.
-        """
+        """Return 2 q^(k(k+1)) exp(-A) times sinh, and cosh, of (2k+1) A, with A = pi a/(2K)."""
+        # Over exp((2k+1) A) times q^(k^2) g^k with g = q exp(2A) <= 1: no large numbers.
         depth = pi() * a / self.K
         g = (depth - pi() * self.K_prime / self.K).exp()
         sinh, cosh = sinh_cosh(depth / 2)

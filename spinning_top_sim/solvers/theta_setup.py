@@ -21,13 +21,6 @@ times a uniform rotation, so that a state costs the same at every t:
     kappa       -1: r t has s pi/2 a quarter period, evenly; r t - s y has them where N steps.
                 In the imaginary form a/K' - 1, as it splits off exp(i s y a/K').
 
-    1  nutation_cubic     (top, state) -> coefficients of u'^2 in u - u0
-    2  _cubic_roots       -> u1, u2, u3, and with them m, m1, w
-    3  _Poles             -> a and b, by Carlson's R_F [DLMF 19.16]
-    4  ThetaForm.of       -> K, K' and the theta series, in the real or the imaginary form
-    5  _Roots.start_phase  -> N and y at t = 0
-    6  factor             -> alpha, beta: R, J, r, c, kappa; `_resting` where theta is constant
-
 The work is done in long decimals, 60 digits and more if two roots of the cubic are close, because
 everything that cancels, cancels here: close to a pole, to the separatrix, to steady precession.
 (F. Klein, A. Sommerfeld, *Ueber die Theorie des Kreisels*, ch. VI;  E. T. Whittaker, *Analytical
@@ -42,16 +35,8 @@ from typing import NamedTuple
 
 from spinning_top_sim.physics.regimes import nutation_cubic
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.decimal_math import (
-    ONE,
-    ZERO,
-    atan2,
-    carlson_rf,
-    pi,
-    precision,
-    reduced_turns,
-    sin_cos,
-)
+from spinning_top_sim.solvers import decimal_math
+from spinning_top_sim.solvers.decimal_math import ONE, ZERO, atan2, carlson_rf, pi, precision
 from spinning_top_sim.solvers.theta_series import Series, ThetaForm
 
 FIRST_DIGITS = 60
@@ -68,21 +53,19 @@ class _RootsTooCloseError(ArithmeticError):
     """Two roots of the cubic agree to most of the digits at hand."""
 
 
-@dataclass(frozen=True)
-class FactorSeries:
-    """R + i s J of alpha or beta at even or at odd N."""
+class FactorSeries(NamedTuple):
+    """R and J of alpha or beta at even or at odd N."""
 
     real: Series
-    imag: Series | None = None  # None: alpha or beta goes through zero, or is a dn
+    imag: Series = Series('cos even', (ZERO,))      # where s = 0
 
     @property
     def has_zero(self) -> bool:
-        """Whether it is real and proportional to sin y: an exact passage through a pole."""
-        return self.imag is None and self.real.kind == 'sin odd'
+        """Whether it is proportional to sin y: an exact passage through a pole."""
+        return self.real.kind == 'sin odd'
 
     def scaled(self, scale: Decimal) -> FactorSeries:
-        """Return the series times a constant."""
-        return FactorSeries(self.real.scaled(scale), self.imag and self.imag.scaled(scale))
+        return FactorSeries(self.real.scaled(scale), self.imag.scaled(scale))
 
 
 @dataclass(frozen=True)
@@ -90,7 +73,7 @@ class Factor:
     """
     Alpha or beta: (R + i s J)/D exp i(r t + c + s kappa y).
 
-    With s = 0 the series are real, and signed by `sign` and, if it `crosses`, by (-1)^floor(N/2).
+    With s = 0, R is signed by `sign` and, if it `crosses`, by (-1)^floor(N/2).
     """
 
     sense: int                  # s
@@ -135,10 +118,10 @@ def set_up(top: Top, start: State) -> ThetaMotion:
     """
     Return alpha and beta of the motion through `start` at t = 0.
 
-    Top and State are taken as exact doubles, and P as the exact product M g R.  The precision is
-    doubled until the closest roots of the cubic are told apart.  They are never equal: on the
-    separatrix, or in steady precession with theta' != 0, cos(theta0) would be algebraic, and no
-    double but 0 has an algebraic cosine.  Raises ValueError beyond MOST_DIGITS.
+    Top and State are taken as exact doubles.  The precision is doubled until the closest roots of
+    the cubic are told apart.  They are never equal: on the separatrix, or in steady precession
+    with theta' != 0, cos(theta0) would be algebraic, and no double but 0 has an algebraic cosine.
+    Raises ValueError beyond MOST_DIGITS.
     """
     digits = FIRST_DIGITS
     while digits <= MOST_DIGITS:
@@ -155,7 +138,6 @@ def set_up(top: Top, start: State) -> ThetaMotion:
 
 
 def _set_up(top: Top, start: State) -> ThetaMotion:
-    """Return alpha and beta to the present precision; with P < 0, from the top upside down."""
     torque = Decimal(top.mass) * Decimal(top.gravity) * Decimal(top.com_distance)
     # Rounded now (+): a sum rounds its result, and -L3 must cancel Lz = L3 to the last digit.
     theta, theta_dot, l3, lz = (
@@ -164,21 +146,20 @@ def _set_up(top: Top, start: State) -> ThetaMotion:
     with precision(DIGITS_OF_SUMS):
         arguments = ((Decimal(start.phi) + Decimal(start.psi)) / 2,
                      (Decimal(start.phi) - Decimal(start.psi)) / 2)
-    sin_half, cos_half = sin_cos(theta / 2)
+    sin_half, cos_half = decimal_math.sin_cos(theta / 2)
     upside_down = torque < 0
     if upside_down:
         torque, theta_dot, l3 = -torque, -theta_dot, -l3
         sin_half, cos_half, arguments = cos_half, sin_half, arguments[::-1]
     lambda1, lambda3 = Decimal(top.lambda1), Decimal(top.lambda3)
     given = _Given(lambda1, l3, lz, theta_dot, sin_half, cos_half,
-                   l3 * (1 / lambda3 - 1 / lambda1), *map(reduced_turns, arguments))
+                   l3 * (1 / lambda3 - 1 / lambda1), *map(decimal_math.reduced_turns, arguments))
     cubic = nutation_cubic(lambda1, torque, l3, lz, theta_dot, sin_half, cos_half)
     motion = _nutating(given, cubic) if cubic[0] or cubic[1] else _resting(given)
     return _upside_down(motion) if upside_down else motion
 
 
 def _upside_down(motion: ThetaMotion) -> ThetaMotion:
-    """Return the motion with theta -> pi - theta: alpha and beta exchanged."""
     low, high = motion.theta_bounds
     even, odd = motion.u_dot
     line = motion.planar_rotation
@@ -244,12 +225,8 @@ class _Roots(NamedTuple):
         return self.gap32 / self.gap31
 
     def start_phase(self, falling: bool, K: Decimal) -> tuple[int, Decimal]:
-        """
-        Return N and 2y/pi at t = 0, negative while u falls.
-
-        From chi = sn R_F(cn^2, dn^2, 1) [DLMF 19.25.5], or K - chi the same way with
-        sn(K - chi) = cn/dn.
-        """
+        """Return N and 2y/pi at t = 0, negative while u falls."""
+        # chi = sn R_F(cn^2, dn^2, 1) [DLMF 19.25.5]; K - chi likewise, with sn(K - chi) = cn/dn.
         sense = -1 if falling else 1
         sn2, cn2, dn2 = -self.y1 / self.gap21, self.y2 / self.gap21, self.y3 / self.gap31
         if sn2 * (1 + self.m1.sqrt()) < 1:
@@ -319,8 +296,7 @@ class _Poles:
     """
     a and b, and the distances of u1 and u2 from the poles u = -1 and u = 1.
 
-    b is None if u3 = 1 exactly: beta then is a dn and has no zero.
-
+    b is None if u3 = 1 exactly: Lz is L3 then, and beta is a dn and has no zero.
     No subtraction cancels: u'^2 at u = -1 and u = 1 is -((Lz +- L3)/lambda1)^2, so the product of
     three distances is known, and the smallest of them needs no difference.
     """
@@ -347,7 +323,6 @@ class _Poles:
 
 
 def _nutating(given: _Given, cubic: tuple[Decimal, Decimal, Decimal, Decimal]) -> ThetaMotion:
-    """Return alpha and beta of a motion whose theta swings."""
     f0, f1, f2, f3 = cubic
     f3 = f3 or NO_GRAVITY * abs(f2)
     roots = _cubic_roots(f0, f1, f2, f3)
@@ -394,12 +369,8 @@ def _nutating(given: _Given, cubic: tuple[Decimal, Decimal, Decimal, Decimal]) -
 
 def _factor_series(form: ThetaForm, is_beta: bool, s: int, zero: Decimal | None, size: Decimal,
                    ) -> tuple[FactorSeries, FactorSeries]:
-    """
-    Return R and J of alpha or beta at even and at odd N, scaled to the largest modulus `size`.
-
-    zero : a or b.  Where it is None, they are a dn; where s = 0, they are real.
-    """
-    if zero is None:
+    """Return R and J at even and at odd N, scaled to the largest modulus `size`; zero: a or b."""
+    if zero is None:                # a dn
         theta1, theta2 = FactorSeries(form.theta(4)), FactorSeries(form.theta(3))
     elif s:
         theta1, theta2 = (FactorSeries(*x) for x in form.shifted(zero))
@@ -418,7 +389,7 @@ def _at_start(form: ThetaForm, series: tuple[FactorSeries, FactorSeries], quarte
     """Return the argument of R + i s J at t = 0 [rad] and, where s = 0, its sign."""
     here, point = series[quarters % 2], form.point(y)
     real = here.real(*point)
-    if here.imag is not None:
+    if s:
         return s * atan2(here.imag(*point), real), 1
     if not any(x.has_zero for x in series):
         return ZERO, 1

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from decimal import Decimal
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +13,7 @@ from spinning_top_sim.physics.attitude import Column, Number
 from spinning_top_sim.solvers.decimal_math import double_double
 
 NANOSECONDS = 1_000_000_000
-Unit = Literal['s', 'ns']
-UNITS: dict[Unit, Decimal] = {'s': Decimal(1), 'ns': Decimal('1e-9')}
+UNITS = {'s': Decimal(1), 'ns': Decimal('1e-9')}
 # The largest time [ns] that is taken as an integer: the end of int64 lies a second behind it.
 LARGEST_NS = 2 ** 63 - NANOSECONDS
 # 2^27 + 1: the factor that splits a double into two halves (Dekker, Numer. Math. 18, 1971, 224).
@@ -67,12 +65,11 @@ class Times:
         given = self._given
         if not len(given):
             return 0.0
-        if isinstance(given, range):
-            return float(max(abs(given[0]), abs(given[-1])))
-        return max(float(given.max()), -float(given.min()))
+        ends = (given[0], given[-1]) if isinstance(given, range) else (given.max(), given.min())
+        return max(abs(float(end)) for end in ends)
 
     @property
-    def unit(self) -> Unit:
+    def unit(self) -> str:
         """Nanoseconds for integers, seconds for doubles."""
         return 's' if self.ns is None else 'ns'
 

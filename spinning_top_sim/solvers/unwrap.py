@@ -96,10 +96,6 @@ class PhaseUnwrapper:
     The phases of alpha and beta of a motion at the begins of its steps.
 
     uniform_rate : of alpha's phase in the frame that is stepped; minus that of beta's [rad/s]
-
-    Attributes
-    ----------
-    of_alpha, of_beta : Phase
     begins : (3, n) phases of alpha and beta, less their uniform parts, and theta/2 [rad]
     """
 

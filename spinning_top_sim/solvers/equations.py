@@ -1,24 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-The equations that the simulator steps by default: regular at every attitude.
-
-Unknowns are the Cayley-Klein parameters and the horizontal angular momentum in the world,
-m = i (L_x + i L_y)/(2 lambda1).  From q' = (1/2) omega q and L' = torque,
-
-    alpha' =  i (Lz - c)/(2 lambda1) alpha + m conj(beta)
-    beta'  =  i (Lz + c)/(2 lambda1) beta  - m conj(alpha)
-    m'     = -(P/lambda1) alpha beta
-
-They are those of a frame that turns about e3 with the body, less a known uniform rate
-chi = L3/lambda3 - (L3 - c)/lambda1.  The factor exp(+-i chi t/2) is put on when a state is read,
-so the step size follows the nutation and not the spin.  With c = 0 the frame keeps the whole
-transverse rotation, with c = L3 it is transported parallel; c = L3/2 centres the spectrum of alpha
-and beta about zero and takes the fewest evaluations on cusps, the commonest of motions
-(docs/gauge.md).
-
-The invariants |q| = 1, L.e3 = L3 and the energy are restored after each step and in each sample
-(projection, Hairer, Lubich & Wanner, *Geometric Numerical Integration*, sect. IV.4).
-"""
+"""The equations of motion that rk45 steps: regular ones, and those of the Euler angles."""
 
 import cmath
 import math
@@ -29,13 +10,16 @@ import numpy as np
 
 from spinning_top_sim.physics.attitude import Column, precession_rate
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.dormand_prince import Equations, Rows, Vector, largest
+from spinning_top_sim.solvers.dormand_prince import Equations, IntegrationError, Rows, Vector
 
 # The energy error is taken out of the nutation rate where its square is this share of the
 # largest |m|^2 or more: at a turning point the energy does not tell the rate.
 NUTATION_SHARE = 1e-6
 # (sin(theta)/2)^2 below which rounding in L.e3 would spoil the momentum more than it mends it.
 POLE_SHARE = 1e-4
+# |sin(theta)| at which the rounding of cos(theta), 1.1e-16, costs phi' a millionth of L3/lambda1.
+SMALLEST_SINE = math.sqrt(2.0 ** -53 / 1e-6)
+ADVICE = "use the regular equations (equations = 'transport') or method = 'exact'"
 
 
 class Unknowns(NamedTuple):
@@ -57,7 +41,22 @@ ONE_STATE = math.sqrt, math.copysign, lambda condition, x, y: x if condition els
 
 class TransportEquations(Equations):
     """
-    The equations above for one top and one motion.
+    The default: regular at every attitude.
+
+    Unknowns are the Cayley-Klein parameters and the horizontal angular momentum in the world,
+    m = i (L_x + i L_y)/(2 lambda1).  From q' = (1/2) omega q and L' = torque,
+
+        alpha' =  i (Lz - c)/(2 lambda1) alpha + m conj(beta)
+        beta'  =  i (Lz + c)/(2 lambda1) beta  - m conj(alpha)
+        m'     = -(P/lambda1) alpha beta
+
+    They are those of a frame that turns about e3 with the body, less a known uniform rate
+    chi = L3/lambda3 - (L3 - c)/lambda1.  The factor exp(+-i chi t/2) is put on when a state is
+    read, so the step size follows the nutation and not the spin.  With c = L3/2 the spectrum of
+    alpha and beta is centred about zero; docs/accuracy.md has the reasons for this choice.
+
+    The invariants |q| = 1, L.e3 = L3 and the energy are restored after each step and in each
+    sample (projection, Hairer, Lubich & Wanner, *Geometric Numerical Integration*, sect. IV.4).
 
     rtol, atol : tolerated error of a step; the unknowns are scaled to 1, so the two add up
     carried_share : c/L3
@@ -126,10 +125,10 @@ class TransportEquations(Equations):
             fall * (da * b - da_imag * b_imag + a * db - a_imag * db_imag),
             fall * (da * b_imag + da_imag * b + a * db_imag + a_imag * db)))
 
-    def error(self, y: Vector, y_new: Vector, difference: Vector) -> float:
-        """Return the largest of the three errors, each over its scale and the tolerance."""
+    def errors(self, y: Vector, y_new: Vector, difference: Vector) -> tuple[float, ...]:
         da, db, dm = difference
-        return largest((abs(da), abs(db), abs(dm) / self._scale)) / self.tolerance
+        tolerance = self.tolerance
+        return abs(da) / tolerance, abs(db) / tolerance, abs(dm) / self._scale / tolerance
 
     def accepted(self, y: Vector, y_new: Vector) -> Vector:
         return self.project(y_new)
@@ -216,3 +215,70 @@ class TransportEquations(Equations):
             cosine * np.cos(alpha_phase), cosine * np.sin(alpha_phase),
             sine * np.cos(beta_phase), sine * np.sin(beta_phase),
             u * meridian_cos - v * meridian_sin, u * meridian_sin + v * meridian_cos)
+
+
+class EulerEquations(Equations):
+    """
+    Equations (29)-(32) of "Analysis of Symmetric Spinning Top" (2023), to the letter, for study.
+
+    They are singular where the axis is vertical, and near there wrong without a sign of it:
+    cos(theta) rounds towards 1, Lz - L3 cos(theta) loses its digits, or a step leaps over the
+    pole, and phi and psi drift off while every error estimate is small.  So these equations stop
+    with an error there.
+    """
+
+    name = 'euler'
+    is_complex = False
+
+    def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
+        self.top, self.l3, self.lz = top, start.l3, start.lz
+        self._rtol, self._atol = rtol, atol
+        self.start = (start.theta, start.theta_dot, start.phi, start.psi)
+        self.tolerance = rtol + atol
+        self.fastest_rate = (
+            abs(start.theta_dot) + (abs(start.l3) + abs(start.lz)) / top.lambda1
+            + abs(start.l3) / top.lambda3 + math.sqrt(abs(top.gravity_torque) / top.lambda1))
+
+    def derivative(self, theta: float, theta_dot: float, phi: float, psi: float) -> Vector:
+        """Return (theta', theta'', phi', psi'), eqs. (29)-(32); IntegrationError near a pole."""
+        sine, cosine = math.sin(theta), math.cos(theta)
+        if not abs(sine) > SMALLEST_SINE:
+            raise IntegrationError(
+                f'euler equations: the axis is at a pole (theta = {theta!r} rad): cos(theta) '
+                f"rounds to {cosine!r} and eq. (31) loses phi'; {ADVICE}")
+        top = self.top
+        phi_dot = (self.lz - self.l3 * cosine) / (top.lambda1 * sine * sine)
+        psi_dot = self.l3 / top.lambda3 - phi_dot * cosine
+        return (theta_dot,
+                phi_dot * phi_dot * sine * cosine
+                - top.lambda3 / top.lambda1 * (psi_dot + phi_dot * cosine) * phi_dot * sine
+                + top.gravity_torque / top.lambda1 * sine,
+                phi_dot, psi_dot)
+
+    def second_derivative(self, y: Rows, derivative: Rows) -> Rows:
+        theta = y[0]
+        theta_dot, theta_ddot, phi_dot, _ = derivative
+        sine, cosine = np.sin(theta), np.cos(theta)
+        lambda1 = self.top.lambda1
+        phi_ddot = theta_dot * (self.l3 / lambda1 - 2.0 * phi_dot * cosine) / sine
+        theta_dddot = (
+            2.0 * phi_dot * phi_ddot * sine * cosine
+            + theta_dot * phi_dot * phi_dot * (cosine * cosine - sine * sine)
+            - self.l3 / lambda1 * (phi_ddot * sine + phi_dot * cosine * theta_dot)
+            + self.top.gravity_torque / lambda1 * cosine * theta_dot)
+        return np.array((theta_ddot, theta_dddot, phi_ddot,
+                         phi_dot * sine * theta_dot - phi_ddot * cosine))
+
+    def errors(self, y: Vector, y_new: Vector, difference: Vector) -> tuple[float, ...]:
+        return tuple(
+            abs(e) / (self._atol + self._rtol * max(abs(a), abs(b)) or math.ulp(0.0))
+            for e, a, b in zip(difference, y, y_new, strict=True))
+
+    def accepted(self, y: Vector, y_new: Vector) -> Vector:
+        """Raise IntegrationError if the step leapt over a pole: phi and psi would be lost."""
+        before, after = y[0].real, y_new[0].real
+        if math.floor(before / math.pi) != math.floor(after / math.pi):
+            raise IntegrationError(
+                f'euler equations: a step leapt over a pole, from theta = {before!r} to '
+                f'{after!r} rad, and lost phi and psi; {ADVICE}')
+        return y_new
