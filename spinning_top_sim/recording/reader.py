@@ -28,12 +28,7 @@ from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.records import HEAD, ChunkContents, DamagedError
 from spinning_top_sim.recording.rosbag2 import Qos, qos_profiles
 from spinning_top_sim.recording.scanner import Scanner
-from spinning_top_sim.recording.summary import (
-    MAGIC_SIZE,
-    McapSource,
-    indexed_messages,
-    read_summary,
-)
+from spinning_top_sim.recording.source import MAGIC_SIZE, McapSource, messages_in, read_summary
 from spinning_top_sim.recording.writer import OUR_LIBRARY
 
 _FIRST_DATE = 10 ** 17       # [ns], in 1973
@@ -220,7 +215,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         spans = [_Span(offset, offset + chunk.chunk_length, chunk.message_start_time,
                        chunk.message_end_time)
                  for offset, chunk in sorted(self._summary.chunks.items())
-                 if indexed_messages(chunk)]
+                 if messages_in(chunk)]
         return spans, metadata
 
     def _leads_to_chunk(self, index: ChunkIndex) -> bool:
