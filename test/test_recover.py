@@ -36,11 +36,10 @@ from rosbags.typesys import Stores, get_typestore
 from test_recording import METADATA, eventually, kill, start_child
 
 from spinning_top_sim.recording import source
-from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.mcap_writer import McapWriter, record_bytes
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic
+from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic, find_definition
 from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.tools.recover import main
 

@@ -146,10 +146,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         return (min((span.start_ns for span in spans), default=0),
                 max((span.end_ns for span in spans), default=0))
 
-    def messages(
-        self, topics: Iterable[str] | None = None, start: int | None = None,
-        end: int | None = None,
-    ) -> Iterator[LogMessage]:
+    def messages(self, topics: Iterable[str] | None = None, start: int | None = None,
+                 end: int | None = None) -> Iterator[LogMessage]:
         """
         Yield the whole messages in the order of their log times, equal ones in file order.
 

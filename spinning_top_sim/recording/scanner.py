@@ -354,22 +354,15 @@ class Scanner:
 
 
 class _MessageCounts:
-    """
-    Messages by channel id, of a file with this summary.
-
-    found : in what `count` was given, without those of unknown channels
-    unknown : those of channels that nothing has declared so far, as losses
-    in_lost_chunks : in damaged chunks, by their message indexes
-    start_ns, end_ns : earliest and latest log time of those found
-    """
+    """Counts by channel id the messages that a scan finds, and those that the log has lost."""
 
     def __init__(self, summary: Summary, *, ours: bool) -> None:
         self._summary = summary
         self._ours = ours       # numbered without gaps
-        self.found: Counter[int] = Counter()
-        self.unknown: dict[int, Loss] = {}
-        self.in_lost_chunks: Counter[int] = Counter()
-        self.start_ns, self.end_ns = 1 << 64, 0
+        self.found: Counter[int] = Counter()    # without those of unknown channels
+        self.unknown: dict[int, Loss] = {}      # of channels that nothing has declared so far
+        self.in_lost_chunks: Counter[int] = Counter()   # by their message indexes
+        self.start_ns, self.end_ns = 1 << 64, 0     # earliest and latest log time of those found
         self._gaps: Counter[int] = Counter()    # in the sequence numbers
         self._next_sequence: dict[int, int] = {}
 

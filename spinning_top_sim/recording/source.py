@@ -28,15 +28,14 @@ MAGIC_SIZE = len(MCAP0_MAGIC)
 
 _Record = TypeVar('_Record', bound=mcap.records.McapRecord)
 _FOOTER_SIZE = HEAD.size + 8 + 8 + 4
-_BLOCK = 1 << 16  # bytes read at a time where a record is not needed whole
-_ATTACHMENT_HEAD = 1 << 16  # bytes; more than any name and media type
+_BLOCK = 1 << 16    # bytes read at a time where a record is not needed whole
 
 # What may begin a chunk, a schema, a channel or metadata: opcode and a length below 2^40.
+# Single messages are not looked for: nothing in them tells them from chance.
 _CANDIDATE = re.compile(rb'[\x03\x04\x06\x0c](?=.{5}\x00\x00\x00)', re.DOTALL)
 # Where the length of the first text is in the content; a chunk's is followed by that of the data.
 _NAME_OFFSETS: dict[int, int] = {
     Opcode.SCHEMA: 2, Opcode.CHANNEL: 4, Opcode.METADATA: 0, Opcode.CHUNK: 28}
-
 _LOOK_BYTES = 64                # of the content, enough for a chunk's fields before its data
 _MAX_NAME = 1 << 12
 _MAX_EXTRA = 1 << 10
@@ -118,8 +117,8 @@ class McapSource:
 
     def attachment(self, offset: int, end: int) -> tuple[mcap.records.AttachmentIndex, int]:
         """Return the index of the attachment there, and the offset of its checksum."""
-        stream = records.StrictStream(BytesIO(
-            self.read(offset, min(end - offset, _ATTACHMENT_HEAD))))
+        # No name and media type need more than a block.
+        stream = records.StrictStream(BytesIO(self.read(offset, min(end - offset, _BLOCK))))
         try:
             stream.read(HEAD.size)
             index = mcap.records.AttachmentIndex(
@@ -135,15 +134,11 @@ class McapSource:
 
 
 class RecordFinder:
-    """
-    Finds records that prove themselves by their inner lengths and, if chunks, their checksum.
-
-    limit : where the data section ends
-    """
+    """Finds records that prove themselves by their inner lengths, chunks by their checksum too."""
 
     def __init__(self, source: McapSource, limit: int) -> None:
         self._source = source
-        self._limit = limit
+        self._limit = limit     # where the data section ends
         # Bytes of candidates to be read and to be uncompressed, so that the time is limited.
         self._effort = _MAX_EFFORT * source.size
         self._unpacking = _MAX_EFFORT * (source.size + source.max_bytes)
@@ -172,11 +167,7 @@ class RecordFinder:
         return True
 
     def find(self, offset: int) -> int:
-        """
-        Return where the next chunk, schema, channel or metadata begins, or the limit.
-
-        Single messages are not looked for: nothing in them tells them from chance.
-        """
+        """Return where the next chunk, schema, channel or metadata begins, or the limit."""
         while offset < self._limit:
             block = self._source.read(offset, _BLOCK + HEAD.size)
             for match in _CANDIDATE.finditer(block, 0, _BLOCK + HEAD.size - 1):
