@@ -31,7 +31,8 @@ ZSTD_LEVEL = 1
 # time, offset, .. (uint64), as in the file: no platform of ROS 2 Jazzy is big-endian.
 Entries = Mapping[int, 'array[int]']
 
-# Packed here, because they grow with every message; mcap's classes pack all other records.
+# Only what grows with every message is packed here (MCAP specification, "Message" and "Message
+# Index"); mcap's record classes do the rest.
 MESSAGE = struct.Struct('<BQHIQQ')  # opcode, length, channel, sequence, log and publish time
 MESSAGE_FIELDS = 2 + 4 + 8 + 8      # what `length` counts besides the data
 _MESSAGE_DTYPE = [('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),

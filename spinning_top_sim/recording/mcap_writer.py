@@ -78,7 +78,7 @@ class McapWriter:
 
     def write(self, record: records.Schema | records.Channel | records.Metadata,
               raw: bytes = b'') -> None:
-        """Write a record, or `raw`, as another file has it; a schema comes before its channels."""
+        """Write a record, or its bytes `raw` in another file; a schema comes before its channels."""
         offset = self.size
         raw = raw or record_bytes(record)
         self._write([raw])
@@ -180,7 +180,7 @@ class McapWriter:
         """
         Write the summary, bring all to the disk and close the file.
 
-        bag : whether to write a `rosbag2` record; with `file_name`, default: that of the file
+        bag : whether to write a `rosbag2` record, which names `file_name`, default: this file
         former_bag : the bag metadata of the log that this one is made from
         """
         try:

@@ -142,7 +142,7 @@ def parse_message_index(raw: bytes) -> tuple[int, array[int], int]:
 
 
 def open_chunk(chunk: Chunk, max_bytes: int) -> ChunkContents:
-    """Decompress and check a chunk, which has no checksum where that is 0."""
+    """Decompress and check a chunk, whose checksum is 0 if it has none; raises DamagedError."""
     plain = _decompress(chunk, max_bytes)
     if chunk.uncompressed_crc and zlib.crc32(plain) != chunk.uncompressed_crc:
         raise DamagedError('its checksum is wrong')

@@ -100,8 +100,6 @@ class Scanner:
             if head[:1] == right[:1] or head[1:] == right[1:]:
                 self._indexed[offset] = opcode
         self._indexed_offsets = sorted(self._indexed)
-
-        # What is found
         self._metadata_bytes = 0
         self._counts = _MessageCounts(summary, ours=ours)
         self._losses: list[Loss] = []

@@ -32,7 +32,7 @@ except ImportError as error:
 
 METADATA_NAME = 'spinning_top_sim'
 OUR_LIBRARY = 'spinning_top_sim '   # what the header of our files begins with
-QUEUE_BYTES = 32_000_000            # no more room; a burst that began with room may go on
+QUEUE_BYTES = 32_000_000            # of a full queue; a burst that began with room may go on
 
 _ENTRY_BYTES = 128  # what a queued message costs besides its data, about
 
