@@ -78,7 +78,7 @@ class McapWriter:
 
     def write(self, record: records.Schema | records.Channel | records.Metadata,
               raw: bytes = b'') -> None:
-        """Write a record, or its bytes `raw` in another file; a schema comes before its channels."""
+        """Write a record, or its bytes `raw` from another file; schemas come before channels."""
         offset = self.size
         raw = raw or record_bytes(record)
         self._write([raw])

@@ -16,6 +16,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
@@ -62,7 +63,8 @@ _POLICY_NAMES = {
 }
 
 
-class MessageDefinition(NamedTuple):
+@dataclass(frozen=True)
+class MessageDefinition:
     """What a log says about one message type."""
 
     text: str       # its `ros2msg` schema: the definition followed by those it depends on

@@ -286,9 +286,8 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
             file.sync()
             sync_directory(path.parent)
     except FileExistsError as error:
-        raise RecordingError(
-            f'cannot record to {path}: it exists, and a recording overwrites nothing'
-        ) from error
+        raise RecordingError(f'cannot record to {path}: it exists, and a recording '
+                             'overwrites nothing') from error
     except FileNotFoundError as error:
         # A directory such as /proc is there, and takes no files.
         reason = 'no files can be made in' if path.parent.is_dir() else 'there is no directory'
