@@ -55,7 +55,7 @@ from test_recover import (
 from spinning_top_sim.recording import records
 from spinning_top_sim.recording.mcap_writer import record_bytes
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.summary import McapSource
+from spinning_top_sim.recording.source import McapSource
 from spinning_top_sim.recording.writer import create_file
 
 HEADER = record_bytes(Header(profile='', library='a stranger'))

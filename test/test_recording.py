@@ -45,11 +45,15 @@ from rosbags.typesys import Stores, get_typestore
 
 from spinning_top_sim.recording import mcap_writer, writer
 from spinning_top_sim.recording.chunks import CHUNK_BYTES, PlainChunk, compressor, time_span
-from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import DefinitionNotFoundError, RecordingError
 from spinning_top_sim.recording.mcap_writer import McapWriter
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic, qos_profiles
+from spinning_top_sim.recording.rosbag2 import (
+    DEFAULT_QOS,
+    RecordedTopic,
+    find_definition,
+    qos_profiles,
+)
 from spinning_top_sim.recording.writer import McapRecorder, create_file
 
 ROOT = Path(__file__).parents[1]

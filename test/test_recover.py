@@ -35,12 +35,11 @@ from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 from test_recording import METADATA, eventually, kill, start_child
 
-from spinning_top_sim.recording import summary
-from spinning_top_sim.recording.definitions import find_definition
+from spinning_top_sim.recording import source
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.mcap_writer import McapWriter, record_bytes
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic
+from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic, find_definition
 from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.tools.recover import main
 
@@ -939,7 +938,7 @@ def test_what_cannot_be_opened_is_named(tmp_path, monkeypatch, log):
         raise PermissionError(13, os.strerror(13), str(path))
 
     (tmp_path / 'run.mcap').write_bytes(log.content)
-    monkeypatch.setattr(summary, 'open', refuse, raising=False)
+    monkeypatch.setattr(source, 'open', refuse, raising=False)
     assert run(tmp_path / 'run.mcap') == (
         FAILED, '', f'recover: cannot read {tmp_path / "run.mcap"}: Permission denied\n')
 
@@ -964,7 +963,7 @@ def test_a_disk_that_fails_while_it_is_read_is_an_error(tmp_path, log, monkeypat
 
     torn = log.content[:log.chunks[-1][2]]
     (tmp_path / 'run.mcap').write_bytes(torn + bytes(40))
-    monkeypatch.setattr(summary, 'open', open_bad, raising=False)
+    monkeypatch.setattr(source, 'open', open_bad, raising=False)
     code, _, err = run(tmp_path / 'run.mcap')
     assert code == FAILED
     assert err == f'recover: cannot read {tmp_path / "run.mcap"}: Input/output error\n'

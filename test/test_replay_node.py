@@ -37,8 +37,7 @@ from spinning_top_sim.nodes import pacing
 from spinning_top_sim.nodes.pacing import ROUND_GAP_NS, Playback, ReadAhead, rounds
 from spinning_top_sim.nodes.replayer import message_class
 from spinning_top_sim.recording import writer
-from spinning_top_sim.recording.definitions import find_definition
-from spinning_top_sim.recording.rosbag2 import RecordedTopic, offered_qos_yaml
+from spinning_top_sim.recording.rosbag2 import RecordedTopic, find_definition, offered_qos_yaml
 from spinning_top_sim.recording.writer import McapRecorder
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)

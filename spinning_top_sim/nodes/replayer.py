@@ -31,10 +31,9 @@ from std_srvs.srv import SetBool
 from spinning_top_sim.nodes import pacing, reports
 from spinning_top_sim.nodes.executable import one_line, wait_for_all_acked
 from spinning_top_sim.nodes.pacing import Message, Playback, ReadAhead, rounds
-from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import DefinitionNotFoundError
 from spinning_top_sim.recording.reader import LogReader, LogTopic
-from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
+from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, find_definition
 from spinning_top_sim.streams.cdr import NANOSECONDS
 
 

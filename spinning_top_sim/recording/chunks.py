@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Makes chunks in memory that is reused: of single messages, and of rows of an array for speed.
-
-Only the records that grow with every message are packed here (MCAP specification, "Message" and
-"Message Index"); mcap's record classes do the rest.
-"""
+"""Makes chunks in memory that is reused: of single messages, and of rows of an array for speed."""
 
 from __future__ import annotations
 
@@ -36,6 +31,8 @@ ZSTD_LEVEL = 1
 # time, offset, .. (uint64), as in the file: no platform of ROS 2 Jazzy is big-endian.
 Entries = Mapping[int, 'array[int]']
 
+# Only what grows with every message is packed here (MCAP specification, "Message" and "Message
+# Index"); mcap's record classes do the rest.
 MESSAGE = struct.Struct('<BQHIQQ')  # opcode, length, channel, sequence, log and publish time
 MESSAGE_FIELDS = 2 + 4 + 8 + 8      # what `length` counts besides the data
 _MESSAGE_DTYPE = [('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
@@ -46,12 +43,7 @@ ENTRY_SIZE = 8 + 8                      # of a message index
 
 
 class PlainChunk:
-    """
-    The messages of a chunk, uncompressed.
-
-    The memory stays when the chunk is cleared: the heap of a thread that takes and frees that
-    much with every chunk becomes fragmented and grows.
-    """
+    """The messages of a chunk, uncompressed."""
 
     def __init__(self) -> None:
         self.clear()
@@ -59,7 +51,7 @@ class PlainChunk:
         self._enlarge(2 * CHUNK_BYTES)
 
     def clear(self) -> None:
-        """Remove all messages."""
+        """Remove all messages but keep the memory: freeing it each time fragments the heap."""
         self.size = 0       # [bytes]
         self.entries: dict[int, array[int]] = defaultdict(lambda: array('Q'))
 
@@ -70,7 +62,6 @@ class PlainChunk:
 
     def add(self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int,
             data: bytes | bytearray | memoryview) -> None:
-        """Add a message."""
         offset = self.size
         start = offset + MESSAGE.size
         end = start + len(data)

@@ -78,11 +78,7 @@ class McapWriter:
 
     def write(self, record: records.Schema | records.Channel | records.Metadata,
               raw: bytes = b'') -> None:
-        """
-        Write a record, a schema before its channels; the summary repeats the first of each id.
-
-        raw : the record as another file has it, default: made from `record`
-        """
+        """Write a record, or its bytes `raw` from another file; schemas come before channels."""
         offset = self.size
         raw = raw or record_bytes(record)
         self._write([raw])
@@ -182,10 +178,9 @@ class McapWriter:
 
     def finish(self, *, bag: bool = True, file_name: str = '', former_bag: str = '') -> None:
         """
-        Write the bag metadata and the summary, bring all to the disk and close the file.
+        Write the summary, bring all to the disk and close the file.
 
-        bag : whether the file has a `rosbag2` metadata record
-        file_name : in that record, default: that of the file
+        bag : whether to write a `rosbag2` record, which names `file_name`, default: this file
         former_bag : the bag metadata of the log that this one is made from
         """
         try:

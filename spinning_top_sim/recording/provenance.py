@@ -24,8 +24,7 @@ def provenance(values_at_start: Mapping[str, Any], epoch_ns: int, begun_ns: int,
     return {
         'format': '1',      # version of these keys
         'parameters': json.dumps(dict(values_at_start), default=list, sort_keys=True),
-        'parameters_now': json.dumps(
-            dict(values_at_recording), default=list, sort_keys=True),
+        'parameters_now': json.dumps(dict(values_at_recording), default=list, sort_keys=True),
         'seed': str(values_at_start['seed']),
         'epoch_ns': str(epoch_ns),
         'begun_ns': str(begun_ns),

@@ -28,12 +28,7 @@ from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.records import HEAD, ChunkContents, DamagedError
 from spinning_top_sim.recording.rosbag2 import Qos, qos_profiles
 from spinning_top_sim.recording.scanner import Scanner
-from spinning_top_sim.recording.summary import (
-    MAGIC_SIZE,
-    McapSource,
-    indexed_messages,
-    read_summary,
-)
+from spinning_top_sim.recording.source import MAGIC_SIZE, McapSource, messages_in, read_summary
 from spinning_top_sim.recording.writer import OUR_LIBRARY
 
 _FIRST_DATE = 10 ** 17       # [ns], in 1973
@@ -151,10 +146,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         return (min((span.start_ns for span in spans), default=0),
                 max((span.end_ns for span in spans), default=0))
 
-    def messages(
-        self, topics: Iterable[str] | None = None, start: int | None = None,
-        end: int | None = None,
-    ) -> Iterator[LogMessage]:
+    def messages(self, topics: Iterable[str] | None = None, start: int | None = None,
+                 end: int | None = None) -> Iterator[LogMessage]:
         """
         Yield the whole messages in the order of their log times, equal ones in file order.
 
@@ -220,7 +213,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         spans = [_Span(offset, offset + chunk.chunk_length, chunk.message_start_time,
                        chunk.message_end_time)
                  for offset, chunk in sorted(self._summary.chunks.items())
-                 if indexed_messages(chunk)]
+                 if messages_in(chunk)]
         return spans, metadata
 
     def _leads_to_chunk(self, index: ChunkIndex) -> bool:

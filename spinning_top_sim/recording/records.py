@@ -51,14 +51,11 @@ class TooLargeError(DamagedError):
 
 @dataclass
 class ChunkContents:
-    """
-    The content of a chunk whose checksum is right, or of messages outside of chunks.
-
-    Millions of tiny messages fit into a chunk, so there are only numbers of each.
-    """
+    """The content of a chunk whose checksum is right, or of messages outside of chunks."""
 
     plain: bytes | bytearray    # uncompressed
-    entries: dict[int, array[int]] = field(default_factory=dict)    # of the message indexes
+    # As in message indexes: millions of tiny messages fit into a chunk.
+    entries: dict[int, array[int]] = field(default_factory=dict)
     declared: list[Schema | Channel] = field(default_factory=list)
     right: bool = True      # may be copied as a whole
 
@@ -145,11 +142,7 @@ def parse_message_index(raw: bytes) -> tuple[int, array[int], int]:
 
 
 def open_chunk(chunk: Chunk, max_bytes: int) -> ChunkContents:
-    """
-    Decompress and check a chunk; raises DamagedError.
-
-    A chunk without checksum (0) is right when it decompresses and breaks up into records.
-    """
+    """Decompress and check a chunk, whose checksum is 0 if it has none; raises DamagedError."""
     plain = _decompress(chunk, max_bytes)
     if chunk.uncompressed_crc and zlib.crc32(plain) != chunk.uncompressed_crc:
         raise DamagedError('its checksum is wrong')

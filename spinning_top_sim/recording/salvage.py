@@ -32,10 +32,8 @@ class Recovered:
     damage: Damage  # of the old file
 
 
-def recover(
-    reader: LogReader, output: str | os.PathLike[str],
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Recovered:
+def recover(reader: LogReader, output: str | os.PathLike[str],
+            progress: Callable[[int, int], None] = lambda done, total: None) -> Recovered:
     """
     Write everything that is whole in a log into a new file.
 
@@ -51,10 +49,9 @@ def recover(
     try:
         if os.path.lexists(output):
             raise FileExistsError
-        try:
+        with contextlib.suppress(_FoundLateError):
             return _recover(reader, output, draft, progress)
-        except _FoundLateError:
-            return _recover(reader, output, draft, progress)
+        return _recover(reader, output, draft, progress)
     except FileExistsError:
         raise LogError(f'{output} exists, and nothing is overwritten') from None
     except FileNotFoundError as error:
@@ -68,9 +65,8 @@ class _FoundLateError(Exception):
     """Channels were found behind their messages; another scan knows them from the beginning."""
 
 
-def _recover(
-    reader: LogReader, output: Path, draft: Path, progress: Callable[[int, int], None],
-) -> Recovered:
+def _recover(reader: LogReader, output: Path, draft: Path,
+             progress: Callable[[int, int], None]) -> Recovered:
     scanner = reader.scan()
     records = iter(scanner)
     first = next(records, None)

@@ -14,7 +14,7 @@ _skip           a damaged record, or one that has no place there   loss         
 _skip           a record that is larger than `max_bytes`           loss, refused    all others
 _skip           the end of the file within a record                loss             all before
 _skip           the same in bag metadata, data end or summary      truncated        all before
-MessageCounts   messages of a channel that nothing declares        loss, counted    all others
+_MessageCounts  messages of a channel that nothing declares        loss, counted    all others
 _check_end      an end of the file or a summary that is damaged    defect           all
 _check_end      no data end before a whole footer                  defect           all
 _check_end      a wrong checksum of a section without all these    loss of 0 bytes  all
@@ -36,6 +36,7 @@ import bisect
 import contextlib
 import struct
 from array import array
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -48,11 +49,9 @@ from spinning_top_sim.recording import records
 from spinning_top_sim.recording.chunks import Entries, message_indexes, time_span
 from spinning_top_sim.recording.damage import Damage, Loss
 from spinning_top_sim.recording.mcap_writer import record_bytes
-from spinning_top_sim.recording.message_counts import MessageCounts
 from spinning_top_sim.recording.records import HEAD, ChunkContents, DamagedError, TooLargeError
-from spinning_top_sim.recording.resync import RecordFinder
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA
-from spinning_top_sim.recording.summary import MAGIC_SIZE, McapSource, Summary
+from spinning_top_sim.recording.source import MAGIC_SIZE, McapSource, RecordFinder, Summary
 
 _CHUNK_TIMES = struct.Struct('<QQ')     # behind the head of a chunk
 _DATA_END_SIZE = HEAD.size + 4
@@ -101,10 +100,8 @@ class Scanner:
             if head[:1] == right[:1] or head[1:] == right[1:]:
                 self._indexed[offset] = opcode
         self._indexed_offsets = sorted(self._indexed)
-
-        # What is found
         self._metadata_bytes = 0
-        self._counts = MessageCounts(summary, ours=ours)
+        self._counts = _MessageCounts(summary, ours=ours)
         self._losses: list[Loss] = []
         self._defects: list[str] = []
 
@@ -352,3 +349,60 @@ class Scanner:
         if statistics is not None and not self._losses and not self._counts.unknown and (
                 statistics.message_count > self._counts.found.total()):
             self._losses.append(Loss(0, 0, 'messages', 'the statistics count more than there are'))
+
+
+class _MessageCounts:
+    """Counts by channel id the messages that a scan finds, and those that the log has lost."""
+
+    def __init__(self, summary: Summary, *, ours: bool) -> None:
+        self._summary = summary
+        self._ours = ours       # numbered without gaps
+        self.found: Counter[int] = Counter()    # without those of unknown channels
+        self.unknown: dict[int, Loss] = {}      # of channels that nothing has declared so far
+        self.in_lost_chunks: Counter[int] = Counter()   # by their message indexes
+        self.start_ns, self.end_ns = 1 << 64, 0     # earliest and latest log time of those found
+        self._gaps: Counter[int] = Counter()    # in the sequence numbers
+        self._next_sequence: dict[int, int] = {}
+
+    def count(self, offset: int, contents: ChunkContents) -> None:
+        """Count messages, and remove those of unknown channels."""
+        unknown = {number for number in contents.entries if not self._summary.knows(number)}
+        for message in contents.messages() if unknown or self._ours else ():
+            number = message.channel_id
+            if number in unknown:
+                loss = self.unknown.setdefault(number, Loss(
+                    offset, 0, f'messages of channel {number}',
+                    'the record of their channel or schema is lost', messages=0))
+                loss.bytes += len(message.data)
+                loss.messages = (loss.messages or 0) + 1
+            elif self._ours:
+                gap = (message.sequence - self._next_sequence.get(number, 0)) & 0xFFFFFFFF
+                if gap < 1 << 31:  # else it is out of order
+                    self._gaps[number] += gap
+                    self._next_sequence[number] = message.sequence + 1
+        for number in unknown:
+            del contents.entries[number]
+            contents.right = False
+        for number, entries in contents.entries.items():
+            self.found[number] += len(entries) // 2
+        if contents.entries:
+            start_ns, end_ns = time_span(contents.entries)
+            self.start_ns = min(self.start_ns, start_ns)
+            self.end_ns = max(self.end_ns, end_ns)
+
+    def missing(self, *, lossless: bool) -> dict[str, int]:
+        """Return the lost messages by topic; '' stands for topics that nothing declares."""
+        if self._summary.statistics is None:
+            lost = (self._gaps | self.in_lost_chunks) + Counter(
+                {number: loss.messages or 0 for number, loss in self.unknown.items()})
+        else:
+            lost = Counter(self._summary.statistics.channel_message_counts)
+            lost.subtract(self.found)
+            if lossless:
+                # A whole file that was made of a truncated one still tells what that had lost.
+                lost.update(self._gaps)
+        missing: Counter[str] = Counter()
+        for number, messages in sorted((+lost).items()):
+            known = self._summary.knows(number)
+            missing[self._summary.channels[number].topic if known else ''] += messages
+        return dict(missing)

@@ -18,10 +18,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.provenance import version
-from spinning_top_sim.recording.rosbag2 import RecordedTopic, offered_qos_yaml
+from spinning_top_sim.recording.rosbag2 import RecordedTopic, find_definition, offered_qos_yaml
 
 try:
     from mcap.records import Channel, Header, Metadata, Schema
@@ -33,7 +32,7 @@ except ImportError as error:
 
 METADATA_NAME = 'spinning_top_sim'
 OUR_LIBRARY = 'spinning_top_sim '   # what the header of our files begins with
-QUEUE_BYTES = 32_000_000            # where a recording has no more room, see `McapRecorder.room`
+QUEUE_BYTES = 32_000_000            # of a full queue; a burst that began with room may go on
 
 _ENTRY_BYTES = 128  # what a queued message costs besides its data, about
 
@@ -56,7 +55,6 @@ class RecordingSummary:
 
     @property
     def messages(self) -> int:
-        """Messages in the file."""
         return sum(self.counts.values())
 
 
@@ -68,11 +66,9 @@ class McapRecorder:
     and `error` says why, naming the path.  What was written up to then stays readable.
     """
 
-    def __init__(
-        self, path: str | os.PathLike[str], topics: Sequence[RecordedTopic],
-        metadata: Mapping[str, str], *, max_loss: float = 0.5, compression: str = 'zstd',
-        min_free_bytes: int = 100_000_000,
-    ) -> None:
+    def __init__(self, path: str | os.PathLike[str], topics: Sequence[RecordedTopic],
+                 metadata: Mapping[str, str], *, max_loss: float = 0.5,
+                 compression: str = 'zstd', min_free_bytes: int = 100_000_000) -> None:
         """
         Create the file and start recording; raises as `create_file`.
 
@@ -106,11 +102,7 @@ class McapRecorder:
 
     @property
     def room(self) -> bool:
-        """
-        Whether the queue has room, or the recording has stopped.
-
-        Where it has none, hold the simulation's clock; a burst that began with room may go on.
-        """
+        """Whether the clock may go on: the queue has room, or the recording has stopped."""
         return self._bytes_in - self._bytes_out < QUEUE_BYTES
 
     @property
@@ -294,9 +286,8 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
             file.sync()
             sync_directory(path.parent)
     except FileExistsError as error:
-        raise RecordingError(
-            f'cannot record to {path}: it exists, and a recording overwrites nothing'
-        ) from error
+        raise RecordingError(f'cannot record to {path}: it exists, and a recording '
+                             'overwrites nothing') from error
     except FileNotFoundError as error:
         # A directory such as /proc is there, and takes no files.
         reason = 'no files can be made in' if path.parent.is_dir() else 'there is no directory'

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bytes of an MCAP file that may be damaged, and the summary section at its end."""
+"""An MCAP file that may be damaged: its bytes, where records begin in it, and its summary."""
 
 import contextlib
 import functools
 import os
+import re
 import stat
 import zlib
 from collections import defaultdict
@@ -13,31 +14,32 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, TypeVar
 
+import mcap.records
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import (
-    AttachmentIndex,
-    Channel,
-    ChunkIndex,
-    Footer,
-    McapRecord,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording import records
-from spinning_top_sim.recording.chunks import ENTRY_SIZE, INDEX_HEAD
+from spinning_top_sim.recording.chunks import ENTRY_SIZE, INDEX_HEAD, MESSAGE_FIELDS
 from spinning_top_sim.recording.errors import LogError
-from spinning_top_sim.recording.records import HEAD, DamagedError
+from spinning_top_sim.recording.records import HEAD, DamagedError, TooLargeError
 
 MAGIC_SIZE = len(MCAP0_MAGIC)
 
-_Record = TypeVar('_Record', bound=McapRecord)
+_Record = TypeVar('_Record', bound=mcap.records.McapRecord)
 _FOOTER_SIZE = HEAD.size + 8 + 8 + 4
-_BLOCK = 1 << 16  # bytes read at a time where a record is not needed whole
-_ATTACHMENT_HEAD = 1 << 16  # bytes; more than any name and media type
+_BLOCK = 1 << 16    # bytes read at a time where a record is not needed whole
+
+# What may begin a chunk, a schema, a channel or metadata: opcode and a length below 2^40.
+# Single messages are not looked for: nothing in them tells them from chance.
+_CANDIDATE = re.compile(rb'[\x03\x04\x06\x0c](?=.{5}\x00\x00\x00)', re.DOTALL)
+# Where the length of the first text is in the content; a chunk's is followed by that of the data.
+_NAME_OFFSETS: dict[int, int] = {
+    Opcode.SCHEMA: 2, Opcode.CHANNEL: 4, Opcode.METADATA: 0, Opcode.CHUNK: 28}
+_LOOK_BYTES = 64                # of the content, enough for a chunk's fields before its data
+_MAX_NAME = 1 << 12
+_MAX_EXTRA = 1 << 10
+_MAX_EFFORT = 4                 # bytes of candidates read, as a multiple of the file's size
 
 
 class McapSource:
@@ -113,13 +115,13 @@ class McapSource:
                 return record
         return None
 
-    def attachment(self, offset: int, end: int) -> tuple[AttachmentIndex, int]:
+    def attachment(self, offset: int, end: int) -> tuple[mcap.records.AttachmentIndex, int]:
         """Return the index of the attachment there, and the offset of its checksum."""
-        stream = records.StrictStream(BytesIO(
-            self.read(offset, min(end - offset, _ATTACHMENT_HEAD))))
+        # No name and media type need more than a block.
+        stream = records.StrictStream(BytesIO(self.read(offset, min(end - offset, _BLOCK))))
         try:
             stream.read(HEAD.size)
-            index = AttachmentIndex(
+            index = mcap.records.AttachmentIndex(
                 offset=offset, length=end - offset, log_time=stream.read8(),
                 create_time=stream.read8(), name=stream.read_prefixed_string(),
                 media_type=stream.read_prefixed_string(), data_size=stream.read8())
@@ -131,6 +133,80 @@ class McapSource:
         return index, crc_offset
 
 
+class RecordFinder:
+    """Finds records that prove themselves by their inner lengths, chunks by their checksum too."""
+
+    def __init__(self, source: McapSource, limit: int) -> None:
+        self._source = source
+        self._limit = limit     # where the data section ends
+        # Bytes of candidates to be read and to be uncompressed, so that the time is limited.
+        self._effort = _MAX_EFFORT * source.size
+        self._unpacking = _MAX_EFFORT * (source.size + source.max_bytes)
+
+    def is_record(self, offset: int) -> bool:
+        """Return whether a record of a known kind begins there, or the data section ends."""
+        try:
+            opcode, end = self._source.head(offset, self._limit)
+            while opcode > Opcode.DATA_END:
+                offset = end
+                opcode, end = self._source.head(offset, self._limit)
+            if opcode == Opcode.MESSAGE:
+                return end - offset >= HEAD.size + MESSAGE_FIELDS
+            if opcode in _NAME_OFFSETS:
+                return self._is_proven(opcode, offset, end)
+            if opcode == Opcode.ATTACHMENT:
+                self._source.attachment(offset, end)
+            elif opcode == Opcode.MESSAGE_INDEX:
+                records.parse_message_index(self._source.raw(offset, end))
+            else:
+                records.parse(self._source.raw(offset, end))
+        except TooLargeError:
+            return opcode == Opcode.CHUNK
+        except DamagedError:
+            return offset == self._limit
+        return True
+
+    def find(self, offset: int) -> int:
+        """Return where the next chunk, schema, channel or metadata begins, or the limit."""
+        while offset < self._limit:
+            block = self._source.read(offset, _BLOCK + HEAD.size)
+            for match in _CANDIDATE.finditer(block, 0, _BLOCK + HEAD.size - 1):
+                place = offset + match.start()
+                if self.is_record(place):
+                    return place
+            offset += _BLOCK
+        return self._limit
+
+    def _is_proven(self, opcode: int, offset: int, end: int) -> bool:
+        """Return whether it is a chunk, schema, channel or metadata; raises DamagedError."""
+        # First what needs no more than a look: most candidates are none.
+        start = offset + HEAD.size
+        if not _looks_right(opcode, end - start, self._source.read(start, _LOOK_BYTES)):
+            return False
+        self._effort -= end - start
+        if self._effort < 0:
+            return False
+        record, _ = records.parse(self._source.raw(offset, end))
+        if not isinstance(record, mcap.records.Chunk):
+            return True
+        self._unpacking -= record.uncompressed_size
+        if self._unpacking < 0:
+            return False
+        contents = records.open_chunk(record, self._source.max_bytes)
+        return bool(contents.entries or contents.declared)      # zeros look like an empty chunk
+
+
+def _looks_right(opcode: int, length: int, start: bytes) -> bool:
+    """Return whether a chunk, schema, channel or metadata of this length may start so."""
+    name_start = _NAME_OFFSETS[opcode] + 4
+    name_size = int.from_bytes(start[name_start - 4:name_start], 'little')
+    if opcode == Opcode.CHUNK:
+        data_start = name_start + name_size + 8
+        data_size = int.from_bytes(start[data_start - 8:data_start], 'little')
+        return 0 <= length - data_start - data_size <= _MAX_EXTRA
+    return 0 < name_size < _MAX_NAME and length <= records.MAX_DECLARED
+
+
 @dataclass
 class Summary:
     """The summary section of a file; empty if it is damaged or missing."""
@@ -140,13 +216,13 @@ class Summary:
     problem: str = ''       # why there is no summary, '' also if the file was written without one
     # By id.  Scans add what the data section declares, so that a second scan knows it from the
     # beginning.
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
+    schemas: dict[int, mcap.records.Schema] = field(default_factory=dict)
+    channels: dict[int, mcap.records.Channel] = field(default_factory=dict)
     declared_bytes: int = 0     # of schemas and channels
-    statistics: Statistics | None = None
-    chunks: dict[int, ChunkIndex] = field(default_factory=dict)  # by offset
-    metadata: list[MetadataIndex] = field(default_factory=list)
-    attachments: list[AttachmentIndex] = field(default_factory=list)
+    statistics: mcap.records.Statistics | None = None
+    chunks: dict[int, mcap.records.ChunkIndex] = field(default_factory=dict)  # by offset
+    metadata: list[mcap.records.MetadataIndex] = field(default_factory=list)
+    attachments: list[mcap.records.AttachmentIndex] = field(default_factory=list)
 
     def knows(self, channel_id: int) -> bool:
         """Return whether the channel and its schema, if it has one, are known."""
@@ -162,7 +238,7 @@ class Summary:
     def indexes_all_messages(self) -> bool:
         """Whether the chunk indexes lead to as many messages as the statistics count."""
         return self.statistics is not None and self.statistics.message_count == sum(
-            map(indexed_messages, self.chunks.values()))
+            map(messages_in, self.chunks.values()))
 
     @property
     def is_complete(self) -> bool:
@@ -184,7 +260,7 @@ class Summary:
             *((index.offset, Opcode.ATTACHMENT, index.length) for index in self.attachments)]
 
 
-def indexed_messages(index: ChunkIndex) -> int:
+def messages_in(index: mcap.records.ChunkIndex) -> int:
     """Return how many messages of a chunk its message indexes have, by their length."""
     return (index.message_index_length
             - INDEX_HEAD.size * len(index.message_index_offsets)) // ENTRY_SIZE
@@ -196,7 +272,7 @@ def read_summary(source: McapSource) -> Summary:
     footer_offset = magic_offset - _FOOTER_SIZE
     if footer_offset < MAGIC_SIZE or source.read(magic_offset, MAGIC_SIZE) != MCAP0_MAGIC:
         return Summary(source.size, problem='the file does not end as an MCAP file ends')
-    footer = source.record(footer_offset, magic_offset, Footer)
+    footer = source.record(footer_offset, magic_offset, mcap.records.Footer)
     if footer is None:
         return Summary(source.size, problem='the footer is damaged')
     start, size = footer.summary_start, source.size - footer.summary_start
@@ -229,11 +305,12 @@ def _read_section(source: McapSource, start: int, end: int) -> Summary:
         offset = record_end
     summary = Summary(
         start, closed=True, declared_bytes=declared_bytes,
-        schemas={schema.id: schema for schema in found[Schema]},
-        channels={channel.id: channel for channel in found[Channel]},
-        statistics=next(reversed(found[Statistics]), None),
-        chunks={index.chunk_start_offset: index for index in found[ChunkIndex]},
-        metadata=found[MetadataIndex], attachments=found[AttachmentIndex])
+        schemas={schema.id: schema for schema in found[mcap.records.Schema]},
+        channels={channel.id: channel for channel in found[mcap.records.Channel]},
+        statistics=next(reversed(found[mcap.records.Statistics]), None),
+        chunks={index.chunk_start_offset: index for index in found[mcap.records.ChunkIndex]},
+        metadata=found[mcap.records.MetadataIndex],
+        attachments=found[mcap.records.AttachmentIndex])
     if any(index.chunk_start_offset + index.chunk_length > start
            for index in summary.chunks.values()):
         raise DamagedError('it places a chunk outside of the data section')
