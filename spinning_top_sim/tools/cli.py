@@ -40,8 +40,7 @@ def run(name: str, help_text: str | None, argv: Sequence[str] | None,
     """
     Run a command; return its exit code.
 
-    That is INTERRUPTED after Ctrl-C, and after one of `errors` FAILED; after a ValueError among
-    them, which wrong arguments raise, WRONG_USAGE.
+    One of `errors` gives FAILED, a ValueError among them (wrong arguments) WRONG_USAGE.
     """
     # A closed stream is None, and a file that is opened would take its place.
     sys.stdout = sys.stdout or open(os.devnull, 'w')    # noqa: SIM115
@@ -83,11 +82,7 @@ def print_line(text: str, file: TextIO | None = None) -> None:
 @contextlib.contextmanager
 def progress(what: str, total: float, unit: str, *, quiet: bool = False,
              ) -> Iterator[Callable[[float], None]]:
-    """
-    Show a bar on a terminal, and elsewhere a line from time to time.
-
-    Yields what takes the amount done so far.
-    """
+    """Show a bar on a terminal, else a line at times; yield what takes the amount done so far."""
     if quiet or not total > 0.0:
         yield lambda done: None
         return
@@ -102,13 +97,8 @@ def progress(what: str, total: float, unit: str, *, quiet: bool = False,
 
         yield show
         return
-    try:
-        from tqdm import tqdm  # noqa: PLC0415 - a system may lack it
-    except ImportError:
-        yield lambda done: print(f'\r{what} {min(done / total, 1.0):4.0%}', end='',
-                                 file=sys.stderr, flush=True)
-        print(file=sys.stderr)
-        return
+    from tqdm import tqdm  # noqa: PLC0415 - it takes 50 ms
+
     with tqdm(total=total, unit=unit, desc=what,
               bar_format='{desc} {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} {unit} '
                          '[{elapsed}<{remaining}]') as bar:
