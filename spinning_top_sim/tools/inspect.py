@@ -31,8 +31,8 @@ from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import cli
 
 if TYPE_CHECKING:
+    from spinning_top_sim.tools.recorded_run import Verdict
     from spinning_top_sim.tools.survey import Motion, Survey
-    from spinning_top_sim.tools.verify import Verdict
 
 MOST_MOTIONS = 12           # shown one by one in the text
 DEGREES = math.degrees(1.0)
@@ -75,8 +75,8 @@ def _picture(endings: tuple[str, ...], name: str) -> Path:
 def _run(arguments: argparse.Namespace) -> int:
     # Not before: --help needs none of it.
     from spinning_top_sim.recording.reader import LogReader  # noqa: PLC0415
+    from spinning_top_sim.tools.recorded_run import verify  # noqa: PLC0415
     from spinning_top_sim.tools.survey import survey  # noqa: PLC0415
-    from spinning_top_sim.tools.verify import verify  # noqa: PLC0415
 
     verdict = None
     with LogReader(arguments.log) as reader:
