@@ -111,7 +111,7 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> bool:
 
         for path, draw in ((arguments.plot, plots.draw_page), (arguments.animate, plots.animate)):
             if path is not None:
-                shown = draw(found, path)
+                shown = draw(found, *found.shown, path)
                 cli.print_line(f'{path}: {shown}', sys.stderr if arguments.json else None)
         return True
     except ImportError as error:

@@ -194,13 +194,11 @@ def _rerun(run: RunDescription, end_ns: int,
     most_steps = LEAST_STEPS + STEPS_A_BYTE * run.log_bytes
     samples_left = LEAST_SAMPLES + SAMPLES_A_BYTE * run.log_bytes
 
-    def has_stepped_enough() -> bool:
-        return simulation.steps > most_steps
-
     def reach(target_ns: int) -> None:
         with contextlib.suppress(IntegrationError):     # as far as the equations go
-            simulation.advance_in_blocks(target_ns, send or (lambda *_: None), has_stepped_enough)
-        if has_stepped_enough():
+            simulation.advance_in_blocks(target_ns, send or (lambda *_: None),
+                                         lambda: simulation.steps > most_steps)
+        if simulation.steps > most_steps:
             raise DepartureError(f'over {most_steps} integration steps are too many for a log of '
                                  f'{run.log_bytes} bytes')
 

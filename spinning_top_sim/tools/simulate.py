@@ -49,7 +49,7 @@ UNITS = {
     'l3': 'kg m^2/s', 'lz': 'kg m^2/s'}
 ROWS_AT_ONCE = 20_000
 
-# Time [ns], and L3 and Lz commanded there [kg m^2/s].
+# Time [ns], and L3 and Lz commanded there [kg m^2/s], None at the end of the run.
 Stop = tuple[int, tuple[float, float] | None]
 
 
@@ -164,9 +164,6 @@ def _write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
     Simulate a run into a new log; return the number of messages and the size of the file.
 
     After an error the log is closed and readable, and holds what was computed before.
-
-    stops : in ascending order of time, the last one is the end of the run
-    show : takes the simulated time reached [s]
     """
     from spinning_top_sim.recording.writer import create_file  # noqa: PLC0415 - needs mcap
 
@@ -200,17 +197,15 @@ class _LogWriter:
     """
     Writes a log in a thread: compression and the file system leave Python to others.
 
-    The blocks of all streams up to one time become one chunk, which one thread compresses and
-    writes while the next blocks are computed.  At most one chunk is on its way, and everything
-    else waits for it: the order in the file is that of the calls, however threads are scheduled.
+    The blocks of all streams up to one time become one chunk, which is compressed and written
+    while the next blocks are computed.  Everything else waits for it, to keep the order.
     """
 
     def __init__(self, file: McapWriter, streams: Sequence[Stream]) -> None:
         self._file, self._streams = file, streams
         self._blocks: list[tuple[int, NDArray[np.int64], NDArray[np.uint8]]] = []
         self._executor = ThreadPoolExecutor(1)
-        # The chunk that is being written; at first there is none to wait for.
-        self._chunk: Future[None] = self._executor.submit(lambda: None)
+        self._chunk: Future[None] = self._executor.submit(lambda: None)     # none at first
 
     def write(self, topic_index: int, stamp_ns: int, data: bytes) -> None:
         """Write an entry of the journal with the next chunk."""
@@ -243,11 +238,7 @@ class _LogWriter:
 
 def _rows(simulation: Simulation, period_ns: int, stops: Sequence[Stop],
           show: Callable[[float], object]) -> Iterator[NDArray[np.float64]]:
-    """
-    Yield blocks (columns, n) of the table of states.  A command changes the rows after its time.
-
-    stops, show : see `_write_log`
-    """
+    """Yield blocks (columns, n) of the table.  A command changes the rows after its time."""
     next_ns = 0
     for target_ns, momenta in offline_targets(0, stops, ROWS_AT_ONCE * period_ns):
         times = range(next_ns, target_ns + 1, period_ns)

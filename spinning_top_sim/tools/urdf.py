@@ -44,8 +44,7 @@ def robot_description(values: Mapping[str, Any], folder: str | Path) -> str:
     import xacro  # noqa: PLC0415
 
     document = xacro.process_file(str(Path(folder) / XACRO_FILE), mappings=arguments(values))
-    text: str = document.documentElement.toprettyxml(indent='  ')
-    return f'<?xml version="1.0"?>\n{text}'
+    return '<?xml version="1.0"?>\n' + document.documentElement.toprettyxml(indent='  ')
 
 
 def inertia_warning(values: Mapping[str, Any]) -> str:
