@@ -17,7 +17,6 @@ FAILED = 1
 WRONG_USAGE = 2             # as argparse has it
 INTERRUPTED = 130
 
-TEXT_WIDTH = 118            # without a terminal
 LINE_EVERY_S = 10.0         # of progress, without a terminal
 GAP = '  '                  # before each column of a table
 
@@ -113,14 +112,13 @@ def table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> Ite
     """
     cells = [[*map(printable, row)] for row in (head, *rows)]
     first, *widths = (max(map(len, column)) for column in zip(*cells, strict=True))
-    stacked = (first + sum(widths) + len(GAP) * (len(widths) + 1)
-               > shutil.get_terminal_size((TEXT_WIDTH, 0)).columns)
+    columns = shutil.get_terminal_size((118, 0)).columns        # 118 without a terminal
+    stacked = first + sum(widths) + len(GAP) * (len(widths) + 1) > columns
     yield from ('', title)
     for name, *numbers in cells:
-        line = GAP + name.ljust(first)
+        start = name.ljust(first)
         if stacked:
             yield GAP + name
-            line = GAP
-        for number, wide in zip(numbers, widths, strict=True):
-            line += GAP + number.rjust(wide)
-        yield line.rstrip()
+            start = ''
+        aligned = (number.rjust(wide) for number, wide in zip(numbers, widths, strict=True))
+        yield GAP.join(('', start, *aligned)).rstrip()

@@ -230,7 +230,6 @@ def _stamps(samples: Sequence[LogMessage]) -> Stamps:
 
 
 def _analyse(found: Survey, motion: Motion, topic: str, samples: list[LogMessage]) -> None:
-    """Analyse consecutive samples of a stream within a motion."""
     stream, segment = motion.streams[topic], motion.segment
     fitting = [sample for sample in samples if len(sample.data) == len(stream.template)]
     found.topics[topic].odd_size += len(samples) - len(fitting)
@@ -287,7 +286,6 @@ def _count(report: TopicReport, stamps_ns: Stamps, sections: Sequence[Section], 
 
 
 def _measure(found: Survey, motion: Motion) -> None:
-    """Measure a motion from the samples of its source."""
     samples, motion.samples = motion.samples, []
     data = analysis.longest_run(samples) if samples else None
     if data is None or len(data.stamps_ns) < 2:
