@@ -12,11 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import TextIO
 
-OK = 0
-FAILED = 1
-WRONG_USAGE = 2             # as argparse has it
-INTERRUPTED = 130
-
+OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130         # 2 as argparse has it
 LINE_EVERY_S = 10.0         # of progress, without a terminal
 GAP = '  '                  # before each column of a table
 

@@ -10,8 +10,6 @@ exit codes:
   130  interrupted; the log holds what was computed before
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import math
@@ -19,11 +17,12 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.physics.top import Top
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.provenance import provenance
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
@@ -35,10 +34,6 @@ from spinning_top_sim.streams.schedule import offline_block_ns, offline_targets
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools import cli
 from spinning_top_sim.tools.scene_file import is_of_ros, parse_assignment, read_scene
-
-if TYPE_CHECKING:
-    from spinning_top_sim.physics.top import Top
-    from spinning_top_sim.recording.mcap_writer import McapWriter
 
 FORMATS = ('mcap', 'csv', 'parquet')
 # Names and units of the columns of a table.
@@ -165,18 +160,11 @@ def _write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
 
     After an error the log is closed and readable, and holds what was computed before.
     """
-    from spinning_top_sim.recording.writer import create_file  # noqa: PLC0415 - needs mcap
-
-    values, epoch_ns = simulation.values, simulation.epoch_ns
-    streams = journal.recorded_streams(simulation.streams, values)
-    topics = [RecordedTopic(journal.resolve_topic(name, namespace), type_name)
-              for name, type_name in (*((stream.topic, stream.type_name) for stream in streams),
-                                      *journal.TOPICS)]
-    commands_topic, events_topic = len(streams), len(streams) + 1
-    metadata = provenance(values, epoch_ns, -1, (), values)
-    file = create_file(path, topics, metadata, compression=values['record.compression'])
+    epoch_ns = simulation.epoch_ns
+    streams = journal.recorded_streams(simulation.streams, simulation.values)
     simulation.log_to(None, streams)
-    with contextlib.closing(_LogWriter(file, streams)) as writer:
+    commands_topic, events_topic = len(streams), len(streams) + 1
+    with contextlib.closing(_LogWriter(path, simulation, streams, namespace)) as writer:
         writer.write(events_topic, epoch_ns, journal.event('start', 0, -1))
         for target_ns, momenta in offline_targets(0, stops, offline_block_ns(streams)):
             try:
@@ -190,7 +178,7 @@ def _write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
                     'command', t_ns, simulation.now_ns, l3=l3, lz=lz))
                 writer.write(commands_topic, epoch_ns + t_ns, journal.command(l3, lz))
             show(target_ns / NANOSECONDS)
-    return f'{sum(file.message_counts.values())} messages, {file.size / 1e6:.1f} MB'
+    return f'{sum(writer.file.message_counts.values())} messages, {writer.file.size / 1e6:.1f} MB'
 
 
 class _LogWriter:
@@ -201,8 +189,17 @@ class _LogWriter:
     while the next blocks are computed.  Everything else waits for it, to keep the order.
     """
 
-    def __init__(self, file: McapWriter, streams: Sequence[Stream]) -> None:
-        self._file, self._streams = file, streams
+    def __init__(self, path: Path, simulation: Simulation, streams: Sequence[Stream],
+                 namespace: str) -> None:
+        from spinning_top_sim.recording.writer import create_file  # noqa: PLC0415 - needs mcap
+
+        values = simulation.values
+        types = {stream.topic: stream.type_name for stream in streams} | dict(journal.TOPICS)
+        topics = [RecordedTopic(journal.resolve_topic(name, namespace), type_name)
+                  for name, type_name in types.items()]
+        metadata = provenance(values, simulation.epoch_ns, -1, (), values)
+        self.file = create_file(path, topics, metadata, compression=values['record.compression'])
+        self._streams = streams
         self._blocks: list[tuple[int, NDArray[np.int64], NDArray[np.uint8]]] = []
         self._executor = ThreadPoolExecutor(1)
         self._chunk: Future[None] = self._executor.submit(lambda: None)     # none at first
@@ -210,7 +207,7 @@ class _LogWriter:
     def write(self, topic_index: int, stamp_ns: int, data: bytes) -> None:
         """Write an entry of the journal with the next chunk."""
         self._chunk.result()
-        self._file.append(topic_index, stamp_ns, data)
+        self.file.append(topic_index, stamp_ns, data)
 
     def take(self, stream: Stream, stamps_ns: NDArray[np.int64],
              rows: NDArray[np.uint8]) -> None:
@@ -221,10 +218,10 @@ class _LogWriter:
         """Begin to write a chunk of the blocks.  Raises OSError of the chunk before."""
         blocks, self._blocks = self._blocks, []
         if blocks:
-            chunk = self._file.chunk_of_rows(blocks)
+            chunk = self.file.chunk_of_rows(blocks)
             self._chunk.result()
-            self._file.write_chunk()
-            self._chunk = self._executor.submit(self._file.write_chunk, chunk)
+            self.file.write_chunk()
+            self._chunk = self._executor.submit(self.file.write_chunk, chunk)
 
     def close(self) -> None:
         """Finish the file."""
@@ -232,8 +229,8 @@ class _LogWriter:
             self._chunk.result()
         finally:
             self._executor.shutdown()
-            self._file.write_chunk()
-            self._file.finish()
+            self.file.write_chunk()
+            self.file.finish()
 
 
 def _rows(simulation: Simulation, period_ns: int, stops: Sequence[Stop],

@@ -182,7 +182,7 @@ def survey(reader: LogReader) -> Survey:
         found.end_ns = last.end_ns = max(last.begin_ns, 0, *(
             int(stamps_ns[topic].max(initial=0)) for topic in last.periods_ns))
     for topic, report in found.topics.items():
-        _count(report, stamps_ns[topic], sections if report.stream is not None else (), topic)
+        _count(report, stamps_ns[topic], sections if report.stream is not None else [], topic)
     for motion in found.motions:
         _measure(found, motion)
     return found
@@ -259,8 +259,7 @@ def _analyse(found: Survey, motion: Motion, topic: str, samples: list[LogMessage
             data.stamps_ns, angle_between(data.quaternion, truth))
 
 
-def _count(report: TopicReport, stamps_ns: Stamps, sections: Sequence[Section], topic: str,
-           ) -> None:
+def _count(report: TopicReport, stamps_ns: Stamps, sections: list[Section], topic: str) -> None:
     """Count a topic's messages, and compare those of a stream with the grid of each section."""
     report.count = len(stamps_ns)
     if report.count > 1:
