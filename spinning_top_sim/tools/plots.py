@@ -126,15 +126,14 @@ def draw_page(found: Survey, motion: Motion, data: Attitudes, path: Path) -> str
                                                           not name.endswith('ground_truth/imu')))
             time, *vectors = np.concatenate(found.readings[topic]).T
             shown = time <= time[0] + float(data.time[-1])
-            for column, quantity in enumerate(('angular velocity [rad/s]',
-                                               'specific force [m/s²]')):
+            for column, label in enumerate(('angular velocity [rad/s]', 'specific force [m/s²]')):
                 axes = figure.add_subplot(grid[3, column])
                 for axis, values in zip('xyz', vectors[3 * column:], strict=False):
                     axes.plot((time - time[0])[shown], values[shown], label=axis)
                 axes.legend(loc='upper right', ncols=3)
                 axes.margins(y=0.2)
-                axes.set(title=f'{quantity.partition(" [")[0]}, {topic}', xlabel='time [s]',
-                         ylabel=quantity)
+                axes.set(title=f'{label.partition(" [")[0]}, {topic}', xlabel='time [s]',
+                         ylabel=label)
         figure.savefig(path, dpi=120)
     return f'motion {_part(found, data, float(data.time[-1]))}; drifts and errors of all of it'
 

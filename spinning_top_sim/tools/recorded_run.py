@@ -254,8 +254,7 @@ def _apply(simulation: Simulation, event: Event) -> None:
             simulation.restart(details['parameters'])
             simulation.epoch_ns = details['epoch_ns']
     except ODD as error:
-        raise DepartureError(
-            f'{event.name} at t = {event.t_ns} ns: {reason_of(error)}') from error
+        raise DepartureError(f'{event.name} at t = {event.t_ns} ns: {reason_of(error)}') from error
 
 
 class Difference(NamedTuple):
@@ -279,8 +278,7 @@ class Verdict:
     unexpected: int = 0                   # messages that are in the log and were not computed
     first: Difference | None = None       # the earliest of all these
     stopped: str = ''                     # why the run could not be computed to its end
-    # Differences of version and machine, which may change the last bits
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)       # of another version or machine
 
     @property
     def identical(self) -> bool:
@@ -294,11 +292,7 @@ class Verdict:
 
 def verify(reader: LogReader, run: RunDescription, end_ns: int,
            show: Callable[[int], None]) -> Verdict:
-    """
-    Compute the run of a log again up to the log time `end_ns`; compare all messages byte for byte.
-
-    show : takes the log time reached [ns]
-    """
+    """Compute a run again up to a log time, and compare; `show` takes the one reached [ns]."""
     commands = run.commands_topic
     verdict = Verdict({topic: 0 for topic in (*run.topics.values(), commands)
                        if topic is not None}, warnings=_warnings(run))
@@ -361,15 +355,14 @@ def _difference(key: tuple[int, str], stream: Stream | None, logged: bytes,
     place = None if stream is None else stream.template.field_at(at)
     if stream is None or place is None:
         return Difference(*key, f'byte {at}', f'0x{logged[at]:02x}', f'0x{computed[at]:02x}', at)
-    number, element, offset = place
+    number, element, start = place
     if number < 0:
         what, code, text = 'header.stamp', '<iI', '{}.{:09d}'
     else:
         names = FIELDS.get(stream.type_name)
         what = f'{names[number] if names else f"array {number}"}[{element}]'
         code, text = '<d', '{!r}'
-    one, two = (text.format(*struct.unpack_from(code, data, offset))
-                for data in (logged, computed))
+    one, two = (text.format(*struct.unpack_from(code, data, start)) for data in (logged, computed))
     return Difference(*key, what, one, two, at)
 
 

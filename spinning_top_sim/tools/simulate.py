@@ -68,8 +68,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--command', metavar='T:L3:LZ', action='append', default=[],
         help='at T [s] set L3 and Lz [kg m^2/s]; may be repeated; commands at the same time are '
         'applied in the order given')
-    # In ROS a stamp of 0 means "no time".
-    add('--epoch', type=float, default=1.0, metavar='S',
+    add('--epoch', type=float, default=1.0, metavar='S',        # in ROS a stamp of 0 is "no time"
         help='stamp of t = 0 [s], default %(default)g')
     add('--namespace', default='/', help='of the topics in the log')
     add('--format', choices=FORMATS,
@@ -209,8 +208,7 @@ class _LogWriter:
         self._chunk.result()
         self.file.append(topic_index, stamp_ns, data)
 
-    def take(self, stream: Stream, stamps_ns: NDArray[np.int64],
-             rows: NDArray[np.uint8]) -> None:
+    def take(self, stream: Stream, stamps_ns: NDArray[np.int64], rows: NDArray[np.uint8]) -> None:
         """Take a block of samples, which `write_blocks` writes."""
         self._blocks.append((self._streams.index(stream), stamps_ns, rows.copy()))
 

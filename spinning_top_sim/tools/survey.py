@@ -137,8 +137,7 @@ class Survey:
     motions: list[Motion] = field(default_factory=list)
     # By topic, of energy, l3 and lz: relative to the beginning of the motion, if that is not 0.
     drifts: dict[str, dict[str, Series]] = field(default_factory=dict)
-    # By topic: angle between the attitude and the exact solution [rad].
-    errors: dict[str, Series] = field(default_factory=dict)
+    errors: dict[str, Series] = field(default_factory=dict)     # of attitudes, by topic [rad]
     # The first motion with samples, and its samples shown in pictures.
     shown: tuple[Motion, Attitudes] | None = None
     # By topic: (n, 7) time [s], angular velocity [rad/s], specific force [m/s^2].
@@ -246,13 +245,11 @@ def _analyse(found: Survey, motion: Motion, topic: str, samples: list[LogMessage
         motion.samples.append((data.stamps_ns, data.rows))
     values = data.constants(segment.solver.top)
     if values is not None and stream.topic != 'imu/data':       # which is noisy
-        drifts = found.drifts.setdefault(
-            topic, {name: Series() for name in ('energy', 'l3', 'lz')})
+        drifts = found.drifts.setdefault(topic, {key: Series() for key in ('energy', 'l3', 'lz')})
         for series, value, start in zip(
                 drifts.values(), values, (segment.energy, segment.l3, segment.lz), strict=True):
             series.add(data.stamps_ns, (value - start) / (abs(start) or 1.0))
-    exact = segment.exact if motion.exact is not None else None
-    if exact is not None:
+    if motion.exact is not None and (exact := segment.exact) is not None:
         times_ns = np.clip(data.stamps_ns - motion.origin_ns, -exact.ns_limit, exact.ns_limit)
         truth = exact.states(times_ns).rows_quaternion
         found.errors.setdefault(topic, Series()).add(
