@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The run of a log: what is said about it there, its computation again, the comparison of both."""
+"""The run of a log: how the log describes it, its computation again, the comparison of both."""
 
 import contextlib
 import json
