@@ -21,6 +21,7 @@ from helpers.reference import ROOT, SCENES, scene_parameters
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.pipeline import Simulation
@@ -418,9 +419,8 @@ def test_a_changed_journal_is_found(stepped, tmp_path, capsys):
 
 
 def test_another_machine_is_warned_of(stepped, capsys, monkeypatch):
-    from spinning_top_sim.tools import verify
-    here = verify.surroundings()
-    monkeypatch.setattr(verify, 'surroundings', lambda: {**here, 'platform': 'abacus'})
+    here = provenance.surroundings()
+    monkeypatch.setattr(provenance, 'surroundings', lambda: {**here, 'platform': 'abacus'})
     verdict = verified(capsys, stepped)
     assert verdict['identical']
     assert len(verdict['warnings']) == 1 and 'abacus' in verdict['warnings'][0]

@@ -403,22 +403,6 @@ def test_progress_is_shown_on_a_terminal_only(monkeypatch):
         assert shown or stream.getvalue() == ''
 
 
-def test_progress_is_shown_without_tqdm_too(monkeypatch):
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
-
-    monkeypatch.setitem(sys.modules, 'tqdm', None)
-    told = ['', 'verified   0%', 'verified  50%', 'verified  50%', 'verified 100%\n']
-    for stream, quiet, shown in ((Terminal(), False, told), (Terminal(), True, ['']),
-                                 (io.StringIO(), False, [''])):
-        monkeypatch.setattr(sys, 'stderr', stream)
-        with cli.progress('verified', 20.0, 's', quiet=quiet) as show:
-            for done in (0.0, 10.0, 10.0001, 25.0):
-                show(done)
-        assert stream.getvalue().split('\r') == shown
-
-
 @pytest.mark.parametrize(('name', 'code'), [('run.csv', 0), ('run.mcap', 1)])
 def test_without_mcap_there_are_tables_and_a_clear_error(tmp_path, name, code):
     run = subprocess.run(

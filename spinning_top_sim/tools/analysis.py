@@ -9,7 +9,6 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq, minimize_scalar
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.regimes import regime
@@ -83,12 +82,7 @@ class Attitudes:
 
 def attitudes_of(name: str, imu: Imu, stamps_ns: NDArray[np.int64],
                  fields: tuple[Reals, ...]) -> Attitudes | None:
-    """
-    Return the attitudes in messages of a stream, None for a stream without.
-
-    name : topic of the stream, such as ground_truth/imu
-    fields : numbers in the messages, as `Template.decode` returns them
-    """
+    """Return the attitudes in the `Template.decode`d fields of a stream, None if it has none."""
     rows = [field.T for field in fields]
     if name in ('ground_truth/imu', 'imu/data'):
         rows = list(map(np.vstack, imu.in_body(tuple(rows[0]), tuple(rows[1]))))
@@ -125,8 +119,8 @@ def interpolate(values: NDArray[Number], at: Reals | float) -> NDArray[Number]:
     Return values at fractional indices, or at one, on the polynomial through POINTS samples.
 
     Berrut & Trefethen, "Barycentric Lagrange interpolation", SIAM Review 46 (2004), eq. 4.2.
-    SciPy's BarycentricInterpolator is for one set of nodes, and orders them at random, so that
-    the last bits change from run to run; a spline is less accurate at the ends of the data.
+    SciPy's BarycentricInterpolator orders the nodes at random, which changes the last bits; a
+    spline is less accurate at the ends of the data.
     """
     points = min(POINTS, len(values))
     at = np.asarray(at)[..., np.newaxis]
@@ -182,6 +176,8 @@ def measure(data: Attitudes) -> Measured:
 
 def _extreme(data: Attitudes, sign: float) -> float:
     """Return the least (sign 1) or greatest (-1) tilt, also between samples [rad]."""
+    from scipy.optimize import minimize_scalar  # noqa: PLC0415 - takes 0.5 s; --help needs none
+
     index = int(np.argmin(sign * data.sin2))
     # Of the two squares the smaller one: it keeps the digits of a small angle.
     near_top = bool(data.sin2[index] < 0.5)
@@ -198,6 +194,8 @@ def _extreme(data: Attitudes, sign: float) -> float:
 
 def _crossings(data: Attitudes) -> tuple[int, float, float]:
     """Return how many whole nutations there are, and the indices at which they begin and end."""
+    from scipy.optimize import brentq  # noqa: PLC0415
+
     # Both rise with the axis; the smaller one keeps the digits of a small angle.
     values = -data.sin2 if np.mean(data.sin2) < 0.5 else data.cos2
     middle = 0.5 * (float(np.min(values)) + float(np.max(values)))

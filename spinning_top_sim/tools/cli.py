@@ -12,12 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import TextIO
 
-OK = 0
-FAILED = 1
-WRONG_USAGE = 2             # as argparse has it
-INTERRUPTED = 130
-
-TEXT_WIDTH = 118            # without a terminal
+OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130         # 2 as argparse has it
 LINE_EVERY_S = 10.0         # of progress, without a terminal
 GAP = '  '                  # before each column of a table
 
@@ -40,8 +35,7 @@ def run(name: str, help_text: str | None, argv: Sequence[str] | None,
     """
     Run a command; return its exit code.
 
-    That is INTERRUPTED after Ctrl-C, and after one of `errors` FAILED; after a ValueError among
-    them, which wrong arguments raise, WRONG_USAGE.
+    One of `errors` gives FAILED, a ValueError among them (wrong arguments) WRONG_USAGE.
     """
     # A closed stream is None, and a file that is opened would take its place.
     sys.stdout = sys.stdout or open(os.devnull, 'w')    # noqa: SIM115
@@ -83,11 +77,7 @@ def print_line(text: str, file: TextIO | None = None) -> None:
 @contextlib.contextmanager
 def progress(what: str, total: float, unit: str, *, quiet: bool = False,
              ) -> Iterator[Callable[[float], None]]:
-    """
-    Show a bar on a terminal, and elsewhere a line from time to time.
-
-    Yields what takes the amount done so far.
-    """
+    """Show a bar on a terminal, else a line at times; yield what takes the amount done so far."""
     if quiet or not total > 0.0:
         yield lambda done: None
         return
@@ -102,13 +92,8 @@ def progress(what: str, total: float, unit: str, *, quiet: bool = False,
 
         yield show
         return
-    try:
-        from tqdm import tqdm  # noqa: PLC0415 - a system may lack it
-    except ImportError:
-        yield lambda done: print(f'\r{what} {min(done / total, 1.0):4.0%}', end='',
-                                 file=sys.stderr, flush=True)
-        print(file=sys.stderr)
-        return
+    from tqdm import tqdm  # noqa: PLC0415 - it takes 50 ms
+
     with tqdm(total=total, unit=unit, desc=what,
               bar_format='{desc} {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} {unit} '
                          '[{elapsed}<{remaining}]') as bar:
@@ -123,14 +108,13 @@ def table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> Ite
     """
     cells = [[*map(printable, row)] for row in (head, *rows)]
     first, *widths = (max(map(len, column)) for column in zip(*cells, strict=True))
-    stacked = (first + sum(widths) + len(GAP) * (len(widths) + 1)
-               > shutil.get_terminal_size((TEXT_WIDTH, 0)).columns)
+    columns = shutil.get_terminal_size((118, 0)).columns        # 118 without a terminal
+    stacked = first + sum(widths) + len(GAP) * (len(widths) + 1) > columns
     yield from ('', title)
     for name, *numbers in cells:
-        line = GAP + name.ljust(first)
+        start = name.ljust(first)
         if stacked:
             yield GAP + name
-            line = GAP
-        for number, wide in zip(numbers, widths, strict=True):
-            line += GAP + number.rjust(wide)
-        yield line.rstrip()
+            start = ''
+        aligned = (number.rjust(wide) for number, wide in zip(numbers, widths, strict=True))
+        yield GAP.join(('', start, *aligned)).rstrip()

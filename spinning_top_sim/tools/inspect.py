@@ -12,8 +12,6 @@ exit codes:
 The keys of --json are in docs/inspect.md.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math
@@ -23,16 +21,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from spinning_top_sim.recording.damage import count, seconds
 from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import cli
-
-if TYPE_CHECKING:
-    from spinning_top_sim.tools.survey import Motion, Survey
-    from spinning_top_sim.tools.verify import Verdict
+from spinning_top_sim.tools.recorded_run import Verdict, verify
+from spinning_top_sim.tools.survey import Motion, Survey, survey
 
 MOST_MOTIONS = 12           # shown one by one in the text
 DEGREES = math.degrees(1.0)
@@ -73,11 +69,6 @@ def _picture(endings: tuple[str, ...], name: str) -> Path:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    # Not before: --help needs none of it.
-    from spinning_top_sim.recording.reader import LogReader  # noqa: PLC0415
-    from spinning_top_sim.tools.survey import survey  # noqa: PLC0415
-    from spinning_top_sim.tools.verify import verify  # noqa: PLC0415
-
     verdict = None
     with LogReader(arguments.log) as reader:
         found = survey(reader)
@@ -111,7 +102,7 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> bool:
 
         for path, draw in ((arguments.plot, plots.draw_page), (arguments.animate, plots.animate)):
             if path is not None:
-                shown = draw(found, path)
+                shown = draw(found, *found.shown, path)
                 cli.print_line(f'{path}: {shown}', sys.stderr if arguments.json else None)
         return True
     except ImportError as error:

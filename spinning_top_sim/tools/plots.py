@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools.analysis import Attitudes, Complexes, Reals, interpolate
-from spinning_top_sim.tools.survey import Survey
+from spinning_top_sim.tools.survey import Motion, Survey
 
 # From the world to the viewer: towards, right, up.
 VIEW = Rotation.from_euler('zy', (60.0, 45.0), degrees=True)
@@ -31,7 +31,6 @@ FINER = 10                  # points drawn for each sample
 PAGE_NUTATIONS, PAGE_S = 8, 5.0      # on the page; seconds where theta rests
 MOST_MARKS = 30             # motions whose begin is marked
 FRAMES_PER_S, LONGEST_S = 20, 10.0
-FRAME_SIZE, FRAME_DPI = 3.6, 90
 DISC, DISC_HEIGHT = 0.42, 0.45      # radius of the body's disc and its place on the axis
 
 
@@ -82,14 +81,12 @@ def smooth_tip(data: Attitudes) -> tuple[Reals, Complexes, Reals]:
     return at * data.period, interpolate(data.tip, at), interpolate(data.height, at)
 
 
-def draw_page(found: Survey, path: Path) -> str:
-    """Draw a page about a log with samples of attitudes (`found.shown`); return what it shows."""
-    assert found.shown is not None
-    (motion, data), start_ns = found.shown, found.damage.start_ns
+def draw_page(found: Survey, motion: Motion, data: Attitudes, path: Path) -> str:
+    """Draw a page about a log and the samples of a motion; return in words what it shows."""
     assert motion.measured is not None
     period, mean = motion.measured.nutation_period, motion.measured.mean_precession_rate
     data = data.first(PAGE_NUTATIONS * period if period else PAGE_S)
-    rows = 4 if found.readings else 3
+    rows, start_ns = 4 if found.readings else 3, found.damage.start_ns
     with rc_context(STYLE):
         figure = Figure(figsize=(11.0, 2.4 * rows + 0.6), layout='constrained')
         grid = figure.add_gridspec(rows, 2, height_ratios=[1.1, 1.1, 1.0, 1.0][:rows])
@@ -129,15 +126,14 @@ def draw_page(found: Survey, path: Path) -> str:
                                                           not name.endswith('ground_truth/imu')))
             time, *vectors = np.concatenate(found.readings[topic]).T
             shown = time <= time[0] + float(data.time[-1])
-            for column, quantity in enumerate(('angular velocity [rad/s]',
-                                               'specific force [m/s²]')):
+            for column, label in enumerate(('angular velocity [rad/s]', 'specific force [m/s²]')):
                 axes = figure.add_subplot(grid[3, column])
                 for axis, values in zip('xyz', vectors[3 * column:], strict=False):
                     axes.plot((time - time[0])[shown], values[shown], label=axis)
                 axes.legend(loc='upper right', ncols=3)
                 axes.margins(y=0.2)
-                axes.set(title=f'{quantity.partition(" [")[0]}, {topic}', xlabel='time [s]',
-                         ylabel=quantity)
+                axes.set(title=f'{label.partition(" [")[0]}, {topic}', xlabel='time [s]',
+                         ylabel=label)
         figure.savefig(path, dpi=120)
     return f'motion {_part(found, data, float(data.time[-1]))}; drifts and errors of all of it'
 
@@ -176,17 +172,15 @@ def _precession_panel(axes: Axes, data: Attitudes, mean: float | None) -> None:
         axes.set_title(f'precession, mean {mean:.9g} rad/s (dashed)')
 
 
-def animate(found: Survey, path: Path) -> str:
+def animate(found: Survey, _motion: Motion, data: Attitudes, path: Path) -> str:
     """Draw the turning top as a GIF: axis, disc with a mark, trace; else as `draw_page`."""
-    assert found.shown is not None
-    _, data = found.shown
     frames = max(2, int(min(LONGEST_S, float(data.time[-1])) * FRAMES_PER_S))
     at = np.arange(frames) / (FRAMES_PER_S * data.period)
     spin = np.interp(at, np.arange(len(data.psi)), data.psi)
     trace = np.linspace(0.0, at[-1], frames * FINER)
     tip, height = interpolate(data.tip, trace), interpolate(data.height, trace)
     lowest = -0.9 if np.min(height) > -0.2 else -1.25
-    figure = Figure(figsize=(FRAME_SIZE, FRAME_SIZE), dpi=FRAME_DPI)
+    figure = Figure(figsize=(3.6, 3.6), dpi=90)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     # The disc across the axis, and a mark that turns with the body.
     rim, mark = (on_sphere(DISC * np.exp(1j * np.linspace(begin, end, count)), DISC_HEIGHT)

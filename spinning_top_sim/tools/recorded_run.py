@@ -1,13 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The run of a log: what metadata and journal say about it, and how it is computed again."""
+"""The run of a log: how the log describes it, its computation again, the comparison of both."""
 
 import contextlib
 import json
+import math
 import operator
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+import re
+import struct
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.writer import METADATA_NAME
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
@@ -15,6 +23,7 @@ from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.cdr import ENCAPSULATION
 from spinning_top_sim.streams.pipeline import Simulation, TakeRows
 from spinning_top_sim.streams.schedule import offline_block_ns, offline_targets
+from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import all_streams
 
 # What values raise that are not as this package writes them.
@@ -25,6 +34,17 @@ MOST_TEXT = 300             # of a reason
 LEAST_STEPS, STEPS_A_BYTE = 200_000, 20
 LEAST_SAMPLES, SAMPLES_A_BYTE = 100_000, 1
 MOST_BLOCKS = 20_000        # of samples between two events
+# Names in the message definition of the arrays of numbers in a template, in their order.
+FIELDS = {
+    'geometry_msgs/msg/PoseStamped': ('pose.orientation',),
+    'sensor_msgs/msg/JointState': ('position', 'velocity'),
+    'sensor_msgs/msg/Imu': ('orientation', 'angular_velocity', 'linear_acceleration'),
+    'nav_msgs/msg/Odometry': ('pose.pose.orientation', 'twist.twist.angular'),
+    'std_msgs/msg/Float64MultiArray': ('data',),
+    'visualization_msgs/msg/MarkerArray': (
+        'markers[0].pose.position', 'markers[0].pose.orientation',
+        'markers[1].pose.orientation', 'markers[2].points'),
+}
 
 
 class ForeignLogError(Exception):
@@ -134,8 +154,7 @@ def _topics(topics: Sequence[LogTopic], values: Mapping[str, Any]) -> dict[str, 
 
 def _event(stamp_ns: int, data: bytes) -> Event:
     """Return an event from its bytes.  Raises one of ODD where they are not as written."""
-    length_field = 4
-    details = json.loads(data[len(ENCAPSULATION) + length_field:-1])
+    details = json.loads(data[len(ENCAPSULATION) + 4:-1])      # 4 for the length of the text
     name, t_ns, sent_ns = (details.pop(key) for key in ('event', 't_ns', 'sent_ns'))
     if journal.event(name, t_ns, sent_ns, **details) != data:
         raise ValueError('the bytes of the entry are not as it was written')
@@ -175,13 +194,11 @@ def _rerun(run: RunDescription, end_ns: int,
     most_steps = LEAST_STEPS + STEPS_A_BYTE * run.log_bytes
     samples_left = LEAST_SAMPLES + SAMPLES_A_BYTE * run.log_bytes
 
-    def has_stepped_enough() -> bool:
-        return simulation.steps > most_steps
-
     def reach(target_ns: int) -> None:
         with contextlib.suppress(IntegrationError):     # as far as the equations go
-            simulation.advance_in_blocks(target_ns, send or (lambda *_: None), has_stepped_enough)
-        if has_stepped_enough():
+            simulation.advance_in_blocks(target_ns, send or (lambda *_: None),
+                                         lambda: simulation.steps > most_steps)
+        if simulation.steps > most_steps:
             raise DepartureError(f'over {most_steps} integration steps are too many for a log of '
                                  f'{run.log_bytes} bytes')
 
@@ -237,5 +254,125 @@ def _apply(simulation: Simulation, event: Event) -> None:
             simulation.restart(details['parameters'])
             simulation.epoch_ns = details['epoch_ns']
     except ODD as error:
-        raise DepartureError(
-            f'{event.name} at t = {event.t_ns} ns: {reason_of(error)}') from error
+        raise DepartureError(f'{event.name} at t = {event.t_ns} ns: {reason_of(error)}') from error
+
+
+class Difference(NamedTuple):
+    """A place where a log and the computation differ."""
+
+    stamp_ns: int                         # log time of the message [ns]
+    topic: str
+    field: str                            # name of the field, or what else is different
+    logged: str                           # its two values
+    computed: str
+    byte: int | None = None               # None where one of them has no such message
+
+
+@dataclass
+class Verdict:
+    """The result of a comparison."""
+
+    compared: dict[str, int]              # messages that both have, by topic
+    different: int = 0                    # how many of these differ
+    missing: int = 0                      # messages that were computed and are not in the log
+    unexpected: int = 0                   # messages that are in the log and were not computed
+    first: Difference | None = None       # the earliest of all these
+    stopped: str = ''                     # why the run could not be computed to its end
+    warnings: list[str] = field(default_factory=list)       # of another version or machine
+
+    @property
+    def identical(self) -> bool:
+        """Whether the messages in the log are those computed."""
+        return not (self.different or self.missing or self.unexpected or self.stopped)
+
+    def note(self, this: Difference) -> None:
+        """Keep a difference if it is the earliest so far."""
+        self.first = min(self.first or this, this, key=operator.attrgetter('stamp_ns'))
+
+
+def verify(reader: LogReader, run: RunDescription, end_ns: int,
+           show: Callable[[int], None]) -> Verdict:
+    """Compute a run again up to a log time, and compare; `show` takes the one reached [ns]."""
+    commands = run.commands_topic
+    verdict = Verdict({topic: 0 for topic in (*run.topics.values(), commands)
+                       if topic is not None}, warnings=_warnings(run))
+    for stamp_ns, reason in run.broken:
+        verdict.different += 1
+        verdict.note(Difference(stamp_ns, run.events_topic or '', 'entry', reason, 'an entry'))
+    # What has not been met in the log, by stamp and topic: several commands may have the same.
+    computed: defaultdict[tuple[int, str], deque[tuple[Stream | None, bytes]]] = defaultdict(deque)
+
+    def take(stream: Stream, stamps_ns: NDArray[np.int64], rows: NDArray[np.uint8]) -> None:
+        for stamp_ns, row in zip(stamps_ns.tolist(), rows, strict=True):
+            computed[stamp_ns, run.topics[stream.topic]].append((stream, row.tobytes()))
+
+    def computing() -> Iterator[float]:
+        """Compute the run; yield the log times before which all is computed, at last infinity."""
+        try:
+            for simulation, event in rerun(run, end_ns, take):
+                if commands is not None and event is not None and event.name == 'command':
+                    computed[event.stamp_ns, commands].append(
+                        (None, journal.command(event.details['l3'], event.details['lz'])))
+                reached_ns = simulation.epoch_ns + simulation.now_ns
+                show(reached_ns)
+                # Not up to it: another command at this very time may follow.
+                yield reached_ns
+        except DepartureError as error:
+            verdict.stopped = str(error)
+        yield math.inf
+
+    reached, before_ns = computing(), -math.inf
+    for message in reader.messages(topics=verdict.compared):
+        while message.log_time >= before_ns:
+            before_ns = next(reached)
+        key = message.log_time, message.topic
+        if key in computed:
+            stream, expected = computed[key].popleft()
+            if not computed[key]:
+                del computed[key]
+            verdict.compared[message.topic] += 1
+            if message.data != expected:
+                verdict.different += 1
+                verdict.note(_difference(key, stream, message.data, expected))
+        else:
+            verdict.unexpected += 1
+            verdict.note(Difference(*key, 'message', 'there', 'no such message'))
+    for _ in reached:
+        pass
+    for key, left in computed.items():
+        verdict.missing += len(left)
+        verdict.note(Difference(*key, 'message', 'no such message', 'there'))
+    return verdict
+
+
+def _difference(key: tuple[int, str], stream: Stream | None, logged: bytes,
+                computed: bytes) -> Difference:
+    """Return the first difference of two messages."""
+    sizes = len(logged), len(computed)
+    if sizes[0] != sizes[1]:
+        return Difference(*key, 'size', f'{sizes[0]} bytes', f'{sizes[1]} bytes', min(sizes))
+    at = next(at for at in range(sizes[0]) if logged[at] != computed[at])
+    place = None if stream is None else stream.template.field_at(at)
+    if stream is None or place is None:
+        return Difference(*key, f'byte {at}', f'0x{logged[at]:02x}', f'0x{computed[at]:02x}', at)
+    number, element, start = place
+    if number < 0:
+        what, code, text = 'header.stamp', '<iI', '{}.{:09d}'
+    else:
+        names = FIELDS.get(stream.type_name)
+        what = f'{names[number] if names else f"array {number}"}[{element}]'
+        code, text = '<d', '{!r}'
+    one, two = (text.format(*struct.unpack_from(code, data, start)) for data in (logged, computed))
+    return Difference(*key, what, one, two, at)
+
+
+def _warnings(run: RunDescription) -> list[str]:
+    """Return the differences of this machine from that of the recording."""
+    now, found = provenance.surroundings(), []
+    for what, key, pattern in (('the version of spinning_top_sim', 'version', '.*'),
+                               ('the platform', 'platform', '.*'),
+                               ('numpy', 'libraries', '"numpy": "[^"]*"')):     # only it computes
+        then, here = (''.join(re.findall(pattern, one[key])) for one in (run.surroundings, now))
+        if then != here:
+            found.append(f'{what} was {then}, is {here}')
+    return found

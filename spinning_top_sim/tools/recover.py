@@ -26,8 +26,7 @@ from spinning_top_sim.recording.salvage import recover
 from spinning_top_sim.tools import cli
 
 SOME_LOST, TERMINATED = 3, 143
-# Smaller files are done before one could read the progress.
-PROGRESS_BYTES = 50_000_000
+PROGRESS_BYTES = 50_000_000     # smaller files are done before one could read the progress
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -34,8 +34,7 @@ for _type, _pattern in (
         ('int', r'[-+]?(0[xX][0-9a-fA-F]+|0[0-7]*|[1-9][0-9]*)'),
         ('float', r'[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|'
                   r'[-+]?\.?(inf|Inf|INF)|\.?(nan|NaN|NAN)')):
-    _Loader.add_implicit_resolver(
-        f'tag:yaml.org,2002:{_type}', re.compile(f'({_pattern})$'), None)
+    _Loader.add_implicit_resolver(f'tag:yaml.org,2002:{_type}', re.compile(f'({_pattern})$'), None)
 
 
 def read_scene(path: str | Path) -> dict[str, object]:

@@ -10,8 +10,6 @@ exit codes:
   130  interrupted; the log holds what was computed before
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import math
@@ -19,11 +17,12 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.physics.top import Top
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.provenance import provenance
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
@@ -36,10 +35,6 @@ from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools import cli
 from spinning_top_sim.tools.scene_file import is_of_ros, parse_assignment, read_scene
 
-if TYPE_CHECKING:
-    from spinning_top_sim.physics.top import Top
-    from spinning_top_sim.recording.mcap_writer import McapWriter
-
 FORMATS = ('mcap', 'csv', 'parquet')
 # Names and units of the columns of a table.
 UNITS = {
@@ -49,7 +44,7 @@ UNITS = {
     'l3': 'kg m^2/s', 'lz': 'kg m^2/s'}
 ROWS_AT_ONCE = 20_000
 
-# Time [ns], and L3 and Lz commanded there [kg m^2/s].
+# Time [ns], and L3 and Lz commanded there [kg m^2/s], None at the end of the run.
 Stop = tuple[int, tuple[float, float] | None]
 
 
@@ -73,8 +68,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--command', metavar='T:L3:LZ', action='append', default=[],
         help='at T [s] set L3 and Lz [kg m^2/s]; may be repeated; commands at the same time are '
         'applied in the order given')
-    # In ROS a stamp of 0 means "no time".
-    add('--epoch', type=float, default=1.0, metavar='S',
+    add('--epoch', type=float, default=1.0, metavar='S',        # in ROS a stamp of 0 is "no time"
         help='stamp of t = 0 [s], default %(default)g')
     add('--namespace', default='/', help='of the topics in the log')
     add('--format', choices=FORMATS,
@@ -164,22 +158,12 @@ def _write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
     Simulate a run into a new log; return the number of messages and the size of the file.
 
     After an error the log is closed and readable, and holds what was computed before.
-
-    stops : in ascending order of time, the last one is the end of the run
-    show : takes the simulated time reached [s]
     """
-    from spinning_top_sim.recording.writer import create_file  # noqa: PLC0415 - needs mcap
-
-    values, epoch_ns = simulation.values, simulation.epoch_ns
-    streams = journal.recorded_streams(simulation.streams, values)
-    topics = [RecordedTopic(journal.resolve_topic(name, namespace), type_name)
-              for name, type_name in (*((stream.topic, stream.type_name) for stream in streams),
-                                      *journal.TOPICS)]
-    commands_topic, events_topic = len(streams), len(streams) + 1
-    metadata = provenance(values, epoch_ns, -1, (), values)
-    file = create_file(path, topics, metadata, compression=values['record.compression'])
+    epoch_ns = simulation.epoch_ns
+    streams = journal.recorded_streams(simulation.streams, simulation.values)
     simulation.log_to(None, streams)
-    with contextlib.closing(_LogWriter(file, streams)) as writer:
+    commands_topic, events_topic = len(streams), len(streams) + 1
+    with contextlib.closing(_LogWriter(path, simulation, streams, namespace)) as writer:
         writer.write(events_topic, epoch_ns, journal.event('start', 0, -1))
         for target_ns, momenta in offline_targets(0, stops, offline_block_ns(streams)):
             try:
@@ -193,32 +177,38 @@ def _write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
                     'command', t_ns, simulation.now_ns, l3=l3, lz=lz))
                 writer.write(commands_topic, epoch_ns + t_ns, journal.command(l3, lz))
             show(target_ns / NANOSECONDS)
-    return f'{sum(file.message_counts.values())} messages, {file.size / 1e6:.1f} MB'
+    return f'{sum(writer.file.message_counts.values())} messages, {writer.file.size / 1e6:.1f} MB'
 
 
 class _LogWriter:
     """
     Writes a log in a thread: compression and the file system leave Python to others.
 
-    The blocks of all streams up to one time become one chunk, which one thread compresses and
-    writes while the next blocks are computed.  At most one chunk is on its way, and everything
-    else waits for it: the order in the file is that of the calls, however threads are scheduled.
+    The blocks of all streams up to one time become one chunk, which is compressed and written
+    while the next blocks are computed.  Everything else waits for it, to keep the order.
     """
 
-    def __init__(self, file: McapWriter, streams: Sequence[Stream]) -> None:
-        self._file, self._streams = file, streams
+    def __init__(self, path: Path, simulation: Simulation, streams: Sequence[Stream],
+                 namespace: str) -> None:
+        from spinning_top_sim.recording.writer import create_file  # noqa: PLC0415 - needs mcap
+
+        values = simulation.values
+        types = {stream.topic: stream.type_name for stream in streams} | dict(journal.TOPICS)
+        topics = [RecordedTopic(journal.resolve_topic(name, namespace), type_name)
+                  for name, type_name in types.items()]
+        metadata = provenance(values, simulation.epoch_ns, -1, (), values)
+        self.file = create_file(path, topics, metadata, compression=values['record.compression'])
+        self._streams = streams
         self._blocks: list[tuple[int, NDArray[np.int64], NDArray[np.uint8]]] = []
         self._executor = ThreadPoolExecutor(1)
-        # The chunk that is being written; at first there is none to wait for.
-        self._chunk: Future[None] = self._executor.submit(lambda: None)
+        self._chunk: Future[None] = self._executor.submit(lambda: None)     # none at first
 
     def write(self, topic_index: int, stamp_ns: int, data: bytes) -> None:
         """Write an entry of the journal with the next chunk."""
         self._chunk.result()
-        self._file.append(topic_index, stamp_ns, data)
+        self.file.append(topic_index, stamp_ns, data)
 
-    def take(self, stream: Stream, stamps_ns: NDArray[np.int64],
-             rows: NDArray[np.uint8]) -> None:
+    def take(self, stream: Stream, stamps_ns: NDArray[np.int64], rows: NDArray[np.uint8]) -> None:
         """Take a block of samples, which `write_blocks` writes."""
         self._blocks.append((self._streams.index(stream), stamps_ns, rows.copy()))
 
@@ -226,10 +216,10 @@ class _LogWriter:
         """Begin to write a chunk of the blocks.  Raises OSError of the chunk before."""
         blocks, self._blocks = self._blocks, []
         if blocks:
-            chunk = self._file.chunk_of_rows(blocks)
+            chunk = self.file.chunk_of_rows(blocks)
             self._chunk.result()
-            self._file.write_chunk()
-            self._chunk = self._executor.submit(self._file.write_chunk, chunk)
+            self.file.write_chunk()
+            self._chunk = self._executor.submit(self.file.write_chunk, chunk)
 
     def close(self) -> None:
         """Finish the file."""
@@ -237,17 +227,13 @@ class _LogWriter:
             self._chunk.result()
         finally:
             self._executor.shutdown()
-            self._file.write_chunk()
-            self._file.finish()
+            self.file.write_chunk()
+            self.file.finish()
 
 
 def _rows(simulation: Simulation, period_ns: int, stops: Sequence[Stop],
           show: Callable[[float], object]) -> Iterator[NDArray[np.float64]]:
-    """
-    Yield blocks (columns, n) of the table of states.  A command changes the rows after its time.
-
-    stops, show : see `_write_log`
-    """
+    """Yield blocks (columns, n) of the table.  A command changes the rows after its time."""
     next_ns = 0
     for target_ns, momenta in offline_targets(0, stops, ROWS_AT_ONCE * period_ns):
         times = range(next_ns, target_ns + 1, period_ns)

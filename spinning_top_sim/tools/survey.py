@@ -137,8 +137,7 @@ class Survey:
     motions: list[Motion] = field(default_factory=list)
     # By topic, of energy, l3 and lz: relative to the beginning of the motion, if that is not 0.
     drifts: dict[str, dict[str, Series]] = field(default_factory=dict)
-    # By topic: angle between the attitude and the exact solution [rad].
-    errors: dict[str, Series] = field(default_factory=dict)
+    errors: dict[str, Series] = field(default_factory=dict)     # of attitudes, by topic [rad]
     # The first motion with samples, and its samples shown in pictures.
     shown: tuple[Motion, Attitudes] | None = None
     # By topic: (n, 7) time [s], angular velocity [rad/s], specific force [m/s^2].
@@ -182,7 +181,7 @@ def survey(reader: LogReader) -> Survey:
         found.end_ns = last.end_ns = max(last.begin_ns, 0, *(
             int(stamps_ns[topic].max(initial=0)) for topic in last.periods_ns))
     for topic, report in found.topics.items():
-        _count(report, stamps_ns[topic], sections if report.stream is not None else (), topic)
+        _count(report, stamps_ns[topic], sections if report.stream is not None else [], topic)
     for motion in found.motions:
         _measure(found, motion)
     return found
@@ -230,7 +229,6 @@ def _stamps(samples: Sequence[LogMessage]) -> Stamps:
 
 
 def _analyse(found: Survey, motion: Motion, topic: str, samples: list[LogMessage]) -> None:
-    """Analyse consecutive samples of a stream within a motion."""
     stream, segment = motion.streams[topic], motion.segment
     fitting = [sample for sample in samples if len(sample.data) == len(stream.template)]
     found.topics[topic].odd_size += len(samples) - len(fitting)
@@ -247,21 +245,18 @@ def _analyse(found: Survey, motion: Motion, topic: str, samples: list[LogMessage
         motion.samples.append((data.stamps_ns, data.rows))
     values = data.constants(segment.solver.top)
     if values is not None and stream.topic != 'imu/data':       # which is noisy
-        drifts = found.drifts.setdefault(
-            topic, {name: Series() for name in ('energy', 'l3', 'lz')})
+        drifts = found.drifts.setdefault(topic, {key: Series() for key in ('energy', 'l3', 'lz')})
         for series, value, start in zip(
                 drifts.values(), values, (segment.energy, segment.l3, segment.lz), strict=True):
             series.add(data.stamps_ns, (value - start) / (abs(start) or 1.0))
-    exact = segment.exact if motion.exact is not None else None
-    if exact is not None:
+    if motion.exact is not None and (exact := segment.exact) is not None:
         times_ns = np.clip(data.stamps_ns - motion.origin_ns, -exact.ns_limit, exact.ns_limit)
         truth = exact.states(times_ns).rows_quaternion
         found.errors.setdefault(topic, Series()).add(
             data.stamps_ns, angle_between(data.quaternion, truth))
 
 
-def _count(report: TopicReport, stamps_ns: Stamps, sections: Sequence[Section], topic: str,
-           ) -> None:
+def _count(report: TopicReport, stamps_ns: Stamps, sections: list[Section], topic: str) -> None:
     """Count a topic's messages, and compare those of a stream with the grid of each section."""
     report.count = len(stamps_ns)
     if report.count > 1:
@@ -287,7 +282,6 @@ def _count(report: TopicReport, stamps_ns: Stamps, sections: Sequence[Section], 
 
 
 def _measure(found: Survey, motion: Motion) -> None:
-    """Measure a motion from the samples of its source."""
     samples, motion.samples = motion.samples, []
     data = analysis.longest_run(samples) if samples else None
     if data is None or len(data.stamps_ns) < 2:

@@ -14,13 +14,12 @@ FRAMES = ('world_frame', 'body_frame', 'imu.frame_id')
 ARGUMENTS = {name.removeprefix('top.').replace('.', '_'): name for name in (
     'top.mass', 'top.com_distance', 'top.lambda1', 'top.lambda3', 'imu.lever_arm', 'imu.rpy',
     *FRAMES)}
-FRAME_NAME = re.compile(r'[\w.-]+(/[\w.-]+)*')
 
 
 def arguments(values: Mapping[str, Any]) -> dict[str, str]:
     """Return the arguments of the xacro file.  Raises ValueError for frames that form no tree."""
     for name in FRAMES:
-        if not FRAME_NAME.fullmatch(values[name]):
+        if not re.fullmatch(r'[\w.-]+(/[\w.-]+)*', values[name]):
             raise ValueError(f'{name} = {values[name]!r}: must be letters, digits, _ . - with / '
                              'between')
     world, body, imu = (values[name] for name in FRAMES)
@@ -44,8 +43,7 @@ def robot_description(values: Mapping[str, Any], folder: str | Path) -> str:
     import xacro  # noqa: PLC0415
 
     document = xacro.process_file(str(Path(folder) / XACRO_FILE), mappings=arguments(values))
-    text: str = document.documentElement.toprettyxml(indent='  ')
-    return f'<?xml version="1.0"?>\n{text}'
+    return '<?xml version="1.0"?>\n' + document.documentElement.toprettyxml(indent='  ')
 
 
 def inertia_warning(values: Mapping[str, Any]) -> str:
