@@ -104,15 +104,6 @@ def pole_momentum(theta: float, l3: float) -> float | None:
     return None
 
 
-def cusp_momentum(theta: float, l3: float) -> float:
-    """
-    Return the lz of a top that was spun about its axis only, and let go: its tip draws cusps.
-
-    ("Analysis of Symmetric Spinning Top", 2023, sect. 4.1 and eq. 33)
-    """
-    return l3 * math.cos(theta)
-
-
 def _freeze_as_floats(record: Top | State) -> None:
     """Store every field as a finite float, or say which one is not."""
     for field in fields(record):
