@@ -5,6 +5,8 @@ The heavy symmetric (Lagrange) top: its constants, its states, and what both mus
 A rigid symmetric body turns about a fixed point on its axis, without friction.  Euler angles are
 ZYZ (Taylor, *Classical Mechanics*, sect. 10.9): body to space is Rz(phi) Ry(theta) Rz(psi), phi is
 the precession, theta the tilt from the upward vertical, psi the spin about the symmetry axis.
+
+Constants and states raise ValueError naming the field, its value and what is allowed.
 """
 
 import math
@@ -21,8 +23,6 @@ class Top:
     mass : [kg], >= 0
     com_distance : signed distance from pivot to centre of mass along +e3 [m]
     gravity : [m/s^2], downwards positive
-
-    Raises ValueError naming the field, its value and what is allowed.
     """
 
     lambda1: float
@@ -66,8 +66,6 @@ class State:
     theta, theta_dot : tilt of the axis from the upward vertical, in [0, pi] [rad], [rad/s]
     phi, psi : precession and spin angle [rad]; their rates follow from l3 and lz
     l3, lz : angular momentum along the body axis and along the vertical [kg m^2/s]
-
-    Raises ValueError naming the field, its value and what is allowed.
     """
 
     theta: float

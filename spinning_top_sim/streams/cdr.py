@@ -86,11 +86,7 @@ class Template:
         return len(self._buffer)
 
     def encode(self, stamps_ns: NDArray[np.int64], *values: Field) -> NDArray[np.uint8]:
-        """
-        Return n messages as rows of bytes (n, size), valid until the next call.
-
-        They have these stamps (n,) [ns], and the numbers of each field.
-        """
+        """Return messages of stamps (n,) [ns] as rows (n, size), valid until the next call."""
         count = len(stamps_ns)
         if len(self._rows) < count:
             self._rows = np.empty(count, self._row_type)

@@ -4,7 +4,6 @@
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,35 +22,26 @@ THINNEST = 0.02
 SMALLEST, LARGEST = 1e-6, 1e6
 
 
-@dataclass(frozen=True)
 class Shape:
     """
-    A solid cylinder about the axis e3, and the end of the axis [m].
+    The solid cylinder about the axis e3 that is drawn for a top, and the end of the axis [m].
+
+    It has lambda3 = M r^2/2 along its axis and M (3 r^2 + h^2)/12 across it, about the centre of
+    mass.  Where there is none (see `Top.is_realizable`) it is a thin disc with the same lambda3,
+    and without a mass it is drawn as of 1 kg.
 
     centre : of the cylinder along e3, signed: the centre of mass
     tip : along e3, on the side of the centre of mass, half a radius out of the cylinder
     """
 
-    radius: float
-    height: float
-    centre: float
-    tip: float
-
-
-def shape_of(top: Top) -> Shape:
-    """
-    Return the cylinder to draw for a top.
-
-    It has lambda3 = M r^2/2 along its axis and M (3 r^2 + h^2)/12 across it, about the centre of
-    mass.  Where there is none (see `Top.is_realizable`) it is a thin disc with the same lambda3,
-    and without a mass it is drawn as of 1 kg.
-    """
-    mass = top.mass or 1.0
-    radius = _drawable(math.sqrt(2.0 * (top.lambda3 / mass)))
-    square = 12.0 * ((top.lambda1_at_com - 0.5 * top.lambda3) / mass)
-    height = _drawable(max(math.sqrt(max(square, 0.0)), THINNEST * radius))
-    reach = abs(top.com_distance) + 0.5 * height + 0.5 * radius
-    return Shape(radius, height, top.com_distance, math.copysign(reach, top.com_distance or 1.0))
+    def __init__(self, top: Top) -> None:
+        mass = top.mass or 1.0
+        square = 12.0 * ((top.lambda1_at_com - 0.5 * top.lambda3) / mass)
+        self.radius = _drawable(math.sqrt(2.0 * (top.lambda3 / mass)))
+        self.height = _drawable(max(math.sqrt(max(square, 0.0)), THINNEST * self.radius))
+        self.centre = top.com_distance
+        reach = abs(self.centre) + 0.5 * self.height + 0.5 * self.radius
+        self.tip = math.copysign(reach, self.centre or 1.0)
 
 
 def _drawable(length: float) -> float:
@@ -71,15 +61,14 @@ class Markers(Stream):
     parameter, topic, type_name = 'markers', 'markers', 'visualization_msgs/msg/MarkerArray'
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        shape = self._shape = shape_of(parameters.top_of(values))
+        shape = self._shape = Shape(parameters.top_of(values))
         self._length_ns = round(values['markers.trace_length'] * NANOSECONDS)
         self._count = min(values['markers.trace_points'], self._length_ns)
         self._spacing_ns = max(1, self._length_ns // max(self._count, 1))
         self._segments: deque[Segment] = deque()
-        side = math.copysign(0.5 * shape.height, shape.tip)
         # Slightly outside, to be seen.
-        rim, far, near = (1.01 * shape.radius, shape.centre + 1.01 * side,
-                          shape.centre - 1.01 * side)
+        rim, side = 1.01 * shape.radius, 1.01 * math.copysign(0.5 * shape.height, shape.tip)
+        far, near = shape.centre + side, shape.centre - side
         lines = (0.0, 0.0, 0.0, 0.0, 0.0, shape.tip,
                  0.0, 0.0, far, rim, 0.0, far,
                  rim, 0.0, far, rim, 0.0, near,

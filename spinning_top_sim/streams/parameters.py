@@ -228,12 +228,11 @@ def checked(values: Mapping[str, Value]) -> dict[str, Value]:
         if name not in BY_NAME:
             raise ValueError(f'{name} = {value!r}: there is no such parameter')
         result[name] = BY_NAME[name].check(value)
-    unknown = [name for name in result['record.streams']
-               if name != 'all' and f'{name}.rate' not in BY_NAME]
-    if unknown:
-        names = ', '.join(row[0] for row in STREAM_DEFAULTS)
-        raise ValueError(f'record.streams = {list(result["record.streams"])!r}: {unknown[0]!r} '
-                         f'is no stream; must be all or some of {names}')
+    names = [row[0] for row in STREAM_DEFAULTS]
+    for name in result['record.streams']:
+        if name not in ('all', *names):
+            raise ValueError(f'record.streams = {list(result["record.streams"])!r}: {name!r} '
+                             f'is no stream; must be all or some of {", ".join(names)}')
     top_of(result)
     start_state(result)
     return result
