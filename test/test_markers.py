@@ -10,8 +10,8 @@ from helpers.reference import SCENES, scene_parameters
 from helpers.simulations import EPOCH_NS, SECOND, record, simulate, stream
 
 from spinning_top_sim import Top, solve
+from spinning_top_sim.physics.top import LARGEST, SMALLEST, THINNEST, Shape
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.markers import LARGEST, SMALLEST, THINNEST, Shape
 
 PERIOD_NS = 50_000_000
 CUSP = {'mass': 2.0, 'com_distance': 0.15, 'lambda1': 0.123, 'lambda3': 0.15, 'gravity': 9.8}

@@ -10,9 +10,9 @@ from helpers.reference import ROOT, SCENES, scene_parameters
 from helpers.simulations import record
 from scipy.spatial.transform import Rotation
 
+from spinning_top_sim.physics.top import Shape
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.markers import Shape
 from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.streams.topics import JOINTS, JointStates, Pose
 from spinning_top_sim.tools import urdf

@@ -139,8 +139,7 @@ def regime(top: Top, state: State, coincide: float = COINCIDE) -> str:
     if resting and 1.0 - abs(low) <= coincide:
         if scale == 0.0:
             return 'at rest'
-        upright = (low > 0.0) == (top.gravity_torque > 0.0)
-        if not upright:
+        if (low > 0.0) != (top.gravity_torque > 0.0):       # the centre of mass is below
             return 'hanging'
         stable = l3 * l3 > 4.0 * top.lambda1 * abs(top.gravity_torque)
         return 'sleeping' if stable else 'sleeping, unstable'

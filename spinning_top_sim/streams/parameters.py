@@ -247,7 +247,7 @@ def top_of(values: Mapping[str, Value]) -> Top:
 def start_state(values: Mapping[str, Value]) -> State:
     """Return the state to start from; an unset spin.lz is the cusp.  Raises ValueError."""
     theta, l3, lz = values['initial.theta'], values['spin.l3'], values['spin.lz']
-    if lz is None:      # spun about its axis only, and let go: sect. 4.1 and eq. 33 of the paper
+    if lz is None:      # "Analysis of Symmetric Spinning Top" (2023), sect. 4.1 and eq. (33)
         lz = l3 * math.cos(theta)
     return State(theta=theta, theta_dot=values['initial.theta_dot'], phi=values['initial.phi'],
                  psi=values['initial.psi'], l3=l3, lz=lz)
