@@ -72,9 +72,8 @@ def precession_rate(top: Top, l3: float, lz: float, cos2_half: Number,
     """
     Return phi' [rad/s] from cos^2 and sin^2 of theta/2.
 
-    Eq. (31) of "Analysis of Symmetric Spinning Top" (2023), (Lz - L3 cos theta)/(lambda1
-    sin^2 theta), split into two terms with one pole each, so that nothing cancels.  A term whose
-    momentum vanishes is 0 at its pole too.
+    (Lz - L3 cos theta)/(lambda1 sin^2 theta), eq. (31) of "Analysis of Symmetric Spinning Top",
+    is split into two terms with one pole each: nothing cancels.  A term without momentum is 0.
     """
     bottom = (lz + l3) / cos2_half if lz + l3 else 0.0 * cos2_half
     upright = (lz - l3) / sin2_half if lz - l3 else 0.0 * sin2_half

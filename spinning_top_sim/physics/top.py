@@ -12,7 +12,7 @@ Constants and states raise ValueError naming the field, its value and what is al
 import math
 from dataclasses import dataclass, fields
 
-# The thinnest disc that can still be seen, by its radius.
+# Of a `Shape`: the thinnest disc that can still be seen, by its radius.
 THINNEST = 0.02
 # What can be drawn in single precision [m].
 SMALLEST, LARGEST = 1e-6, 1e6

@@ -262,9 +262,8 @@ class Simulation:
             for stream in self.streams:
                 times = stream.times(self.now_ns, until_ns)
                 if stream.log_index is not None and times:
-                    rows = stream.encode(states(times), self.epoch_ns, times)
-                    send(stream, self.epoch_ns + np.arange(times.start, times.stop, times.step),
-                         rows)
+                    stamps_ns = self.epoch_ns + np.arange(times.start, times.stop, times.step)
+                    send(stream, stamps_ns, stream.encode(states(times), self.epoch_ns, times))
             self.now_ns = max(self.now_ns, until_ns)
             segment.release(self.now_ns)
 
