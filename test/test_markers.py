@@ -10,7 +10,7 @@ from helpers.reference import SCENES, scene_parameters
 from helpers.simulations import EPOCH_NS, SECOND, record, simulate, stream
 
 from spinning_top_sim import Top, solve
-from spinning_top_sim.physics.shape import LARGEST, SMALLEST, THINNEST, shape_of
+from spinning_top_sim.physics.top import LARGEST, SMALLEST, THINNEST, Shape
 from spinning_top_sim.streams import parameters
 
 PERIOD_NS = 50_000_000
@@ -59,7 +59,7 @@ def axis_of(q):
 @pytest.mark.parametrize('scene', SCENES)
 def test_the_body_has_the_mass_and_the_moments_of_the_top(scene):
     top = parameters.top_of(parameters.checked(scene_parameters(scene)))
-    shape = shape_of(top)
+    shape = Shape(top)
     assert 0.5 * top.mass * shape.radius ** 2 == pytest.approx(top.lambda3, rel=1e-12)
     if top.is_realizable and shape.height > THINNEST * shape.radius:
         across = top.mass * (3.0 * shape.radius ** 2 + shape.height ** 2) / 12.0
@@ -83,7 +83,7 @@ def test_the_body_has_the_mass_and_the_moments_of_the_top(scene):
 def test_every_top_can_be_drawn(changed, expected):
     top = Top(**{**CUSP, **changed})
     assert top.is_realizable in (False, True)
-    shape = shape_of(top)
+    shape = Shape(top)
     for name, value in expected.items():
         found = getattr(shape, name)
         if name == 'tip':
@@ -107,7 +107,7 @@ def test_the_body_is_where_the_pose_is(values):
         (attitude,) = simulation.state().quaternion
         position, body, axis, points = decoded(run, k * PERIOD_NS)
         assert tuple(body) == tuple(axis) == tuple(attitude)
-        arm, shape = axis_of(attitude), shape_of(simulation.top)
+        arm, shape = axis_of(attitude), Shape(simulation.top)
         assert position == pytest.approx(shape.centre * arm, abs=1e-15)
         assert points[-1] == pytest.approx(shape.tip * arm, abs=1e-15)
 
@@ -116,7 +116,7 @@ def test_the_body_is_where_the_pose_is(values):
 @pytest.mark.parametrize('method', ['rk45', 'exact'])
 def test_the_trace_is_the_path_of_the_tip(scene, method):
     run = markers_of({**scene_parameters(scene), 'solver.method': method})
-    tip = shape_of(run.simulation.top).tip
+    tip = Shape(run.simulation.top).tip
     start = parameters.start_state(run.simulation.values)
     for t_ns in (0, PERIOD_NS, 10 * PERIOD_NS, 60 * PERIOD_NS):
         points = decoded(run, t_ns)[3]
@@ -195,7 +195,7 @@ def test_short_traces_and_none(length, points):
     top, start = run.simulation.top, parameters.start_state(run.simulation.values)
     axis = axis_of(solve(top, start, grid_ns * 1e-9, method='exact').quaternion)
     assert found.shape == (count + 1, 3)
-    assert np.abs(found[:-1] - shape_of(top).tip * axis).max() < 1e-12
+    assert np.abs(found[:-1] - Shape(top).tip * axis).max() < 1e-12
 
 
 def test_a_reset_begins_the_trace_anew():
@@ -218,7 +218,7 @@ def test_the_lines_are_drawn_to_the_scale_of_the_top(values):
 
     run = markers_of(values, duration_ns=SECOND)
     body, axis, trace = deserialize_message(run.sent[SECOND], MarkerArray).markers
-    shape = shape_of(run.simulation.top)
+    shape = Shape(run.simulation.top)
     assert (body.scale.x, body.scale.y, body.scale.z) == (
         2.0 * shape.radius, 2.0 * shape.radius, shape.height)
     assert axis.scale.x == pytest.approx(0.02 * abs(shape.tip), rel=1e-12)

@@ -10,7 +10,7 @@ from helpers.reference import ROOT, SCENES, scene_parameters
 from helpers.simulations import record
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.physics.shape import shape_of
+from spinning_top_sim.physics.top import Shape
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.pipeline import Simulation
@@ -138,7 +138,7 @@ def test_an_inertia_that_no_body_has_is_left_out_with_a_warning(name):
 @pytest.mark.parametrize('values', [{}, *ILLEGAL.values(), {'top.com_distance': -0.1},
                                     {'top.com_distance': 0.0}, *map(scene_parameters, SCENES)])
 def test_it_looks_as_the_markers_do(values):
-    shape = shape_of(parameters.top_of(parameters.checked(values)))
+    shape = Shape(parameters.top_of(parameters.checked(values)))
     visuals = {visual.get('name'): visual for visual in element(values).iter('visual')}
     body, axis = (visuals[name].find('geometry/cylinder') for name in ('body', 'axis'))
     found = [float(body.get('radius')), float(body.get('length')),

@@ -72,39 +72,12 @@ def precession_rate(top: Top, l3: float, lz: float, cos2_half: Number,
     """
     Return phi' [rad/s] from cos^2 and sin^2 of theta/2.
 
-    Eq. (31) of "Analysis of Symmetric Spinning Top" (2023), (Lz - L3 cos theta)/(lambda1
-    sin^2 theta), split into two terms with one pole each, so that nothing cancels.  A term whose
-    momentum vanishes is 0 at its pole too.
+    (Lz - L3 cos theta)/(lambda1 sin^2 theta), eq. (31) of "Analysis of Symmetric Spinning Top",
+    is split into two terms with one pole each: nothing cancels.  A term without momentum is 0.
     """
     bottom = (lz + l3) / cos2_half if lz + l3 else 0.0 * cos2_half
     upright = (lz - l3) / sin2_half if lz - l3 else 0.0 * sin2_half
     return 0.25 / top.lambda1 * (bottom + upright)
-
-
-def angular_acceleration(top: Top, omega: Vector, vertical: Vector) -> Vector:
-    """Return omega' [rad/s^2] from omega [rad/s] by Euler's equations, all in the body frame."""
-    gyroscopic = (top.lambda1 - top.lambda3) * omega[2]
-    torque = top.gravity_torque
-    return ((gyroscopic * omega[1] + torque * vertical[1]) / top.lambda1,
-            -(gyroscopic * omega[0] + torque * vertical[0]) / top.lambda1, 0.0)
-
-
-def specific_force(gravity: float, point: tuple[float, float, float], omega: Vector,
-                   acceleration: Vector, vertical: Vector) -> Vector:
-    """
-    Return what an ideal accelerometer at a point of the body measures [m/s^2].
-
-    f = omega' x r + omega x (omega x r) + g z: at rest +g upwards, as REP-145 has it.  In the body
-    frame: point r [m], omega [rad/s], acceleration omega' [rad/s^2], upward vertical z.
-    """
-    r1, r2, r3 = point
-    w1, w2, w3 = omega
-    a1, a2, a3 = acceleration
-    along = w1 * r1 + w2 * r2 + w3 * r3
-    square = w1 * w1 + w2 * w2 + w3 * w3
-    return (a2 * r3 - a3 * r2 + w1 * along - r1 * square + gravity * vertical[0],
-            a3 * r1 - a1 * r3 + w2 * along - r2 * square + gravity * vertical[1],
-            a1 * r2 - a2 * r1 + w3 * along - r3 * square + gravity * vertical[2])
 
 
 def angle_between(p: Quaternion, q: Quaternion) -> Column:

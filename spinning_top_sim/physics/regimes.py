@@ -24,10 +24,9 @@ COINCIDE = 1e-12
 @dataclass(frozen=True)
 class Description:
     """
-    A motion in the numbers that a physicist asks for: angles [rad], rates [rad/s].
+    A motion in numbers: angles [rad], rates [rad/s], means over a nutation.
 
     nutation_period : [s], None where theta rests
-    mean_precession_rate, mean_spin_rate : <phi'>, <psi'> over a nutation
     separatrix_distance : 1 - m of the elliptic functions; 0 is the motion that rises for ever
     gyroscopic_ratio : L3^2/(4 lambda1 |P|); an upright top sleeps above 1; inf without gravity
     """
@@ -140,8 +139,7 @@ def regime(top: Top, state: State, coincide: float = COINCIDE) -> str:
     if resting and 1.0 - abs(low) <= coincide:
         if scale == 0.0:
             return 'at rest'
-        upright = (low > 0.0) == (top.gravity_torque > 0.0)
-        if not upright:
+        if (low > 0.0) != (top.gravity_torque > 0.0):       # the centre of mass is below
             return 'hanging'
         stable = l3 * l3 > 4.0 * top.lambda1 * abs(top.gravity_torque)
         return 'sleeping' if stable else 'sleeping, unstable'

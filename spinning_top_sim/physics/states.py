@@ -39,8 +39,6 @@ class States:
     def __len__(self) -> int:
         return self._n
 
-    # ------------------------------------------------------- the columns of a solver's subclass
-
     @cached_property
     def t(self) -> Column:
         raise NotImplementedError
@@ -72,7 +70,9 @@ class States:
     def l3(self) -> Column:
         return np.full(len(self), self._l3)
 
-    # ------------------------------------------------------------------ what follows from them
+    @cached_property
+    def lz(self) -> Column:
+        return np.full(len(self), self._lz)
 
     @property
     def phi(self) -> Column:
@@ -131,21 +131,34 @@ class States:
 
     @cached_property
     def rows_angular_acceleration(self) -> Vector:
-        return attitude.angular_acceleration(self.top, self.rows_angular_velocity,
-                                             self.rows_vertical)
+        """By Euler's equations."""
+        top, (w1, w2, w3), (z1, z2, _) = self.top, self.rows_angular_velocity, self.rows_vertical
+        gyroscopic = (top.lambda1 - top.lambda3) * w3
+        return ((gyroscopic * w2 + top.gravity_torque * z2) / top.lambda1,
+                -(gyroscopic * w1 + top.gravity_torque * z1) / top.lambda1, 0.0)
 
     @cached_property
     def angular_acceleration(self) -> NDArray[np.float64]:
         return np.stack(np.broadcast_arrays(*self.rows_angular_acceleration), axis=-1)
 
     def specific_force(self, point: tuple[float, float, float]) -> Vector:
-        """Return the specific force at a point r of the body [m], in the body frame [m/s^2]."""
+        """
+        Return what an ideal accelerometer at a point r of the body [m] measures [m/s^2].
+
+        f = omega' x r + omega x (omega x r) + g z in the body frame, with the upward vertical z:
+        at rest +g upwards, as REP-145 has it.
+        """
+        gravity, (z1, z2, z3) = self.top.gravity, self.rows_vertical
         if not any(point):          # the pivot is at rest: no rate is needed
-            gravity = self.top.gravity
-            x, y, z = self.rows_vertical
-            return gravity * x, gravity * y, gravity * z
-        return attitude.specific_force(self.top.gravity, point, self.rows_angular_velocity,
-                                       self.rows_angular_acceleration, self.rows_vertical)
+            return gravity * z1, gravity * z2, gravity * z3
+        r1, r2, r3 = point
+        w1, w2, w3 = self.rows_angular_velocity
+        a1, a2, a3 = self.rows_angular_acceleration
+        along = w1 * r1 + w2 * r2 + w3 * r3
+        square = w1 * w1 + w2 * w2 + w3 * w3
+        return (a2 * r3 - a3 * r2 + w1 * along - r1 * square + gravity * z1,
+                a3 * r1 - a1 * r3 + w2 * along - r2 * square + gravity * z2,
+                a1 * r2 - a2 * r1 + w3 * along - r3 * square + gravity * z3)
 
     @cached_property
     def energy(self) -> Column:
@@ -153,7 +166,3 @@ class States:
         return (0.5 * self.top.lambda1 * (omega1 * omega1 + omega2 * omega2)
                 + 0.5 * self._l3 * self._l3 / self.top.lambda3
                 + self.top.gravity_torque * self.rows_vertical[2])
-
-    @cached_property
-    def lz(self) -> Column:
-        return np.full(len(self), self._lz)

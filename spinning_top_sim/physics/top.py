@@ -1,14 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The heavy symmetric (Lagrange) top: its constants, its states, and what both must satisfy.
+The heavy symmetric (Lagrange) top: its constants, its states, and what it looks like.
 
 A rigid symmetric body turns about a fixed point on its axis, without friction.  Euler angles are
 ZYZ (Taylor, *Classical Mechanics*, sect. 10.9): body to space is Rz(phi) Ry(theta) Rz(psi), phi is
 the precession, theta the tilt from the upward vertical, psi the spin about the symmetry axis.
+
+Constants and states raise ValueError naming the field, its value and what is allowed.
 """
 
 import math
 from dataclasses import dataclass, fields
+
+# Of a `Shape`: the thinnest disc that can still be seen, by its radius.
+THINNEST = 0.02
+# What can be drawn in single precision [m].
+SMALLEST, LARGEST = 1e-6, 1e6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,8 +28,6 @@ class Top:
     mass : [kg], >= 0
     com_distance : signed distance from pivot to centre of mass along +e3 [m]
     gravity : [m/s^2], downwards positive
-
-    Raises ValueError naming the field, its value and what is allowed.
     """
 
     lambda1: float
@@ -66,8 +71,6 @@ class State:
     theta, theta_dot : tilt of the axis from the upward vertical, in [0, pi] [rad], [rad/s]
     phi, psi : precession and spin angle [rad]; their rates follow from l3 and lz
     l3, lz : angular momentum along the body axis and along the vertical [kg m^2/s]
-
-    Raises ValueError naming the field, its value and what is allowed.
     """
 
     theta: float
@@ -97,20 +100,33 @@ class ContinuedState(State):
 
 def pole_momentum(theta: float, l3: float) -> float | None:
     """Return the only lz a top with a vertical axis can have, or None where the axis tilts."""
-    if theta == 0.0:
-        return l3
-    if theta == math.pi:
-        return -l3
-    return None
+    return {0.0: l3, math.pi: -l3}.get(theta)
 
 
-def cusp_momentum(theta: float, l3: float) -> float:
+class Shape:
     """
-    Return the lz of a top that was spun about its axis only, and let go: its tip draws cusps.
+    The solid cylinder about the axis e3 that is drawn for a top, and the end of the axis [m].
 
-    ("Analysis of Symmetric Spinning Top", 2023, sect. 4.1 and eq. 33)
+    It has lambda3 = M r^2/2 along its axis and M (3 r^2 + h^2)/12 across it, about the centre of
+    mass.  Where there is none (see `Top.is_realizable`) it is a thin disc with the same lambda3,
+    and without a mass it is drawn as of 1 kg.
+
+    centre : of the cylinder along e3, signed: the centre of mass
+    tip : along e3, on the side of the centre of mass, half a radius out of the cylinder
     """
-    return l3 * math.cos(theta)
+
+    def __init__(self, top: Top) -> None:
+        mass = top.mass or 1.0
+        square = 12.0 * ((top.lambda1_at_com - 0.5 * top.lambda3) / mass)
+        self.radius = _drawable(math.sqrt(2.0 * (top.lambda3 / mass)))
+        self.height = _drawable(max(math.sqrt(max(square, 0.0)), THINNEST * self.radius))
+        self.centre = top.com_distance
+        reach = abs(self.centre) + 0.5 * self.height + 0.5 * self.radius
+        self.tip = math.copysign(reach, self.centre or 1.0)
+
+
+def _drawable(length: float) -> float:
+    return min(max(length, SMALLEST), LARGEST)
 
 
 def _freeze_as_floats(record: Top | State) -> None:

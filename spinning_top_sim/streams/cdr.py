@@ -86,16 +86,10 @@ class Template:
         return len(self._buffer)
 
     def encode(self, stamps_ns: NDArray[np.int64], *values: Field) -> NDArray[np.uint8]:
-        """
-        Return n messages as rows of bytes (n, size), valid until the next call.
-
-        They have these stamps (n,) [ns], and the numbers of each field.
-        """
+        """Return messages with stamps (n,) [ns], bytes (n, size), valid until the next call."""
         count = len(stamps_ns)
         if len(self._rows) < count:
-            self._rows = np.empty(count, self._row_type)
-            self._rows.view(np.uint8).reshape(count, len(self))[:] = np.frombuffer(
-                self._buffer, np.uint8)
+            self._rows = np.frombuffer(count * self._buffer, self._row_type)
         rows = self._rows[:count]
         for at in self._stamps_at:
             rows[f'sec{at}'], rows[f'nanosec{at}'] = np.divmod(stamps_ns, NANOSECONDS)

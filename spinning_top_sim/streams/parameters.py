@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from spinning_top_sim.physics.top import State, Top, cusp_momentum
+from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.propagator import EQUATIONS, METHODS
 
 Value = Any
@@ -228,12 +228,12 @@ def checked(values: Mapping[str, Value]) -> dict[str, Value]:
         if name not in BY_NAME:
             raise ValueError(f'{name} = {value!r}: there is no such parameter')
         result[name] = BY_NAME[name].check(value)
-    unknown = [name for name in result['record.streams']
-               if name != 'all' and f'{name}.rate' not in BY_NAME]
-    if unknown:
-        names = ', '.join(row[0] for row in STREAM_DEFAULTS)
-        raise ValueError(f'record.streams = {list(result["record.streams"])!r}: {unknown[0]!r} '
-                         f'is no stream; must be all or some of {names}')
+    names = [row[0] for row in STREAM_DEFAULTS]
+    for name in result['record.streams']:
+        if name not in ('all', *names):
+            raise ValueError(f'record.streams = {list(result["record.streams"])!r}: {name!r} '
+                             f'is no stream; must be all or some of {", ".join(names)}')
+    top_of(result)
     start_state(result)
     return result
 
@@ -246,8 +246,8 @@ def top_of(values: Mapping[str, Value]) -> Top:
 
 def start_state(values: Mapping[str, Value]) -> State:
     """Return the state to start from; an unset spin.lz is the cusp.  Raises ValueError."""
-    top_of(values)
     theta, l3, lz = values['initial.theta'], values['spin.l3'], values['spin.lz']
+    if lz is None:      # "Analysis of Symmetric Spinning Top" (2023), sect. 4.1 and eq. (33)
+        lz = l3 * math.cos(theta)
     return State(theta=theta, theta_dot=values['initial.theta_dot'], phi=values['initial.phi'],
-                 psi=values['initial.psi'], l3=l3,
-                 lz=cusp_momentum(theta, l3) if lz is None else lz)
+                 psi=values['initial.psi'], l3=l3, lz=lz)

@@ -107,8 +107,6 @@ class Simulation:
         for stream in self.streams:
             stream.follow(segment)
 
-    # -------------------------------------------------------------------------- the present
-
     @property
     def epoch_ns(self) -> int:
         """Stamp of t = 0 [ns]."""
@@ -152,8 +150,6 @@ class Simulation:
         """Return the present motion in numbers; None where the closed form cannot hold it."""
         exact = self.segment.exact
         return None if exact is None else exact.describe()
-
-    # ------------------------------------------------------------------------------ sending
 
     def log_to(self, write: Log | None, streams: Sequence[Stream] = ()) -> None:
         """
@@ -250,8 +246,7 @@ class Simulation:
         Send every sample of the recorded streams up to `target_ns`, a block of a stream at a time.
 
         The same bytes as `advance` sends, in another order; for offline use.  True of `give_way`
-        ends the call early.  Raises IntegrationError if the equations cannot go on; the samples
-        before that are sent.
+        ends the call early.  Raises IntegrationError after the last sample that is reached.
         """
         segment = self.segment
         self._schedule.invalidate()
@@ -267,17 +262,14 @@ class Simulation:
             for stream in self.streams:
                 times = stream.times(self.now_ns, until_ns)
                 if stream.log_index is not None and times:
-                    rows = stream.encode(states(times), self.epoch_ns, times)
-                    send(stream, self.epoch_ns + np.arange(times.start, times.stop, times.step),
-                         rows)
+                    stamps_ns = self.epoch_ns + np.arange(times.start, times.stop, times.step)
+                    send(stream, stamps_ns, stream.encode(states(times), self.epoch_ns, times))
             self.now_ns = max(self.now_ns, until_ns)
             segment.release(self.now_ns)
 
     def skip_to(self, t_ns: int) -> None:
         """Take every sample up to this time as sent, and none later; only for offline use."""
         self.now_ns = t_ns
-
-    # ----------------------------------------------------------------------------- commands
 
     def command(self, l3: float, lz: float) -> None:
         """
@@ -288,9 +280,8 @@ class Simulation:
         for name, value in (('l3', l3), ('lz', lz)):
             if not math.isfinite(value):
                 raise ValueError(f'{name} = {value!r} kg m^2/s: must be finite')
-        at_ns = max(self.now_ns, 0)
-        self.advance(at_ns)
-        now = self.segment.states(range(at_ns, at_ns + 1))
+        self.advance(max(self.now_ns, 0))
+        now = self.state()
         theta = float(now.theta[0])
         pole = pole_momentum(abs(theta), l3)
         if pole is not None and lz != pole:
@@ -299,10 +290,10 @@ class Simulation:
                 f'{theta!r} rad), where lz must equal {pole!r}; command both together')
         start = ContinuedState(theta=theta, theta_dot=float(now.theta_dot[0]),
                                phi=float(now.phi[0]), psi=float(now.psi[0]), l3=l3, lz=lz)
-        segment = _segment(self.top, start, at_ns, self.values)
+        segment = _segment(self.top, start, self.now_ns, self.values)
         self._steps_before, self._evaluations_before = self.steps, self.evaluations
         self._begin(segment)
-        self.history.append((at_ns, l3, lz))
+        self.history.append((self.now_ns, l3, lz))
 
 
 def _segment(top: Top, start: State, start_ns: int, values: Mapping[str, Any]) -> Segment:

@@ -17,8 +17,6 @@ from spinning_top_sim.solvers.propagator import Propagator
 # A motion whose exact solution ends before three years is refused when it begins.
 SHORTEST_RUN_NS = 10 ** 17
 
-Axis = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
-
 
 class Segment:
     """
@@ -86,7 +84,7 @@ class Segment:
             errors[:len(held)] = attitude.angle_between((x, y, z, w), truth)
         return errors
 
-    def exact_axis(self, times_ns: NDArray[np.int64]) -> Axis:
+    def exact_axis(self, times_ns: NDArray[np.int64]) -> attitude.Vector:
         """Return the exact axis in the world at times (n,) [ns]; where not known, it rests."""
         if self.exact is not None:
             return self.exact.states(
