@@ -10,7 +10,6 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterable
-from os import _exit
 from typing import TYPE_CHECKING, Protocol, cast
 
 from spinning_top_sim.recording.errors import LogError
@@ -40,7 +39,7 @@ def run(name: str, argv: list[str],
     prepare : takes the arguments; returns what makes the node, or None if there is nothing to run
     """
     # Nothing is open yet, and a KeyboardInterrupt in the midst of imports is easily lost.
-    _handle(signal.SIGINT, lambda *_: _exit(130))
+    _handle(signal.SIGINT, lambda *_: os._exit(130))
     _open_standard_streams()
     try:
         if '--version' in argv[1:]:
@@ -145,7 +144,7 @@ def wait_for_all_acked(publishers: Iterable[Publisher], seconds: float,
     from rclpy.duration import Duration  # noqa: PLC0415
 
     end = time.monotonic() + seconds
-    waiting = [publisher for publisher in publishers if publisher.get_subscription_count()]
-    while waiting and time.monotonic() < end and not stopped():
-        waiting = [publisher for publisher in waiting
-                   if not publisher.wait_for_all_acked(Duration(seconds=0.02))]
+    for publisher in list(publishers):      # the node may close some meanwhile
+        while (publisher.get_subscription_count() and time.monotonic() < end and not stopped()
+                and not publisher.wait_for_all_acked(Duration(seconds=0.02))):
+            pass

@@ -32,12 +32,8 @@ class SimulatedClock:
         self._from_simulated = simulated_ns
 
     def set_scale(self, scale: float) -> None:
-        self.set(self.now(), self.running)
+        self.set(self.now(), self._from_source is not None)
         self._scale = scale
-
-    @property
-    def running(self) -> bool:
-        return self._from_source is not None
 
     def now(self) -> int:
         """Return the simulated time [ns]."""

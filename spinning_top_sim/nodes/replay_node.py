@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -65,40 +64,36 @@ def _parser() -> argparse.ArgumentParser:
         prog='replay_node', description=DESCRIPTION, epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
+    not_negative = _number(0.0, sys.float_info.max, 'a finite number >= 0')
     add('file', type=Path, metavar='FILE', help='the log')
     add('--version', action='store_true', help='print the version, then end')
-    add('-r', '--rate', type=_rate, metavar='R',
+    add('-r', '--rate', metavar='R',
+        type=_number(SLOWEST, FASTEST, f'{RATES}; --start-paused begins with a pause'),
         help='recorded over real time (default: the parameter `rate`, 1)')
     add('-l', '--loop', action='store_true', help='begin again at the end; --clock goes on')
-    add('--start', type=_not_negative, default=0.0, metavar='S',
+    add('--start', type=not_negative, default=0.0, metavar='S',
         help='begin S seconds after the begin of the log')
     add('--topics', nargs='+', default=[], metavar='T',
         help='play these only, by their recorded names')
-    add('--clock', type=_not_negative, nargs='?', const=CLOCK_RATE, default=0.0, metavar='HZ',
+    add('--clock', type=not_negative, nargs='?', const=CLOCK_RATE, default=0.0, metavar='HZ',
         help="publish the log's time on /clock, HZ times a second "
         f'(default {CLOCK_RATE:g}), instead of a recorded /clock')
     add('--partial', action='store_true', help='play what is whole of a torn log')
     add('-p', '--start-paused', action='store_true', help='wait for ~/set_pause false')
-    add('-d', '--delay', type=_not_negative, default=0.0, metavar='S',
+    add('-d', '--delay', type=not_negative, default=0.0, metavar='S',
         help='wait S seconds before the first message')
     add('--wait-for-subscribers', type=int, default=0, metavar='COUNT',
         help='wait until there are so many, over all topics')
     return parser
 
 
-def _rate(text: str) -> float:
-    with contextlib.suppress(ValueError):
-        if SLOWEST <= float(text) <= FASTEST:
-            return float(text)
-    raise argparse.ArgumentTypeError(f'{text}: must be {RATES}; '
-                                     '--start-paused begins with a pause')
-
-
-def _not_negative(text: str) -> float:
-    with contextlib.suppress(ValueError):
-        if 0.0 <= float(text) < math.inf:
-            return float(text)
-    raise argparse.ArgumentTypeError(f'{text}: must be a finite number >= 0')
+def _number(lowest: float, highest: float, allowed: str) -> Callable[[str], float]:
+    def parse(text: str) -> float:
+        with contextlib.suppress(ValueError):
+            if lowest <= float(text) <= highest:
+                return float(text)
+        raise argparse.ArgumentTypeError(f'{text}: must be {allowed}')
+    return parse
 
 
 if __name__ == '__main__':

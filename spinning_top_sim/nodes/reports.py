@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the nodes say about themselves: /diagnostics, and the status line on the terminal."""
 
-from __future__ import annotations
-
 import math
 import os
 import shlex
@@ -11,19 +9,15 @@ import sys
 import time
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from std_msgs.msg import Header
 
-from spinning_top_sim.nodes.tick_loop import State
+from spinning_top_sim.nodes.recording_session import RecordingSession
+from spinning_top_sim.nodes.tick_loop import State, TickLoop
 from spinning_top_sim.streams.cdr import NANOSECONDS
-
-if TYPE_CHECKING:
-    from spinning_top_sim.nodes.recording_session import RecordingSession
-    from spinning_top_sim.nodes.tick_loop import TickLoop
-    from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.pipeline import Simulation
 
 
 class MotionReport:
@@ -131,19 +125,18 @@ class Terminal:
     """Shows a status line; on a terminal each one overwrites the one before."""
 
     def __init__(self) -> None:
-        self._columns = _columns()
         self._open = False              # the cursor stands behind a line
 
     def show(self, line: str) -> None:
         """Show the newest line, on a terminal as many of its parts as fit."""
-        self._columns = self._columns and _columns()        # it may have gone meanwhile
-        if self._columns:
-            while len(line) >= self._columns and ' | ' in line:
-                line = line.rpartition(' | ')[0]
-            self._write(f'\r\x1b[K{line[:max(self._columns - 1, 1)]}')
-            self._open = True
-        else:
+        columns = _columns()
+        if not columns:
             self._write(f'{line}\n')
+            return
+        while len(line) >= columns and ' | ' in line:
+            line = line.rpartition(' | ')[0]
+        self._write(f'\r\x1b[K{line[:max(columns - 1, 1)]}')
+        self._open = True
 
     def tell(self, line: str) -> None:
         """Show a line that stays."""
