@@ -44,7 +44,6 @@ def run(name: str, argv: list[str],
     try:
         if '--version' in argv[1:]:
             from spinning_top_sim.recording.provenance import version  # noqa: PLC0415
-
             print(f'{name} {version("spinning_top_sim")}')
             return 0
         make_node = prepare(argv)

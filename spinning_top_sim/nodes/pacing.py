@@ -73,9 +73,8 @@ class DeadlineThread(threading.Thread):
     """
 
     LONGEST_SLEEP = 0.05    # [s], so that `stop` is quick
-    # The thread sleeps for this share of the period between `tick` and `idle`, if that is long
-    # enough.  A tick wakes up the threads that send; they often run on the core of this one, and
-    # would wait for `idle`.
+    # The thread sleeps for this share of the period between `tick` and `idle`: the threads that
+    # send, which a tick wakes up, often run on the same core and would wait for `idle`.
     NAP = 0.15
     SHORTEST_NAP = 1e-4     # [s]
 

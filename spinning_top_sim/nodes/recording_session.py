@@ -49,8 +49,7 @@ class RecordingSession:
         """
         Begin to record into memory; return a function that opens the log and moves it there.
 
-        The function returns a text with the path.  It raises RecordingError if the log cannot be
-        opened; then nothing is recorded.
+        It returns a text with the path, or raises RecordingError; then nothing is recorded.
         """
         if self._recorder is not None:
             path = self._recorder.path

@@ -1,20 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The executable `replay_node`."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from spinning_top_sim.nodes import executable
+from spinning_top_sim.nodes.executable import RunnableNode, run
 from spinning_top_sim.nodes.pacing import FASTEST, RATES, SLOWEST
-
-if TYPE_CHECKING:
-    from spinning_top_sim.nodes.replayer import Replayer
 
 DESCRIPTION = """\
 Publish the messages of a ROS 2 log (.mcap) with their recorded spacing.
@@ -46,10 +40,10 @@ CLOCK_RATE = 40.0           # Hz, as `ros2 bag play` has it
 
 def main(argv: list[str] | None = None) -> int:
     """Run the node; return 0 after an ordinary end, 2 for what could not be played."""
-    return executable.run('replay_node', sys.argv if argv is None else argv, _prepare)
+    return run('replay_node', sys.argv if argv is None else argv, _prepare)
 
 
-def _prepare(argv: list[str]) -> Callable[[], Replayer]:
+def _prepare(argv: list[str]) -> Callable[[], RunnableNode]:
     from rclpy.utilities import remove_ros_args  # noqa: PLC0415
 
     options = _parser().parse_args(remove_ros_args(argv)[1:])

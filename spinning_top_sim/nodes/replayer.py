@@ -30,7 +30,6 @@ from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes import pacing, reports
 from spinning_top_sim.nodes.executable import one_line, wait_for_all_acked
-from spinning_top_sim.nodes.pacing import Message, Playback, ReadAhead, rounds
 from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import DefinitionNotFoundError
 from spinning_top_sim.recording.reader import LogReader, LogTopic
@@ -55,7 +54,7 @@ class Replayer(Node):
             raise ValueError(f'--start {options.start:g}: the log lasts {self._length_s:.3f} s')
         self._outputs = self._open_publishers()     # by channel
         self._senders = set(self._outputs.values())
-        self._playback = Playback(self._begin_ns, paused=options.start_paused)
+        self._playback = pacing.Playback(self._begin_ns, paused=options.start_paused)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self.declare_parameter('rate', 1.0, ParameterDescriptor(
             description='recorded over real time; a change takes effect at once',
@@ -70,7 +69,7 @@ class Replayer(Node):
         self.create_service(SetBool, '~/set_pause', self._on_pause)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._play, name='playback', daemon=True)
-        self._ahead = ReadAhead(rounds(self._messages, self._span_ns, options.loop))
+        self._ahead = pacing.ReadAhead(pacing.rounds(self._messages, self._span_ns, options.loop))
 
     @property
     def _log(self) -> Any:
@@ -174,7 +173,7 @@ class Replayer(Node):
                 f'topics, {self._playback.late} of them late')
             self.finished.set_result(code)
 
-    def _messages(self) -> Iterator[Message]:
+    def _messages(self) -> Iterator[pacing.Message]:
         names = {channel.name for channel in self._reader.topics
                  if channel.channel_id in self._outputs}
         # A reader that is told where to start takes the index's word for it.
@@ -189,11 +188,11 @@ class Replayer(Node):
 
     def _tell_damage(self) -> bool:
         """Return whether messages are missing unexpectedly; say so once."""
-        damaged = self._reader.left_out > 0 and not self._options.partial
-        if damaged:
-            self._log.error(f'{self._reader.path} is damaged inside, and messages are '
-                            'left out: `recover` tells which', once=True)
-        return damaged
+        if self._options.partial or not self._reader.left_out:
+            return False
+        self._log.error(f'{self._reader.path} is damaged inside, and messages are left out: '
+                        '`recover` tells which', once=True)
+        return True
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._playback.pause(request.data)

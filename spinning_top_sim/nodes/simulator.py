@@ -32,11 +32,9 @@ from spinning_top_sim.nodes.tick_loop import State, TickLoop, next_epoch
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.parameters import Effect
 from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.streams.stream import Stream
 
-NAMES_PERIOD = 10           # reports from one look for a node of the same name to the next
 CLOCK_PATIENCE_S = 2.0      # a followed /clock that stands for longer is said to have stopped
 
 
@@ -76,22 +74,21 @@ class StreamPublishers:
 
     def topics_to_record(self, streams: Sequence[Stream]) -> list[Topic]:
         """Return the topics of these streams, and behind them those of the journal."""
-        policies = ('history', 'depth', 'reliability', 'durability', 'liveliness')
         topics: list[Topic] = []
         for stream in streams:
             publisher = self.by_topic[stream.topic]
             topics.append((publisher.topic_name, stream.type_name, {
-                name: int(getattr(publisher.qos_profile, name)) for name in policies}))
-        return [*topics, *((self._node.resolve_topic_name(name), type_name, {})
-                           for name, type_name in journal.TOPICS)]
+                name: int(getattr(publisher.qos_profile, name)) for name in (
+                    'history', 'depth', 'reliability', 'durability', 'liveliness')}))
+        return topics + [(self._node.resolve_topic_name(name), type_name, {})
+                         for name, type_name in journal.TOPICS]
 
 
 class Simulator(Node):
     """
     The node.  Raises ValueError for a bad parameter.
 
-    One thread ticks, the executor's does everything else; both hold the lock while they use the
-    simulation.
+    One thread ticks, the executor's does all else; both hold the lock to use the simulation.
     """
 
     def __init__(self, argv: Sequence[str] = ()) -> None:
@@ -292,7 +289,7 @@ class Simulator(Node):
                 if 'status_period' in rest:
                     self._set_status_period(values['status_period'])
                 self._loop.set_pace(values)
-        for effect in (Effect.RESET, Effect.RECORDING):
+        for effect in (parameters.Effect.RESET, parameters.Effect.RECORDING):
             names = [name for name in rest if parameters.BY_NAME[name].effect is effect
                      and values[name] != self._values[name]]
             if names:
@@ -348,7 +345,7 @@ class Simulator(Node):
         if self._session.warning:
             self._log.warning(
                 f'recording: {self._session.warning}', throttle_duration_sec=10.0)
-        if next(self._reports) % NAMES_PERIOD == 1:
+        if next(self._reports) % 10 == 1:       # a look every 10 s
             names = self.get_node_names_and_namespaces()
             if names.count((self.get_name(), self.get_namespace())) > 1:
                 self._log.warning(
