@@ -141,7 +141,6 @@ def wait_for_all_acked(publishers: Iterable[Publisher], seconds: float,
                        stopped: Callable[[], bool] = lambda: False) -> None:
     """Wait until all subscribers have the last messages, until stopped, and at most so long."""
     from rclpy.duration import Duration  # noqa: PLC0415
-
     end = time.monotonic() + seconds
     for publisher in list(publishers):      # the node may close some meanwhile
         while (publisher.get_subscription_count() and time.monotonic() < end and not stopped()

@@ -36,7 +36,6 @@ class SimulatedClock:
         self._scale = scale
 
     def now(self) -> int:
-        """Return the simulated time [ns]."""
         if self._from_source is None:
             return self._from_simulated
         return self._from_simulated + int((self._source() - self._from_source) * self._scale)

@@ -138,7 +138,6 @@ class RecordingSession:
         return len(self._pending) < MOST_PENDING
 
     def wait_for_room(self) -> None:
-        """Wait until there is room, at most 0.1 s."""
         if self._recorder is not None:
             self._recorder.wait_for_room(0.1)
 
@@ -162,11 +161,7 @@ class RecordingSession:
 
 
 def _open_log(topics: Sequence[Topic], run: Mapping[str, Any]) -> McapRecorder:
-    """
-    Open the log that `record.uri` asks for, under the first name that is free in a folder.
-
-    run : the arguments of `provenance`
-    """
+    """Open the log that `record.uri` asks for, under the first name that is free in a folder."""
     from spinning_top_sim.recording.provenance import provenance  # noqa: PLC0415
     from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
     from spinning_top_sim.recording.writer import McapRecorder  # noqa: PLC0415

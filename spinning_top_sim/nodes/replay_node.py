@@ -35,28 +35,23 @@ exit code: 0 played (also in part: topics left out, ended by a signal),
 2 cannot be played, or is damaged inside
 """
 
-CLOCK_RATE = 40.0           # Hz, as `ros2 bag play` has it
-
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the node; return 0 after an ordinary end, 2 for what could not be played."""
+    """Run the node; return its exit code, as `run` does."""
     return run('replay_node', sys.argv if argv is None else argv, _prepare)
 
 
 def _prepare(argv: list[str]) -> Callable[[], RunnableNode]:
     from rclpy.utilities import remove_ros_args  # noqa: PLC0415
-
     options = _parser().parse_args(remove_ros_args(argv)[1:])
     from spinning_top_sim.nodes.replayer import Replayer, open_log  # noqa: PLC0415
-
     log = open_log(options.file, options.partial)
     return lambda: Replayer(log, options)
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog='replay_node', description=DESCRIPTION, epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser('replay_node', description=DESCRIPTION, epilog=EPILOG,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     not_negative = _number(0.0, sys.float_info.max, 'a finite number >= 0')
     add('file', type=Path, metavar='FILE', help='the log')
@@ -69,9 +64,9 @@ def _parser() -> argparse.ArgumentParser:
         help='begin S seconds after the begin of the log')
     add('--topics', nargs='+', default=[], metavar='T',
         help='play these only, by their recorded names')
-    add('--clock', type=not_negative, nargs='?', const=CLOCK_RATE, default=0.0, metavar='HZ',
+    add('--clock', type=not_negative, nargs='?', const=40.0, default=0.0, metavar='HZ',
         help="publish the log's time on /clock, HZ times a second "
-        f'(default {CLOCK_RATE:g}), instead of a recorded /clock')
+        '(default 40), instead of a recorded /clock')
     add('--partial', action='store_true', help='play what is whole of a torn log')
     add('-p', '--start-paused', action='store_true', help='wait for ~/set_pause false')
     add('-d', '--delay', type=not_negative, default=0.0, metavar='S',

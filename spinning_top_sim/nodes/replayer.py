@@ -71,12 +71,6 @@ class Replayer(Node):
         self._thread = threading.Thread(target=self._play, name='playback', daemon=True)
         self._ahead = pacing.ReadAhead(pacing.rounds(self._messages, self._span_ns, options.loop))
 
-    @property
-    def _log(self) -> Any:
-        """The logger; ends the status line first."""
-        self._terminal.end()
-        return self.get_logger()
-
     def _open_publishers(self) -> dict[int, Publisher]:
         """Return a publisher for each channel; warn of the topics that cannot be played."""
         there = {channel.name for channel in self._reader.topics}
@@ -84,7 +78,7 @@ class Replayer(Node):
         for name in sorted(wanted - there):
             near = difflib.get_close_matches(name, there, 1)
             hint = f'; did you mean {near[0]}?' if near else ''
-            self._log.warning(f'the log has no topic {name}{hint}')
+            self.get_logger().warning(f'the log has no topic {name}{hint}')
         channels: dict[tuple[str, str], list[LogTopic]] = defaultdict(list)
         for channel in self._reader.topics:
             if channel.name in wanted:
@@ -94,7 +88,7 @@ class Replayer(Node):
             try:
                 outputs |= dict.fromkeys([one.channel_id for one in alike], self._publisher(alike))
             except Exception as error:      # whatever a log may ask for: the others are played
-                self._log.warning(one_line(f'{name} is not played: {error}'))
+                self.get_logger().warning(one_line(f'{name} is not played: {error}'))
         if wanted and not outputs and not self._options.clock:
             raise ValueError('none of the topics can be played; the log has '
                              f'{", ".join(sorted(there)) or "none at all"}')
@@ -111,16 +105,17 @@ class Replayer(Node):
         type_hash = topic.metadata.get('topic_type_hash')
         with contextlib.suppress(DefinitionNotFoundError):
             if type_hash and type_hash != find_definition(topic.type_name).type_hash:
-                self._log.warning(f'{topic.name} was recorded with another {topic.type_name} than '
-                                  'is installed: subscribers may misread it')
+                self.get_logger().warning(
+                    f'{topic.name} was recorded with another {topic.type_name} than is '
+                    'installed: subscribers may misread it')
         profiles = [profile for channel in channels for profile in channel.qos] or [DEFAULT_QOS]
         try:
             if any(profile != profiles[0] for profile in profiles):
                 raise ValueError('its publishers had different ones')
             qos = qos_profile(profiles[0])
         except ValueError as error:
-            self._log.warning(f'{topic.name} is published with default QoS, not with '
-                              f'the recorded one: {error}')
+            self.get_logger().warning(f'{topic.name} is published with default QoS, not with '
+                                      f'the recorded one: {error}')
             qos = qos_profile(DEFAULT_QOS)
         return self.create_publisher(
             kind, topic.name, qos,
@@ -165,7 +160,8 @@ class Replayer(Node):
             code = 2 if self._tell_damage() else 0
         except Exception as error:
             if self.context.ok():           # publishing fails once the context is down
-                self._log.error(f'cannot be played any further: {error}')
+                self._terminal.end()
+                self.get_logger().error(f'cannot be played any further: {error}')
             code = 2
         if self.context.ok():
             self._terminal.tell(
@@ -190,8 +186,9 @@ class Replayer(Node):
         """Return whether messages are missing unexpectedly; say so once."""
         if self._options.partial or not self._reader.left_out:
             return False
-        self._log.error(f'{self._reader.path} is damaged inside, and messages are left out: '
-                        '`recover` tells which', once=True)
+        self._terminal.end()
+        self.get_logger().error(f'{self._reader.path} is damaged inside, and messages are left '
+                                'out: `recover` tells which', once=True)
         return True
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:

@@ -26,13 +26,12 @@ Publishes, where enabled:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the node; return 0 after an ordinary end, 2 for what could not be started."""
+    """Run the node; return its exit code, as `run` does."""
     return run('sim_node', sys.argv if argv is None else argv, _prepare)
 
 
 def _prepare(argv: list[str]) -> Callable[[], RunnableNode] | None:
     from spinning_top_sim.streams import parameters  # noqa: PLC0415
-
     if {'--help', '-h'}.intersection(argv[1:]):
         print(USAGE)
         for *_, text in parameters.STREAM_DEFAULTS:
@@ -42,11 +41,9 @@ def _prepare(argv: list[str]) -> Callable[[], RunnableNode] | None:
             default = parameter.default
             shown = list(default) if isinstance(default, tuple) else default
             print(f'  {parameter.name}  (default {"unset" if shown is None else shown})')
-            print(textwrap.fill(parameter.describe(), 80, initial_indent=6 * ' ',
-                                subsequent_indent=6 * ' '))
+            print(textwrap.indent(textwrap.fill(parameter.describe(), 74), 6 * ' '))
         return None
     from rclpy.utilities import remove_ros_args  # noqa: PLC0415
-
     try:
         stray = ' '.join(remove_ros_args(argv)[1:])
     except RuntimeError as error:

@@ -35,8 +35,6 @@ from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.streams.stream import Stream
 
-CLOCK_PATIENCE_S = 2.0      # a followed /clock that stands for longer is said to have stopped
-
 
 class StreamPublishers:
     """Has a publisher for each enabled stream."""
@@ -46,7 +44,6 @@ class StreamPublishers:
         self.by_topic: dict[str, Publisher] = {}
 
     def create(self, message_class: type, topic: str) -> Publisher:
-        """Create a reliable publisher whose QoS can be overridden by parameters."""
         return self._node.create_publisher(
             message_class, topic, QoSProfile(depth=10),
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
@@ -112,7 +109,8 @@ class Simulator(Node):
         self._outputs = StreamPublishers(self)
         self._session = RecordingSession(simulation, self._lock, self._outputs.topics_to_record)
         self._loop = TickLoop(
-            simulation, values, self._session, tell=self._tell,
+            simulation, values, self._session,
+            tell=lambda text, bad: self._log.error(text) if bad else self._log.warning(text),
             update_subscribers=lambda: self._outputs.update_subscribers(simulation.streams),
             source=self._date_ns if self._follows else time.monotonic_ns)
         self._pacer = DeadlineThread(self._tick, self._idle, lambda: self._loop.grid, self._fail)
@@ -139,12 +137,6 @@ class Simulator(Node):
         """The logger; ends the status line first."""
         self._terminal.end()
         return self.get_logger()
-
-    def _tell(self, text: str, failed: bool) -> None:
-        if failed:
-            self._log.error(text)
-        else:
-            self._log.warning(text)
 
     def _steady_timer(self, period: float, callback: Callable[[], object]) -> Timer:
         """Create a timer that no clock can hold up; unexpected errors stop the motion."""
@@ -192,11 +184,11 @@ class Simulator(Node):
                 self._log.error(f'not recording: {error}')
 
     def _watch_clock(self) -> None:
-        """Warn when the followed /clock stops or has not begun; say when it goes on."""
+        """Warn when the followed /clock stands for 2 s or has not begun; say when it goes on."""
         date_ns, now = self._date_ns(), time.monotonic()
         if date_ns != self._clock_seen[0]:
             self._clock_seen = date_ns, now
-        waits = self._follows and (date_ns == 0 or now > self._clock_seen[1] + CLOCK_PATIENCE_S)
+        waits = self._follows and (date_ns == 0 or now > self._clock_seen[1] + 2.0)
         if waits and not self._report.waits_for_clock:
             self._log.warning('waiting for /clock (use_sim_time is set)')
         elif self._report.waits_for_clock and not waits:
@@ -343,8 +335,7 @@ class Simulator(Node):
         if reason:
             self._log.error(f'recording stopped: {reason}; the simulation goes on')
         if self._session.warning:
-            self._log.warning(
-                f'recording: {self._session.warning}', throttle_duration_sec=10.0)
+            self._log.warning(f'recording: {self._session.warning}', throttle_duration_sec=10.0)
         if next(self._reports) % 10 == 1:       # a look every 10 s
             names = self.get_node_names_and_namespaces()
             if names.count((self.get_name(), self.get_namespace())) > 1:

@@ -213,8 +213,7 @@ class TickLoop:
         stop_at_ns = self._steady() + STEP_BUDGET_NS
 
         def give_way() -> bool:
-            if not self._recording.has_room():
-                self._recording.wait_for_room()
+            self._recording.wait_for_room()
             return self._steady() > stop_at_ns
 
         try:
