@@ -50,7 +50,6 @@ def run(name: str, argv: list[str],
         if make_node is None:
             return 0
         import rclpy  # noqa: PLC0415
-
         # rclpy shuts the context down at SIGINT and SIGTERM, from `init` on; a launched node gets
         # SIGINT twice, from the terminal and from launch.
         interrupts: list[int] = []

@@ -66,8 +66,7 @@ class StreamPublishers:
         for stream in streams:
             publisher = self.by_topic.get(stream.topic)
             if publisher is not None:
-                heard = publisher.get_subscription_count() > 0
-                stream.publish = publisher.publish if heard else None
+                stream.publish = publisher.publish if publisher.get_subscription_count() else None
 
     def topics_to_record(self, streams: Sequence[Stream]) -> list[Topic]:
         """Return the topics of these streams, and behind them those of the journal."""
@@ -97,7 +96,6 @@ class Simulator(Node):
         # For `~/reset`.  An unset spin.lz stays unset: a reset computes it from initial.theta.
         self._start_spin = {name: values[name] for name in SPIN}
         self._values = {**values, 'spin.lz': simulation.lz}
-        self._resetting = False
         self.add_pre_set_parameters_callback(ros_parameters.with_doubles)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         # Another node's /clock is followed, but not one that this node publishes.
@@ -255,7 +253,7 @@ class Simulator(Node):
                 return SetParametersResult(successful=False, reason=(
                     f'{p.name} = {p.value!r}: cannot be changed while the node runs'))
         changes = {p.name: p.value for p in given if p.name in parameters.BY_NAME}
-        if self._resetting or not changes:
+        if not changes:
             return SetParametersResult(successful=True)
         successful, reason = self._outcome(self._change, changes)
         if not (successful or changes.keys().isdisjoint(SPIN)):
@@ -276,8 +274,7 @@ class Simulator(Node):
                 changed = {name: values[name] for name in rest}
                 self._session.write_event('parameters', **changed)
                 self._simulation.apply(changed)
-                if any(name.endswith('.enabled') for name in rest):
-                    self._outputs.open(self._simulation.streams, values)
+                self._outputs.open(self._simulation.streams, values)
                 if 'status_period' in rest:
                     self._set_status_period(values['status_period'])
                 self._loop.set_pace(values)
@@ -315,11 +312,10 @@ class Simulator(Node):
             self._check_started()
             self._loop.reset({**self._values, **self._start_spin}, self._date_ns())
         self._values |= {'spin.l3': self._simulation.l3, 'spin.lz': self._simulation.lz}
-        self._resetting = True
-        try:
-            self.set_parameters([Parameter(name, value=self._values[name]) for name in SPIN])
-        finally:
-            self._resetting = False
+        # The motion has this spin already: the parameters only show it.
+        self.remove_on_set_parameters_callback(self._on_set_parameters)
+        self.set_parameters([Parameter(name, value=self._values[name]) for name in SPIN])
+        self.add_on_set_parameters_callback(self._on_set_parameters)
         return f'at t = 0, stamps go on from {self._simulation.epoch_ns} ns'
 
     def _record(self, request: SetBool.Request) -> str:
