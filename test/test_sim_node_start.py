@@ -74,7 +74,7 @@ def test_the_last_value_wins_whatever_the_types_and_as_in_simulate(peer, tmp_pat
     assert simulate.main(['-o', str(tmp_path / 'ours.mcap'), '--quiet', '--duration', '0.1',
                           '--params', file, *options]) == 0
     with LogReader(tmp_path / 'ours.mcap') as log:
-        ours = read_run_description(log).now
+        ours = read_run_description(log).values_at_recording
     names = ('spin.l3', 'max_error', 'imu.rate', 'top.mass', 'time_scale')
     for arguments, expected in (
             (['--params-file', file, *options], [2.25, 1e-7, 400.0, 1.0, 2.0, (0.0, 0.0, 1.0)]),

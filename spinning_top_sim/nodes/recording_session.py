@@ -49,7 +49,7 @@ class RecordingSession:
         """
         Begin to record into memory; return a function that opens the log and moves it there.
 
-        It returns a text with the path, or raises RecordingError; then nothing is recorded.
+        The function returns a text with the path, or raises RecordingError and records nothing.
         """
         if self._recorder is not None:
             path = self._recorder.path

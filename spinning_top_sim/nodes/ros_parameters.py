@@ -46,11 +46,11 @@ def _given_twice(argv: Sequence[str], node_name: str) -> dict[str, object]:
 
 
 def _leaves(tree: object, path: str = '') -> Iterator[tuple[str, object]]:
-    if not isinstance(tree, Mapping):
+    if isinstance(tree, Mapping):
+        for key, below in tree.items():
+            yield from _leaves(below, f'{path}/{str(key).strip("/")}')
+    else:
         yield path, tree
-        return
-    for key, below in tree.items():
-        yield from _leaves(below, f'{path}/{str(key).strip("/")}')
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:

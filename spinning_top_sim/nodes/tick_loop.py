@@ -213,7 +213,8 @@ class TickLoop:
         stop_at_ns = self._steady() + STEP_BUDGET_NS
 
         def give_way() -> bool:
-            self._recording.wait_for_room()
+            if not self._recording.has_room():
+                self._recording.wait_for_room()
             return self._steady() > stop_at_ns
 
         try:
@@ -253,8 +254,7 @@ class TickLoop:
         self.interruptions += 1
         self.set_pace(values)           # which a failed change has left half done
         self._enter(State.PAUSED if self.paused else State.RUNNING)
-        self._recording.write_event('reset', sent_ns, epoch_ns=simulation.epoch_ns,
-                                    parameters=values)
+        self._recording.write_event('reset', sent_ns, epoch_ns=epoch_ns, parameters=values)
 
     def fail(self, reason: str) -> None:
         """Hold the motion until `reset`."""
