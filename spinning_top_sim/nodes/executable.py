@@ -10,7 +10,6 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterable
-from os import _exit
 from typing import TYPE_CHECKING, Protocol, cast
 
 from spinning_top_sim.recording.errors import LogError
@@ -40,19 +39,17 @@ def run(name: str, argv: list[str],
     prepare : takes the arguments; returns what makes the node, or None if there is nothing to run
     """
     # Nothing is open yet, and a KeyboardInterrupt in the midst of imports is easily lost.
-    _handle(signal.SIGINT, lambda *_: _exit(130))
+    _handle(signal.SIGINT, lambda *_: os._exit(130))
     _open_standard_streams()
     try:
         if '--version' in argv[1:]:
             from spinning_top_sim.recording.provenance import version  # noqa: PLC0415
-
             print(f'{name} {version("spinning_top_sim")}')
             return 0
         make_node = prepare(argv)
         if make_node is None:
             return 0
         import rclpy  # noqa: PLC0415
-
         # rclpy shuts the context down at SIGINT and SIGTERM, from `init` on; a launched node gets
         # SIGINT twice, from the terminal and from launch.
         interrupts: list[int] = []
@@ -143,9 +140,8 @@ def wait_for_all_acked(publishers: Iterable[Publisher], seconds: float,
                        stopped: Callable[[], bool] = lambda: False) -> None:
     """Wait until all subscribers have the last messages, until stopped, and at most so long."""
     from rclpy.duration import Duration  # noqa: PLC0415
-
     end = time.monotonic() + seconds
-    waiting = [publisher for publisher in publishers if publisher.get_subscription_count()]
-    while waiting and time.monotonic() < end and not stopped():
-        waiting = [publisher for publisher in waiting
-                   if not publisher.wait_for_all_acked(Duration(seconds=0.02))]
+    for publisher in list(publishers):      # the node may close some meanwhile
+        while (publisher.get_subscription_count() and time.monotonic() < end and not stopped()
+                and not publisher.wait_for_all_acked(Duration(seconds=0.02))):
+            pass

@@ -32,15 +32,10 @@ class SimulatedClock:
         self._from_simulated = simulated_ns
 
     def set_scale(self, scale: float) -> None:
-        self.set(self.now(), self.running)
+        self.set(self.now(), self._from_source is not None)
         self._scale = scale
 
-    @property
-    def running(self) -> bool:
-        return self._from_source is not None
-
     def now(self) -> int:
-        """Return the simulated time [ns]."""
         if self._from_source is None:
             return self._from_simulated
         return self._from_simulated + int((self._source() - self._from_source) * self._scale)
@@ -77,9 +72,8 @@ class DeadlineThread(threading.Thread):
     """
 
     LONGEST_SLEEP = 0.05    # [s], so that `stop` is quick
-    # The thread sleeps for this share of the period between `tick` and `idle`, if that is long
-    # enough.  A tick wakes up the threads that send; they often run on the core of this one, and
-    # would wait for `idle`.
+    # The thread sleeps for this share of the period between `tick` and `idle`: the threads that
+    # send, which a tick wakes up, often run on the same core and would wait for `idle`.
     NAP = 0.15
     SHORTEST_NAP = 1e-4     # [s]
 

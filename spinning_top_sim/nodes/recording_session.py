@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from spinning_top_sim.nodes.pacing import FairLock
 from spinning_top_sim.recording.errors import RecordingError
@@ -22,16 +22,6 @@ if TYPE_CHECKING:
 MOST_PENDING = 20_000       # stamps whose messages wait for the file that is being opened
 
 Topic = tuple[str, str, dict[str, int]]     # full name, type, and offered QoS
-
-
-class Run(NamedTuple):
-    """The arguments of `provenance`, which describes them."""
-
-    values: Mapping[str, Any]
-    epoch_ns: int
-    begun_ns: int
-    history: tuple[tuple[int, float, float], ...]
-    now: Mapping[str, Any]
 
 
 class RecordingSession:
@@ -59,8 +49,7 @@ class RecordingSession:
         """
         Begin to record into memory; return a function that opens the log and moves it there.
 
-        The function returns a text with the path.  It raises RecordingError if the log cannot be
-        opened; then nothing is recorded.
+        The function returns a text with the path, or raises RecordingError and records nothing.
         """
         if self._recorder is not None:
             path = self._recorder.path
@@ -69,14 +58,16 @@ class RecordingSession:
             simulation = self._simulation
             streams = journal.recorded_streams(simulation.streams, values)
             topics = self._topics(streams)
-            run = Run(simulation.values, simulation.epoch_ns, simulation.now_ns,
-                      tuple(simulation.history), values)
+            run = {'values_at_start': simulation.values, 'epoch_ns': simulation.epoch_ns,
+                   'begun_ns': simulation.now_ns, 'history': tuple(simulation.history),
+                   'values_at_recording': values}
             self._journal_index = len(streams)
             self._feed(lambda *messages: self._pending.append(messages), streams)
             self.write_event('start')
         return lambda: self._open(streams, topics, run)
 
-    def _open(self, streams: Sequence[Stream], topics: Sequence[Topic], run: Run) -> str:
+    def _open(self, streams: Sequence[Stream], topics: Sequence[Topic],
+              run: Mapping[str, Any]) -> str:
         with self._file_lock:
             try:
                 recorder = _open_log(topics, run)
@@ -147,7 +138,6 @@ class RecordingSession:
         return len(self._pending) < MOST_PENDING
 
     def wait_for_room(self) -> None:
-        """Wait until there is room, at most 0.1 s."""
         if self._recorder is not None:
             self._recorder.wait_for_room(0.1)
 
@@ -170,13 +160,13 @@ class RecordingSession:
                 'possible loss [s]': f'{recorder.possible_loss:.3f}'}
 
 
-def _open_log(topics: Sequence[Topic], run: Run) -> McapRecorder:
+def _open_log(topics: Sequence[Topic], run: Mapping[str, Any]) -> McapRecorder:
     """Open the log that `record.uri` asks for, under the first name that is free in a folder."""
     from spinning_top_sim.recording.provenance import provenance  # noqa: PLC0415
     from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
     from spinning_top_sim.recording.writer import McapRecorder  # noqa: PLC0415
 
-    values, metadata = run.now, provenance(*run)
+    values, metadata = run['values_at_recording'], provenance(**run)
     recorded = [RecordedTopic(*topic) for topic in topics]
     folder = path = Path(values['record.uri']).expanduser().absolute()
     if values['record.uri'].endswith('/'):

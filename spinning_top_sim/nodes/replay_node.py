@@ -1,21 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The executable `replay_node`."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
-import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from spinning_top_sim.nodes import executable
+from spinning_top_sim.nodes.executable import RunnableNode, run
 from spinning_top_sim.nodes.pacing import FASTEST, RATES, SLOWEST
-
-if TYPE_CHECKING:
-    from spinning_top_sim.nodes.replayer import Replayer
 
 DESCRIPTION = """\
 Publish the messages of a ROS 2 log (.mcap) with their recorded spacing.
@@ -42,63 +35,54 @@ exit code: 0 played (also in part: topics left out, ended by a signal),
 2 cannot be played, or is damaged inside
 """
 
-CLOCK_RATE = 40.0           # Hz, as `ros2 bag play` has it
-
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the node; return 0 after an ordinary end, 2 for what could not be played."""
-    return executable.run('replay_node', sys.argv if argv is None else argv, _prepare)
+    """Run the node; return its exit code, as `run` does."""
+    return run('replay_node', sys.argv if argv is None else argv, _prepare)
 
 
-def _prepare(argv: list[str]) -> Callable[[], Replayer]:
+def _prepare(argv: list[str]) -> Callable[[], RunnableNode]:
     from rclpy.utilities import remove_ros_args  # noqa: PLC0415
-
     options = _parser().parse_args(remove_ros_args(argv)[1:])
     from spinning_top_sim.nodes.replayer import Replayer, open_log  # noqa: PLC0415
-
     log = open_log(options.file, options.partial)
     return lambda: Replayer(log, options)
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog='replay_node', description=DESCRIPTION, epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser('replay_node', description=DESCRIPTION, epilog=EPILOG,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
+    not_negative = _number(0.0, sys.float_info.max, 'a finite number >= 0')
     add('file', type=Path, metavar='FILE', help='the log')
     add('--version', action='store_true', help='print the version, then end')
-    add('-r', '--rate', type=_rate, metavar='R',
+    add('-r', '--rate', metavar='R',
+        type=_number(SLOWEST, FASTEST, f'{RATES}; --start-paused begins with a pause'),
         help='recorded over real time (default: the parameter `rate`, 1)')
     add('-l', '--loop', action='store_true', help='begin again at the end; --clock goes on')
-    add('--start', type=_not_negative, default=0.0, metavar='S',
+    add('--start', type=not_negative, default=0.0, metavar='S',
         help='begin S seconds after the begin of the log')
     add('--topics', nargs='+', default=[], metavar='T',
         help='play these only, by their recorded names')
-    add('--clock', type=_not_negative, nargs='?', const=CLOCK_RATE, default=0.0, metavar='HZ',
+    add('--clock', type=not_negative, nargs='?', const=40.0, default=0.0, metavar='HZ',
         help="publish the log's time on /clock, HZ times a second "
-        f'(default {CLOCK_RATE:g}), instead of a recorded /clock')
+        '(default 40), instead of a recorded /clock')
     add('--partial', action='store_true', help='play what is whole of a torn log')
     add('-p', '--start-paused', action='store_true', help='wait for ~/set_pause false')
-    add('-d', '--delay', type=_not_negative, default=0.0, metavar='S',
+    add('-d', '--delay', type=not_negative, default=0.0, metavar='S',
         help='wait S seconds before the first message')
     add('--wait-for-subscribers', type=int, default=0, metavar='COUNT',
         help='wait until there are so many, over all topics')
     return parser
 
 
-def _rate(text: str) -> float:
-    with contextlib.suppress(ValueError):
-        if SLOWEST <= float(text) <= FASTEST:
-            return float(text)
-    raise argparse.ArgumentTypeError(f'{text}: must be {RATES}; '
-                                     '--start-paused begins with a pause')
-
-
-def _not_negative(text: str) -> float:
-    with contextlib.suppress(ValueError):
-        if 0.0 <= float(text) < math.inf:
-            return float(text)
-    raise argparse.ArgumentTypeError(f'{text}: must be a finite number >= 0')
+def _number(lowest: float, highest: float, allowed: str) -> Callable[[str], float]:
+    def parse(text: str) -> float:
+        with contextlib.suppress(ValueError):
+            if lowest <= float(text) <= highest:
+                return float(text)
+        raise argparse.ArgumentTypeError(f'{text}: must be {allowed}')
+    return parse
 
 
 if __name__ == '__main__':

@@ -30,7 +30,6 @@ from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes import pacing, reports
 from spinning_top_sim.nodes.executable import one_line, wait_for_all_acked
-from spinning_top_sim.nodes.pacing import Message, Playback, ReadAhead, rounds
 from spinning_top_sim.recording.errors import DefinitionNotFoundError
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, find_definition
@@ -54,7 +53,7 @@ class Replayer(Node):
             raise ValueError(f'--start {options.start:g}: the log lasts {self._length_s:.3f} s')
         self._outputs = self._open_publishers()     # by channel
         self._senders = set(self._outputs.values())
-        self._playback = Playback(self._begin_ns, paused=options.start_paused)
+        self._playback = pacing.Playback(self._begin_ns, paused=options.start_paused)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self.declare_parameter('rate', 1.0, ParameterDescriptor(
             description='recorded over real time; a change takes effect at once',
@@ -69,13 +68,7 @@ class Replayer(Node):
         self.create_service(SetBool, '~/set_pause', self._on_pause)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._play, name='playback', daemon=True)
-        self._ahead = ReadAhead(rounds(self._messages, self._span_ns, options.loop))
-
-    @property
-    def _log(self) -> Any:
-        """The logger; ends the status line first."""
-        self._terminal.end()
-        return self.get_logger()
+        self._ahead = pacing.ReadAhead(pacing.rounds(self._messages, self._span_ns, options.loop))
 
     def _open_publishers(self) -> dict[int, Publisher]:
         """Return a publisher for each channel; warn of the topics that cannot be played."""
@@ -84,7 +77,7 @@ class Replayer(Node):
         for name in sorted(wanted - there):
             near = difflib.get_close_matches(name, there, 1)
             hint = f'; did you mean {near[0]}?' if near else ''
-            self._log.warning(f'the log has no topic {name}{hint}')
+            self.get_logger().warning(f'the log has no topic {name}{hint}')
         channels: dict[tuple[str, str], list[LogTopic]] = defaultdict(list)
         for channel in self._reader.topics:
             if channel.name in wanted:
@@ -94,7 +87,7 @@ class Replayer(Node):
             try:
                 outputs |= dict.fromkeys([one.channel_id for one in alike], self._publisher(alike))
             except Exception as error:      # whatever a log may ask for: the others are played
-                self._log.warning(one_line(f'{name} is not played: {error}'))
+                self.get_logger().warning(one_line(f'{name} is not played: {error}'))
         if wanted and not outputs and not self._options.clock:
             raise ValueError('none of the topics can be played; the log has '
                              f'{", ".join(sorted(there)) or "none at all"}')
@@ -111,16 +104,17 @@ class Replayer(Node):
         type_hash = topic.metadata.get('topic_type_hash')
         with contextlib.suppress(DefinitionNotFoundError):
             if type_hash and type_hash != find_definition(topic.type_name).type_hash:
-                self._log.warning(f'{topic.name} was recorded with another {topic.type_name} than '
-                                  'is installed: subscribers may misread it')
+                self.get_logger().warning(
+                    f'{topic.name} was recorded with another {topic.type_name} than is '
+                    'installed: subscribers may misread it')
         profiles = [profile for channel in channels for profile in channel.qos] or [DEFAULT_QOS]
         try:
             if any(profile != profiles[0] for profile in profiles):
                 raise ValueError('its publishers had different ones')
             qos = qos_profile(profiles[0])
         except ValueError as error:
-            self._log.warning(f'{topic.name} is published with default QoS, not with '
-                              f'the recorded one: {error}')
+            self.get_logger().warning(f'{topic.name} is published with default QoS, not with '
+                                      f'the recorded one: {error}')
             qos = qos_profile(DEFAULT_QOS)
         return self.create_publisher(
             kind, topic.name, qos,
@@ -165,7 +159,8 @@ class Replayer(Node):
             code = 2 if self._tell_damage() else 0
         except Exception as error:
             if self.context.ok():           # publishing fails once the context is down
-                self._log.error(f'cannot be played any further: {error}')
+                self._terminal.end()
+                self.get_logger().error(f'cannot be played any further: {error}')
             code = 2
         if self.context.ok():
             self._terminal.tell(
@@ -173,7 +168,7 @@ class Replayer(Node):
                 f'topics, {self._playback.late} of them late')
             self.finished.set_result(code)
 
-    def _messages(self) -> Iterator[Message]:
+    def _messages(self) -> Iterator[pacing.Message]:
         names = {channel.name for channel in self._reader.topics
                  if channel.channel_id in self._outputs}
         # A reader that is told where to start takes the index's word for it.
@@ -188,11 +183,12 @@ class Replayer(Node):
 
     def _tell_damage(self) -> bool:
         """Return whether messages are missing unexpectedly; say so once."""
-        damaged = self._reader.left_out > 0 and not self._options.partial
-        if damaged:
-            self._log.error(f'{self._reader.path} is damaged inside, and messages are '
-                            'left out: `recover` tells which', once=True)
-        return damaged
+        if self._options.partial or not self._reader.left_out:
+            return False
+        self._terminal.end()
+        self.get_logger().error(f'{self._reader.path} is damaged inside, and messages are left '
+                                'out: `recover` tells which', once=True)
+        return True
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._playback.pause(request.data)

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the nodes say about themselves: /diagnostics, and the status line on the terminal."""
 
-from __future__ import annotations
-
 import math
 import os
 import shlex
@@ -11,19 +9,15 @@ import sys
 import time
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from std_msgs.msg import Header
 
-from spinning_top_sim.nodes.tick_loop import State
+from spinning_top_sim.nodes.recording_session import RecordingSession
+from spinning_top_sim.nodes.tick_loop import State, TickLoop
 from spinning_top_sim.streams.cdr import NANOSECONDS
-
-if TYPE_CHECKING:
-    from spinning_top_sim.nodes.recording_session import RecordingSession
-    from spinning_top_sim.nodes.tick_loop import TickLoop
-    from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.pipeline import Simulation
 
 
 class MotionReport:
@@ -33,7 +27,7 @@ class MotionReport:
         self._simulation, self._loop, self._session = simulation, loop, session
         self._speed = math.nan                  # simulated over real time, at the last reading
         self._read_at, self._read_ns = time.monotonic(), 0
-        self._interruptions, self._undisturbed = 0, False       # at and before the last reading
+        self._interruptions = -1, 0             # at the last reading but one, and at the last
         self._described: object = None          # the motion that `_regime` names
         self._regime = ''
         self.waits_for_clock = False            # whether /clock has stopped, or not begun
@@ -86,8 +80,7 @@ class MotionReport:
             since_ns = self._read_ns if self._read_ns <= now_ns else 0
             self._speed = (now_ns - since_ns) / NANOSECONDS / elapsed
             self._read_at, self._read_ns = self._read_at + elapsed, now_ns
-            self._undisturbed = self._interruptions == self._loop.interruptions
-            self._interruptions = self._loop.interruptions
+            self._interruptions = self._interruptions[1], self._loop.interruptions
         return self._speed
 
     def new_motion(self) -> str | None:
@@ -108,15 +101,13 @@ class MotionReport:
         flag = (' FAILED' if loop.failure else ' waiting for /clock' if self.waits_for_clock
                 else ' paused' if loop.paused else '')
         # The speed of an interval in which the motion ran all the time, as it still does.
-        runs = (self._undisturbed and self._interruptions == loop.interruptions
-                and loop.state is State.RUNNING)
+        runs = self._interruptions[0] == loop.interruptions and loop.state is State.RUNNING
         # The most important first: a terminal shows as many as fit.
-        return ' | '.join([
+        return ' | '.join(filter(None, (
             f't {loop.now_ns / NANOSECONDS:9.2f} s{flag}', self._regime, f'theta {theta:6.2f} deg',
-            *([f'x{self._speed:.2f}'] if runs else []),
-            *([f'log {size}'] if size else []),
+            f'x{self._speed:.2f}' if runs else '', f'log {size}' if size else '',
             f'L3 {simulation.l3:.4g} Lz {simulation.lz:.4g}', f'{sent} messages' if sent
-            else 'no subscribers yet', f'dE/E {simulation.energy_drift:+.0e}'])
+            else 'no subscribers yet', f'dE/E {simulation.energy_drift:+.0e}')))
 
 
 def inspect_command(log: Path) -> str:
@@ -131,19 +122,21 @@ class Terminal:
     """Shows a status line; on a terminal each one overwrites the one before."""
 
     def __init__(self) -> None:
-        self._columns = _columns()
         self._open = False              # the cursor stands behind a line
 
     def show(self, line: str) -> None:
         """Show the newest line, on a terminal as many of its parts as fit."""
-        self._columns = self._columns and _columns()        # it may have gone meanwhile
-        if self._columns:
-            while len(line) >= self._columns and ' | ' in line:
-                line = line.rpartition(' | ')[0]
-            self._write(f'\r\x1b[K{line[:max(self._columns - 1, 1)]}')
-            self._open = True
-        else:
+        try:
+            columns = os.get_terminal_size(1).columns if sys.stdout.isatty() else 0
+        except (AttributeError, OSError):       # the shell has closed it, or the terminal is gone
+            columns = 0
+        if not columns:
             self._write(f'{line}\n')
+            return
+        while len(line) >= columns and ' | ' in line:
+            line = line.rpartition(' | ')[0]
+        self._write(f'\r\x1b[K{line[:max(columns - 1, 1)]}')
+        self._open = True
 
     def tell(self, line: str) -> None:
         """Show a line that stays."""
@@ -165,11 +158,3 @@ class Terminal:
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, sys.stdout.fileno())
             os.close(nowhere)
-
-
-def _columns() -> int:
-    """Return the width of the terminal, 0 where there is none, or none any more."""
-    try:
-        return os.get_terminal_size(1).columns if sys.stdout.isatty() else 0
-    except (AttributeError, OSError):   # stdout is None where the shell has closed it
-        return 0

@@ -5,6 +5,7 @@ import array
 import contextlib
 import difflib
 import re
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -16,7 +17,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.parameters import Effect, Parameter
+from spinning_top_sim.streams.parameters import Parameter
 
 SPIN = ('spin.l3', 'spin.lz')
 
@@ -27,37 +28,36 @@ def _given_twice(argv: Sequence[str], node_name: str) -> dict[str, object]:
 
     rcl keeps the last value of each type; of these, rclpy takes an integer rather than a double.
     """
-    given: dict[str, list[object]] = {}
+    given = defaultdict(list)
     for flag, text in pairwise(argv):
+        tree: Any = {}
         if flag == '--params-file':
             tree = yaml.safe_load(Path(text).read_bytes())
         elif flag in {'-p', '--param'}:
             rule, _, shown = text.partition(':=')
             node, _, name = rule.rpartition(':')
             tree = {node or '/**': {'ros__parameters': {name: yaml.safe_load(shown)}}}
-        else:
-            continue
-        for keys, value in _leaves(tree):
-            nodes, _, name = '/'.join(keys).partition('/ros__parameters/')
-            pattern = re.escape(f'/{nodes.lstrip("/")}').replace(r'/\*\*', r'(/\w+)*')
-            if re.fullmatch(pattern.replace(r'\*', r'\w+'), node_name):
-                given.setdefault(name.replace('/', '.'), []).append(value)
+        for path, value in _leaves(tree):
+            nodes, _, name = path.partition('/ros__parameters/')
+            pattern = re.escape(nodes).replace(r'/\*\*', r'(/\w+)*').replace(r'\*', r'\w+')
+            if re.fullmatch(pattern, node_name):
+                given[name.replace('/', '.')].append(value)
     return {name: values[-1] for name, values in given.items() if len(values) > 1}
 
 
-def _leaves(tree: Mapping[object, object]) -> Iterator[tuple[list[str], object]]:
-    for key, below in tree.items():
-        if isinstance(below, Mapping):
-            yield from (([str(key).rstrip('/'), *keys], value) for keys, value in _leaves(below))
-        else:
-            yield [str(key)], below
+def _leaves(tree: object, path: str = '') -> Iterator[tuple[str, object]]:
+    if isinstance(tree, Mapping):
+        for key, below in tree.items():
+            yield from _leaves(below, f'{path}/{str(key).strip("/")}')
+    else:
+        yield path, tree
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     """Return what `ros2 param describe` shows; dynamic types, as `Parameter.check` decides."""
     result = ParameterDescriptor(
         name=parameter.name, description=parameter.describe(range_too=False), dynamic_typing=True,
-        read_only=parameter.effect is Effect.START)
+        read_only=parameter.effect is parameters.Effect.START)
     lowest = parameter.minimum if parameter.above is None else parameter.above
     if lowest is None or parameter.maximum is None:
         result.additional_constraints = parameter.allowed
@@ -79,8 +79,6 @@ def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
     """
     Declare the table, warn of unknown parameters; return the start values or raise ValueError.
 
-    Where the command line `argv` gives a parameter more than once, the last value holds.
-
     The node was made with `automatically_declare_parameters_from_overrides`, the public way to
     learn of overrides that nobody declares.
     """
@@ -92,8 +90,7 @@ def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
         if name in {'use_sim_time', 'start_type_description_service'}:
             continue        # rclpy declares these itself
         if name in parameters.BY_NAME:
-            value = _with_doubles(name, given_twice.get(name, value))
-            given[name] = list(value) if isinstance(value, array.array) else value
+            given[name] = _with_doubles(parameters.BY_NAME[name], given_twice.get(name, value))
         elif not name.startswith('qos_overrides.'):
             near = difflib.get_close_matches(name, parameters.BY_NAME, 1)
             hint = f'; did you mean {near[0]}?' if near else ''
@@ -111,19 +108,16 @@ def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
 
 def with_doubles(given: Sequence[RosParameter]) -> list[RosParameter]:
     """Make doubles where the table has some: of integers, and of texts, as YAML 1.1 has 1e-9."""
-    values = [_with_doubles(one.name, one.value) for one in given]
-    return [one if value is one.value else RosParameter(one.name, value=value)
-            for one, value in zip(given, values, strict=True)]
+    return [RosParameter(one.name, value=_with_doubles(parameters.BY_NAME[one.name], one.value))
+            if one.name in parameters.BY_NAME else one for one in given]
 
 
-def _with_doubles(name: str, value: Any) -> Any:
-    row = parameters.BY_NAME.get(name)
-    if row is not None and row.is_double:
-        return _as_double(value)
-    if row is not None and isinstance(value, list | array.array):
-        of_doubles = isinstance(row.default, tuple) and isinstance(row.default[0], float)
+def _with_doubles(parameter: Parameter, value: Any) -> Any:
+    default = parameter.default
+    if isinstance(value, list | array.array):
+        of_doubles = isinstance(default, tuple) and isinstance(default[0], float)
         return [_as_double(item) if of_doubles else item for item in value]
-    return value
+    return _as_double(value) if parameter.is_double else value
 
 
 def _as_double(value: object) -> object:

@@ -1,17 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The executable `sim_node`."""
 
-from __future__ import annotations
-
 import sys
 import textwrap
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
-from spinning_top_sim.nodes import executable
-
-if TYPE_CHECKING:
-    from spinning_top_sim.nodes.simulator import Simulator
+from spinning_top_sim.nodes.executable import RunnableNode, one_line, run
 
 USAGE = """usage: sim_node [--help] [--version]
                 [--ros-args -p NAME:=VALUE --params-file FILE ...]
@@ -32,13 +26,12 @@ Publishes, where enabled:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the node; return 0 after an ordinary end, 2 for what could not be started."""
-    return executable.run('sim_node', sys.argv if argv is None else argv, _prepare)
+    """Run the node; return its exit code, as `run` does."""
+    return run('sim_node', sys.argv if argv is None else argv, _prepare)
 
 
-def _prepare(argv: list[str]) -> Callable[[], Simulator] | None:
+def _prepare(argv: list[str]) -> Callable[[], RunnableNode] | None:
     from spinning_top_sim.streams import parameters  # noqa: PLC0415
-
     if {'--help', '-h'}.intersection(argv[1:]):
         print(USAGE)
         for *_, text in parameters.STREAM_DEFAULTS:
@@ -48,17 +41,15 @@ def _prepare(argv: list[str]) -> Callable[[], Simulator] | None:
             default = parameter.default
             shown = list(default) if isinstance(default, tuple) else default
             print(f'  {parameter.name}  (default {"unset" if shown is None else shown})')
-            print(textwrap.fill(parameter.describe(), 80, initial_indent=6 * ' ',
-                                subsequent_indent=6 * ' '))
+            print(textwrap.indent(textwrap.fill(parameter.describe(), 74), 6 * ' '))
         return None
     from rclpy.utilities import remove_ros_args  # noqa: PLC0415
-
     try:
         stray = ' '.join(remove_ros_args(argv)[1:])
     except RuntimeError as error:
         if not str(error).startswith('['):      # else these are words behind --ros-args
             raise
-        stray = executable.one_line(error)
+        stray = one_line(error)
     if stray:
         raise ValueError(f'{stray!r} is not expected here; the form is: sim_node --ros-args '
                          '-p NAME:=VALUE --params-file FILE')

@@ -32,12 +32,8 @@ from spinning_top_sim.nodes.tick_loop import State, TickLoop, next_epoch
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.parameters import Effect
 from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.streams.stream import Stream
-
-NAMES_PERIOD = 10           # reports from one look for a node of the same name to the next
-CLOCK_PATIENCE_S = 2.0      # a followed /clock that stands for longer is said to have stopped
 
 
 class StreamPublishers:
@@ -48,7 +44,6 @@ class StreamPublishers:
         self.by_topic: dict[str, Publisher] = {}
 
     def create(self, message_class: type, topic: str) -> Publisher:
-        """Create a reliable publisher whose QoS can be overridden by parameters."""
         return self._node.create_publisher(
             message_class, topic, QoSProfile(depth=10),
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
@@ -71,27 +66,25 @@ class StreamPublishers:
         for stream in streams:
             publisher = self.by_topic.get(stream.topic)
             if publisher is not None:
-                heard = publisher.get_subscription_count() > 0
-                stream.publish = publisher.publish if heard else None
+                stream.publish = publisher.publish if publisher.get_subscription_count() else None
 
     def topics_to_record(self, streams: Sequence[Stream]) -> list[Topic]:
         """Return the topics of these streams, and behind them those of the journal."""
-        policies = ('history', 'depth', 'reliability', 'durability', 'liveliness')
         topics: list[Topic] = []
         for stream in streams:
             publisher = self.by_topic[stream.topic]
             topics.append((publisher.topic_name, stream.type_name, {
-                name: int(getattr(publisher.qos_profile, name)) for name in policies}))
-        return [*topics, *((self._node.resolve_topic_name(name), type_name, {})
-                           for name, type_name in journal.TOPICS)]
+                name: int(getattr(publisher.qos_profile, name)) for name in (
+                    'history', 'depth', 'reliability', 'durability', 'liveliness')}))
+        return topics + [(self._node.resolve_topic_name(name), type_name, {})
+                         for name, type_name in journal.TOPICS]
 
 
 class Simulator(Node):
     """
     The node.  Raises ValueError for a bad parameter.
 
-    One thread ticks, the executor's does everything else; both hold the lock while they use the
-    simulation.
+    One thread ticks, the executor's does all else; both hold the lock to use the simulation.
     """
 
     def __init__(self, argv: Sequence[str] = ()) -> None:
@@ -103,7 +96,6 @@ class Simulator(Node):
         # For `~/reset`.  An unset spin.lz stays unset: a reset computes it from initial.theta.
         self._start_spin = {name: values[name] for name in SPIN}
         self._values = {**values, 'spin.lz': simulation.lz}
-        self._resetting = False
         self.add_pre_set_parameters_callback(ros_parameters.with_doubles)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         # Another node's /clock is followed, but not one that this node publishes.
@@ -115,7 +107,8 @@ class Simulator(Node):
         self._outputs = StreamPublishers(self)
         self._session = RecordingSession(simulation, self._lock, self._outputs.topics_to_record)
         self._loop = TickLoop(
-            simulation, values, self._session, tell=self._tell,
+            simulation, values, self._session,
+            tell=lambda text, bad: self._log.error(text) if bad else self._log.warning(text),
             update_subscribers=lambda: self._outputs.update_subscribers(simulation.streams),
             source=self._date_ns if self._follows else time.monotonic_ns)
         self._pacer = DeadlineThread(self._tick, self._idle, lambda: self._loop.grid, self._fail)
@@ -142,12 +135,6 @@ class Simulator(Node):
         """The logger; ends the status line first."""
         self._terminal.end()
         return self.get_logger()
-
-    def _tell(self, text: str, failed: bool) -> None:
-        if failed:
-            self._log.error(text)
-        else:
-            self._log.warning(text)
 
     def _steady_timer(self, period: float, callback: Callable[[], object]) -> Timer:
         """Create a timer that no clock can hold up; unexpected errors stop the motion."""
@@ -195,11 +182,11 @@ class Simulator(Node):
                 self._log.error(f'not recording: {error}')
 
     def _watch_clock(self) -> None:
-        """Warn when the followed /clock stops or has not begun; say when it goes on."""
+        """Warn when the followed /clock stands for 2 s or has not begun; say when it goes on."""
         date_ns, now = self._date_ns(), time.monotonic()
         if date_ns != self._clock_seen[0]:
             self._clock_seen = date_ns, now
-        waits = self._follows and (date_ns == 0 or now > self._clock_seen[1] + CLOCK_PATIENCE_S)
+        waits = self._follows and (date_ns == 0 or now > self._clock_seen[1] + 2.0)
         if waits and not self._report.waits_for_clock:
             self._log.warning('waiting for /clock (use_sim_time is set)')
         elif self._report.waits_for_clock and not waits:
@@ -266,7 +253,7 @@ class Simulator(Node):
                 return SetParametersResult(successful=False, reason=(
                     f'{p.name} = {p.value!r}: cannot be changed while the node runs'))
         changes = {p.name: p.value for p in given if p.name in parameters.BY_NAME}
-        if self._resetting or not changes:
+        if not changes:
             return SetParametersResult(successful=True)
         successful, reason = self._outcome(self._change, changes)
         if not (successful or changes.keys().isdisjoint(SPIN)):
@@ -287,12 +274,11 @@ class Simulator(Node):
                 changed = {name: values[name] for name in rest}
                 self._session.write_event('parameters', **changed)
                 self._simulation.apply(changed)
-                if any(name.endswith('.enabled') for name in rest):
-                    self._outputs.open(self._simulation.streams, values)
+                self._outputs.open(self._simulation.streams, values)
                 if 'status_period' in rest:
                     self._set_status_period(values['status_period'])
                 self._loop.set_pace(values)
-        for effect in (Effect.RESET, Effect.RECORDING):
+        for effect in (parameters.Effect.RESET, parameters.Effect.RECORDING):
             names = [name for name in rest if parameters.BY_NAME[name].effect is effect
                      and values[name] != self._values[name]]
             if names:
@@ -326,11 +312,10 @@ class Simulator(Node):
             self._check_started()
             self._loop.reset({**self._values, **self._start_spin}, self._date_ns())
         self._values |= {'spin.l3': self._simulation.l3, 'spin.lz': self._simulation.lz}
-        self._resetting = True
-        try:
-            self.set_parameters([Parameter(name, value=self._values[name]) for name in SPIN])
-        finally:
-            self._resetting = False
+        # The motion has this spin already: the parameters only show it.
+        self.remove_on_set_parameters_callback(self._on_set_parameters)
+        self.set_parameters([Parameter(name, value=self._values[name]) for name in SPIN])
+        self.add_on_set_parameters_callback(self._on_set_parameters)
         return f'at t = 0, stamps go on from {self._simulation.epoch_ns} ns'
 
     def _record(self, request: SetBool.Request) -> str:
@@ -346,9 +331,8 @@ class Simulator(Node):
         if reason:
             self._log.error(f'recording stopped: {reason}; the simulation goes on')
         if self._session.warning:
-            self._log.warning(
-                f'recording: {self._session.warning}', throttle_duration_sec=10.0)
-        if next(self._reports) % NAMES_PERIOD == 1:
+            self._log.warning(f'recording: {self._session.warning}', throttle_duration_sec=10.0)
+        if next(self._reports) % 10 == 1:       # a look every 10 s
             names = self.get_node_names_and_namespaces()
             if names.count((self.get_name(), self.get_namespace())) > 1:
                 self._log.warning(

@@ -42,14 +42,11 @@ class State(Enum):
     """
     What a `TickLoop` does; simulated time runs in RUNNING only.
 
-        WAITING --start--> RUNNING --duration--> ENDED
-                           |     ^
-                     pause |     | resume
-                           v     |
-                           PAUSED
+        WAITING --start--> RUNNING --duration--> ENDED, which is final
+                           RUNNING --pause--> PAUSED --resume--> RUNNING
+        any state --fail--> FAILED --reset--> RUNNING
 
-    `fail` leads to FAILED, and `reset` from there to RUNNING, or to PAUSED if a pause is asked
-    for, as `start` does.  ENDED is final.
+    `start` and `reset` lead to PAUSED if a pause is asked for.
     """
 
     WAITING = 'waiting for the start'
@@ -63,14 +60,12 @@ class TickLoop:
     """
     Moves a simulation along with a clock; calls from several threads need a lock around them.
 
-    A tick sends all samples that are due and find room in the recording, so what is sent does not
-    depend on when ticks come.
+    What is sent does not depend on when ticks come: each sends all samples that are due.
 
     update_subscribers : sets `publish` of each stream that has subscribers
     tell : takes a text for the log, and whether the motion has failed
     source : returns the time that simulated time follows [ns]
     steady : returns steady time [ns]; decides which ticks are late and how long one may work
-
     grid : steady time of a tick, just after samples are due, and the time between ticks [s]
     """
 
@@ -107,10 +102,7 @@ class TickLoop:
     def start(self) -> None:
         """Let simulated time run from 0 on, unless the motion is paused or has failed."""
         if self.state is State.WAITING:
-            self._run_or_pause()
-
-    def _run_or_pause(self) -> None:
-        self._enter(State.PAUSED if self.paused else State.RUNNING)
+            self._enter(State.PAUSED if self.paused else State.RUNNING)
 
     def _enter(self, state: State) -> None:
         """Change the state; time runs, or stands, from where all samples are sent."""
@@ -261,9 +253,8 @@ class TickLoop:
         self.failure = None
         self.interruptions += 1
         self.set_pace(values)           # which a failed change has left half done
-        self._run_or_pause()
-        self._recording.write_event('reset', sent_ns, epoch_ns=simulation.epoch_ns,
-                                    parameters=values)
+        self._enter(State.PAUSED if self.paused else State.RUNNING)
+        self._recording.write_event('reset', sent_ns, epoch_ns=epoch_ns, parameters=values)
 
     def fail(self, reason: str) -> None:
         """Hold the motion until `reset`."""
