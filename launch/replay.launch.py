@@ -69,12 +69,12 @@ def _nodes(context: LaunchContext) -> list:
     except (LogError, ForeignLogError, OSError) as error:
         # replay_node reports a log that cannot be played.
         return [*actions, LogInfo(msg=f'neither TF nor RViz: {error}')]
-    namespace = _namespace(run.topics)
+    namespace, values = _namespace(run.topics), run.values_at_recording
     if on['tf'] and 'joint_states' in run.topics:
         actions += launch_helpers.state_publisher(
-            SHARE, run.now, namespace, run.topics['joint_states'], clocked)
+            SHARE, values, namespace, run.topics['joint_states'], clocked)
     if on['rviz']:
-        actions += launch_helpers.rviz(SHARE, run.now['world_frame'], namespace, clocked)
+        actions += launch_helpers.rviz(SHARE, values['world_frame'], namespace, clocked)
     return actions
 
 

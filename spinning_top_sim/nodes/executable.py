@@ -10,6 +10,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterable
+from os import _exit
 from typing import TYPE_CHECKING, Protocol, cast
 
 from spinning_top_sim.recording.errors import LogError
@@ -39,7 +40,7 @@ def run(name: str, argv: list[str],
     prepare : takes the arguments; returns what makes the node, or None if there is nothing to run
     """
     # Nothing is open yet, and a KeyboardInterrupt in the midst of imports is easily lost.
-    _handle(signal.SIGINT, lambda *_: os._exit(130))
+    _handle(signal.SIGINT, lambda *_: _exit(130))
     _open_standard_streams()
     try:
         if '--version' in argv[1:]:
