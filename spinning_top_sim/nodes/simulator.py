@@ -355,6 +355,6 @@ class Simulator(Node):
         _ = self._simulation.segment.exact
         with self._lock:
             motion, line = self._report.new_motion(), self._report.status_line()
-        if motion:
+        if motion and self.context.ok():        # a signal may have ended it
             self._log.info(motion)
         self._terminal.show(line)
