@@ -67,7 +67,7 @@ class ScannedRecord:
     opcode: int             # above DATA_END: of an application, or of a later version of MCAP
     offset: int             # in the file
     end: int
-    # A schema or channel as the file has it elsewhere.  The index of an attachment; None for
+    # Of a schema or channel the version that is valid, of an attachment its index.  None for
     # single messages, message indexes and unknown kinds.
     record: McapRecord | None = None
     raw: bytes = b''    # with head and extra fields; b'' for attachments and unknown kinds
