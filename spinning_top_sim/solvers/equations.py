@@ -115,6 +115,7 @@ class TransportEquations(Equations):
                 self._fall * (alpha * beta))
 
     def second_derivative(self, y: Rows, derivative: Rows) -> Rows:
+        # The product rule in real parts: of complex columns the last bits depend on the block.
         a, a_imag, b, b_imag, m, m_imag = y
         da, da_imag, db, db_imag, dm, dm_imag = derivative
         turn_a, turn_b, fall = self._turn_alpha.imag, self._turn_beta.imag, self._fall.real

@@ -7,8 +7,8 @@ Times are integer nanoseconds since the start.  Three of them move on, each with
     0 ------ now_ns ---------- reached_ns ---- ready_ns ------> t
       sent            computed               |   first sample that is neither
 
-    now_ns      Simulation  samples up to here are sent; none after it
-    ready_ns    Schedule    samples before here are sent or computed
+    now_ns      Simulation  samples up to here are sent; none after it (-1: not even t = 0)
+    ready_ns    Schedule    samples before here are sent or computed (-1: dropped, as by a command)
     reached_ns  Segment     the solver has stepped up to here; it may be on either side of ready_ns
                 Propagator  the same, since the start of its motion
 
