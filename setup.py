@@ -47,7 +47,7 @@ setup(
     install_requires=[
         'numpy>=1.26,<3',
         'mcap>=1.2,<2',             # with zstandard and lz4
-        'PyYAML>=6,<7',             # parameter files, QoS in logs; not used by sim_node
+        'PyYAML>=6,<7',             # parameter files, QoS in logs
         'scipy>=1.11,<2',           # used by the tools only; sim_node never imports it
         'tqdm>=4.64,<5',            # progress bars of the tools
     ],

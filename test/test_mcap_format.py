@@ -589,6 +589,15 @@ def test_memory_has_a_ceiling(tmp_path, bomb, report):
     assert peak < CEILING_MB
 
 
+def test_what_is_read_twice_at_once_has_the_ceiling_twice(tmp_path):
+    path = tmp_path / 'a.mcap'
+    chunk = zstd_chunk(message(5, b'') + message(6, bytes(1_000_000)) + message(9, b''), 9)
+    path.write_bytes(closed(HEADER, RAW_CHANNEL, chunk * 2))
+    with LogReader(path, max_bytes=1_200_000) as reader:
+        pairs = list(zip(reader.messages(), reader.messages(), strict=True))
+    assert len(pairs) == 6 and all(one == other for one, other in pairs)
+
+
 @pytest.mark.parametrize('kind', [
     Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.SCHEMA, 0x90])
 def test_a_record_of_many_gigabytes_is_not_read(tmp_path, kind):

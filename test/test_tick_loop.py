@@ -361,6 +361,24 @@ def test_a_command_comes_after_what_is_due():
     assert run.loop.commands == run.told.count('command') == 1
 
 
+def test_steps_end_with_the_duration():
+    run = started(start_paused=True, duration=0.75)
+    run.loop.step(1, 0.5)
+    assert run.loop.state is tick_loop.State.PAUSED
+    run.loop.step(1, 0.5)
+    assert run.loop.state is tick_loop.State.ENDED
+    assert run.loop.now_ns == max(run.stamps) - run.simulation.epoch_ns == 750_000_000
+
+
+def test_after_a_failure_a_step_is_refused_and_sends_nothing():
+    run = started(start_paused=True)
+    run.loop.fail('for a test')
+    sent = len(run.stamps)
+    with pytest.raises(RuntimeError, match='stands still: for a test'):
+        run.loop.step(1, 0.5)
+    assert len(run.stamps) == sent
+
+
 def test_a_pause_asked_for_during_a_failure_holds_after_the_reset():
     run = started().ticks(4)
     run.loop.fail('for a test')

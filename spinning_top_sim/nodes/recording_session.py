@@ -50,6 +50,8 @@ class RecordingSession:
         Begin to record into memory; return a function that opens the log and moves it there.
 
         The function returns a text with the path, or raises RecordingError and records nothing.
+        One start at a time: the executor, which alone calls this, runs the function before the
+        next one.
         """
         if self._recorder is not None:
             path = self._recorder.path

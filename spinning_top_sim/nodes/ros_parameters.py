@@ -90,7 +90,7 @@ def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
         if name in {'use_sim_time', 'start_type_description_service'}:
             continue        # rclpy declares these itself
         if name in parameters.BY_NAME:
-            given[name] = _with_doubles(parameters.BY_NAME[name], given_twice.get(name, value))
+            given[name] = _as_doubles(parameters.BY_NAME[name], given_twice.get(name, value))
         elif not name.startswith('qos_overrides.'):
             near = difflib.get_close_matches(name, parameters.BY_NAME, 1)
             hint = f'; did you mean {near[0]}?' if near else ''
@@ -108,11 +108,11 @@ def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
 
 def with_doubles(given: Sequence[RosParameter]) -> list[RosParameter]:
     """Make doubles where the table has some: of integers, and of texts, as YAML 1.1 has 1e-9."""
-    return [RosParameter(one.name, value=_with_doubles(parameters.BY_NAME[one.name], one.value))
+    return [RosParameter(one.name, value=_as_doubles(parameters.BY_NAME[one.name], one.value))
             if one.name in parameters.BY_NAME else one for one in given]
 
 
-def _with_doubles(parameter: Parameter, value: Any) -> Any:
+def _as_doubles(parameter: Parameter, value: Any) -> Any:
     default = parameter.default
     if isinstance(value, list | array.array):
         of_doubles = isinstance(default, tuple) and isinstance(default[0], float)

@@ -120,7 +120,7 @@ class Simulator(Node):
                                 ('step', Trigger, self._step), ('reset', Trigger, self._reset),
                                 ('record', SetBool, self._record)):
             self.create_service(kind, f'~/{name}', functools.partial(self._serve, act))
-        self._reports = itertools.count()
+        self._diagnostics_count = itertools.count()
         self._steady_timer(1.0, self._publish_diagnostics)
         self._status_timer: Timer | None = None
         self._set_status_period(values['status_period'])
@@ -332,7 +332,7 @@ class Simulator(Node):
             self._log.error(f'recording stopped: {reason}; the simulation goes on')
         if self._session.warning:
             self._log.warning(f'recording: {self._session.warning}', throttle_duration_sec=10.0)
-        if next(self._reports) % 10 == 1:       # a look every 10 s
+        if next(self._diagnostics_count) % 10 == 1:       # a look every 10 s
             names = self.get_node_names_and_namespaces()
             if names.count((self.get_name(), self.get_namespace())) > 1:
                 self._log.warning(
@@ -355,6 +355,6 @@ class Simulator(Node):
         _ = self._simulation.segment.exact
         with self._lock:
             motion, line = self._report.new_motion(), self._report.status_line()
-        if motion:
+        if motion and self.context.ok():        # a signal may have ended it
             self._log.info(motion)
         self._terminal.show(line)

@@ -16,8 +16,8 @@ from spinning_top_sim.streams.schedule import NEVER_NS
 # The stamp of t = 0 is a multiple of this, so that grids meet across streams and runs.
 EPOCH_GRID_NS = 10_000_000
 SUBSCRIBERS_PERIOD_NS = 50_000_000      # subscribers are counted so often
-# The look-ahead is computed in pieces that fill this share of the time between two ticks.  It
-# begins this many ticks, or this much time, before it is needed.
+# `idle` may fill this share of the time between two ticks.  The look-ahead starts so many ticks,
+# or so much time, before it is needed, whichever is shorter.
 BUSY_SHARE = 0.35
 TICKS_AHEAD, AHEAD_NS = 24, 50_000_000
 # One tick works at most this long before services and signals get their turn; so does one step.
@@ -27,13 +27,13 @@ LATEST_NS = 500_000_000         # samples later than this are recorded, but not 
 # A simulation further behind than this lets its clock slip: its real-time factor falls below 1.
 LONGEST_LAG_NS = 1_000_000_000
 # A day before the seconds of a stamp, an int32, end: no look-ahead goes that far.
-LAST_STAMP_NS = (2 ** 31 - 86_400) * NANOSECONDS
+LAST_LIVE_STAMP_NS = (2 ** 31 - 86_400) * NANOSECONDS
 TOO_LATE = 'stamps cannot be later than 2038-01-18: the stamps of ROS messages end'
 
 
 def next_epoch(date_ns: int) -> int:
     """Return the first stamp from this date on [ns] that t = 0 may have.  Raises ValueError."""
-    if date_ns > LAST_STAMP_NS:
+    if date_ns > LAST_LIVE_STAMP_NS:
         raise ValueError(TOO_LATE)
     return -(-date_ns // EPOCH_GRID_NS) * EPOCH_GRID_NS
 
@@ -174,7 +174,7 @@ class TickLoop:
             self._enter(State.RUNNING)
             return simulation.now_ns
         publish_from_ns = target_ns - int(LATEST_NS * self._time_scale)
-        if simulation.epoch_ns + target_ns > LAST_STAMP_NS:
+        if simulation.epoch_ns + target_ns > LAST_LIVE_STAMP_NS:
             self.fail(TOO_LATE)
             return target_ns
         stop_at_ns = self._steady() + TICK_BUDGET_NS
@@ -204,12 +204,18 @@ class TickLoop:
             self._enter(State.RUNNING)
 
     def step(self, count: int, dt: float) -> None:
-        """Move a paused motion on by count x dt [s], rounded to 1 ns, or raise RuntimeError."""
+        """
+        Move a paused motion on by count x dt [s], rounded to 1 ns, or raise RuntimeError.
+
+        It goes no further than `duration`.
+        """
         if not self.paused:
             raise RuntimeError('running: ~/step works while paused (~/set_pause true)')
+        if self.failure:
+            raise RuntimeError(f'the motion stands still: {self.failure}')
         self._update_subscribers()
-        target_ns = self.now_ns + round(count * dt * NANOSECONDS)
-        last_ns = LAST_STAMP_NS - self._simulation.epoch_ns
+        target_ns = min(self.now_ns + round(count * dt * NANOSECONDS), self._duration_ns)
+        last_ns = LAST_LIVE_STAMP_NS - self._simulation.epoch_ns
         stop_at_ns = self._steady() + STEP_BUDGET_NS
 
         def give_way() -> bool:
@@ -221,7 +227,7 @@ class TickLoop:
             self._simulation.advance(min(target_ns, last_ns), give_way=give_way)
         except IntegrationError as error:
             self.fail(str(error))
-        self._enter(self.state)
+        self._enter(State.ENDED if self.now_ns >= self._duration_ns else self.state)
         if self.failure:
             raise RuntimeError(self.failure)
         if self.now_ns == last_ns:
@@ -252,7 +258,7 @@ class TickLoop:
         simulation.epoch_ns = epoch_ns
         self.failure = None
         self.interruptions += 1
-        self.set_pace(values)           # which a failed change has left half done
+        self.set_pace(values)           # a change that failed midway may not have set it
         self._enter(State.PAUSED if self.paused else State.RUNNING)
         self._recording.write_event('reset', sent_ns, epoch_ns=epoch_ns, parameters=values)
 

@@ -159,22 +159,23 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         channels = {number: channel.topic for number, channel in self._summary.channels.items()
                     if (names is None or channel.topic in names) and self._summary.knows(number)}
         times = range(start or 0, 1 << 64 if end is None else end)
-        self._held_bytes = 0
+        held: list[int] = []        # bytes of each span that is read and not yet passed
         # A span is read when its time comes.
-        streams = [self._stream(span, channels) for span in spans
+        streams = [self._stream(span, channels, held) for span in spans
                    if span.end_ns >= times.start and span.start_ns < times.stop
                    and not (names is not None and self._is_without(span, channels))]
         for message in heapq.merge(*streams, key=attrgetter('log_time')):
             if message.channel_id >= 0 and message.log_time in times:
                 yield message
 
-    def _stream(self, span: _Span, channels: Mapping[int, str]) -> Iterator[LogMessage]:
-        """Yield what stands for the time at which a span begins, then its messages in order."""
+    def _stream(self, span: _Span, channels: Mapping[int, str], held: list[int],
+                ) -> Iterator[LogMessage]:
+        """Yield a placeholder at the span's first time, so that spans open in turn, then all."""
         yield LogMessage('', span.start_ns, 0, 0, b'', -1)
         contents = self._read(span)
         held_bytes = len(contents.plain) + _STREAM_BYTES
-        self._held_bytes += held_bytes
-        if self._held_bytes > 2 * self.source.max_bytes:
+        held.append(held_bytes)
+        if sum(held) > 2 * self.source.max_bytes:
             raise LogError(f'cannot read {self.path}: the messages of several chunks overlap in '
                            f'time, and these have more than {2 * self.source.max_bytes} bytes')
         for channel_id in contents.entries.keys() - channels:
@@ -183,7 +184,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             yield LogMessage(
                 channels[message.channel_id], message.log_time, message.publish_time,
                 message.sequence, message.data, message.channel_id)
-        self._held_bytes -= held_bytes
+        held.remove(held_bytes)
 
     def _is_without(self, span: _Span, channels: Mapping[int, str]) -> bool:
         """Whether a chunk has message indexes by the summary, and none of these channels."""

@@ -67,7 +67,7 @@ class ScannedRecord:
     opcode: int             # above DATA_END: of an application, or of a later version of MCAP
     offset: int             # in the file
     end: int
-    # A schema or channel as the file has it elsewhere.  The index of an attachment; None for
+    # Of a schema or channel the version that is valid, of an attachment its index.  None for
     # single messages, message indexes and unknown kinds.
     record: McapRecord | None = None
     raw: bytes = b''    # with head and extra fields; b'' for attachments and unknown kinds
@@ -90,7 +90,7 @@ class Scanner:
         self.schemas, self.channels = summary.schemas, summary.channels     # by id, known so far
         self._all_in_chunks = ours or summary.indexes_all_messages
         self._limit = summary.data_limit
-        self._limit_is_end = not summary.problem    # of the data section, else of the file
+        self._limit_is_summary = not summary.problem   # else the end of the file
         self._finder = RecordFinder(source, self._limit)
         self._indexed: dict[int, int] = {}      # opcodes by offset, of records in the summary
         for offset, opcode, length in summary.places:
@@ -113,7 +113,7 @@ class Scanner:
         # among them ends the scan.
         in_summary = False
         # The last bytes before a known end can only be the data end.
-        while offset < self._limit - (_DATA_END_SIZE if self._limit_is_end else 0):
+        while offset < self._limit - (_DATA_END_SIZE if self._limit_is_summary else 0):
             try:
                 scanned = self._read(offset)
             except DamagedError as damage:
@@ -174,11 +174,11 @@ class Scanner:
         record, extra = records.parse(raw)
         self._check_extra(extra, end)
         if isinstance(record, DataEnd) and (
-                end == self._limit if self._limit_is_end else not extra):
+                end == self._limit if self._limit_is_summary else not extra):
             return None
         # Without extra fields, what belongs to a summary is no chunk of a damaged kind.
         if (isinstance(record, DataEnd) or (isinstance(record, Header) and offset != MAGIC_SIZE)
-                or (opcode in _SUMMARY_KINDS and (self._limit_is_end or extra))):
+                or (opcode in _SUMMARY_KINDS and (self._limit_is_summary or extra))):
             raise DamagedError('it has no place there')
         if isinstance(record, Chunk):
             contents = self._open_chunk(offset, record)
@@ -252,9 +252,10 @@ class Scanner:
             offset = end
         # What is left of those expected is damaged, or was not written.
         kind = self.source.read(offset, 1)
-        if not expected or (kind != _INDEX_KIND and self._finder.is_record(offset) and not any(
-                self.source.read(offset + 1, len(raw) - 1) == raw[1:]  # but for its kind
-                for raw in expected.values())):
+        only_kind_is_wrong = any(self.source.read(offset + 1, len(raw) - 1) == raw[1:]
+                                 for raw in expected.values())
+        other_record = kind != _INDEX_KIND and self._finder.is_record(offset)
+        if not expected or (other_record and not only_kind_is_wrong):
             return offset
         end = offset + sum(map(len, expected.values()))
         if end > self._limit and kind == _INDEX_KIND and not self._summary.closed:

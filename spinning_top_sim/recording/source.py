@@ -46,8 +46,8 @@ class McapSource:
     """
     Random access to a file, up to the size that it has now; raises LogError where that fails.
 
-    A record stands between `offset` and `end`; what reads one raises DamagedError if it is not
-    what it says it is.
+    Methods that read a record take its first byte and its end; they raise DamagedError if it is
+    inconsistent.
     """
 
     def __init__(self, path: Path, max_bytes: int) -> None:
@@ -93,7 +93,7 @@ class McapSource:
             lambda crc, block: zlib.crc32(block, crc), self.blocks(offset, end), 0)
 
     def head(self, offset: int, limit: int) -> tuple[int, int]:
-        """Return opcode and end of the record there, which ends before `limit`."""
+        """Return opcode and end of the record there, which ends by `limit`."""
         head = self.read(offset, HEAD.size)
         if len(head) == HEAD.size and head[0] != 0:
             opcode, length = HEAD.unpack(head)

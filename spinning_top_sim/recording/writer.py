@@ -89,7 +89,8 @@ class McapRecorder:
         self._offered = 0              # messages handed over, ever
         self._accepting = True
         self._longest_flush = 0.0
-        self._on_disk = time.monotonic(), 0     # what came by this time; bytes out of the queue
+        # (time, bytes): what had left the queue by that time is on the disk.
+        self._on_disk = time.monotonic(), 0
         self._sync_error: Exception | None = None
         self._syncing: threading.Thread | None = None
         self._wake = threading.Event()
@@ -102,7 +103,7 @@ class McapRecorder:
 
     @property
     def room(self) -> bool:
-        """Whether the clock may go on: the queue has room, or the recording has stopped."""
+        """Whether the queue takes more, or the recording has stopped and takes nothing."""
         return self._bytes_in - self._bytes_out < QUEUE_BYTES
 
     @property

@@ -12,8 +12,8 @@ from spinning_top_sim.physics.attitude import Column, precession_rate
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.dormand_prince import Equations, IntegrationError, Rows, Vector
 
-# The energy error is taken out of the nutation rate where its square is this share of the
-# largest |m|^2 or more: at a turning point the energy does not tell the rate.
+# The energy corrects the nutation rate only where its square is at least this share of the
+# largest |m|^2: at a turning point the energy does not tell the rate.
 NUTATION_SHARE = 1e-6
 # (sin(theta)/2)^2 below which rounding in L.e3 would spoil the momentum more than it mends it.
 POLE_SHARE = 1e-4
@@ -50,10 +50,11 @@ class TransportEquations(Equations):
         beta'  =  i (Lz + c)/(2 lambda1) beta  - m conj(alpha)
         m'     = -(P/lambda1) alpha beta
 
-    They are those of a frame that turns about e3 with the body, less a known uniform rate
-    chi = L3/lambda3 - (L3 - c)/lambda1.  The factor exp(+-i chi t/2) is put on when a state is
-    read, so the step size follows the nutation and not the spin.  With c = L3/2 the spectrum of
-    alpha and beta is centred about zero; docs/accuracy.md has the reasons for this choice.
+    with c the part of L3 that these equations carry.  They are those of a frame that turns about
+    e3 with the body, less a known uniform rate chi = L3/lambda3 - (L3 - c)/lambda1.  The factor
+    exp(+-i chi t/2) is put on when a state is read, so the step size follows the nutation and not
+    the spin.  With c = L3/2 the spectrum of alpha and beta is centred about zero;
+    docs/accuracy.md has the reasons for this choice.
 
     The invariants |q| = 1, L.e3 = L3 and the energy are restored after each step and in each
     sample (projection, Hairer, Lubich & Wanner, *Geometric Numerical Integration*, sect. IV.4).
@@ -114,6 +115,7 @@ class TransportEquations(Equations):
                 self._fall * (alpha * beta))
 
     def second_derivative(self, y: Rows, derivative: Rows) -> Rows:
+        # The product rule in real parts: of complex columns the last bits depend on the block.
         a, a_imag, b, b_imag, m, m_imag = y
         da, da_imag, db, db_imag, dm, dm_imag = derivative
         turn_a, turn_b, fall = self._turn_alpha.imag, self._turn_beta.imag, self._fall.real

@@ -53,7 +53,7 @@ class AttitudeSeries:
         self._rotations = Rotations(angles if self._hyperbolic else
                                     [*angles, (v_rate, v_start)])
         self._drifts = np.array([[float(motion.beta.drift)], [-float(motion.alpha.drift)]])
-        # Signs of the four series that change with every second even quarter period.
+        # First row of each factor (beta 0, alpha 2) whose sign is (-1)^(N/2).
         self._flipped = [k for k, factor in ((0, motion.beta), (2, motion.alpha))
                          if factor.crosses]
         series = (*_real_and_imaginary(motion.beta, -ONE), *_real_and_imaginary(motion.alpha, ONE))

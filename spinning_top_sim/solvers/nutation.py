@@ -141,7 +141,7 @@ class Nutation:
         # Even and odd quarter periods.
         self._kinds = _Quarter(motion, 0), _Quarter(motion, 1)
         self._phase = NutationPhase(motion)
-        self._turning = motion.planar_rotation
+        self._planar_rotation = motion.planar_rotation
         self._turns0 = 0.0
         if motion.planar_rotation:
             self._turns0 = round(self._turns(
@@ -166,7 +166,7 @@ class Nutation:
             elif here.any():
                 out[:5, here] = quarter.at(y[here], flip[here])
         half_theta = np.arctan2(out[1], out[0])
-        if self._turning:
+        if self._planar_rotation:
             half_theta += 2.0 * math.pi * np.rint(self._turns(quarters, y, half_theta))
         out[5] = half_theta
 
@@ -177,8 +177,8 @@ class Nutation:
         In a planar rotation, which passes both poles, theta/2 stays within a quarter turn of
         (pi/2) (intercept + slope Z), Z in quarter periods.
         """
-        assert self._turning is not None
-        intercept, slope = self._turning
+        assert self._planar_rotation is not None
+        intercept, slope = self._planar_rotation
         steady = QUARTER_PERIOD_ANGLE * (intercept + slope * quarters) + slope * y
         return (steady - half_theta) / (2.0 * math.pi) - self._turns0
 

@@ -109,7 +109,7 @@ class SteppedMotion(ABC):
         return np.concatenate((interpolants.at(steps - first, t), self._phases_at(steps)))
 
     def _phases_at(self, steps: NDArray[np.int64]) -> Rows:
-        """Return what else is known at the begins of these of the steps that are kept: nothing."""
+        """Return further rows per time, of the step that it lies in: none here."""
         return np.empty((0, len(steps)))
 
     def exact_solution(self) -> ExactSolution | None:

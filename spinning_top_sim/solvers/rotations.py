@@ -88,13 +88,13 @@ class Rotations:
         fastest = max(abs(rate) for rate, _ in angles)
         # [steps], as halves of doubles and what they leave out, and the times up to which they
         # are enough.
-        self._in: dict[str, tuple[Rows, Rows, float]] = {}
+        self._constants: dict[str, tuple[Rows, Rows, float]] = {}
         for unit, scale in UNITS.items():
             exact = [rate * scale * STEPS for rate, _ in angles]
             high = halves(_column(exact))[0]
             low = _column(rate - Decimal(float(x))
                           for rate, x in zip(exact, high[:, 0], strict=True))
-            self._in[unit] = high, low, SHORT_TURNS / max(float(fastest * scale), 1e-300)
+            self._constants[unit] = high, low, SHORT_TURNS / max(float(fastest * scale), 1e-300)
         # By step and offset [ns]: `_within_second` of uniform grids.
         self._grids: dict[tuple[int, int], Rows] = {}
         # The first of the seconds that `_at_seconds` has computed, and what it found.
@@ -116,7 +116,7 @@ class Rotations:
         second.  A uniform grid that divides the second needs the latter once: it takes half the
         time of `cosines_and_sines`, and a value depends on its own time only.
         """
-        if self._in['ns'][2] < 1.0:        # a second has more turns than a double counts
+        if self._constants['ns'][2] < 1.0:        # a second has more turns than a double counts
             return self.cosines_and_sines(Times.from_ns(ns))
         if isinstance(ns, range) and NANOSECONDS % ns.step == 0 and ns.step >= SHORTEST_STEP_NS:
             return self._on_grid(ns)
@@ -173,7 +173,7 @@ class Rotations:
         """
         exact, rest, step, table_cosine, table_sine, product = _ANGLES.rows(
             6, len(self._whole), len(times))
-        rate_high, rate_low, short = self._in[times.unit]
+        rate_high, rate_low, short = self._constants[times.unit]
         time_high, time_low = times.halves
         np.multiply(rate_high, time_high, out=exact)
         np.multiply(rate_high, time_low + times.low, out=rest)

@@ -18,8 +18,9 @@ times a uniform rotation, so that a state costs the same at every t:
                 near u2); of beta, with b for a, the other way round [DLMF 20.2]
     D           theta4(y) at even N, theta3(y) at odd N;  R, J, D up to constant factors
     r, c        mean rate, with s w (pi/(2K) - d/da log theta2(v0)) in it, and phase at t = 0
-    kappa       -1: r t has s pi/2 a quarter period, evenly; r t - s y has them where N steps.
-                In the imaginary form a/K' - 1, as it splits off exp(i s y a/K').
+    kappa       -1: s y is taken out of r t, since r t grows evenly and (R + i s J) holds the
+                quarter turns.  In the imaginary form a/K' - 1, as that splits off
+                exp(i s y a/K').
 
 The work is done in long decimals, 60 digits and more if two roots of the cubic are close, because
 everything that cancels, cancels here: close to a pole, to the separatrix, to steady precession.

@@ -127,11 +127,12 @@ class Rate:
     """A rate [1/s] as two doubles; its product with a time has no error that grows with it."""
 
     def __init__(self, per_second: Decimal) -> None:
-        self._in = {unit: double_double(per_second * scale) for unit, scale in UNITS.items()}
+        self._constants = {
+            unit: double_double(per_second * scale) for unit, scale in UNITS.items()}
 
     def product(self, times: Times) -> tuple[Column, Column]:
         """Return rate * t as nearest doubles and what they leave out."""
-        rate_high, rate_low = self._in[times.unit]
+        rate_high, rate_low = self._constants[times.unit]
         r1, r2 = halves(rate_high)
         t1, t2 = times.halves
         high = rate_high * times.high

@@ -7,8 +7,8 @@ Times are integer nanoseconds since the start.  Three of them move on, each with
     0 ------ now_ns ---------- reached_ns ---- ready_ns ------> t
       sent            computed               |   first sample that is neither
 
-    now_ns      Simulation  samples up to here are sent; none after it
-    ready_ns    Schedule    samples before here are sent or computed
+    now_ns      Simulation  samples up to here are sent; none after it (-1: not even t = 0)
+    ready_ns    Schedule    samples before here are sent or computed (-1: dropped, as by a command)
     reached_ns  Segment     the solver has stepped up to here; it may be on either side of ready_ns
                 Propagator  the same, since the start of its motion
 
@@ -40,8 +40,8 @@ from spinning_top_sim.streams.topics import all_streams
 FIRST_STEPS, OFFLINE_STEPS = 500, 2000
 # Turns a second whose phases doubles hold for the shortest run.
 MOST_RATE = MOST_TURNS / SHORTEST_RUN_NS * NANOSECONDS
-# Takes the samples of an instant for a log: numbers of their streams there, stamp [ns], messages,
-# size of these together [bytes].
+# Takes the samples of an instant for a log: numbers of their streams in the log, stamp [ns],
+# messages, and the size of these together [bytes].
 Log = Callable[[Sequence[int], int, Sequence[bytes], int], object]
 # Takes a block of samples of a stream: stamps (n,) [ns], and messages as rows of bytes (n, size),
 # valid until it returns.
@@ -156,7 +156,7 @@ class Simulation:
         Record these streams from now on, and no others.
 
         write : takes their samples from `advance`; None if `advance_in_blocks` sends them
-        streams : a stream has the number in the log that it has here
+        streams : their order here is their number in the log
         """
         self._log = write
         for stream in self.streams:
@@ -187,7 +187,7 @@ class Simulation:
             if moved and give_way():
                 return False
             moved = True
-            if not ready:
+            if not ready:       # to compute does not move the time that is due next
                 schedule.compute(self.now_ns, target_ns)
             if ready and due_ns <= target_ns:
                 self._send(ready.popleft(), due_ns >= publish_from_ns)

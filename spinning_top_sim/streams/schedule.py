@@ -115,7 +115,7 @@ class Schedule:
         """
         Compute a block if there are samples due up to `until_ns` that are not computed.
 
-        Return False if the block takes longer than `budget_ns`: the next call goes on there.
+        Return False only if the block takes longer than `budget_ns`: the next call goes on there.
         """
         if self._work is None:
             self.next_due(now_ns)

@@ -85,7 +85,7 @@ class Segment:
         return errors
 
     def exact_axis(self, times_ns: NDArray[np.int64]) -> attitude.Vector:
-        """Return the exact axis in the world at times (n,) [ns]; where not known, it rests."""
+        """Return the exact axis in the world at times (n,) [ns]; its start where not known."""
         if self.exact is not None:
             return self.exact.states(
                 np.minimum(times_ns - self.start_ns, self.exact.ns_limit)).rows_axis

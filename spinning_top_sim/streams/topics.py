@@ -99,7 +99,7 @@ class ImuData(ImuRaw):
 
 
 class ImuBias(ImuStream):
-    """The bias that the readings contain."""
+    """The bias that the readings contain; it has the rate of the raw readings, `imu.rate`."""
 
     parameter, topic, has_orientation = 'imu', 'ground_truth/imu_bias', False
 

@@ -229,14 +229,14 @@ def _rerun(run: RunDescription, end_ns: int,
         if samples_left < 0:
             raise DepartureError(f'a log of {run.log_bytes} bytes lacks most samples of this run')
         block_ns = max(offline_block_ns(recorded), (stop_ns - now_ns) // MOST_BLOCKS)
-        for target_ns, reached in offline_targets(now_ns, [(stop_ns, item)], block_ns):
+        for target_ns, arrived in offline_targets(now_ns, [(stop_ns, item)], block_ns):
             # Without samples states are only needed where a command finds them.
-            if send is not None or (reached is not None and reached.name == 'command'):
+            if send is not None or (arrived is not None and arrived.name == 'command'):
                 reach(target_ns)
             simulation.skip_to(target_ns)
-            if reached is not None:
-                _apply(simulation, reached)
-            yield simulation, reached
+            if arrived is not None:
+                _apply(simulation, arrived)
+            yield simulation, arrived
 
 
 def _apply(simulation: Simulation, event: Event) -> None:
@@ -321,10 +321,10 @@ def verify(reader: LogReader, run: RunDescription, end_ns: int,
             verdict.stopped = str(error)
         yield math.inf
 
-    reached, before_ns = computing(), -math.inf
+    progress, before_ns = computing(), -math.inf
     for message in reader.messages(topics=verdict.compared):
         while message.log_time >= before_ns:
-            before_ns = next(reached)
+            before_ns = next(progress)
         key = message.log_time, message.topic
         if key in computed:
             stream, expected = computed[key].popleft()
@@ -337,7 +337,7 @@ def verify(reader: LogReader, run: RunDescription, end_ns: int,
         else:
             verdict.unexpected += 1
             verdict.note(Difference(*key, 'message', 'there', 'no such message'))
-    for _ in reached:
+    for _ in progress:
         pass
     for key, left in computed.items():
         verdict.missing += len(left)

@@ -218,7 +218,7 @@ class _LogWriter:
         if blocks:
             chunk = self.file.chunk_of_rows(blocks)
             self._chunk.result()
-            self.file.write_chunk()
+            self.file.write_chunk()         # of the journal's entries, which wait in memory
             self._chunk = self._executor.submit(self.file.write_chunk, chunk)
 
     def close(self) -> None:

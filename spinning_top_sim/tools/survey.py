@@ -37,7 +37,7 @@ MOST_GAPS = 10              # listed one by one
 MOST_EXACT = 1000           # motions that are compared with the exact one: 10 ms each
 SHOWN_NUTATIONS, SHOWN_S = 8.0, 10.0      # in pictures: whichever is longer
 IMU_TOPICS = ('imu/data_raw', 'ground_truth/imu', 'ground_truth/imu_bias')
-# Streams that measure a motion, the best first: with angles, with exact rates, with neither.
+# Streams that measure a motion, the best first: angles; exact rates; noisy rates; none.
 SOURCES = ('joint_states', 'ground_truth/imu', 'ground_truth/odom', 'imu/data', 'pose')
 ENOUGH_SAMPLES = 12.0       # in a nutation: a faster stream shows nothing new
 Stamps = NDArray[np.int64]
