@@ -11,7 +11,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
@@ -28,6 +27,12 @@ def _given_twice(argv: Sequence[str], node_name: str) -> dict[str, object]:
 
     rcl keeps the last value of each type; of these, rclpy takes an integer rather than a double.
     """
+    names = [text.partition(':=')[0].rpartition(':')[2] for flag, text in pairwise(argv)
+             if flag in {'-p', '--param'}]
+    if '--params-file' not in argv and len(set(names)) == len(names):
+        return {}
+    import yaml  # noqa: PLC0415 - it takes 10 ms
+
     given = defaultdict(list)
     for flag, text in pairwise(argv):
         tree: Any = {}
