@@ -98,8 +98,8 @@ def motion(commanded):
     return commanded
 
 
-def l3_of(topic):
-    return np.array([m.twist.twist.angular.z * LAMBDA3 for m in topic.messages()])
+def l3_of(messages):
+    return np.array([m.twist.twist.angular.z * LAMBDA3 for m in messages])
 
 
 @pytest.mark.parametrize(('command', 'l3', 'lz'), [
@@ -114,16 +114,17 @@ def test_a_command_sets_the_momenta_and_nothing_jumps(peer, motion, command, l3,
     """
     topics = motion.topics
     command(peer, motion.node, l3, lz)
-    wait_for('the new momentum', lambda: abs(l3_of(topics['ground_truth/odom'])[-1] - l3) < 1e-9)
+    odometry = topics['ground_truth/odom']
+    wait_for('the new momentum', lambda: abs(l3_of([odometry.last()])[0] - l3) < 1e-9)
     for topic in topics.values():
         topic.wait_more(50)
     # Omega3 = L3/lambda3 has one jump, from the one exactly to the other.
-    momentum = l3_of(topics['ground_truth/odom'])
+    momentum = l3_of(odometry.messages())
     jump = int(np.argmax(np.abs(momentum - momentum[0]) > 1e-9))
     assert jump >= 40
     assert np.abs(momentum[:jump] - momentum[0]).max() < 1e-12
     assert np.abs(momentum[jump:] - l3).max() < 1e-12
-    at = stamps_of(topics['ground_truth/odom'])[jump]
+    at = stamps_of(odometry)[jump]
     # L3 and Lz as the node itself reports them.
     invariants = np.array([m.data for m in topics['~/invariants'].messages()])
     assert np.abs(invariants[-1, 1:3] - (l3, lz)).max() < 1e-11
