@@ -27,6 +27,7 @@ from spinning_top_sim.solvers.times import Times
 
 NEGLIGIBLE = Decimal('1e-18')           # beside the largest term
 BLOCK = 16384           # times evaluated together: temporaries stay in the cache
+HUGE_PAGE = 2 ** 18     # doubles
 _SCRATCH = Scratch()
 
 
@@ -67,7 +68,7 @@ class AttitudeSeries:
 
     def quaternion(self, times: Times) -> NDArray[np.float64]:
         """Return x, y, z, w at n times, (4, n)."""
-        out = np.empty((4, len(times)))
+        out = _rows_on_huge_pages(4, len(times))
         for first in range(0, len(times), BLOCK):
             block = slice(first, first + BLOCK)
             self._fill(out[:, block], times[block])
@@ -116,6 +117,21 @@ class AttitudeSeries:
         growing = 0.5 * np.exp(self._stretch * y)
         falling = 0.25 / growing
         return y, growing - falling, growing + falling, flip
+
+
+def _rows_on_huge_pages(count: int, n: int) -> NDArray[np.float64]:
+    """
+    Return an uninitialized array (count, n) that begins on a huge page if it fills half of one.
+
+    numpy asks for huge pages for arrays of 4 MiB and more.  Clearing small pages, one by one,
+    takes a quarter of the time of an evaluation.
+    """
+    size = count * n
+    if size < HUGE_PAGE // 2:
+        return np.empty((count, n))
+    memory = np.empty(size + 2 * HUGE_PAGE)
+    begin = -(memory.ctypes.data // memory.itemsize) % HUGE_PAGE
+    return memory[begin:begin + size].reshape(count, n)
 
 
 def _real_and_imaginary(factor: Factor, sense: Decimal) -> tuple[Series, Series]:
