@@ -143,15 +143,25 @@ def _stream(name: str, rate: float, enabled: bool, text: str) -> tuple[Parameter
 
 
 def _axes(kind: str, unit: str, walk_unit: str) -> list[Parameter]:
-    """Return the error model of three axes; names and units of the first two are kalibr's."""
-    return [
+    """Return the error model of three axes; names and units as kalibr has them."""
+    errors = [
         _at_reset(f'imu.{kind}_{name}', 0.0, text, unit_text, 0.0, 1e12, smallest=1e-12)
         for name, text, unit_text in (
             ('noise_density', f'White noise of the {kind}, 0 = none', f'{unit}/sqrt(Hz)'),
             ('random_walk', f'Random walk of the bias of the {kind}, 0 = none', walk_unit),
             ('turn_on_bias', f'Standard deviation of the bias of the {kind} at the start', unit),
+            ('bias_stddev', f'Standard deviation of a Gauss-Markov bias of the {kind}, 0 = none',
+             unit),
+            ('bias_instability', f'Flat of the Allan deviation of a flicker bias of the {kind}, '
+             '0 = none', unit),
             ('range', f'Largest reading of the {kind}, 0 = unlimited', unit),
             ('resolution', f'Smallest step of the readings of the {kind}, 0 = none', unit))]
+    return [
+        _at_reset(f'imu.{kind}_M', (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
+                  f'Scale and misalignment of the {kind}, row by row', '', -1e6, 1e6),
+        *errors,
+        _at_reset(f'imu.{kind}_bias_correlation_time', 100.0,
+                  f'Correlation time of the Gauss-Markov bias of the {kind}', 's', 0.01, LONGEST)]
 
 
 TABLE: tuple[Parameter, ...] = (
@@ -196,6 +206,10 @@ TABLE: tuple[Parameter, ...] = (
               'yaw about fixed axes', 'rad', -1e6, 1e6),
     *_axes('gyroscope', 'rad/s', 'rad/s^2/sqrt(Hz)'),
     *_axes('accelerometer', 'm/s^2', 'm/s^3/sqrt(Hz)'),
+    _at_reset('imu.gyroscope_A', 9 * (0.0,), 'Sensitivity of the gyroscope to specific force, row '
+              'by row', '(rad/s)/(m/s^2)', -1e6, 1e6),
+    _at_reset('imu.bias_instability_band', (1.0, 1000.0), 'Shortest and longest averaging time '
+              'with the flat of the flicker bias', 's', 0.01, 1e6),
     _at_reset('markers.trace_length', 4.0, 'How far back the trace of the tip goes, 0 = no trace',
               's', 0.0, 3600.0),
     _at_reset('markers.trace_points', 200, 'Points of the trace, evenly spaced in time', '', 1,
@@ -233,6 +247,10 @@ def checked(values: Mapping[str, Value]) -> dict[str, Value]:
         if name not in ('all', *names):
             raise ValueError(f'record.streams = {list(result["record.streams"])!r}: {name!r} '
                              f'is no stream; must be all or some of {", ".join(names)}')
+    shortest, longest = result['imu.bias_instability_band']
+    if not shortest < longest:
+        raise ValueError(f'imu.bias_instability_band = {[shortest, longest]!r}: the second number '
+                         'must be larger than the first')
     top_of(result)
     start_state(result)
     return result

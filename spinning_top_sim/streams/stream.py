@@ -33,7 +33,12 @@ class Stream:
         self.on_change: Callable[[], None] = lambda: None
         self.sent = self.skipped = 0
         self._skipped_until_ns = 0
-        self.period_ns = period_ns(values[f'{self.parameter}.rate'])
+        self.period_ns = period_ns(values[self.rate_parameter])
+
+    @property
+    def rate_parameter(self) -> str:
+        """Name of the parameter that is its rate."""
+        return f'{self.parameter}.rate'
 
     @property
     def publish(self) -> Callable[[bytes], object] | None:
@@ -52,11 +57,11 @@ class Stream:
     @property
     def at_once(self) -> tuple[str, ...]:
         """Names of the parameters that `apply` takes over; a run is replayed by them."""
-        return (f'{self.parameter}.rate',)
+        return (self.rate_parameter,)
 
     def apply(self, changes: Mapping[str, Any]) -> None:
         """Take over new values of parameters, of those in `at_once` that are among them."""
-        rate = changes.get(f'{self.parameter}.rate')
+        rate = changes.get(self.rate_parameter)
         if rate is not None and period_ns(rate) != self.period_ns:
             self.period_ns = period_ns(rate)
             self.on_change()
