@@ -74,9 +74,10 @@ def page() -> str:
     values = parameters.checked({})
     lines = [HEAD]
     for stream in all_streams(values):
-        rate, on = values[f'{stream.parameter}.rate'], values[f'{stream.parameter}.enabled']
+        rate, on = values[stream.rate_parameter], values[f'{stream.parameter}.enabled']
         lines.append(f'| `{stream.topic}` | {stream.type_name} | {rate:g} | '
-                     f'{"yes" if on else "no"} | `{stream.parameter}.enabled`, `.rate` |\n')
+                     f'{"yes" if on else "no"} | `{stream.parameter}.enabled`, '
+                     f'`{stream.rate_parameter.removeprefix(stream.parameter)}` |\n')
     lines.append(AFTER_TOPICS.format(joints=', '.join(f'`{name}`' for name in JOINTS),
                                      invariants=', '.join(f'`{name}`' for name in INVARIANTS)))
     for parameter in parameters.TABLE:

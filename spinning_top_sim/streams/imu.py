@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.states import States
+from spinning_top_sim.streams.parameters import IDENTITY
 
 if TYPE_CHECKING:
     from spinning_top_sim.streams.noise import SensorNoise
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 # Six columns: three axes of the gyroscope, three of the accelerometer.
 Rows = NDArray[np.float64]
 NO_ERRORS = np.zeros((6, 1))
-IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class Imu:
@@ -70,6 +70,7 @@ class Sensor:
     newest sample, so that all streams agree where they have a time in common.
 
     rate_variance, force_variance : of white noise and rounding together
+    orientation_variances : about the axes of the IMU [rad^2]
 
     (kalibr, "IMU Noise Model"; N. Trawny, S. Roumeliotis, "Indirect Kalman filter for 3D attitude
     estimation", 2005, eqs. 133, 140; for the matrices J. Rehder et al., "Extending kalibr", ICRA
@@ -93,6 +94,10 @@ class Sensor:
         is_noisy = any(six(name).any() for name in (
             'noise_density', 'turn_on_bias', 'random_walk', 'bias_stddev', 'bias_instability'))
         self._noise = _noise(values, period_ns, white) if is_noisy else None
+        deviations = values['imu.orientation_stddev']
+        self.orientation_variances = tuple(deviation ** 2 for deviation in deviations)
+        self._orientation_noise = (_orientation_noise(values['seed'], period_ns, deviations)
+                                   if any(deviations) else None)
         self._is_perfect = not (
             is_noisy or resolution.any() or limit.any() or any(self._g_sensitivity)
             or (*self._rate_matrix, *self._force_matrix) != 2 * IDENTITY)
@@ -108,6 +113,13 @@ class Sensor:
                     itertools.chain(*self._distorted(*exact)), bias, white, self._converters,
                     strict=True)]
         return (rows[0], rows[1], rows[2]), (rows[3], rows[4], rows[5])
+
+    def orientation(self, exact: Quaternion, times: range) -> Quaternion:
+        """Return the orientation as the IMU estimates it; its error is in the IMU's frame."""
+        if self._orientation_noise is None:
+            return exact
+        (x, y, z), _ = self._orientation_noise.at(times)
+        return attitude.product(exact, attitude.quaternion_of_vector((x, y, z)))
 
     def bias(self, times: range) -> tuple[Vector, Vector]:
         """Return the bias at these times [ns]: [rad/s], [m/s^2]."""
@@ -150,6 +162,13 @@ def _noise(values: Mapping[str, Any], period_ns: int, white: Rows) -> 'SensorNoi
     turn_on = np.array(six('turn_on_bias'))[:, np.newaxis] * noise.constant(
         seed, noise.Purpose.TURN_ON, 6)
     return noise.SensorNoise(seed, noise.Purpose.WHITE, period_ns, white, turn_on, paths)
+
+
+def _orientation_noise(seed: int, period_ns: int, deviations: Sequence[float]) -> 'SensorNoise':
+    from spinning_top_sim.streams import noise  # noqa: PLC0415 - not for a perfect IMU
+
+    return noise.SensorNoise(seed, noise.Purpose.ORIENTATION, period_ns,
+                             np.array(deviations)[:, np.newaxis], np.zeros((3, 1)), ())
 
 
 class Converter:

@@ -28,6 +28,7 @@ class Purpose(enum.IntEnum):
     """What a random number is for: those of two purposes are independent."""
 
     WHITE, TURN_ON, WALK, GAUSS_MARKOV, FLICKER, ORIENTATION = range(6)
+    TIMING, MAG_WHITE, MAG_WALK = range(6, 9)
 
 
 def white(seed: int, purpose: Purpose, numbers: NDArray[np.int64], columns: int) -> Rows:
@@ -103,12 +104,13 @@ def flicker_parts(shortest: float, longest: float) -> Sequence[tuple[float, floa
     """
     Return correlation time [s] and standard deviation of some Gauss-Markov processes.
 
-    The Allan deviation of their sum is 1 from `shortest` to `longest` [s], within 3 %.  Each
+    The Allan deviation of their sum is 1 from `shortest` to `longest` [s], within 6 %.  Each
     process has its largest Allan variance at 1.89 correlation times; the variances are those with
     which the sum is 1 at all these averaging times.
     """
-    count = 1 + max(1, round(np.log(longest / shortest) / np.log(SPACING)))
-    tau = np.geomspace(shortest, longest, count)
+    count = 1 + round(np.log(longest / shortest) / np.log(SPACING))
+    tau = (np.geomspace(shortest, longest, count) if count > 1
+           else np.array([np.sqrt(shortest * longest)]))
     times = tau / 1.89
     variances = np.linalg.solve(gauss_markov_allan_variance(tau[:, np.newaxis] / times),
                                 np.ones(count))
@@ -123,8 +125,10 @@ def gauss_markov_allan_variance(ratio: Rows) -> Rows:
 
     (IEEE Std 952-1997, annex C, with the variance q^2 T/2.)
     """
-    return 2.0 / ratio * (1.0 - (3.0 - 4.0 * np.exp(-ratio) + np.exp(-2.0 * ratio))
-                          / (2.0 * ratio))
+    whole = 2.0 / ratio * (1.0 - (3.0 - 4.0 * np.exp(-ratio) + np.exp(-2.0 * ratio))
+                           / (2.0 * ratio))
+    # There its terms cancel.
+    return np.where(ratio < 1e-3, ratio * (2.0 / 3.0 - 0.5 * ratio), whole)
 
 
 def _columns(block: Callable[[int], Rows], numbers: NDArray[np.int64]) -> Rows:

@@ -87,8 +87,12 @@ class Stream:
             self._skipped_until_ns = before_ns
             self.on_change()
 
+    def sent_ns(self, times: range) -> NDArray[np.int64]:
+        """Return the times of the messages of these samples: some may be lost, some repeated."""
+        return np.arange(times.start, times.stop, times.step)
+
     def encode(self, states: States, epoch_ns: int, times: range) -> NDArray[np.uint8]:
-        """Return messages of states at times [ns]; epoch_ns is t = 0; see `Template.encode`."""
+        """Return messages, at `sent_ns`, of states at times [ns]; see `Template.encode`."""
         stamps_ns = np.arange(epoch_ns + times.start, epoch_ns + times.stop, times.step)
         return self.template.encode(stamps_ns, *self.fields(states, times))
 
