@@ -11,7 +11,7 @@ import math
 import numpy as np
 from helpers.reference import scene_parameters
 from helpers.sensor_logs import recorded
-from helpers.simulations import SECOND, record, simulate, stream
+from helpers.simulations import SECOND, record, simulate
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
