@@ -124,10 +124,10 @@ the angle to the true attitude after 60 s, divided by 60 s. With `last`, a sampl
 step that it ends, as in most drivers; with `mean`, the mean of both ends counts.
 """
 NINE = """\
-With a perfect magnetometer at 100 Hz VQF knows the heading. The table has its largest error from the
-same time on. With the mean of two angular velocities, `vqf9 mean`, it is the drift of the heading in
-the 9 s within which the magnetometer corrects it. `vqf9` gets rates whose rotation is right to third
-order. On a lever arm the error is that of the filter, at every rate.
+With a perfect magnetometer at 100 Hz VQF knows the heading. The table has its largest error from
+the same time on. With the mean of two angular velocities, `vqf9 mean`, it is the drift of the
+heading in the 9 s within which the magnetometer corrects it. `vqf9` gets rates whose rotation is
+right to third order. On a lever arm the error is that of the filter, at every rate.
 """
 GAIN = """\
 The gain is the only setting of Madgwick's filter, in rad/s. With a low gain the filter needs

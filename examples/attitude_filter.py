@@ -75,8 +75,8 @@ class vqf9:      # noqa: N801 - its name on the command line
     """
     VQF with a magnetometer.
 
-    The magnetometer corrects the heading within 9 s, and so long the errors of the integrated rates
-    add up.  With `third_order` the rotation of a step is right to third order: the curvature is
+    The magnetometer corrects the heading within 9 s, in which errors of the integrated rates add
+    up.  With `third_order` the rotation of a step is right to third order: the curvature is
     taken from the mean of both ends, and the coning term is added (P. Savage, "Strapdown inertial
     navigation integration algorithm design part 1", J. Guid. Control Dyn. 21 (1998) 19).
     """
