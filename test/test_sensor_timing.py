@@ -146,7 +146,8 @@ def test_a_node_with_all_errors_records_a_log_that_is_verified(peer, tmp_path):
     from spinning_top_sim.tools.inspect import main as inspect
 
     errors = {**FAULTS, 'imu.gyroscope_bias_instability': 1e-3,
-              'imu.orientation_stddev': [0.1] * 3, 'imu.accelerometer_bias_stddev': 0.1, 'mag.noise_density': 1e-7,
+              'imu.orientation_stddev': [0.1] * 3,
+              'imu.accelerometer_bias_stddev': 0.1, 'mag.noise_density': 1e-7,
               'imu.gyroscope_A': [1e-3] * 9, 'mag.hard_iron': [1e-5, 0.0, 0.0]}
     with SimNode(tmp_path, {**errors, 'imu_timing.enabled': True, 'imu_data.enabled': True,
                             'mag.enabled': True, 'record.enabled': True}) as node:
