@@ -195,7 +195,9 @@ class Comparison:
             self._advance(sample)
             return
         self._first.append(sample)
-        if len(self._first) > LEARNED_FROM:
+        if self.has_mag and len(self._mag_stamps) < 2:      # its period is not known yet
+            del self._first[:-LEARNED_FROM]
+        elif len(self._first) > LEARNED_FROM:
             self._period_ns = min(abs(b[0] - a[0])
                                   for a, b in itertools.pairwise(self._first)) or 1
             self._start(self._first[0])
@@ -231,8 +233,8 @@ class Comparison:
     def _start(self, sample: tuple[int, np.ndarray, np.ndarray]) -> None:
         periods = [self._period_ns / NANOSECONDS]
         if self.has_mag:
-            periods.append(min((abs(b - a) for a, b in itertools.pairwise(self._mag_stamps)),
-                               default=self._period_ns) / NANOSECONDS)
+            periods.append(min(abs(b - a) for a, b in itertools.pairwise(self._mag_stamps))
+                           / NANOSECONDS)
         self._step = FILTERS[self.name](*periods)
         self._last = sample
 
