@@ -75,6 +75,14 @@ def in_body(q: Quaternion, v: Vector) -> tuple[Column, Column, Column]:
             + (w * w - x * x - y * y + z * z) * vz)
 
 
+def rotation_vector(q: Quaternion) -> tuple[Column, Column, Column]:
+    """Return axis times angle [rad] of a unit quaternion; the angle is in [0, 2 pi]."""
+    x, y, z, w = q
+    sine = np.sqrt(x * x + y * y + z * z)
+    scale = 2.0 * np.arctan2(sine, w) / np.where(sine > 0.0, sine, 1.0)
+    return scale * x, scale * y, scale * z
+
+
 def precession_rate(top: Top, l3: float, lz: float, cos2_half: Number,
                     sin2_half: Number) -> Number:
     """

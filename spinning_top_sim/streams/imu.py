@@ -20,6 +20,8 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams.parameters import IDENTITY
+from spinning_top_sim.streams.intervals import Intervals
+from spinning_top_sim.streams.stream import period_ns
 
 if TYPE_CHECKING:
     from spinning_top_sim.streams.noise import SensorNoise
@@ -37,6 +39,8 @@ class Imu:
         self._is_rotated = any(values['imu.rpy'])
         self._mounting = _quaternion(*values['imu.rpy'])
         self.sensor: Callable[[int], Sensor] = lru_cache(4)(partial(Sensor, values))
+        self._takes_means = values['imu.sampling'] == 'mean'
+        self.intervals = Intervals(self._lever_arm, period_ns(values['imu.rate']))
 
     def orientation(self, states: States) -> Quaternion:
         """Return q(world <- IMU): columns x, y, z, w."""
@@ -52,12 +56,43 @@ class Imu:
 
     def true(self, states: States) -> tuple[Vector, Vector]:
         """Return angular velocity [rad/s] and specific force [m/s^2] in the IMU's frame."""
-        rates = states.rows_angular_velocity
-        force = states.specific_force(self._lever_arm)
-        if not self._is_rotated:
-            return rates, force
+        return (self._from_body(states.rows_angular_velocity),
+                self._from_body(states.specific_force(self._lever_arm)))
+
+    def means(self, states: States, times: range) -> tuple[Vector, Vector]:
+        """Return the means of `true` over the intervals that end at these times [ns]."""
+        increments, seconds = self.intervals.increments(times), self.intervals.lengths(times)
+        # Over no time the mean is the value.
+        divisor = np.where(seconds > 0.0, seconds, 1.0)
+        w1, w2, w3, f1, f2, f3 = (
+            np.where(seconds > 0.0, integral / divisor, value) for integral, value in zip(
+                (*increments.angles, *increments.forces),
+                (*states.rows_angular_velocity, *states.specific_force(self._lever_arm)),
+                strict=True))
+        return self._from_body((w1, w2, w3)), self._from_body((f1, f2, f3))
+
+    def sampled(self, states: States, times: range) -> tuple[Vector, Vector]:
+        """Return what a perfect sensor reads at these times [ns], by `imu.sampling`."""
+        return self.means(states, times) if self._takes_means else self.true(states)
+
+    def increments(self, times: range) -> tuple[Quaternion, Vector]:
+        """Return rotation and velocity increment [m/s] over these intervals; see `Intervals`."""
+        increments = self.intervals.increments(times)
+        x, y, z, w = increments.rotation
+        v1, v2, v3 = increments.velocity
+        if self._is_rotated:
+            x, y, z = attitude.in_body(self._mounting, (x, y, z))
+        return (x, y, z, w), self._from_body((v1, v2, v3))
+
+    def motion(self, states: States) -> tuple[Vector, Vector]:
+        """Return position in the world [m], and velocity in the IMU's frame [m/s]."""
+        x, y, z, w = states.rows_quaternion
+        return (attitude.in_body((-x, -y, -z, w), self._lever_arm),
+                self._from_body(states.velocity(self._lever_arm)))
+
+    def _from_body(self, vector: Vector) -> Vector:
         # What the world is to the body, the body is to the IMU.
-        return attitude.in_body(self._mounting, rates), attitude.in_body(self._mounting, force)
+        return attitude.in_body(self._mounting, vector) if self._is_rotated else vector
 
 
 class Sensor:
@@ -71,6 +106,7 @@ class Sensor:
 
     rate_variance, force_variance : of white noise and rounding together
     orientation_variances : about the axes of the IMU [rad^2]
+    is_perfect : whether the readings are the truth
 
     (kalibr, "IMU Noise Model"; N. Trawny, S. Roumeliotis, "Indirect Kalman filter for 3D attitude
     estimation", 2005, eqs. 133, 140; for the matrices J. Rehder et al., "Extending kalibr", ICRA
@@ -98,13 +134,13 @@ class Sensor:
         self.orientation_variances = tuple(deviation ** 2 for deviation in deviations)
         self._orientation_noise = (_orientation_noise(values['seed'], period_ns, deviations)
                                    if any(deviations) else None)
-        self._is_perfect = not (
+        self.is_perfect = not (
             is_noisy or resolution.any() or limit.any() or any(self._g_sensitivity)
             or (*self._rate_matrix, *self._force_matrix) != 2 * IDENTITY)
 
     def read(self, exact: tuple[Vector, Vector], times: range) -> tuple[Vector, Vector]:
         """Return the readings [rad/s], [m/s^2] at these times [ns] of what is exact there."""
-        if self._is_perfect:
+        if self.is_perfect:
             return exact
         white, bias = self._errors(times)
         # The chain of docs/sensor.md: matrices, g-sensitivity, bias, noise, rounding, range.
@@ -120,6 +156,25 @@ class Sensor:
             return exact
         (x, y, z), _ = self._orientation_noise.at(times)
         return attitude.product(exact, attitude.quaternion_of_vector((x, y, z)))
+
+    def disturb(self, exact: tuple[Quaternion, Vector], means: tuple[Vector, Vector],
+                times: range, seconds: Column) -> tuple[Quaternion, Vector]:
+        """
+        Return measured increments over intervals of these lengths that end at these times [ns].
+
+        The error of the reading of the means acts throughout the interval, in the sensor's frame:
+        it adds to the rotation vector, and to the velocity half-way through the rotation.
+        """
+        rotation, (v1, v2, v3) = exact
+        r1, r2, r3, *force = (
+            seconds * (reading - mean) for reading, mean in zip(
+                itertools.chain(*self.read(means, times)), itertools.chain(*means), strict=True))
+        x, y, z = attitude.rotation_vector(rotation)
+        f1, f2, f3 = attitude.in_body(
+            attitude.quaternion_of_vector((-0.5 * x, -0.5 * y, -0.5 * z)),
+            (force[0], force[1], force[2]))
+        return (attitude.quaternion_of_vector((x + r1, y + r2, z + r3)),
+                (v1 + f1, v2 + f2, v3 + f3))
 
     def bias(self, times: range) -> tuple[Vector, Vector]:
         """Return the bias at these times [ns]: [rad/s], [m/s^2]."""

@@ -82,6 +82,30 @@ def odometry(frame_id: str, child_frame_id: str) -> Template:
     return Template(writer)
 
 
+def moving_odometry(frame_id: str, child_frame_id: str) -> Template:
+    """
+    nav_msgs/Odometry, exact.
+
+    Fields: position, orientation, linear velocity, angular velocity, each in its frame.
+    """
+    writer = CdrWriter()
+    writer.header(frame_id)
+    writer.string(child_frame_id)
+    for counts in ((3, 4), (3, 3)):
+        for count in counts:
+            writer.field(count)
+        writer.append('d', *diagonal(*(6 * (0.0,))))
+    return Template(writer)
+
+
+def stamped(frame_id: str, count: int) -> Template:
+    """geometry_msgs/Vector3Stamped (count 3) or QuaternionStamped (4); fields: x, y, z(, w)."""
+    writer = CdrWriter()
+    writer.header(frame_id)
+    writer.field(count)
+    return Template(writer)
+
+
 def float64_multi_array(labels: Sequence[str]) -> Template:
     """std_msgs/Float64MultiArray, one dimension labelled with its columns; fields: the data."""
     writer = CdrWriter()

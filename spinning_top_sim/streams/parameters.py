@@ -121,13 +121,18 @@ STREAM_DEFAULTS: tuple[tuple[str, float | None, bool, str], ...] = (
     ('ground_truth_imu', 200.0, True, 'ground_truth/imu (sensor_msgs/Imu, noise-free)'),
     ('imu_timing', None, False, 'ground_truth/imu_timing (std_msgs/Float64MultiArray)'),
     ('mag', 100.0, False, 'imu/mag and ground_truth/mag (sensor_msgs/MagneticField)'),
+    ('increments', None, False, 'imu/dq (geometry_msgs/QuaternionStamped), imu/dv '
+     '(geometry_msgs/Vector3Stamped), both at imu.rate, and ground_truth/imu_odom'),
     ('ground_truth_odom', 100.0, True, 'ground_truth/odom (nav_msgs/Odometry)'),
+    ('ground_truth_imu_odom', 200.0, False, 'ground_truth/imu_odom (nav_msgs/Odometry)'),
     ('invariants', 10.0, True, '~/invariants (std_msgs/Float64MultiArray)'),
     ('markers', 20.0, False, 'markers (visualization_msgs/MarkerArray)'),
     ('clock', 100.0, False, '/clock (rosgraph_msgs/Clock)'),
 )
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 HIGHEST_RATE = 10_000.0
+# The motion is kept for a second: the longest interval of an increment, or a mean.
+LOWEST_RATE_OF_INTERVALS = 1.0
 # Values of physics up to here have squares and products that doubles hold.
 LARGEST = 1e30
 # The longest time of anything [s], three years.
@@ -208,6 +213,8 @@ TABLE: tuple[Parameter, ...] = (
               1e12),
     _at_reset('imu.rpy', (0.0, 0.0, 0.0), 'Orientation of the IMU in the body, roll, pitch and '
               'yaw about fixed axes', 'rad', -1e6, 1e6),
+    _at_reset('imu.sampling', 'instant', 'A sample is the value at its stamp, or the mean over '
+              'the period before it', choices=('instant', 'mean')),
     *_axes('gyroscope', 'rad/s', 'rad/s^2/sqrt(Hz)'),
     *_axes('accelerometer', 'm/s^2', 'm/s^3/sqrt(Hz)'),
     _at_reset('imu.gyroscope_A', 9 * (0.0,), 'Sensitivity of the gyroscope to specific force, row '
@@ -279,6 +286,11 @@ def checked(values: Mapping[str, Value]) -> dict[str, Value]:
     if not shortest < longest:
         raise ValueError(f'imu.bias_instability_band = {[shortest, longest]!r}: the second number '
                          'must be larger than the first')
+    if result['imu.rate'] < LOWEST_RATE_OF_INTERVALS and (
+            result['increments.enabled'] or result['imu.sampling'] == 'mean'):
+        raise ValueError(f'imu.rate = {result["imu.rate"]!r}: must be >= '
+                         f'{LOWEST_RATE_OF_INTERVALS:g} with increments.enabled, or with '
+                         'imu.sampling = mean')
     top_of(result)
     start_state(result)
     return result

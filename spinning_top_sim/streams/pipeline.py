@@ -98,7 +98,7 @@ class Simulation:
     def apply(self, changes: Mapping[str, Any]) -> None:
         """Take over new values of parameters that act on samples at once; see `Stream.at_once`."""
         for stream in self.streams:
-            stream.apply(changes)
+            stream.apply(changes, self.now_ns)
 
     def _begin(self, segment: Segment) -> None:
         self.segment = segment

@@ -59,8 +59,8 @@ class Stream:
         """Names of the parameters that `apply` takes over; a run is replayed by them."""
         return (self.rate_parameter,)
 
-    def apply(self, changes: Mapping[str, Any]) -> None:
-        """Take over new values of parameters, of those in `at_once` that are among them."""
+    def apply(self, changes: Mapping[str, Any], now_ns: int) -> None:
+        """Take over values of parameters in `at_once`, from the simulated time `now_ns` on."""
         rate = changes.get(self.rate_parameter)
         if rate is not None and period_ns(rate) != self.period_ns:
             self.period_ns = period_ns(rate)

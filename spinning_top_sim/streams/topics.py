@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.physics.attitude import Quaternion, Vector
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import Shape
 from spinning_top_sim.streams import messages, parameters
@@ -69,21 +70,26 @@ class ImuStream(Stream):
 
     def __init__(self, values: Mapping[str, Any], imu: Imu) -> None:
         self._frame_id, self._imu = values['imu.frame_id'], imu
-        super().__init__(values, self._template(values['imu.rate']))
+        self._sensor = imu.sensor(period_ns(values['imu.rate']))
+        super().__init__(values, self._template())
 
     @property
     def at_once(self) -> tuple[str, ...]:
         return (*super().at_once, 'imu.rate')
 
-    def apply(self, changes: Mapping[str, Any]) -> None:
-        super().apply(changes)
+    def apply(self, changes: Mapping[str, Any], now_ns: int) -> None:
+        super().apply(changes, now_ns)
         if 'imu.rate' in changes:
-            self.template = self._template(changes['imu.rate'])
+            # A density says how much noise a sample has at a rate.
+            self._sensor = self._imu.sensor(period_ns(changes['imu.rate']))
+            self._imu.intervals.set_length(period_ns(changes['imu.rate']), now_ns)
+            self.template = self._template()
             self.on_change()
 
-    def _template(self, imu_rate: float) -> Template:
-        """Use the sensor of this rate: a density says how much noise a sample has at a rate."""
-        self._sensor = self._imu.sensor(period_ns(imu_rate))
+    def follow(self, segment: Segment) -> None:
+        self._imu.intervals.follow(segment)
+
+    def _template(self) -> Template:
         sensor = self._sensor
         variances = (sensor.orientation_variances, 3 * (sensor.rate_variance,),
                      3 * (sensor.force_variance,)) if self.is_noisy else 3 * (3 * (0.0,),)
@@ -115,7 +121,7 @@ class ImuRaw(ImuStream):
         return np.repeat(rows, self._timing.copies(t_ns, self.period_ns), axis=0)
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
-        return (IDENTITY, *self._sensor.read(self._imu.true(states), times))
+        return (IDENTITY, *self._sensor.read(self._imu.sampled(states, times), times))
 
 
 class ImuData(ImuRaw):
@@ -204,7 +210,60 @@ class GroundTruthImu(ImuStream):
     parameter, topic = 'ground_truth_imu', 'ground_truth/imu'
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
-        return (self._imu.orientation(states), *self._imu.true(states))
+        return (self._imu.orientation(states), *self._imu.sampled(states, times))
+
+
+class ImuIncrements(ImuRaw):
+    """What the sensor measures over the interval that ends with a sample: docs/increments.md."""
+
+    parameter, rate_parameter = 'increments', 'imu.rate'
+
+    def _measured(self, states: States, times: range) -> tuple[Quaternion, Vector]:
+        exact = self._imu.increments(times)
+        if self._sensor.is_perfect:
+            return exact
+        return self._sensor.disturb(exact, self._imu.means(states, times), times,
+                                    self._imu.intervals.lengths(times))
+
+
+class ImuDq(ImuIncrements):
+    """The rotation increment."""
+
+    topic, type_name = 'imu/dq', 'geometry_msgs/msg/QuaternionStamped'
+
+    def _template(self) -> Template:
+        return messages.stamped(self._frame_id, 4)
+
+    def fields(self, states: States, times: range) -> Sequence[Field]:
+        return (self._measured(states, times)[0],)
+
+
+class ImuDv(ImuIncrements):
+    """The velocity increment."""
+
+    topic, type_name = 'imu/dv', 'geometry_msgs/msg/Vector3Stamped'
+
+    def _template(self) -> Template:
+        return messages.stamped(self._frame_id, 3)
+
+    def fields(self, states: States, times: range) -> Sequence[Field]:
+        return (self._measured(states, times)[1],)
+
+
+class GroundTruthImuOdometry(Stream):
+    """The IMU's frame in the world, exact: a lever arm moves it."""
+
+    parameter, topic, type_name = ('ground_truth_imu_odom', 'ground_truth/imu_odom',
+                                   'nav_msgs/msg/Odometry')
+
+    def __init__(self, values: Mapping[str, Any], imu: Imu) -> None:
+        self._imu = imu
+        super().__init__(values, messages.moving_odometry(values['world_frame'],
+                                                          values['imu.frame_id']))
+
+    def fields(self, states: States, times: range) -> Sequence[Field]:
+        position, velocity = self._imu.motion(states)
+        return position, self._imu.orientation(states), velocity, self._imu.true(states)[0]
 
 
 class Invariants(Stream):
@@ -306,5 +365,7 @@ def all_streams(values: Mapping[str, Any]) -> list[Stream]:
             JointStates(values, messages.joint_state(JOINTS)), ImuRaw(values, imu),
             ImuData(values, imu), ImuBias(values, imu), GroundTruthImu(values, imu),
             ImuTiming(values), Mag(values, imu), GroundTruthMag(values, imu),
+            ImuDq(values, imu), ImuDv(values, imu),
             GroundTruthOdometry(values, messages.odometry(world, body)),
+            GroundTruthImuOdometry(values, imu),
             Invariants(values, messages.float64_multi_array(INVARIANTS)), Markers(values)]
