@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.states import States
-from spinning_top_sim.streams.parameters import IDENTITY
 from spinning_top_sim.streams.intervals import Intervals
+from spinning_top_sim.streams.parameters import IDENTITY
 from spinning_top_sim.streams.stream import period_ns
 
 if TYPE_CHECKING:
@@ -40,7 +40,8 @@ class Imu:
         self._mounting = _quaternion(*values['imu.rpy'])
         self.sensor: Callable[[int], Sensor] = lru_cache(4)(partial(Sensor, values))
         self._takes_means = values['imu.sampling'] == 'mean'
-        self.intervals = Intervals(self._lever_arm, period_ns(values['imu.rate']))
+        self.intervals = Intervals(self._lever_arm, period_ns(values['imu.rate']),
+                                   self._takes_means or values['increments.enabled'])
 
     def orientation(self, states: States) -> Quaternion:
         """Return q(world <- IMU): columns x, y, z, w."""

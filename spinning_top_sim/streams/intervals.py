@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.physics.states import Point
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.parameters import LOWEST_RATE_OF_INTERVALS
@@ -35,10 +36,11 @@ class Intervals:
     belongs to the interval that contains it, with its begin and without its end.
 
     length_ns : of an interval, the period of the IMU [ns]
+    in_use : whether any stream needs them; if not, steps are not kept for them
     """
 
-    def __init__(self, lever_arm: tuple[float, float, float], length_ns: int) -> None:
-        self._lever_arm, self.length_ns = lever_arm, length_ns
+    def __init__(self, lever_arm: Point, length_ns: int, in_use: bool) -> None:
+        self._lever_arm, self.length_ns, self._in_use = lever_arm, length_ns, in_use
         # When the present rate began, and where the first interval after that begins [ns].
         self._since_ns = self._first_begin_ns = 0
         self._segments: deque[Segment] = deque()
@@ -54,17 +56,26 @@ class Intervals:
                 self._segments[1].start_ns < segment.start_ns - segment.kept_ns):
             self._segments.popleft()
 
+    def use(self, now_ns: int) -> None:
+        """Keep what the intervals after `now_ns` need; earlier steps may be forgotten already."""
+        if not self._in_use:
+            self._in_use = True
+            self._since_ns = self._first_begin_ns = max(now_ns, 0)
+            self._keep_steps()
+
     def set_length(self, length_ns: int, now_ns: int) -> None:
         """Let the intervals after `now_ns` have another length."""
         if length_ns != self.length_ns:
-            self._since_ns = max(now_ns, 0)
-            last_ns = self._since_ns // self.length_ns * self.length_ns
-            self._first_begin_ns = max(last_ns, self._since_ns - LONGEST_NS)
+            now_ns = max(now_ns, 0)
+            last_ns = now_ns // self.length_ns * self.length_ns
+            if last_ns <= self._since_ns:       # no sample since the change before this one
+                last_ns = self._first_begin_ns
+            self._since_ns, self._first_begin_ns = now_ns, max(last_ns, now_ns - LONGEST_NS)
             self.length_ns = length_ns
             self._keep_steps()
 
     def _keep_steps(self) -> None:
-        self._segments[-1].kept_ns = (
+        self._segments[-1].kept_ns = self._in_use * (
             min(self.length_ns, LONGEST_NS) + self._since_ns - self._first_begin_ns)
         self._newest = NOTHING, None
 

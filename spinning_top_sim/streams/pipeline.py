@@ -161,6 +161,8 @@ class Simulation:
         self._log = write
         for stream in self.streams:
             stream.log_index = streams.index(stream) if stream in streams else None
+            if stream.log_index is not None:
+                stream.begin(self.now_ns)
         self._schedule.invalidate()
 
     def advance(self, target_ns: int, publish_from_ns: int = 0,

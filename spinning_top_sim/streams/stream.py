@@ -54,6 +54,9 @@ class Stream:
     def follow(self, segment: Segment) -> None:
         """Begin with the samples of a motion, or of the one after a command."""
 
+    def begin(self, now_ns: int) -> None:
+        """Prepare for samples after the simulated time `now_ns`: it will be recorded."""
+
     @property
     def at_once(self) -> tuple[str, ...]:
         """Names of the parameters that `apply` takes over; a run is replayed by them."""

@@ -218,6 +218,14 @@ class ImuIncrements(ImuRaw):
 
     parameter, rate_parameter = 'increments', 'imu.rate'
 
+    def begin(self, now_ns: int) -> None:
+        self._imu.intervals.use(now_ns)
+
+    def apply(self, changes: Mapping[str, Any], now_ns: int) -> None:
+        super().apply(changes, now_ns)
+        if changes.get('increments.enabled'):
+            self.begin(now_ns)
+
     def _measured(self, states: States, times: range) -> tuple[Quaternion, Vector]:
         exact = self._imu.increments(times)
         if self._sensor.is_perfect:
