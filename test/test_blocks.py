@@ -36,7 +36,8 @@ MOUNTED = {'imu.lever_arm': (0.1, -0.2, 0.3), 'imu.rpy': (0.1, 0.2, 0.3),
            'imu.stamp_offset': 0.01, 'imu.stamp_jitter': 1e-3, 'imu.clock_drift': -80.0,
            'imu.drop_rate': 0.1, 'imu.duplicate_rate': 0.1, 'mag.noise_density': 1e-7,
            'mag.random_walk': 1e-7, 'mag.hard_iron': (1e-5, 0.0, -2e-5), 'mag.resolution': 1.5e-7,
-           'mag.soft_iron': (1.1, 0.0, 0.1, 0.0, 0.9, 0.0, 0.1, 0.0, 1.0), 'mag.rate': 125.0}
+           'mag.soft_iron': (1.1, 0.0, 0.1, 0.0, 0.9, 0.0, 0.1, 0.0, 1.0), 'mag.rate': 125.0,
+           'imu.sampling': 'mean'}
 SCENES = {
     'cusps': {},
     'a sensor elsewhere': {**scene_parameters('looping'), **MOUNTED},

@@ -32,16 +32,20 @@ NO_ERRORS = np.zeros((6, 1))
 
 
 class Imu:
-    """One IMU, at `imu.lever_arm` [m] and `imu.rpy` [rad]; what it adds is of its `sensor`."""
+    """
+    One IMU, at `imu.lever_arm` [m] and `imu.rpy` [rad]; what it adds is of its `sensor`.
+
+    takes_means : whether a sample is the mean over the interval before it, by `imu.sampling`
+    """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self._lever_arm: tuple[float, float, float] = values['imu.lever_arm']
         self._is_rotated = any(values['imu.rpy'])
         self._mounting = _quaternion(*values['imu.rpy'])
         self.sensor: Callable[[int], Sensor] = lru_cache(4)(partial(Sensor, values))
-        self._takes_means = values['imu.sampling'] == 'mean'
+        self.takes_means = values['imu.sampling'] == 'mean'
         self.intervals = Intervals(self._lever_arm, period_ns(values['imu.rate']),
-                                   self._takes_means or values['increments.enabled'])
+                                   self.takes_means or values['increments.enabled'])
 
     def orientation(self, states: States) -> Quaternion:
         """Return q(world <- IMU): columns x, y, z, w."""
@@ -74,7 +78,7 @@ class Imu:
 
     def sampled(self, states: States, times: range) -> tuple[Vector, Vector]:
         """Return what a perfect sensor reads at these times [ns], by `imu.sampling`."""
-        return self.means(states, times) if self._takes_means else self.true(states)
+        return self.means(states, times) if self.takes_means else self.true(states)
 
     def increments(self, times: range) -> tuple[Quaternion, Vector]:
         """Return rotation and velocity increment [m/s] over these intervals; see `Intervals`."""
