@@ -126,6 +126,7 @@ benchmark: performance
 	.venv-benchmark/bin/python benchmark/stability.py
 	.venv-benchmark/bin/python benchmark/work_precision.py
 	.venv-benchmark/bin/python benchmark/allan.py
+	.venv-benchmark/bin/python benchmark/increments.py
 	.venv-benchmark/bin/python benchmark/attitude_filter.py
 
 $(VENV)/.peers: $(wildcard benchmark/requirements*.txt) $(VENV)/.deps-test
