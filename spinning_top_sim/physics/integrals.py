@@ -2,9 +2,10 @@
 """
 Rotation and velocity increments of a body, exact to rounding however short the interval is.
 
-The difference of two attitudes, or velocities, keeps the rounding of both: over 0.1 ms three of
-sixteen digits are lost.  Here the increments are integrals of the body's own rates, whose rounding
-shrinks with the interval, by a Gauss-Legendre rule at whole nanoseconds.
+Increments are the differences of the states at both ends.  These errors do not add up in a sum of
+increments, but over a short time, such as 0.1 ms, they are large beside the difference: there the
+increments are integrals of the body's rates, whose rounding shrinks with the interval.  Means are
+integrals, too, by a Gauss-Legendre rule at whole nanoseconds.
 """
 
 import math
@@ -17,10 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.attitude import Vector
+from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.states import Point, States
 from spinning_top_sim.physics.top import Top
 
+# Increments over panels of a larger angle are differences: the rounding is below 1e-13 of them.
+LEAST_ANGLE = 0.05
 # A panel is at most so many times 1/`fastest_rate` long; with n nodes for an angle of a = rate *
 # length, where (a/2)^n is less than this, the error of the rule, some (a/2)^2n, is a rounding.
 LONGEST_PANEL, HALF_THE_DIGITS = 0.5, 1e-8
@@ -86,7 +89,8 @@ def increments(states: Callable[[range], States], begins: range, length_ns: int,
     point : of which the specific force is taken, in the body [m]
     rate : `fastest_rate` of the motion
     """
-    x, y, z, w = states(begins).rows_quaternion
+    first = states(begins)
+    x, y, z, w = first.rows_quaternion
     inverse = -x, -y, -z, w
     sums = np.zeros((13, len(begins)))
     for offset_ns, weight in _rule(length_ns, _nodes(rate * length_ns * 1e-9)):
@@ -101,7 +105,34 @@ def increments(states: Callable[[range], States], begins: range, length_ns: int,
         for row, derivative in enumerate(derivatives):
             sums[row] += weight * derivative
     sums[3] += 1.0
+    if rate * length_ns * 1e-9 >= LEAST_ANGLE:
+        last = states(range(begins.start + length_ns, begins.stop + length_ns, begins.step))
+        sums[:7] = _differences(first, last, length_ns * 1e-9, point)
     return Increments(sums[:4], sums[4:7], sums[7:10], sums[10:])
+
+
+def _differences(first: States, last: States, seconds: float, point: Point) -> Rows:
+    """Return rotation and velocity (7, n) of `Increments` from the states at both ends."""
+    x, y, z, w = now = first.rows_quaternion
+    a, b, c, d = last.rows_quaternion
+    # conj(q) p = 1 + conj(q) (p - q) rounds less than the product.
+    *axis, shrunk = attitude.product((-x, -y, -z, w), (a - x, b - y, c - z, d - w))
+    # The lengths of q and p, rounded like their components, would scale all the small angles.
+    too_long, longer = _excess(now), _excess(last.rows_quaternion)
+    scale = 1.0 - 0.5 * (too_long + longer)
+    v1, v2, v3 = (attitude.in_body((-x, -y, -z, w), first.velocity(point)))
+    u1, u2, u3 = (attitude.in_body((-a, -b, -c, d), last.velocity(point)))
+    change = u1 - v1, u2 - v2, u3 - v3 + first.top.gravity * seconds
+    return np.stack((*(scale * part for part in axis), 1.0 + (shrunk + 0.5 * (too_long - longer)),
+                     *attitude.in_body(now, change)))
+
+
+def _excess(q: Quaternion) -> Column:
+    """Return |q|^2 - 1, exact to 2^-76: the squares of numbers of 26 bits are exact."""
+    coarse = [np.rint(2.0 ** 26 * part) * 2.0 ** -26 for part in q]
+    (x, y, z, w), (a, b, c, d) = coarse, ((part - one) * (part + one)
+                                          for part, one in zip(q, coarse, strict=True))
+    return ((x * x + y * y + z * z + w * w) - 1.0) + (a + b + c + d)
 
 
 def _nodes(angle: float) -> int:
