@@ -4,10 +4,10 @@ Navigate by the noise-free increments of the IMU alone, and compare with the tru
 
     PYTHONPATH=. python benchmark/increments.py
 
-The start is the first message of `ground_truth/imu_odom`, and the truth its last one. Attitude and
-velocity are the sums of `imu/dq` and `imu/dv`. The position is the integral of the velocity, by the
-trapezoidal rule with Gregory's corrections at both ends. With long doubles the increments' own
-errors are left; with doubles those of the user's sums are added.
+The start is the first message of `ground_truth/imu_odom`, and the truth its last one. Attitude
+and velocity are the sums of `imu/dq` and `imu/dv`. The position is the integral of the velocity,
+by the trapezoidal rule with Gregory's corrections at both ends. With long doubles the increments'
+own errors are left; with doubles those of the user's sums are added.
 """
 
 from __future__ import annotations
@@ -67,8 +67,9 @@ def main() -> None:
         'and a tilt that walks moves the position by g t^2/sqrt(20) times its final deviation. '
         f'At 10 rad/s this is {bound(10.0, duration):.0e} m, at 50 rad/s '
         f'{bound(50.0, duration):.0e} m: less is not possible with independent roundings.\n\n'
-        'The nutation of fast_gyroscope has more than one radian in a sample: attitude and velocity '
-        'are sums, but no rule finds the position from such samples of the velocity.\n')))
+        'The nutation of fast_gyroscope has more than one radian in a sample: attitude and '
+        'velocity are sums, but no rule finds the position from such samples of the velocity.\n'
+    )))
 
 
 def bound(rate: float, duration: float) -> float:

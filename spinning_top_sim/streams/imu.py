@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.states import States
-from spinning_top_sim.streams.intervals import Intervals
 from spinning_top_sim.streams.parameters import IDENTITY
 from spinning_top_sim.streams.stream import period_ns
 
 if TYPE_CHECKING:
+    from spinning_top_sim.streams.intervals import Intervals
     from spinning_top_sim.streams.noise import SensorNoise
+    from spinning_top_sim.streams.segment import Segment
 
 # Six columns: three axes of the gyroscope, three of the accelerometer.
 Rows = NDArray[np.float64]
@@ -44,8 +45,33 @@ class Imu:
         self._mounting = _quaternion(*values['imu.rpy'])
         self.sensor: Callable[[int], Sensor] = lru_cache(4)(partial(Sensor, values))
         self.takes_means = values['imu.sampling'] == 'mean'
-        self.intervals = Intervals(self._lever_arm, period_ns(values['imu.rate']),
-                                   self.takes_means or values['increments.enabled'])
+        self._period_ns = period_ns(values['imu.rate'])
+        self._segment: Segment | None = None
+        self._intervals: Intervals | None = None
+        if self.takes_means or values['increments.enabled']:
+            self.use_intervals(0)
+
+    def use_intervals(self, now_ns: int) -> 'Intervals':
+        """Return the intervals between samples; what they need is kept from the first use on."""
+        if self._intervals is None:
+            from spinning_top_sim.streams.intervals import Intervals  # noqa: PLC0415 - where needed
+
+            self._intervals = Intervals(self._lever_arm, self._period_ns, now_ns)
+            if self._segment is not None:
+                self._intervals.follow(self._segment)
+        return self._intervals
+
+    def follow(self, segment: 'Segment') -> None:
+        """Go on with another motion."""
+        self._segment = segment
+        if self._intervals is not None:
+            self._intervals.follow(segment)
+
+    def set_period(self, period_ns: int, now_ns: int) -> None:
+        """Let it take a sample every `period_ns` after the simulated time `now_ns`."""
+        self._period_ns = period_ns
+        if self._intervals is not None:
+            self._intervals.set_length(period_ns, now_ns)
 
     def orientation(self, states: States) -> Quaternion:
         """Return q(world <- IMU): columns x, y, z, w."""
@@ -66,7 +92,8 @@ class Imu:
 
     def means(self, states: States, times: range) -> tuple[Vector, Vector]:
         """Return the means of `true` over the intervals that end at these times [ns]."""
-        increments, seconds = self.intervals.increments(times), self.intervals.lengths(times)
+        increments = self.use_intervals(times.start).increments(times)
+        seconds = self.lengths(times)
         # Over no time the mean is the value.
         divisor = np.where(seconds > 0.0, seconds, 1.0)
         w1, w2, w3, f1, f2, f3 = (
@@ -80,9 +107,13 @@ class Imu:
         """Return what a perfect sensor reads at these times [ns], by `imu.sampling`."""
         return self.means(states, times) if self.takes_means else self.true(states)
 
+    def lengths(self, times: range) -> Column:
+        """Return the lengths (n,) [s] of these intervals."""
+        return self.use_intervals(times.start).lengths(times)
+
     def increments(self, times: range) -> tuple[Quaternion, Vector]:
         """Return rotation and velocity increment [m/s] over these intervals; see `Intervals`."""
-        increments = self.intervals.increments(times)
+        increments = self.use_intervals(times.start).increments(times)
         x, y, z, w = increments.rotation
         v1, v2, v3 = increments.velocity
         if self._is_rotated:

@@ -4,19 +4,17 @@
 from collections import deque
 from functools import reduce
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.physics import integrals
+from spinning_top_sim.physics.integrals import Increments
 from spinning_top_sim.physics.states import Point
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.parameters import LOWEST_RATE_OF_INTERVALS
 from spinning_top_sim.streams.segment import Segment
-
-if TYPE_CHECKING:
-    from spinning_top_sim.physics.integrals import Increments
 
 LONGEST_NS = round(NANOSECONDS / LOWEST_RATE_OF_INTERVALS)
 # Half a second of computation for one interval.
@@ -36,13 +34,13 @@ class Intervals:
     belongs to the interval that contains it, with its begin and without its end.
 
     length_ns : of an interval, the period of the IMU [ns]
-    in_use : whether any stream needs them; if not, steps are not kept for them
     """
 
-    def __init__(self, lever_arm: Point, length_ns: int, in_use: bool) -> None:
-        self._lever_arm, self.length_ns, self._in_use = lever_arm, length_ns, in_use
-        # When the present rate began, and where the first interval after that begins [ns].
-        self._since_ns = self._first_begin_ns = 0
+    def __init__(self, lever_arm: Point, length_ns: int, now_ns: int) -> None:
+        self._lever_arm, self.length_ns = lever_arm, length_ns
+        # When the present rate began, and where the first interval after that begins [ns]: steps
+        # before the first look at the motion may be forgotten.
+        self._since_ns = self._first_begin_ns = max(now_ns, 0)
         self._segments: deque[Segment] = deque()
         self._newest: tuple[range, Increments | None] = NOTHING, None
 
@@ -56,13 +54,6 @@ class Intervals:
                 self._segments[1].start_ns < segment.start_ns - segment.kept_ns):
             self._segments.popleft()
 
-    def use(self, now_ns: int) -> None:
-        """Keep what the intervals after `now_ns` need; earlier steps may be forgotten already."""
-        if not self._in_use:
-            self._in_use = True
-            self._since_ns = self._first_begin_ns = max(now_ns, 0)
-            self._keep_steps()
-
     def set_length(self, length_ns: int, now_ns: int) -> None:
         """Let the intervals after `now_ns` have another length."""
         if length_ns != self.length_ns:
@@ -75,7 +66,7 @@ class Intervals:
             self._keep_steps()
 
     def _keep_steps(self) -> None:
-        self._segments[-1].kept_ns = self._in_use * (
+        self._segments[-1].kept_ns = (
             min(self.length_ns, LONGEST_NS) + self._since_ns - self._first_begin_ns)
         self._newest = NOTHING, None
 
@@ -87,7 +78,7 @@ class Intervals:
         begin_ns = end_ns - self.length_ns
         return begin_ns if begin_ns > self._since_ns else self._first_begin_ns
 
-    def increments(self, times: range) -> 'Increments':
+    def increments(self, times: range) -> Increments:
         """
         Return the increments over the intervals that end at these times [ns].
 
@@ -103,15 +94,13 @@ class Intervals:
             parts = [self._over(time, 1, times.step) for time in times[:single]]
             if single < len(times):
                 parts.append(self._over(times[single], len(times) - single, times.step))
-            result = parts[0] if len(parts) == 1 else type(parts[0])(*(
+            result = parts[0] if len(parts) == 1 else Increments(*(
                 np.concatenate(rows, axis=1) for rows in zip(*parts, strict=True)))
             self._newest = times, result
         return result
 
-    def _over(self, end_ns: int, count: int, step_ns: int) -> 'Increments':
+    def _over(self, end_ns: int, count: int, step_ns: int) -> Increments:
         """Return the increments over intervals with the same parts, the first of which ends."""
-        from spinning_top_sim.physics import integrals  # noqa: PLC0415 - only where it is needed
-
         begin_ns = self._begin_ns(end_ns)
         pieces: list[Increments] = []
         for number, segment in enumerate(self._segments):
@@ -128,12 +117,10 @@ class Intervals:
             if from_ns < until_ns:
                 begins = range(from_ns, from_ns + count * step_ns, step_ns)
                 pieces += self._within(segment, begins, until_ns - from_ns)
-        return reduce(integrals.Increments.then, pieces or [integrals.impulse(NO_JUMP)])
+        return reduce(Increments.then, pieces or [integrals.impulse(NO_JUMP)])
 
-    def _within(self, segment: Segment, begins: range, length_ns: int) -> 'list[Increments]':
+    def _within(self, segment: Segment, begins: range, length_ns: int) -> list[Increments]:
         """Return the increments over consecutive parts of intervals within a segment."""
-        from spinning_top_sim.physics import integrals  # noqa: PLC0415
-
         rate = integrals.fastest_rate(segment.solver.top, segment.l3, segment.energy)
         count = integrals.panels(rate, length_ns)
         if count > MOST_PANELS:

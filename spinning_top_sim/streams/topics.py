@@ -82,12 +82,12 @@ class ImuStream(Stream):
         if 'imu.rate' in changes:
             # A density says how much noise a sample has at a rate.
             self._sensor = self._imu.sensor(period_ns(changes['imu.rate']))
-            self._imu.intervals.set_length(period_ns(changes['imu.rate']), now_ns)
+            self._imu.set_period(period_ns(changes['imu.rate']), now_ns)
             self.template = self._template()
             self.on_change()
 
     def follow(self, segment: Segment) -> None:
-        self._imu.intervals.follow(segment)
+        self._imu.follow(segment)
 
     def _template(self) -> Template:
         sensor = self._sensor
@@ -219,7 +219,7 @@ class ImuIncrements(ImuRaw):
     parameter, rate_parameter = 'increments', 'imu.rate'
 
     def begin(self, now_ns: int) -> None:
-        self._imu.intervals.use(now_ns)
+        self._imu.use_intervals(now_ns)
 
     def apply(self, changes: Mapping[str, Any], now_ns: int) -> None:
         super().apply(changes, now_ns)
@@ -231,7 +231,7 @@ class ImuIncrements(ImuRaw):
         if self._sensor.is_perfect:
             return exact
         return self._sensor.disturb(exact, self._imu.means(states, times), times,
-                                    self._imu.intervals.lengths(times))
+                                    self._imu.lengths(times))
 
 
 class ImuDq(ImuIncrements):
