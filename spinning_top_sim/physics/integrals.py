@@ -26,7 +26,7 @@ from spinning_top_sim.physics.top import Top
 LEAST_ANGLE = 0.05
 # A panel is at most so many times 1/`fastest_rate` long; with n nodes for an angle of a = rate *
 # length, where (a/2)^n is less than this, the error of the rule, some (a/2)^2n, is a rounding.
-LONGEST_PANEL, HALF_THE_DIGITS = 0.5, 1e-8
+LONGEST_PANEL, HALF_THE_DIGITS, MOST_PANELS = 0.5, 1e-8, 100
 Rows = NDArray[np.float64]
 
 
@@ -76,8 +76,13 @@ def fastest_rate(top: Top, l3: float, energy: float) -> float:
 
 
 def panels(rate: float, length_ns: int) -> int:
-    """Return into how many panels an interval is divided for motions of this `fastest_rate`."""
-    return max(1, math.ceil(rate * length_ns * 1e-9 / LONGEST_PANEL))
+    """
+    Return into how many panels an interval is divided for motions of this `fastest_rate`.
+
+    They are at most MOST_PANELS, which hold 8 turns: with more of them the integrals of angular
+    velocity and specific force become less exact.
+    """
+    return max(1, math.ceil(min(rate * length_ns * 1e-9 / LONGEST_PANEL, MOST_PANELS)))
 
 
 def increments(states: Callable[[range], States], begins: range, length_ns: int, point: Point,
@@ -137,7 +142,8 @@ def _excess(q: Quaternion) -> Column:
 
 def _nodes(angle: float) -> int:
     """Return how many nodes a panel has in which the motion turns by up to `angle` [rad]."""
-    return max(4, math.ceil(math.log(HALF_THE_DIGITS) / math.log(0.5 * max(angle, 1e-8))))
+    angle = min(max(angle, 1e-8), LONGEST_PANEL)
+    return max(4, math.ceil(math.log(HALF_THE_DIGITS) / math.log(0.5 * angle)))
 
 
 @lru_cache(64)

@@ -11,14 +11,11 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics import integrals
 from spinning_top_sim.physics.integrals import Increments
 from spinning_top_sim.physics.states import Point
-from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.parameters import LOWEST_RATE_OF_INTERVALS
 from spinning_top_sim.streams.segment import Segment
 
 LONGEST_NS = round(NANOSECONDS / LOWEST_RATE_OF_INTERVALS)
-# Half a second of computation for one interval.
-MOST_PANELS = 1000
 NOTHING = range(0)
 NO_JUMP = 3 * (np.zeros(1),)
 
@@ -79,11 +76,7 @@ class Intervals:
         return begin_ns if begin_ns > self._since_ns else self._first_begin_ns
 
     def increments(self, times: range) -> Increments:
-        """
-        Return the increments over the intervals that end at these times [ns].
-
-        Raises IntegrationError if the top turns too often within one.
-        """
+        """Return the increments over the intervals that end at these times [ns]."""
         known, result = self._newest        # streams of one rate ask for the same ones
         if known != times or result is None:
             # Those that may be shorter, or contain a command, are computed one by one.
@@ -123,10 +116,6 @@ class Intervals:
         """Return the increments over consecutive parts of intervals within a segment."""
         rate = integrals.fastest_rate(segment.solver.top, segment.l3, segment.energy)
         count = integrals.panels(rate, length_ns)
-        if count > MOST_PANELS:
-            raise IntegrationError(
-                f'the top turns too often in an interval of {length_ns / 1e9:g} s for '
-                'increments.enabled, or imu.sampling = mean: increase imu.rate')
         edges = [length_ns * k // count for k in range(count + 1)]
         return [integrals.increments(
             segment.states, range(begins.start + begin, begins.stop + begin, begins.step),
