@@ -442,7 +442,9 @@ def test_a_long_verification_tells_how_far_it_is_without_a_terminal(
     assert told_if_a_look_takes(1e-6) == ['', '']
 
 
-def test_live_logs_verify(tmp_path, capsys):
+@pytest.mark.parametrize('more', [{}, {'increments.enabled': True, 'imu.sampling': 'mean',
+                                       'imu.lever_arm': [0.1, -0.2, 0.3]}])
+def test_live_logs_verify(tmp_path, capsys, more):
     """From the start, and from the middle with commands before; rates change, resets happen."""
     pytest.importorskip('rclpy')
     from geometry_msgs.msg import PoseStamped
@@ -450,7 +452,7 @@ def test_live_logs_verify(tmp_path, capsys):
 
     whole, part = tmp_path / 'whole.mcap', tmp_path / 'part.mcap'
     options = {'status_period': 0.0, 'record.uri': str(whole), 'start_paused': True,
-               'imu.gyroscope_noise_density': 0.01}
+               'imu.gyroscope_noise_density': 0.01, **more}
     with SimNode(tmp_path, options, namespace='/live') as node, Peer() as peer:
         pose = peer.listen(node.topic('pose'), PoseStamped)
 

@@ -36,6 +36,14 @@ def quaternion_of_angles(phi: Column, theta: Column, psi: Column) -> Quaternion:
             cosine * np.sin(half_sum), cosine * np.cos(half_sum))
 
 
+def quaternion_of_vector(v: Vector) -> Quaternion:
+    """Return the rotation by |v| [rad] about v."""
+    x, y, z = v
+    half = 0.5 * np.sqrt(x * x + y * y + z * z)
+    scale = 0.5 * np.sinc(half / np.pi)
+    return scale * x, scale * y, scale * z, np.cos(half)
+
+
 def product(p: Quaternion, q: Quaternion) -> Quaternion:
     """Return the quaternion product p q: first the rotation q, then p."""
     (a, b, c, d), (x, y, z, w) = p, q
@@ -65,6 +73,14 @@ def in_body(q: Quaternion, v: Vector) -> tuple[Column, Column, Column]:
             + 2.0 * (y * z + w * x) * vz,
             2.0 * (x * z + w * y) * vx + 2.0 * (y * z - w * x) * vy
             + (w * w - x * x - y * y + z * z) * vz)
+
+
+def rotation_vector(q: Quaternion) -> tuple[Column, Column, Column]:
+    """Return axis times angle [rad] of a unit quaternion; the angle is in [0, 2 pi]."""
+    x, y, z, w = q
+    sine = np.sqrt(x * x + y * y + z * z)
+    scale = 2.0 * np.arctan2(sine, w) / np.where(sine > 0.0, sine, 1.0)
+    return scale * x, scale * y, scale * z
 
 
 def precession_rate(top: Top, l3: float, lz: float, cos2_half: Number,

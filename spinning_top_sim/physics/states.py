@@ -10,6 +10,8 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.top import State, Top
 
+Point = tuple[float, float, float]
+
 
 class States:
     """
@@ -141,7 +143,12 @@ class States:
     def angular_acceleration(self) -> NDArray[np.float64]:
         return np.stack(np.broadcast_arrays(*self.rows_angular_acceleration), axis=-1)
 
-    def specific_force(self, point: tuple[float, float, float]) -> Vector:
+    def velocity(self, point: Point) -> Vector:
+        """Return omega x r, that of a point r of the body [m], in the body frame [m/s]."""
+        (w1, w2, w3), (r1, r2, r3) = self.rows_angular_velocity, point
+        return w2 * r3 - w3 * r2, w3 * r1 - w1 * r3, w1 * r2 - w2 * r1
+
+    def specific_force(self, point: Point) -> Vector:
         """
         Return what an ideal accelerometer at a point r of the body [m] measures [m/s^2].
 

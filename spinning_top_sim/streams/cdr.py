@@ -111,6 +111,13 @@ class Template:
         rows = np.frombuffer(data, self._row_type)
         return tuple(rows[f'field{i}'] for i in range(len(self._fields)))
 
+    def stamps_ns(self, data: bytes) -> NDArray[np.int64]:
+        """Return the stamps (n,) [ns] of n messages one after the other."""
+        rows, at = np.frombuffer(data, self._row_type), self._stamps_at[0]
+        stamps: NDArray[np.int64] = rows[f'sec{at}'].astype(np.int64) * NANOSECONDS
+        stamps += rows[f'nanosec{at}']
+        return stamps
+
     def field_at(self, at: int) -> tuple[int, int, int] | None:
         """Return field, element and offset of what holds a byte: field -1 is the stamp."""
         for stamp_at in self._stamps_at:

@@ -34,9 +34,9 @@ def resolve_topic(topic: str, namespace: str) -> str:
 
 
 def is_enabled(parameter: str, values: Mapping[str, Any]) -> bool:
-    """Return whether a stream is switched on; /clock has two switches."""
-    return bool(values[f'{parameter}.enabled']
-                or (parameter == 'clock' and values['publish_clock']))
+    """Return whether a stream is switched on; some have two switches."""
+    other = {'clock': 'publish_clock', 'ground_truth_imu_odom': 'increments.enabled'}
+    return bool(values[f'{parameter}.enabled'] or values.get(other.get(parameter, '')))
 
 
 def command(l3: float, lz: float) -> bytes:

@@ -98,7 +98,7 @@ class Simulation:
     def apply(self, changes: Mapping[str, Any]) -> None:
         """Take over new values of parameters that act on samples at once; see `Stream.at_once`."""
         for stream in self.streams:
-            stream.apply(changes)
+            stream.apply(changes, self.now_ns)
 
     def _begin(self, segment: Segment) -> None:
         self.segment = segment
@@ -161,6 +161,8 @@ class Simulation:
         self._log = write
         for stream in self.streams:
             stream.log_index = streams.index(stream) if stream in streams else None
+            if stream.log_index is not None:
+                stream.begin(self.now_ns)
         self._schedule.invalidate()
 
     def advance(self, target_ns: int, publish_from_ns: int = 0,
@@ -262,8 +264,9 @@ class Simulation:
             for stream in self.streams:
                 times = stream.times(self.now_ns, until_ns)
                 if stream.log_index is not None and times:
-                    stamps_ns = self.epoch_ns + np.arange(times.start, times.stop, times.step)
-                    send(stream, stamps_ns, stream.encode(states(times), self.epoch_ns, times))
+                    rows = stream.encode(states(times), self.epoch_ns, times)
+                    if len(rows):
+                        send(stream, self.epoch_ns + stream.sent_ns(times), rows)
             self.now_ns = max(self.now_ns, until_ns)
             segment.release(self.now_ns)
 

@@ -26,7 +26,10 @@ class Segment:
     reached_ns, end_ns : simulated times up to which no further steps are needed, and up to which
         the solver goes at all [ns]
     energy, l3, lz : constants of the motion, as it began
+    kept_ns : `release` keeps the steps of this time before its argument [ns]
     """
+
+    kept_ns = 0
 
     def __init__(self, solver: Propagator, start: State, start_ns: int) -> None:
         self.solver, self.start, self.start_ns = solver, start, start_ns
@@ -62,7 +65,7 @@ class Segment:
 
     def release(self, before_ns: int) -> None:
         """Forget the steps that only states before this simulated time [ns] need."""
-        self.solver.release(before_ns - self.start_ns)
+        self.solver.release(before_ns - self.start_ns - self.kept_ns)
 
     def states(self, times: range) -> States:
         """Return the states at ascending simulated times [ns]."""

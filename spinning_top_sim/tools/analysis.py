@@ -86,6 +86,8 @@ def attitudes_of(name: str, imu: Imu, stamps_ns: NDArray[np.int64],
     rows = [field.T for field in fields]
     if name in ('ground_truth/imu', 'imu/data'):
         rows = list(map(np.vstack, imu.in_body(tuple(rows[0]), tuple(rows[1]))))
+        if imu.takes_means:         # of the rates: they are not those at the stamps
+            del rows[1]
     elif name == 'joint_states':
         (phi, theta, psi), (phi_dot, theta_dot, psi_dot) = rows
         across = phi_dot * np.sin(theta)

@@ -26,7 +26,7 @@ from spinning_top_sim.recording.damage import count, seconds
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.tools import cli
+from spinning_top_sim.tools import cli, export
 from spinning_top_sim.tools.recorded_run import Verdict, verify
 from spinning_top_sim.tools.survey import Motion, Survey, survey
 
@@ -46,7 +46,8 @@ ROWS = (('nutation period [s]', 'nutation_period', 1.0),
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('inspect', __doc__, argv, _add_arguments, _run, (LogError, OSError))
+    return cli.run('inspect', __doc__, argv, _add_arguments, _run,
+                   (LogError, OSError, export.ExportError))
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,6 +59,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help='draw the turning top; needs matplotlib')
     add('--verify', action='store_true',
         help='compute the run again and compare every message byte for byte')
+    export.add_argument(parser)
     add('--json', action='store_true', help='print everything as JSON')
 
 
@@ -78,6 +80,9 @@ def _run(arguments: argparse.Namespace) -> int:
                           quiet=arguments.json) as show:
                 verdict = verify(reader, found.run, end_ns,
                                  lambda stamp_ns: show((stamp_ns - begin_ns) / NANOSECONDS))
+        if arguments.export and found.run is None:
+            raise export.ExportError(f'--export: {found.foreign_reason}')
+        exported = list(export.write(reader, found.run, arguments.export)) if found.run else []
     if arguments.json:
         print(json.dumps(_as_json(found, verdict), indent=2, allow_nan=False))
     else:
@@ -88,6 +93,8 @@ def _run(arguments: argparse.Namespace) -> int:
         if verdict is None:
             cli.print_line(f'inspect: --verify: {found.foreign_reason}', sys.stderr)
         passed = passed and verdict is not None and verdict.identical
+    for line in exported:
+        cli.print_line(line, sys.stderr if arguments.json else None)
     if arguments.plot is not None or arguments.animate is not None:
         passed = _draw(arguments, found) and passed
     return cli.OK if passed else cli.FAILED

@@ -34,12 +34,18 @@ MOST_TEXT = 300             # of a reason
 LEAST_STEPS, STEPS_A_BYTE = 200_000, 20
 LEAST_SAMPLES, SAMPLES_A_BYTE = 100_000, 1
 MOST_BLOCKS = 20_000        # of samples between two events
-# Names in the message definition of the arrays of numbers in a template, in their order.
+# Names in the message definition of the arrays of numbers in a template, in their order, by topic
+# or by type.
 FIELDS = {
     'geometry_msgs/msg/PoseStamped': ('pose.orientation',),
     'sensor_msgs/msg/JointState': ('position', 'velocity'),
     'sensor_msgs/msg/Imu': ('orientation', 'angular_velocity', 'linear_acceleration'),
+    'sensor_msgs/msg/MagneticField': ('magnetic_field', 'magnetic_field_covariance'),
     'nav_msgs/msg/Odometry': ('pose.pose.orientation', 'twist.twist.angular'),
+    'ground_truth/imu_odom': ('pose.pose.position', 'pose.pose.orientation',
+                              'twist.twist.linear', 'twist.twist.angular'),
+    'geometry_msgs/msg/QuaternionStamped': ('quaternion',),
+    'geometry_msgs/msg/Vector3Stamped': ('vector',),
     'std_msgs/msg/Float64MultiArray': ('data',),
     'visualization_msgs/msg/MarkerArray': (
         'markers[0].pose.position', 'markers[0].pose.orientation',
@@ -202,16 +208,17 @@ def _rerun(run: RunDescription, end_ns: int,
             raise DepartureError(f'over {most_steps} integration steps are too many for a log of '
                                  f'{run.log_bytes} bytes')
 
-    # 1. Before the recording: the motion and its commands, no samples.
+    # 1. Before the recording: the motion and its commands, no samples.  The rates are already
+    # those of the recording: the first of its samples may be a mean over a time before it.
+    simulation.apply(run.values_at_recording)
     for event in run.history:
         reach(event.t_ns)
         _apply(simulation, event)
     if send is not None:
         reach(run.begun_ns)
 
-    # 2. The recording begins, with the parameters and the streams of this moment.
+    # 2. The recording begins, with the streams of this moment.
     simulation.skip_to(max(run.begun_ns, -1))
-    simulation.apply(run.values_at_recording)
     if send is not None:
         simulation.log_to(None, [stream for stream in simulation.streams
                                  if stream.topic in run.topics])
@@ -359,7 +366,7 @@ def _difference(key: tuple[int, str], stream: Stream | None, logged: bytes,
     if number < 0:
         what, code, text = 'header.stamp', '<iI', '{}.{:09d}'
     else:
-        names = FIELDS.get(stream.type_name)
+        names = FIELDS.get(stream.topic) or FIELDS.get(stream.type_name)
         what = f'{names[number] if names else f"array {number}"}[{element}]'
         code, text = '<d', '{!r}'
     one, two = (text.format(*struct.unpack_from(code, data, start)) for data in (logged, computed))

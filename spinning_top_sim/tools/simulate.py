@@ -32,7 +32,7 @@ from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import MOST_RATE, Simulation
 from spinning_top_sim.streams.schedule import offline_block_ns, offline_targets
 from spinning_top_sim.streams.stream import Stream
-from spinning_top_sim.tools import cli
+from spinning_top_sim.tools import cli, export
 from spinning_top_sim.tools.scene_file import is_of_ros, parse_assignment, read_scene
 
 FORMATS = ('mcap', 'csv', 'parquet')
@@ -73,6 +73,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--namespace', default='/', help='of the topics in the log')
     add('--format', choices=FORMATS,
         help='format of the output; default: by the extension of its name')
+    export.add_argument(parser)
     add('--quiet', action='store_true', help='no progress, no summary')
 
 
@@ -84,8 +85,12 @@ def _run(arguments: argparse.Namespace) -> int:
                          'given')
     if not 0.0 <= arguments.epoch <= 2.0 ** 31:
         raise ValueError(f'--epoch {arguments.epoch!r}: must be from 0 to {2 ** 31} s')
+    if arguments.export and file_format != 'mcap':
+        raise ValueError(f'--export: needs a log, and {output} is {file_format}')
     values = _parameters(arguments)
     simulation = Simulation(values, round(arguments.epoch * NANOSECONDS))
+    export.check(arguments.export, [stream.topic for stream in journal.recorded_streams(
+        simulation.streams, values)], values)
     stops = _parse_stops(arguments.command, round(values['duration'] * NANOSECONDS),
                          simulation.top)
     with cli.progress('simulated', values['duration'], 's', quiet=arguments.quiet) as show:
@@ -96,9 +101,22 @@ def _run(arguments: argparse.Namespace) -> int:
             write = _write_csv if file_format == 'csv' else _write_parquet
             write(output, _rows(simulation, period_ns, stops, show))
             summary = f'{stops[-1][0] // period_ns + 1} rows of {", ".join(UNITS)}'
+    lines = [f'{output}: {summary}', *_export(output, arguments.export)]
     if not arguments.quiet:
-        cli.print_line(f'{output}: {summary}')
+        for line in lines:
+            cli.print_line(line)
     return cli.OK
+
+
+def _export(log: Path, exports: Sequence[export.Export]) -> list[str]:
+    """Write the files for other tools from the log; return a line about each."""
+    if not exports:
+        return []
+    from spinning_top_sim.recording.reader import LogReader  # noqa: PLC0415 - needs mcap
+    from spinning_top_sim.tools.recorded_run import read_run_description  # noqa: PLC0415
+
+    with LogReader(log) as reader:
+        return list(export.write(reader, read_run_description(reader), exports))
 
 
 def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:

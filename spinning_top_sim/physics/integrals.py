@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Rotation and velocity increments of a body, exact to rounding however short the interval is.
+
+Increments are the differences of the states at both ends.  These errors do not add up in a sum of
+increments, but over a short time, such as 0.1 ms, they are large beside the difference: there the
+increments are integrals of the body's rates, whose rounding shrinks with the interval.  Means are
+integrals, too, by a Gauss-Legendre rule at whole nanoseconds.
+"""
+
+import math
+from collections.abc import Callable
+from fractions import Fraction
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
+from spinning_top_sim.physics.states import Point, States
+from spinning_top_sim.physics.top import Top
+
+# Increments over panels of a larger angle are differences: the rounding is below 1e-13 of them.
+LEAST_ANGLE = 0.05
+# A panel is at most so many times 1/`fastest_rate` long; with n nodes for an angle of a = rate *
+# length, where (a/2)^n is less than this, the error of the rule, some (a/2)^2n, is a rounding.
+LONGEST_PANEL, HALF_THE_DIGITS, MOST_PANELS = 0.5, 1e-8, 100
+Rows = NDArray[np.float64]
+
+
+class Increments(NamedTuple):
+    """
+    What a body did in an interval [a, b), for n intervals at a time.
+
+    rotation : (4, n) q(body at a <- body at b) as x, y, z, w
+    velocity : (3, n) integral of the specific force of a point of the body, in the body frame at a
+        [m/s]: R(a)^T (v(b) - v(a) + g (b - a) z) with the velocity v of the point in the world
+    angles : (3, n) integral of the angular velocity in the body frame of each moment [rad]
+    forces : (3, n) integral of the specific force in the body frame of each moment [m/s]
+    """
+
+    rotation: Rows
+    velocity: Rows
+    angles: Rows
+    forces: Rows
+
+    def then(self, later: 'Increments') -> 'Increments':
+        """Return the increments over this interval and the one that follows it."""
+        (x, y, z, w), (a, b, c, d), (v1, v2, v3) = self.rotation, later.rotation, later.velocity
+        return Increments(
+            np.stack(attitude.product((x, y, z, w), (a, b, c, d))),
+            self.velocity + np.stack(attitude.in_body((-x, -y, -z, w), (v1, v2, v3))),
+            self.angles + later.angles, self.forces + later.forces)
+
+
+def impulse(velocity: Vector) -> Increments:
+    """Return the increments of a moment (n = 1) in which the velocity of the point jumps [m/s]."""
+    jump, zeros = np.stack(velocity), np.zeros((3, 1))
+    return Increments(np.array([[0.0], [0.0], [0.0], [1.0]]), jump, zeros, jump)
+
+
+def fastest_rate(top: Top, l3: float, energy: float) -> float:
+    """
+    Return a bound on how fast the attitude and the body's rates change [rad/s].
+
+    The energy bounds the angular velocity across the axis; by Euler's equations this turns in the
+    body at |1 - lambda3/lambda1| omega3, and the torque adds a pendulum's rate.
+    """
+    spin = l3 / top.lambda3
+    kinetic = max(energy - 0.5 * l3 * spin + abs(top.gravity_torque), 0.0)
+    return (math.hypot(spin, math.sqrt(2.0 * kinetic / top.lambda1))
+            + abs((1.0 - top.lambda3 / top.lambda1) * spin)
+            + math.sqrt(abs(top.gravity_torque) / top.lambda1))
+
+
+def panels(rate: float, length_ns: int) -> int:
+    """
+    Return into how many panels an interval is divided for motions of this `fastest_rate`.
+
+    They are at most MOST_PANELS, which hold 8 turns: with more of them the integrals of angular
+    velocity and specific force become less exact.
+    """
+    return max(1, math.ceil(min(rate * length_ns * 1e-9 / LONGEST_PANEL, MOST_PANELS)))
+
+
+def increments(states: Callable[[range], States], begins: range, length_ns: int, point: Point,
+               rate: float) -> Increments:
+    """
+    Return the increments over panels of one length that begin at these times [ns].
+
+    states : gives the states at ascending times [ns]
+    point : of which the specific force is taken, in the body [m]
+    rate : `fastest_rate` of the motion
+    """
+    first = states(begins)
+    x, y, z, w = first.rows_quaternion
+    inverse = -x, -y, -z, w
+    sums = np.zeros((13, len(begins)))
+    for offset_ns, weight in _rule(length_ns, _nodes(rate * length_ns * 1e-9)):
+        now = states(range(begins.start + offset_ns, begins.stop + offset_ns, begins.step))
+        rates, force = now.rows_angular_velocity, now.specific_force(point)
+        w1, w2, w3 = np.broadcast_arrays(*rates)
+        x, y, z, w = rotation = attitude.product(inverse, now.rows_quaternion)
+        # The derivative of the rotation is half of its product with the angular velocity.
+        derivatives = (
+            *attitude.product(rotation, (0.5 * w1, 0.5 * w2, 0.5 * w3, 0.0 * w3)),
+            *attitude.in_body((-x, -y, -z, w), force), *rates, *force)
+        for row, derivative in enumerate(derivatives):
+            sums[row] += weight * derivative
+    sums[3] += 1.0
+    if rate * length_ns * 1e-9 >= LEAST_ANGLE:
+        last = states(range(begins.start + length_ns, begins.stop + length_ns, begins.step))
+        sums[:7] = _differences(first, last, length_ns * 1e-9, point)
+    return Increments(sums[:4], sums[4:7], sums[7:10], sums[10:])
+
+
+def _differences(first: States, last: States, seconds: float, point: Point) -> Rows:
+    """Return rotation and velocity (7, n) of `Increments` from the states at both ends."""
+    x, y, z, w = now = first.rows_quaternion
+    a, b, c, d = last.rows_quaternion
+    # conj(q) p = 1 + conj(q) (p - q) rounds less than the product.
+    *axis, shrunk = attitude.product((-x, -y, -z, w), (a - x, b - y, c - z, d - w))
+    # The lengths of q and p, rounded like their components, would scale all the small angles.
+    too_long, longer = _excess(now), _excess(last.rows_quaternion)
+    scale = 1.0 - 0.5 * (too_long + longer)
+    v1, v2, v3 = (attitude.in_body((-x, -y, -z, w), first.velocity(point)))
+    u1, u2, u3 = (attitude.in_body((-a, -b, -c, d), last.velocity(point)))
+    change = u1 - v1, u2 - v2, u3 - v3 + first.top.gravity * seconds
+    return np.stack((*(scale * part for part in axis), 1.0 + (shrunk + 0.5 * (too_long - longer)),
+                     *attitude.in_body(now, change)))
+
+
+def _excess(q: Quaternion) -> Column:
+    """Return |q|^2 - 1, exact to 2^-76: the squares of numbers of 26 bits are exact."""
+    coarse = [np.rint(2.0 ** 26 * part) * 2.0 ** -26 for part in q]
+    (x, y, z, w), (a, b, c, d) = coarse, ((part - one) * (part + one)
+                                          for part, one in zip(q, coarse, strict=True))
+    return ((x * x + y * y + z * z + w * w) - 1.0) + (a + b + c + d)
+
+
+def _nodes(angle: float) -> int:
+    """Return how many nodes a panel has in which the motion turns by up to `angle` [rad]."""
+    angle = min(max(angle, 1e-8), LONGEST_PANEL)
+    return max(4, math.ceil(math.log(HALF_THE_DIGITS) / math.log(0.5 * angle)))
+
+
+@lru_cache(64)
+def _rule(length_ns: int, count: int) -> tuple[tuple[int, float], ...]:
+    """
+    Return nodes [ns] and weights [s] of an interpolatory rule: Gauss' nodes, rounded.
+
+    The weights are those of the rounded nodes, from rational arithmetic: the same everywhere.
+    """
+    gauss, _ = np.polynomial.legendre.leggauss(count)
+    nodes = sorted({round(0.5 * (1.0 + node) * length_ns) for node in gauss.tolist()})
+    rule = []
+    for node in nodes:
+        # Lagrange's polynomial of this node, lowest power first, and its integral.
+        polynomial, scale = [1], 1
+        for other in nodes:
+            if other != node:
+                polynomial = [a - other * b for a, b in zip(
+                    (0, *polynomial), (*polynomial, 0), strict=True)]
+                scale *= node - other
+        integral = sum(Fraction(factor * length_ns ** power, power)
+                       for power, factor in enumerate(polynomial, start=1))
+        rule.append((node, float(integral / scale / 10 ** 9)))
+    return tuple(rule)

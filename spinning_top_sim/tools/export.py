@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Exports of a log to the files of other tools.
+
+TUM: "timestamp tx ty tz qx qy qz qw", in s and m (vision.in.tum.de, RGB-D dataset, file formats).
+EuRoC: state_groundtruth_estimate0/data.csv and imu0/data.csv (M. Burri et al., "The EuRoC micro
+aerial vehicle datasets", IJRR 35, 2016).  kalibr: imu.yaml (github.com/ethz-asl/kalibr, wiki "Yaml
+formats"; the matrices as its model scale-misalignment writes them).
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import itertools
+import os
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.streams.parameters import IDENTITY
+from spinning_top_sim.streams.topics import all_streams
+
+if TYPE_CHECKING:       # simulate writes tables without mcap
+    from spinning_top_sim.recording.reader import LogReader
+    from spinning_top_sim.tools.recorded_run import RunDescription
+
+BLOCK = 16384               # messages read together
+RAW, BIAS, ODOMETRY = 'imu/data_raw', 'ground_truth/imu_bias', 'ground_truth/imu_odom'
+# Parameter that switches a topic on.
+SWITCHES = {RAW: 'imu.enabled', BIAS: 'imu.enabled', ODOMETRY: 'ground_truth_imu_odom.enabled'}
+KALIBR_NEEDS = tuple(f'imu.{kind}_{name}' for kind in ('accelerometer', 'gyroscope')
+                     for name in ('noise_density', 'random_walk'))
+EUROC_HEAD = ('#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],'
+              'q_RS_y [],q_RS_z [],v_RS_R_x [m s^-1],v_RS_R_y [m s^-1],v_RS_R_z [m s^-1],'
+              'b_w_RS_S_x [rad s^-1],b_w_RS_S_y [rad s^-1],b_w_RS_S_z [rad s^-1],'
+              'b_a_RS_S_x [m s^-2],b_a_RS_S_y [m s^-2],b_a_RS_S_z [m s^-2]\n')
+EUROC_IMU_HEAD = ('#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],'
+                  'a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n')
+Reals = NDArray[np.float64]
+
+
+class ExportError(ValueError):
+    """An export cannot be made of this run; the text says why."""
+
+
+class Export(NamedTuple):
+    """A file to write, and its kind, a name in KINDS."""
+
+    kind: str
+    path: Path
+
+
+def add_argument(parser: argparse.ArgumentParser) -> None:
+    """Add the argument --export."""
+    parser.add_argument(
+        '--export', type=_parse, metavar='KIND:FILE', action='append', default=[],
+        help='write a file for other tools: tum or euroc, the true trajectory of the IMU; '
+        'euroc_imu, its readings (CSV); kalibr, its parameters (imu.yaml); may be repeated; an '
+        'existing file is never overwritten')
+
+
+def _parse(text: str) -> Export:
+    kind, colon, name = text.partition(':')
+    if kind not in KINDS or not name:
+        raise argparse.ArgumentTypeError(
+            f'{text}: must be KIND:FILE with one of {", ".join(KINDS)}, such as tum:truth.tum')
+    return Export(kind, Path(name))
+
+
+def check(exports: Sequence[Export], topics: Collection[str], values: Mapping[str, Any]) -> None:
+    """
+    Refuse what cannot be made of a run with these topics and parameters.
+
+    Raises ExportError, or FileExistsError.
+    """
+    for kind, path in exports:
+        for topic in KINDS[kind][0]:
+            if topic not in topics:
+                raise ExportError(f'--export {kind}: the log has no {topic}: it must be recorded '
+                                  f'with {SWITCHES[topic]}')
+        for name in KALIBR_NEEDS if kind == 'kalibr' else ():
+            if not values[name] > 0.0:
+                raise ExportError(f'--export kalibr: {name} = {values[name]!r}: kalibr reads only '
+                                  'what is > 0')
+        if path.exists():
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+
+
+def write(reader: LogReader, run: RunDescription, exports: Sequence[Export]) -> Iterator[str]:
+    """Write the files; yield a line about each.  Raises as `check` does, and OSError."""
+    check(exports, run.topics, run.values_at_recording)
+    for kind, path in exports:
+        lines = KINDS[kind][1](reader, run)
+        first = next(lines, '')         # what is refused leaves no file
+        with open(path, 'x', encoding='utf-8') as file:
+            file.write(first)
+            file.writelines(lines)
+        yield f'{path}: {kind}'
+
+
+def _tum(reader: LogReader, run: RunDescription) -> Iterator[str]:
+    for stamps_ns, (position, orientation, *_) in _blocks(reader, run, ODOMETRY):
+        for stamp_ns, row in zip(stamps_ns.tolist(), np.hstack((position, orientation)).tolist(),
+                                 strict=True):
+            seconds, rest_ns = divmod(stamp_ns, 10 ** 9)
+            yield f'{seconds}.{rest_ns:09d} {" ".join(map(repr, row))}\n'
+
+
+def _euroc(reader: LogReader, run: RunDescription) -> Iterator[str]:
+    biases = list(_blocks(reader, run, BIAS))
+    if not biases:
+        raise ExportError(f'--export euroc: the log has no sample of {BIAS}')
+    bias_ns = np.concatenate([stamps_ns for stamps_ns, _ in biases])
+    bias = np.concatenate([np.hstack(fields[1:]) for _, fields in biases])
+    yield EUROC_HEAD
+    for stamps_ns, (position, orientation, velocity, _) in _blocks(reader, run, ODOMETRY):
+        x, y, z, w = orientation.T
+        world = attitude.in_body((-x, -y, -z, w), tuple(velocity.T))
+        # The bias of the newest reading.
+        newest = np.maximum(np.searchsorted(bias_ns, stamps_ns, 'right') - 1, 0)
+        yield from _csv(stamps_ns, position, np.column_stack((w, x, y, z)),
+                        np.column_stack(world), bias[newest])
+
+
+def _euroc_imu(reader: LogReader, run: RunDescription) -> Iterator[str]:
+    yield EUROC_IMU_HEAD
+    for stamps_ns, (_, rates, force) in _blocks(reader, run, RAW):
+        yield from _csv(stamps_ns, rates, force)
+
+
+def _csv(stamps_ns: NDArray[np.int64], *columns: Reals) -> Iterator[str]:
+    for stamp_ns, row in zip(stamps_ns.tolist(), np.hstack(columns).tolist(), strict=True):
+        yield f'{stamp_ns},{",".join(map(repr, row))}\n'
+
+
+def _kalibr(_: LogReader, run: RunDescription) -> Iterator[str]:
+    values = run.values_at_recording
+    content = {'rostopic': run.topics[RAW], 'update_rate': values['imu.rate'],
+               **{name.removeprefix('imu.'): values[name] for name in KALIBR_NEEDS}}
+    force, rates, sensitivity = (values[f'imu.{name}'] for name in (
+        'accelerometer_M', 'gyroscope_M', 'gyroscope_A'))
+    if force != IDENTITY or rates != IDENTITY or any(sensitivity):
+        content |= {'model': 'scale-misalignment', 'accelerometers': {'M': _matrix(force)},
+                    'gyroscopes': {'M': _matrix(rates), 'A': _matrix(sensitivity),
+                                   'C_gyro_i': _matrix(IDENTITY)}}
+    yield yaml.safe_dump(content, sort_keys=True, default_flow_style=None)
+
+
+def _matrix(rows: Sequence[float]) -> list[list[float]]:
+    return [list(rows[k:k + 3]) for k in (0, 3, 6)]
+
+
+def _blocks(reader: LogReader, run: RunDescription, topic: str,
+            ) -> Iterator[tuple[NDArray[np.int64], tuple[Reals, ...]]]:
+    """Yield stamps (n,) [ns] and fields of the messages of a stream, in blocks."""
+    template = next(stream.template for stream in all_streams(run.values_at_recording)
+                    if stream.topic == topic)
+    messages = reader.messages(topics=[run.topics[topic]])
+    while block := list(itertools.islice(messages, BLOCK)):
+        data = b''.join(message.data for message in block if len(message.data) == len(template))
+        yield template.stamps_ns(data), template.decode(data)
+
+
+# Name: the topics that it needs, and what yields its text.
+KINDS: dict[str, tuple[Sequence[str], Callable[..., Iterator[str]]]] = {
+    'tum': ((ODOMETRY,), _tum), 'euroc': ((ODOMETRY, BIAS), _euroc),
+    'euroc_imu': ((RAW,), _euroc_imu), 'kalibr': ((RAW,), _kalibr)}

@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exports, read as their formats are documented, beside what the log has."""
+
+import csv
+
+import numpy as np
+import pytest
+import yaml
+from rosbags.highlevel import AnyReader
+
+from spinning_top_sim.tools import inspect, simulate
+
+NOISY = {'imu.gyroscope_noise_density': 1e-3, 'imu.gyroscope_random_walk': 1e-5,
+         'imu.gyroscope_turn_on_bias': 0.01, 'imu.accelerometer_noise_density': 0.02,
+         'imu.accelerometer_random_walk': 1e-4, 'imu.accelerometer_turn_on_bias': 0.1}
+VALUES = {**NOISY, 'ground_truth_imu_odom.enabled': True, 'ground_truth_imu_odom.rate': 125.0,
+          'imu.lever_arm': [0.1, -0.2, 0.3], 'imu.rpy': [0.3, -0.7, 1.9]}
+FILES = {'tum': 'truth.tum', 'euroc': 'truth.csv', 'euroc_imu': 'imu.csv', 'kalibr': 'imu.yaml'}
+
+
+def options(values, **more):
+    return [text for name, value in {**values, **more}.items()
+            for text in ('-p', f'{name}:={str(value).lower()}')]
+
+
+def exports(folder, *kinds):
+    return [text for kind in kinds or FILES
+            for text in ('--export', f'{kind}:{folder / FILES[kind]}')]
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    """Two runs: a log with its exports, and those that `inspect` makes of the log."""
+    folder = tmp_path_factory.mktemp('exports')
+    (folder / 'again').mkdir()
+    log = folder / 'run.mcap'
+    assert simulate.main([*options(VALUES), '--command', '0.503:2.0:1.5', '--duration', '1',
+                          '--epoch', '1700000000', '-o', str(log), '--quiet',
+                          *exports(folder)]) == 0
+    assert inspect.main([str(log), *exports(folder / 'again')]) == 0
+    return folder
+
+
+@pytest.fixture(scope='module')
+def messages(folder):
+    found = {}
+    with AnyReader([folder / 'run.mcap']) as reader:
+        for connection, _, data in reader.messages():
+            found.setdefault(connection.topic, []).append(
+                reader.deserialize(data, connection.msgtype))
+    return found
+
+
+def rows(path, delimiter):
+    with open(path, newline='') as file:
+        return [row for row in csv.reader(file, delimiter=delimiter) if not row[0].startswith('#')]
+
+
+def stamps(messages):
+    return [one.header.stamp.sec * 10 ** 9 + one.header.stamp.nanosec for one in messages]
+
+
+def xyz(vector):
+    return [vector.x, vector.y, vector.z]
+
+
+def test_both_tools_write_the_same(folder):
+    for name in FILES.values():
+        assert (folder / name).read_bytes() == (folder / 'again' / name).read_bytes()
+
+
+def test_tum_is_the_odometry_to_the_last_bit(folder, messages):
+    found = rows(folder / 'truth.tum', ' ')
+    odometry = messages['/ground_truth/imu_odom']
+    assert [int(row[0].replace('.', '')) for row in found] == stamps(odometry)
+    assert all(len(row[0].split('.')[1]) == 9 for row in found)
+    expected = [[*xyz(one.pose.pose.position), *xyz(one.pose.pose.orientation),
+                 one.pose.pose.orientation.w] for one in odometry]
+    assert np.array_equal(np.array(found, np.float64)[:, 1:], expected)
+
+
+def test_euroc_has_the_velocity_in_the_world_and_the_bias_of_the_newest_reading(folder, messages):
+    """In the world the velocity is the rate of the position."""
+    found = rows(folder / 'truth.csv', ',')
+    odometry, biases = messages['/ground_truth/imu_odom'], messages['/ground_truth/imu_bias']
+    assert [int(row[0]) for row in found] == stamps(odometry)
+    numbers = np.array(found, np.float64)
+    assert numbers.shape == (126, 17)
+    assert np.array_equal(numbers[:, 1:4], [xyz(one.pose.pose.position) for one in odometry])
+    assert np.array_equal(numbers[:, 4:8], [
+        [one.pose.pose.orientation.w, *xyz(one.pose.pose.orientation)] for one in odometry])
+    # Before the command; central differences of order 4.
+    p = numbers[:60, 1:4]
+    rate = (p[:-4] - 8.0 * p[1:-3] + 8.0 * p[3:-1] - p[4:]) / (12.0 * 0.008)
+    assert np.abs(rate - numbers[2:58, 8:11]).max() <= 2e-4 * np.abs(rate).max()
+    times = stamps(biases)
+    newest = [biases[np.searchsorted(times, stamp, 'right') - 1] for stamp in stamps(odometry)]
+    assert np.array_equal(numbers[:, 11:], [
+        [*xyz(one.angular_velocity), *xyz(one.linear_acceleration)] for one in newest])
+
+
+def test_euroc_imu_is_what_the_sensor_reads(folder, messages):
+    found, raw = rows(folder / 'imu.csv', ','), messages['/imu/data_raw']
+    assert [int(row[0]) for row in found] == stamps(raw)
+    assert np.array_equal(np.array(found, np.float64)[:, 1:], [
+        [*xyz(one.angular_velocity), *xyz(one.linear_acceleration)] for one in raw])
+    head = (folder / 'imu.csv').read_text().splitlines()[0]
+    assert head.startswith('#timestamp [ns],w_RS_S_x [rad s^-1],') and head.count(',') == 6
+
+
+def test_kalibr_gets_the_parameters(folder):
+    """The fields and checks of ImuParameters in kalibr_common/ConfigReader.py."""
+    content = yaml.safe_load((folder / 'imu.yaml').read_text())
+    assert content == {
+        'rostopic': '/imu/data_raw', 'update_rate': 200.0,
+        **{name.removeprefix('imu.'): value for name, value in NOISY.items()
+           if 'turn_on' not in name}}
+    assert all(isinstance(content[name], float) and content[name] > 0.0
+               for name in content if name != 'rostopic')
+
+
+def test_kalibr_gets_matrices_that_are_not_the_identity(tmp_path):
+    matrix = [1.01, 0.0, 0.0, 0.002, 0.99, 0.0, 0.0, 0.003, 1.0]
+    assert simulate.main([*options(NOISY, **{'imu.accelerometer_M': matrix}), '--duration', '0.1',
+                          '-o', str(tmp_path / 'run.mcap'), '--quiet', '--namespace', 'left',
+                          *exports(tmp_path, 'kalibr')]) == 0
+    content = yaml.safe_load((tmp_path / 'imu.yaml').read_text())
+    identity = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    assert content['rostopic'] == '/left/imu/data_raw'
+    assert content['model'] == 'scale-misalignment'
+    assert content['accelerometers'] == {'M': [matrix[:3], matrix[3:6], matrix[6:]]}
+    assert content['gyroscopes'] == {'M': identity, 'A': [[0.0, 0.0, 0.0]] * 3,
+                                     'C_gyro_i': identity}
+
+
+@pytest.mark.parametrize(('arguments', 'reason', 'code'), [
+    (['--export', 'tum:DIR/a'], 'no ground_truth/imu_odom: it must be recorded with '
+     'ground_truth_imu_odom.enabled', 2),
+    (['--export', 'euroc_imu:DIR/a', '-p', 'imu.enabled:=false'], 'imu.enabled', 2),
+    (['--export', 'kalibr:DIR/a'], 'imu.accelerometer_noise_density = 0.0', 2),
+    (['--export', 'euroc_imu:DIR/there'], 'there: File exists', 1)])
+def test_what_cannot_be_exported_is_told_before_anything_is_computed(
+        tmp_path, capsys, arguments, reason, code):
+    (tmp_path / 'there').write_text('precious')
+    log = tmp_path / 'run.mcap'
+    assert simulate.main([*(text.replace('DIR', str(tmp_path)) for text in arguments),
+                          '--duration', '1', '-o', str(log), '--quiet']) == code
+    assert reason in capsys.readouterr().err
+    assert not log.exists()
+    assert not (tmp_path / 'a').exists()
+    assert (tmp_path / 'there').read_text() == 'precious'
+
+
+@pytest.mark.parametrize('text', ['tum', 'tum:', 'kitti:a', 'a.tum'])
+def test_a_wrong_kind_is_told_with_the_right_ones(tmp_path, capsys, text):
+    with pytest.raises(SystemExit):
+        simulate.main(['--export', text, '-o', str(tmp_path / 'run.mcap')])
+    assert f'{text}: must be KIND:FILE with one of tum, euroc, euroc_imu, kalibr' in (
+        capsys.readouterr().err)
+
+
+def test_a_table_has_no_exports(tmp_path, capsys):
+    assert simulate.main(['--export', f'tum:{tmp_path}/a', '--duration', '1',
+                          '-o', str(tmp_path / 'run.csv')]) == 2
+    assert 'is csv' in capsys.readouterr().err
+
+
+def test_inspect_refuses_what_the_log_lacks_and_what_is_there(tmp_path, folder, capsys):
+    log = tmp_path / 'run.mcap'
+    assert simulate.main(['--duration', '0.1', '-o', str(log), '--quiet']) == 0
+    assert inspect.main([str(log), *exports(tmp_path, 'tum')]) == 2
+    assert 'no ground_truth/imu_odom' in capsys.readouterr().err
+    assert inspect.main([str(folder / 'run.mcap'), *exports(folder, 'tum')]) == 1
+    assert 'File exists' in capsys.readouterr().err
