@@ -115,7 +115,7 @@ performance:
 	.venv-benchmark/bin/python benchmark/solvers.py
 	.venv-benchmark/bin/python benchmark/offline.py --hour
 	.venv-benchmark/bin/python benchmark/offline_scaling.py --long
-	.venv-benchmark/bin/python benchmark/compression.py
+	.venv-benchmark/bin/python benchmark/log_compression.py
 	.venv-benchmark/bin/python benchmark/soak.py
 
 benchmark: performance
