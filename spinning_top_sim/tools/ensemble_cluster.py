@@ -13,6 +13,7 @@ from itertools import count, islice
 from multiprocessing import resource_tracker
 from typing import TypeVar
 
+import dask
 import distributed
 
 from spinning_top_sim.tools.ensemble_part import EnsembleError
@@ -39,6 +40,8 @@ def connect(workers: int | None, scheduler: str | None) -> Iterator[distributed.
         handler.setLevel(logging.CRITICAL)          # what matters becomes an error of ours
     with contextlib.ExitStack() as stack:
         if scheduler is None:
+            # The profile of an hour takes more memory than the runs.
+            stack.enter_context(dask.config.set({'distributed.worker.profile.enabled': False}))
             with _interrupts_blocked():
                 # Neither a dashboard nor a port that other machines reach.
                 address: object = stack.enter_context(distributed.LocalCluster(
