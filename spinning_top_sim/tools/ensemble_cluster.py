@@ -40,7 +40,7 @@ def connect(workers: int | None, scheduler: str | None) -> Iterator[distributed.
         handler.setLevel(logging.CRITICAL)          # what matters becomes an error of ours
     with contextlib.ExitStack() as stack:
         if scheduler is None:
-            # The profile of an hour takes more memory than the runs.
+            # Dask's profile grows with time, and memory grew with the number of runs.
             stack.enter_context(dask.config.set({'distributed.worker.profile.enabled': False}))
             with _interrupts_blocked():
                 # Neither a dashboard nor a port that other machines reach.
