@@ -116,7 +116,7 @@ performance:
 	.venv-benchmark/bin/python benchmark/solvers.py
 	.venv-benchmark/bin/python benchmark/offline.py --hour
 	.venv-benchmark/bin/python benchmark/offline_scaling.py --long
-	.venv-benchmark/bin/python benchmark/compression.py
+	.venv-benchmark/bin/python benchmark/log_compression.py
 	.venv-benchmark/bin/python benchmark/soak.py
 
 benchmark: performance
@@ -128,6 +128,7 @@ benchmark: performance
 	.venv-benchmark/bin/python benchmark/allan.py
 	.venv-benchmark/bin/python benchmark/increments.py
 	.venv-benchmark/bin/python benchmark/attitude_filter.py
+	.venv-benchmark/bin/python benchmark/ensemble.py
 
 $(VENV)/.peers: $(wildcard benchmark/requirements*.txt) $(VENV)/.deps-test
 	@echo 'Installing into $(VENV) the programs that the benchmarks compare with'

@@ -16,6 +16,7 @@ EXECUTABLES = {
     'simulate': 'spinning_top_sim.tools.cli:simulate',
     'recover': 'spinning_top_sim.tools.cli:recover',
     'inspect': 'spinning_top_sim.tools.cli:inspect',
+    'ensemble': 'spinning_top_sim.tools.cli:ensemble',
 }
 
 DATA_FILES = {
@@ -59,6 +60,7 @@ setup(
         'test': [
             'ahrs>=0.4,<0.5',
             'catkin_pkg>=1.0,<2',
+            'distributed>=2024.5,<2028',
             'docutils>=0.20,<1',
             'matplotlib>=3.6,<4',
             'mcap-ros2-support>=0.5.5,<0.7',
@@ -71,6 +73,7 @@ setup(
             'yourdfpy>=0.0.60,<0.1',
         ],
         'parquet': ['pyarrow>=14,<30'],
+        'exam': ['distributed>=2024.5,<2028', 'pyarrow>=14,<30'],     # ensembles
         'plot': ['matplotlib>=3.6,<4'],     # inspect --plot, docs/figures.py
         # examples/attitude_filter.py
         'examples': ['ahrs>=0.4,<0.5', 'matplotlib>=3.6,<4', 'rosbags>=0.10.11,<0.12',

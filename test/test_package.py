@@ -181,7 +181,7 @@ def test_a_script_helps_and_does_nothing(script, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize('name', ['simulate', 'inspect', 'recover'])
+@pytest.mark.parametrize('name', ['simulate', 'inspect', 'recover', 'ensemble'])
 def test_ctrl_c_during_the_imports_of_a_tool_is_quiet(name):
     code = ('import runpy, signal, sys\n'
             'class Interrupted:\n'

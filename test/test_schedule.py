@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The schedule: what is computed ahead, how far, and when it no longer holds."""
 
+import gc
+import weakref
+
 import pytest
 from helpers.simulations import (
     MILLISECOND,
@@ -271,3 +274,17 @@ def test_what_cannot_go_on_fails_at_the_same_time_when_computed_ahead():
         return taken, str(failure.value), simulation.now_ns
 
     assert run(True) == run(False)
+
+
+def test_a_run_that_ends_is_freed_without_a_search_for_cycles():
+    simulation = simulate()
+    publish(simulation, 'pose')
+    simulation.advance(SECOND)
+    segment, on_change = weakref.ref(simulation.segment), simulation.streams[0].on_change
+    gc.disable()
+    try:
+        del simulation
+        assert segment() is None
+        on_change()             # of a schedule that is no more
+    finally:
+        gc.enable()

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 CHUNK_BYTES = 1 << 20   # uncompressed; a single larger message still makes a chunk of its own
 
 # Half the time of zstd's own default, 3, and less memory, for files that are 1 to 6 % larger:
-# `python benchmark/compression.py`.
+# `python benchmark/log_compression.py`.
 ZSTD_LEVEL = 1
 
 # Message index entries of a chunk by channel id: log time, offset in the uncompressed chunk, log

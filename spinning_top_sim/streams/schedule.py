@@ -3,8 +3,9 @@
 
 import contextlib
 import time
+import weakref
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 from typing import TypeVar
 
@@ -37,6 +38,22 @@ def check_stamp(stamp_ns: int, error: type[Exception] = IntegrationError) -> Non
     if not 0 <= stamp_ns <= LAST_STAMP_NS:
         raise error(f'the stamp {stamp_ns / NANOSECONDS:.12g} s: must be from 0 to '
                     f'{LAST_STAMP_NS / NANOSECONDS:.0f} s, in January 2038')
+
+
+def _weakly(method: Callable[[], None]) -> Callable[[], None]:
+    """
+    Return what calls a method while its object lives.
+
+    A cycle of streams and schedule would keep the arrays of a run until Python looks for cycles.
+    """
+    reference = weakref.WeakMethod(method)
+
+    def call() -> None:
+        found = reference()
+        if found is not None:
+            found()
+
+    return call
 
 
 class Delivery:
@@ -80,7 +97,7 @@ class Schedule:
         self._streams, self.epoch_ns = streams, epoch_ns
         self.ready: deque[Instant] = deque()
         for stream in streams:
-            stream.on_change = self.invalidate
+            stream.on_change = _weakly(self.invalidate)
 
     def follow(self, segment: Segment) -> None:
         """Go on with another segment."""

@@ -26,7 +26,8 @@ def _start(name: str) -> int:
 
 
 # The executables.
-simulate, inspect, recover = (partial(_start, name) for name in ('simulate', 'inspect', 'recover'))
+simulate, inspect, recover, ensemble = (
+    partial(_start, name) for name in ('simulate', 'inspect', 'recover', 'ensemble'))
 
 
 def run(name: str, help_text: str | None, argv: Sequence[str] | None,

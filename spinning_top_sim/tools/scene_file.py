@@ -43,15 +43,20 @@ def read_scene(path: str | Path) -> dict[str, object]:
 
     Raises OSError, or ValueError which names the file and what is wrong with it.
     """
-    content = _parse_yaml(Path(path).read_bytes(), str(path))
+    content = parse_yaml(Path(path).read_bytes(), str(path))
     sections = [node['ros__parameters'] for name, node in content.items()
                 if name in NODES and isinstance(node, Mapping) and isinstance(
                     node.get('ros__parameters'), Mapping)] if isinstance(content, Mapping) else []
     if not sections:
         raise ValueError(f'{path} has no parameters for the node spinning_top: it must have '
                          "'/**:' or 'spinning_top:', and 'ros__parameters:' in it")
-    return _known({name: value for section in sections for name, value in _flatten(section)},
-                  str(path))
+    return {name: value for section in sections
+            for name, value in parse_section(section, str(path)).items()}
+
+
+def parse_section(section: Mapping[object, object], source: str) -> dict[str, object]:
+    """Return parameters by name, not checked yet.  Raises ValueError, which names the source."""
+    return _known(dict(_flatten(section)), source)
 
 
 def parse_assignment(text: str) -> tuple[str, object]:
@@ -59,12 +64,13 @@ def parse_assignment(text: str) -> tuple[str, object]:
     name, separator, yaml_text = text.partition(':=')
     if not separator:
         raise ValueError(f'{text!r}: must be NAME:=VALUE')
-    value = _parse_yaml(yaml_text, text)
+    value = parse_yaml(yaml_text, text)
     _known({name: value}, text)
     return name, value
 
 
-def _parse_yaml(text: str | bytes, source: str) -> object:
+def parse_yaml(text: str | bytes, source: str) -> object:
+    """Return what YAML says, with the types of rcl.  Raises ValueError, which names the source."""
     try:
         return yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:

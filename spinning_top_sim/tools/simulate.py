@@ -95,7 +95,7 @@ def _run(arguments: argparse.Namespace) -> int:
                          simulation.top)
     with cli.progress('simulated', values['duration'], 's', quiet=arguments.quiet) as show:
         if file_format == 'mcap':
-            summary = _write_log(output, simulation, stops, show, arguments.namespace)
+            summary = write_log(output, simulation, stops, show, arguments.namespace)
         else:
             period_ns = max(1, round(NANOSECONDS / values['pose.rate']))
             write = _write_csv if file_format == 'csv' else _write_parquet
@@ -170,8 +170,8 @@ def _command(simulation: Simulation, l3: float, lz: float) -> None:
                                f'up to t = {t!r} s') from error
 
 
-def _write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
-               show: Callable[[float], object], namespace: str) -> str:
+def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
+              show: Callable[[float], object], namespace: str) -> str:
     """
     Simulate a run into a new log; return the number of messages and the size of the file.
 

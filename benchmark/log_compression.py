@@ -3,8 +3,8 @@
 """
 Measure size and time of compressed chunks of a live log: levels of zstd, and lz4.
 
-    python benchmark/compression.py
-    python benchmark/compression.py --no-report
+    python benchmark/log_compression.py
+    python benchmark/log_compression.py --no-report
 
 The chunks are those of a node that records three streams (pose, joint_states, and imu/data_raw
 with a noisy gyroscope) with the default max_loss, four per second.  Each compressor gets every
