@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A filter without the faults that the exam looks for: it is what the exam itself is tested on."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.exam.scenarios import CALIBRATED, FIELD, FIELD_NOISE, GRAVITY, Reals
+
+# A specific force whose size is this far from gravity [standard deviations] is no gravity.
+LARGEST_DEVIATION = 5.0
+# What is assumed of it then [m/s^2], and for how long [s].
+DISTURBED, DISTURBED_S = 0.5 * GRAVITY, 2.0
+
+
+class ReferenceFilter:
+    """
+    A multiplicative extended Kalman filter of attitude and bias (Markley 2003).
+
+    The rates are integrated in closed form.  Specific force and field are compared with gravity
+    and the known field; a force of another size than gravity is hardly believed.  The covariance
+    is of the error's rotation vector in the frame of the sensor.
+
+    gyroscope_density : [rad/s/sqrt(Hz)]
+    accelerometer_density : [m/s^2/sqrt(Hz)]
+    field, field_noise : in the world, east, north, up, and standard deviation of a sample [T]
+    bias_stddev : of the gyroscope's bias before it is estimated [rad/s]
+    """
+
+    is_gravity_trusted = False      # every specific force is taken for gravity
+
+    def __init__(self, gyroscope_density: float = CALIBRATED['imu.gyroscope_noise_density'],
+                 accelerometer_density: float = CALIBRATED['imu.accelerometer_noise_density'],
+                 field: tuple[float, float, float] = FIELD, field_noise: float = FIELD_NOISE,
+                 bias_stddev: float = 0.02) -> None:
+        self._densities = gyroscope_density, accelerometer_density
+        self._field, self._field_variance = np.array(field), field_noise ** 2
+        self._quaternion: Reals | None = None
+        self._p = np.diag([0.5 ** 2] * 3 + [bias_stddev ** 2] * 3)
+        self._disturbed_s = 0.0
+        self.bias = np.zeros(3)
+
+    @property
+    def covariance(self) -> Reals:
+        """Of the rotation vector from the estimate to the truth, sensor frame (3, 3) [rad^2]."""
+        return self._p[:3, :3]
+
+    def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
+               dt: float) -> Reals:
+        """Take the readings of a step of dt [s]; return q(world <- sensor) as x, y, z, w."""
+        if self._quaternion is None:
+            self._quaternion = from_two_vectors(accelerometer, magnetometer)
+        else:
+            self.predict(gyroscope - self.bias, dt)
+        gyroscope_density, accelerometer_density = self._densities
+        variance = accelerometer_density ** 2 / dt
+        deviation = abs(math.sqrt(accelerometer @ accelerometer) - GRAVITY)
+        self._disturbed_s -= dt
+        if deviation > LARGEST_DEVIATION * math.sqrt(variance) and not self.is_gravity_trusted:
+            self._disturbed_s = DISTURBED_S
+        if self._disturbed_s > 0.0:
+            variance = DISTURBED ** 2
+        self._correct(accelerometer, np.array((0.0, 0.0, GRAVITY)), variance)
+        if magnetometer is not None:
+            self._correct(magnetometer, self._field, self._field_variance)
+        return self._quaternion.copy()
+
+    def predict(self, rates: Reals, dt: float) -> None:
+        """Turn by the rates [rad/s] for dt [s]."""
+        turn = rates * dt
+        self._quaternion = self.integrate(self._quaternion, turn)
+        transition = np.eye(6)
+        transition[:3, :3] = matrix_of(exponential(-turn))
+        transition[:3, 3:] = -dt * np.eye(3)
+        self._p = transition @ self._p @ transition.T
+        self._p[:3, :3] += self._densities[0] ** 2 * dt * np.eye(3)
+
+    def integrate(self, quaternion: Reals, turn: Reals) -> Reals:
+        """Return a quaternion after a turn by a rotation vector in the frame of the sensor."""
+        return product(quaternion, exponential(turn))
+
+    def _correct(self, reading: Reals, world: Reals, variance: float) -> None:
+        """Compare a vector with what it is in the world; both have the same unit."""
+        expected = matrix_of(self._quaternion).T @ world
+        h = np.zeros((3, 6))
+        h[:, :3] = _cross(expected)
+        gain = np.linalg.solve(h @ self._p @ h.T + variance * np.eye(3), h @ self._p).T
+        change = gain @ (reading - expected)
+        self._quaternion = product(self._quaternion, exponential(change[:3]))
+        self.bias = self.bias + change[3:]
+        kept = np.eye(6) - gain @ h
+        self._p = kept @ self._p @ kept.T + variance * gain @ gain.T
+
+
+def product(p: Reals, q: Reals) -> Reals:
+    """Return the quaternion product p q, x, y, z, w, of norm 1."""
+    a, b, c, d = p.tolist()
+    x, y, z, w = q.tolist()
+    r = np.array((d * x + a * w + b * z - c * y, d * y - a * z + b * w + c * x,
+                  d * z + a * y - b * x + c * w, d * w - a * x - b * y - c * z))
+    unit: Reals = r / math.sqrt(r @ r)
+    return unit
+
+
+def exponential(vector: Reals) -> Reals:
+    """Return the quaternion of a rotation vector [rad]."""
+    x, y, z = vector.tolist()
+    half = 0.5 * math.sqrt(x * x + y * y + z * z)
+    scale = 0.5 * math.sin(half) / half if half else 0.5
+    return np.array((scale * x, scale * y, scale * z, math.cos(half)))
+
+
+def matrix_of(quaternion: Reals) -> Reals:
+    """Return the matrix of a unit quaternion (3, 3)."""
+    x, y, z, w = quaternion.tolist()
+    return np.array((
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))))
+
+
+def _cross(vector: Reals) -> Reals:
+    x, y, z = vector.tolist()
+    return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+
+
+def from_two_vectors(up: Reals, magnetometer: Reals | None) -> Reals:
+    """
+    Return the attitude in which a vector points up, and the field has no east component (TRIAD).
+
+    Without a field any heading will do.
+    """
+    z = up / np.linalg.norm(up)
+    north = magnetometer if magnetometer is not None else np.eye(3)[np.argmin(np.abs(z))]
+    x = np.cross(north, z)
+    x /= np.linalg.norm(x)
+    rows: NDArray[np.float64] = np.stack((x, np.cross(z, x), z))
+    # Shepperd's method, by the largest of the four.
+    trace = np.array((*(2.0 * np.diag(rows)), 0.0)) - np.trace(rows)
+    trace[3] = np.trace(rows)
+    k = int(np.argmax(trace))
+    odd = np.array((rows[2, 1] - rows[1, 2], rows[0, 2] - rows[2, 0], rows[1, 0] - rows[0, 1]))
+    if k == 3:
+        q = np.array((*odd, 1.0 + trace[3]))
+    else:
+        q = np.array((*(rows[k] + rows[:, k]), odd[k]))
+        q[k] = 1.0 + trace[k]
+    unit: Reals = q / np.linalg.norm(q)
+    return unit
