@@ -16,6 +16,7 @@ EXECUTABLES = {
     'simulate': 'spinning_top_sim.tools.cli:simulate',
     'recover': 'spinning_top_sim.tools.cli:recover',
     'inspect': 'spinning_top_sim.tools.cli:inspect',
+    'examine': 'spinning_top_sim.tools.cli:examine',
 }
 
 DATA_FILES = {
@@ -75,6 +76,8 @@ setup(
         # examples/attitude_filter.py
         'examples': ['ahrs>=0.4,<0.5', 'matplotlib>=3.6,<4', 'rosbags>=0.10.11,<0.12',
                      'vqf>=2.1,<3'],
+        # The filters that `examine` knows by name; gtsam is another, and not needed.
+        'exam': ['ahrs>=0.4,<0.5', 'imufusion>=1.3,<2', 'vqf>=2.1,<3'],
         # Narrow ranges: a new release reports new faults.
         'lint': [
             'mypy>=2.4.1,<2.5',

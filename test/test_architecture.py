@@ -17,6 +17,7 @@ MAY_IMPORT = {
     'streams': {'physics', 'solvers'},
     'recording': set(),
     'tools': {'physics', 'solvers', 'streams', 'recording'},
+    'exam': {'physics', 'solvers', 'streams', 'recording', 'tools'},
     'nodes': {'physics', 'solvers', 'streams', 'recording', 'tools'},
 }
 ROS = {'rclpy', 'launch', 'launch_ros', 'rcl_interfaces', 'ament_index_python', 'std_msgs',
@@ -27,6 +28,7 @@ MAY_NOT_IMPORT = {
     'streams': ROS | {'scipy', 'mcap', 'os', 'pathlib'},
     'recording': {'rclpy', 'scipy'},
     'tools': {'rclpy'},
+    'exam': {'rclpy'},
     'nodes': {'scipy'},
 }
 MODULES = {'.'.join(path.relative_to(PACKAGE.parent).with_suffix('').parts): path

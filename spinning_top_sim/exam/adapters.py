@@ -8,6 +8,7 @@ readings show.  With `magnetic=False` it does not get the magnetometer.
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,7 +23,7 @@ FROM_NWU = Rotation.from_euler('z', 90.0, degrees=True)
 
 
 class Vqf:
-    """VQF (Laidig and Seel 2023), package vqf; it has one period, and lost samples are repeated."""
+    """VQF (Laidig and Seel 2023), package vqf.  Its period is fixed: lost samples are repeated."""
 
     def __init__(self, magnetic: bool = True) -> None:
         self._magnetic, self._period = magnetic, 0.0
@@ -96,7 +97,7 @@ class Imufusion:
         import imufusion  # noqa: PLC0415
 
         self._magnetic = magnetic
-        self._filter = imufusion.Ahrs()
+        self._filter: Any = imufusion.Ahrs()
         settings = imufusion.AhrsSettings()
         settings.convention = imufusion.CONVENTION_ENU
         self._filter.set_settings(settings)
@@ -120,7 +121,7 @@ class Gtsam:
     def __init__(self) -> None:
         import gtsam  # noqa: PLC0415
 
-        self._integrated = gtsam.PreintegratedRotation(gtsam.PreintegratedRotationParams())
+        self._integrated: Any = gtsam.PreintegratedRotation(gtsam.PreintegratedRotationParams())
         self._start: Rotation | None = None
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,

@@ -6,7 +6,7 @@ A misreading that stays the same is found by undoing it: the attitudes, or the r
 changed as the fault would have it, and the error vanishes.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -112,6 +112,22 @@ REPEATED = (
     GRAVITY_SIGN)
 
 
+def marks(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
+    """Return what docs/exam.md defines of the errors of filters, over several runs."""
+    settled = [outcome.later() for outcome in outcomes]
+    errors = [outcome.errors for outcome in settled]
+    return {
+        'tilt_rms_deg': np.degrees(rms(np.concatenate([one.tilt for one in errors]))),
+        'tilt_max_deg': np.degrees(max(float(np.max(one.tilt)) for one in errors)),
+        'heading_rms_deg': np.degrees(rms(np.concatenate(
+            [one.turned(absolute) for one in errors]))),
+        'convergence_s': max(measures.convergence_time(outcome.run.t, outcome.errors.tilt)
+                             for outcome in outcomes),
+        'heading_drift_deg_per_s': np.degrees(float(np.mean([
+            abs(measures.drift(outcome.run.t, one.heading))
+            for outcome, one in zip(settled, errors, strict=True)])))}
+
+
 def error_of(outcome: Outcome, absolute: bool) -> float:
     """Return the rms attitude error [rad]."""
     return rms(outcome.errors.attitude(absolute))
@@ -188,9 +204,8 @@ class BiasEffect(NamedTuple):
     found: float | None
 
 
-def bias_effect(plus: Outcome, minus: Outcome, absolute: bool) -> BiasEffect:
-    """Compare two runs with opposite biases; errors of other causes cancel."""
-    bias = np.array(plus.run.scenario.bias)
+def bias_effect(plus: Outcome, minus: Outcome, bias: Reals, absolute: bool) -> BiasEffect:
+    """Compare runs with this bias [rad/s] and its opposite; errors of other causes cancel."""
     size = float(np.linalg.norm(bias))
     one, other = (Rotation.from_quat(outcome.estimates) for outcome in (plus, minus))
     if absolute:
@@ -220,9 +235,20 @@ def bias_fault(effect: BiasEffect, absolute: bool) -> Fault | None:
     return Fault('no_bias_estimate', text)
 
 
-def covariance_fault(consistency: Sequence[tuple[str, measures.Nees]]) -> Fault | None:
-    """Judge the NEES of attitude and of tilt."""
-    for what, nees in consistency:
+def consistency(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, measures.Nees]:
+    """Return the NEES of tilt and attitude, by what it is of; nothing without covariances."""
+    runs = [(one.estimates[one.read], one.run.truth[one.read], one.covariances)
+            for outcome in outcomes for one in (outcome.later(0.75),)
+            if one.covariances is not None]
+    if not runs:
+        return {}
+    found = {'tilt': measures.nees_of(runs, False)}
+    return found | {'attitude': measures.nees_of(runs, True)} if absolute else found
+
+
+def covariance_fault(found: Mapping[str, measures.Nees]) -> Fault | None:
+    """Judge what `consistency` returns."""
+    for what, nees in found.items():
         low, high = nees.band(CONSISTENT)
         if not low <= nees.ratio <= high:
             name = 'covariance_small' if nees.ratio > high else 'covariance_large'
@@ -230,6 +256,16 @@ def covariance_fault(consistency: Sequence[tuple[str, measures.Nees]]) -> Fault 
                          f'the covariance says; consistent are {low:.3g} to {high:.3g}, for '
                          f'{nees.degrees:.0f} degrees of freedom')
     return None
+
+
+def divergence(outcome: Outcome, absolute: bool) -> Fault | None:
+    """Judge the error at the end."""
+    last = outcome.later(0.25)
+    error = error_of(last, True) if absolute else rms(last.errors.tilt)
+    if error < DIVERGED:
+        return None
+    return Fault('diverges', f'{last.run.name}: the error in the last quarter is '
+                 f'{_degrees(error)}, for no reason that is known')
 
 
 def in_order(faults: Sequence[Fault]) -> Iterator[Fault]:

@@ -2,7 +2,7 @@
 """The exam of a filter in Python: which runs it gets, and what follows from them."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -62,7 +62,7 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
         raise ValueError(f'seeds = {seeds!r}: must be a positive number, or integers >= 0')
     exam = _Exam(make_filter, values, [int(seed) for seed in numbers])
     exam.sit(EXTRA if level == 'full' else ())
-    return Report(subject or getattr(make_filter, '__name__', 'filter'),
+    return Report(subject or str(getattr(make_filter, '__name__', 'filter')),
                   tuple(diagnosis.in_order(exam.faults)), exam.measures, exam.outcomes)
 
 
@@ -80,30 +80,44 @@ class _Exam:
 
     def sit(self, extra: Sequence[Scenario]) -> None:
         """Do all the runs."""
-        try:
-            self._absolute = self._uses_field()
-        except InvalidOutputError as error:
-            self.faults.append(Fault('invalid_output', str(error)))
+        self._guard(self._ask_for_field)
         noisy = self._noisy_runs()
         if not noisy:
             return
-        self._marks(noisy)
-        for part in (self._judge_integration, self._judge_lever_arm, self._judge_bias):
-            try:
-                part()
-            except InvalidOutputError as error:
-                self.faults.append(Fault('invalid_output', str(error)))
+        self.measures |= diagnosis.marks(self.outcomes, self._absolute)
+        offset, fault = diagnosis.stamp_fault(noisy[0].later(), self._absolute)
+        self.measures['stamp_offset_s'] = offset.seconds
+        self._add(fault)
+        if not self.faults:
+            self._guard(self._judge_divergence)
+        if 'diverges' not in [one.name for one in self.faults]:     # else the rest says nothing
+            for part in (self._judge_integration, self._judge_lever_arm, self._judge_bias):
+                self._guard(part)
         for scenario in extra:
             outcome = self._try(scenario, self._seeds[0])
             if outcome is not None:
                 self.measures[f'tilt_rms_{scenario.name}_deg'] = math.degrees(
                     rms(outcome.later().errors.tilt))
-        self._judge_covariance(noisy)
-        error = diagnosis.error_of(noisy[0].later(0.25), self._absolute)
-        tilt = rms(noisy[0].later(0.25).errors.tilt)
-        if not self.faults and (error if self._absolute else tilt) > diagnosis.DIVERGED:
-            self.faults.append(Fault('diverges', 'after half a minute of slow motion the error is '
-                                     f'{math.degrees(error):.3g} deg, for no known reason'))
+        if not self.faults:
+            self._add(diagnosis.divergence(noisy[0], self._absolute))
+        consistency = diagnosis.consistency(noisy, self._absolute)
+        if consistency:
+            nees = consistency['attitude' if self._absolute else 'tilt']
+            low, high = nees.band()
+            self.measures |= {'nees': nees.ratio, 'nees_low': low, 'nees_high': high}
+            # An error that has another reason is no matter of the covariance.
+            self._add(None if self.faults else diagnosis.covariance_fault(consistency))
+
+    def _add(self, fault: Fault | None) -> None:
+        if fault is not None:
+            self.faults.append(fault)
+
+    def _guard(self, part: Callable[[], None]) -> None:
+        """Do a part of the exam; one that the filter fails does not end the others."""
+        try:
+            part()
+        except InvalidOutputError as error:
+            self._add(Fault('invalid_output', str(error)))
 
     def _run(self, scenario: Scenario, seed: int, given: Input | None = None,
              magnetometer: bool = True) -> Outcome:
@@ -115,69 +129,54 @@ class _Exam:
             return follow(self._make_filter, run, _both(self._correction.given, given),
                           self._correction.read, magnetometer)
         except InvalidOutputError as error:
-            scenario = run.scenario
-            raise InvalidOutputError(f'{scenario.name} at {scenario.rate:g} Hz, seed {run.seed}: '
-                                     f'{error}') from error
+            raise InvalidOutputError(f'{run.name}: {error}') from error
 
     def _try(self, scenario: Scenario, seed: int) -> Outcome | None:
         try:
             outcome = self._run(scenario, seed)
         except InvalidOutputError as error:
-            self.faults.append(Fault('invalid_output', str(error)))
+            self._add(Fault('invalid_output', str(error)))
             return None
         self.outcomes.append(outcome)
         return outcome
 
-    def _uses_field(self) -> bool:
-        """Return whether another field gives other attitudes."""
+    def _ask_for_field(self) -> None:
+        """Find out whether another field gives other attitudes: then the heading counts."""
         run = scenarios.record(scenarios.SLOW, self._imu, self._seeds[0]).part(
             slice(FIELD_ASKED))
         other = replace(run, magnetometer=run.magnetometer[:, [1, 2, 0]])
         one, two = (self._follow(fed).estimates for fed in (run, other))
-        return bool(np.max(np.abs(one - two)) > 1e-9)
+        self._absolute = bool(np.max(np.abs(one - two)) > 1e-9)
+
+    def _judge_divergence(self) -> None:
+        """Look at the errors without noise, bias and lever arm."""
+        self._add(diagnosis.divergence(self._run(scenarios.PIVOT, self._seeds[0]),
+                                       self._absolute))
 
     def _noisy_runs(self) -> list[Outcome]:
-        """Return the outcomes on the slow motion, and look for what explains a gross error."""
-        noisy = [outcome for seed in self._seeds
-                 if (outcome := self._try(scenarios.SLOW, seed)) is not None]
-        if not noisy:
+        """Return the outcomes on the slow motion, a misreading that explains them undone."""
+        said = {seed: outcome for seed in self._seeds
+                if (outcome := self._try(scenarios.SLOW, seed)) is not None}
+        if not said:
             return []
-        seed = noisy[0].run.seed
+        first = next(iter(said))
 
         def again(hypothesis: Hypothesis) -> Outcome:
-            return self._run(scenarios.SLOW, seed, hypothesis.given).later()
+            return self._run(scenarios.SLOW, first, hypothesis.given).later()
 
         try:
-            found = diagnosis.explain(noisy[0].later(), self._absolute, again)
-        except InvalidOutputError:      # of a filter that cannot take what it seems to need
-            found = diagnosis.explain(noisy[0].later(), self._absolute, None)
+            found = diagnosis.explain(said[first].later(), self._absolute, again)
+        except InvalidOutputError:      # of a filter that cannot take other readings
+            found = diagnosis.explain(said[first].later(), self._absolute, None)
         if found is None:
-            return noisy
+            return list(said.values())
         self.faults += [Fault(name, found.text) for name in found.faults]
-        # What is known is undone, so that it hides nothing else.
+        # So that it hides nothing else.
         self._correction = found
-        return [self._run(scenarios.SLOW, outcome.run.seed) for outcome in noisy]
-
-    def _marks(self, noisy: Sequence[Outcome]) -> None:
-        """Measure the errors on the slow motion; the means are those of all seeds."""
-        outcomes = self.outcomes[:len(noisy)]       # as they are, without corrections
-        errors = [outcome.later().errors for outcome in outcomes]
-        heading = [one.heading if self._absolute else one.heading - np.mean(one.heading)
-                   for one in errors]
-        fault: Fault | None
-        offset, fault = diagnosis.stamp_fault(noisy[0].later(), self._absolute)
-        self.measures |= {
-            'tilt_rms_deg': math.degrees(rms(np.concatenate([one.tilt for one in errors]))),
-            'tilt_max_deg': math.degrees(max(float(np.max(one.tilt)) for one in errors)),
-            'heading_rms_deg': math.degrees(rms(np.concatenate(heading))),
-            'convergence_s': max(measures.convergence_time(outcome.run.t, outcome.errors.tilt)
-                                 for outcome in outcomes),
-            'heading_drift_deg_per_s': math.degrees(float(np.mean([abs(measures.drift(
-                outcome.later().run.t, one.heading)) for outcome, one in zip(
-                    outcomes, errors, strict=True)]))),
-            'stamp_offset_s': offset.seconds}
-        if fault is not None:
-            self.faults.append(fault)
+        if found.given is None:
+            return [replace(outcome, estimates=found.read(outcome.estimates))
+                    for outcome in said.values()]
+        return [self._run(scenarios.SLOW, seed) for seed in said]
 
     def _judge_integration(self) -> None:
         """Compare sampling rates on the fast motion, without what could correct the heading."""
@@ -196,11 +195,9 @@ class _Exam:
         self.measures['order'] = measures.convergence_order(FINER, moved)
         self.measures['integration_error_deg'] = math.degrees(moved[0])
         corrected = self._run(finer[0], seed, diagnosis.for_first_order, magnetometer).later()
-        fault = diagnosis.first_order_fault(
+        self._add(diagnosis.first_order_fault(
             diagnosis.error_of(outcomes[0], absolute), diagnosis.error_of(corrected, absolute),
-            finer[0].rate)
-        if fault is not None:
-            self.faults.append(fault)
+            finer[0].rate))
 
     def _judge_lever_arm(self) -> None:
         """Compare the attitudes with and without a lever arm, and with and without noise."""
@@ -209,15 +206,13 @@ class _Exam:
                          for scenario in (scenarios.PIVOT, scenarios.LEVER_ARM))
         # The filter has settled before, so that this is no matter of its start.
         begin = len(still.t) // 3
-        moving = replace(still, scenario=moving.scenario, accelerometer=np.concatenate(
+        moving = replace(moving, accelerometer=np.concatenate(
             (still.accelerometer[:begin], moving.accelerometer[begin:])))
         pivot, arm = (self._follow(run).later() for run in (still, moving))
         effect = rms(measures.errors_of(arm.estimates, pivot.estimates).tilt)
         self.measures['lever_arm_deg'] = math.degrees(effect)
-        fault = diagnosis.lever_arm_fault(
-            effect, math.hypot(*scenarios.LEVER_ARM.values['imu.lever_arm']))
-        if fault is not None:
-            self.faults.append(fault)
+        self._add(diagnosis.lever_arm_fault(
+            effect, math.hypot(*scenarios.LEVER_ARM.values['imu.lever_arm'])))
         density = self._imu.get('imu.accelerometer_noise_density', 0.0)
         if density:
             noisy = self._run(scenarios.SLOW, seed).later()
@@ -227,31 +222,13 @@ class _Exam:
 
     def _judge_bias(self) -> None:
         """Compare two runs with opposite biases of the gyroscope."""
-        plus, minus = (self._run(replace(BIASED, bias=tuple(sign * part for part in BIAS)),
-                                 self._seeds[0]) for sign in (1.0, -1.0))
-        effect = diagnosis.bias_effect(plus, minus, self._absolute)
+        x, y, z = BIAS
+        plus, minus = (self._run(replace(BIASED, bias=bias), self._seeds[0])
+                       for bias in (BIAS, (-x, -y, -z)))
+        effect = diagnosis.bias_effect(plus, minus, np.array(BIAS), self._absolute)
         self.measures['bias_error_s'] = effect.late
         self.measures['bias_found'] = math.nan if effect.found is None else effect.found
-        fault = diagnosis.bias_fault(effect, self._absolute)
-        if fault is not None:
-            self.faults.append(fault)
-
-    def _judge_covariance(self, noisy: Sequence[Outcome]) -> None:
-        """Compare errors and covariances, where nothing else explains the errors."""
-        settled = [outcome.later(0.75) for outcome in noisy]
-        runs = [(outcome.estimates[outcome.read], outcome.run.truth[outcome.read],
-                 outcome.covariances) for outcome in settled if outcome.covariances is not None]
-        if not runs:
-            return
-        consistency = [('tilt', measures.nees_of(runs, False))]
-        if self._absolute:
-            consistency.append(('attitude', measures.nees_of(runs, True)))
-        _, nees = consistency[-1]
-        low, high = nees.band()
-        self.measures |= {'nees': nees.ratio, 'nees_low': low, 'nees_high': high}
-        fault = diagnosis.covariance_fault(consistency)
-        if fault is not None and not self.faults:
-            self.faults.append(fault)
+        self._add(diagnosis.bias_fault(effect, self._absolute))
 
 
 def _both(first: Input | None, second: Input | None) -> Input | None:

@@ -22,7 +22,13 @@ class Errors(NamedTuple):
 
     def attitude(self, absolute: bool) -> Reals:
         """Return tilt and heading together (n,); without a reference, the heading's change."""
-        return np.hypot(self.tilt, self.heading - (0.0 if absolute else np.mean(self.heading)))
+        return np.hypot(self.tilt, self.turned(absolute))
+
+    def turned(self, absolute: bool) -> Reals:
+        """Return the heading in [-pi, pi] (n,), relative to its mean unless it is absolute."""
+        phase = np.exp(1j * self.heading)
+        turned: Reals = np.angle(phase if absolute else phase * np.conj(np.mean(phase)))
+        return turned
 
 
 def errors_of(estimates: Reals, truth: Reals) -> Errors:

@@ -36,7 +36,7 @@ class ReferenceFilter:
                  bias_stddev: float = 0.02) -> None:
         self._densities = gyroscope_density, accelerometer_density
         self._field, self._field_variance = np.array(field), field_noise ** 2
-        self._quaternion: Reals | None = None
+        self._quaternion = np.empty(0)      # before the first update
         self._p = np.diag([0.5 ** 2] * 3 + [bias_stddev ** 2] * 3)
         self._disturbed_s = 0.0
         self.bias = np.zeros(3)
@@ -44,12 +44,13 @@ class ReferenceFilter:
     @property
     def covariance(self) -> Reals:
         """Of the rotation vector from the estimate to the truth, sensor frame (3, 3) [rad^2]."""
-        return self._p[:3, :3]
+        covariance: Reals = self._p[:3, :3]
+        return covariance
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
         """Take the readings of a step of dt [s]; return q(world <- sensor) as x, y, z, w."""
-        if self._quaternion is None:
+        if not len(self._quaternion):
             self._quaternion = from_two_vectors(accelerometer, magnetometer)
         else:
             self.predict(gyroscope - self.bias, dt)

@@ -5,14 +5,15 @@ The motions of the exam, and what an IMU on them reads.
 Each motion shows a fault that the others hide.  A seed decides the noise, and varies the start.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.imu import Imu
@@ -79,34 +80,42 @@ COMMAND = replace(WAVES, name='command', reversals=(20.0,))
 
 
 @dataclass(frozen=True)
-class Run:
+class Truth:
     """
-    What an IMU reads along a motion, and the truth, at the ends of n steps.
+    The true motion of a sensor at n times.
+
+    name : of the motion
+    t, dt : time and length of the step that ends there, by the stamps [s], (n,)
+    truth : q(world <- sensor) as x, y, z, w (n, 4)
+    rates : true angular velocity in the frame of the sensor (n, 3) [rad/s]
+    """
+
+    name: str
+    t: Reals
+    dt: Reals
+    truth: Reals
+    rates: Reals
+
+    def part(self, rows: slice | NDArray[np.int64]) -> Self:
+        """Return the motion at these times only."""
+        return replace(self, **{one.name: getattr(self, one.name)[rows] for one in fields(self)
+                                if one.name != 'name'})
+
+
+@dataclass(frozen=True)
+class Run(Truth):
+    """
+    What an IMU reads along a motion.
 
     The gyroscope's reading is the mean over the step that ends, as of an integrating sensor; the
     other readings are of its end.
 
-    t, dt : time and length of the step, by the stamps [s], (n,)
     gyroscope, accelerometer, magnetometer : in the frame of the IMU, (n, 3) [rad/s], [m/s^2], [T]
-    truth : q(world <- IMU) as x, y, z, w (n, 4)
-    rates : true angular velocity at the end of the step (n, 3) [rad/s]
     """
 
-    scenario: Scenario
-    seed: int
-    t: Reals
-    dt: Reals
     gyroscope: Reals
     accelerometer: Reals
     magnetometer: Reals
-    truth: Reals
-    rates: Reals
-    values: Mapping[str, Any] = field(repr=False)
-
-    def part(self, rows: slice | NDArray[np.int64]) -> 'Run':
-        """Return the run with these samples only."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in (
-            't', 'dt', 'gyroscope', 'accelerometer', 'magnetometer', 'truth', 'rates')})
 
 
 def record(scenario: Scenario, imu: Mapping[str, Any], seed: int) -> Run:
@@ -125,37 +134,47 @@ def record(scenario: Scenario, imu: Mapping[str, Any], seed: int) -> Run:
     simulation, device = Simulation(values), Imu(values)
     period_ns = 2 * round(0.5 * NANOSECONDS / scenario.rate)
     end_ns = round(scenario.duration * scenario.rate) * period_ns
-    stops = [round(t * scenario.rate) * period_ns for t in scenario.reversals]
-    parts: list[tuple[Sequence[Any], ...]] = []
-    begin_ns = 0
-    for stop_ns in (*stops, end_ns):
-        halves = simulation.segment.states(range(begin_ns, stop_ns + 1, period_ns // 2))
+    parts, begin_ns = [], 0
+    for stop_ns in (*(round(t * scenario.rate) * period_ns for t in scenario.reversals), end_ns):
         steps = range(begin_ns + period_ns, stop_ns + 1, period_ns)
-        rates, force = (np.broadcast_arrays(*vector, np.empty(len(halves)))[:3]
-                        for vector in device.true(halves))
-        # Simpson's rule: exact to 1e-6 of the change within a step.
-        mean = tuple((rate[:-2:2] + 4.0 * rate[1::2] + rate[2::2]) / 6.0 for rate in rates)
-        at_end = tuple(column[2::2] for column in force)
-        readings = device.sensor(period_ns).read((mean, at_end), steps)
-        orientation = tuple(column[2::2] for column in device.orientation(halves))
-        parts.append((*readings[0], *readings[1], *attitude.in_body(orientation, FIELD),
-                      *orientation, *(rate[2::2] for rate in rates)))
+        halves = simulation.segment.states(range(begin_ns, stop_ns + 1, period_ns // 2))
+        parts.append(_readings(device, halves, steps))
         if stop_ns < end_ns:
             simulation.skip_to(stop_ns)
             simulation.command(-simulation.l3, -simulation.lz)
         begin_ns = stop_ns
-    columns = np.concatenate([np.stack(np.broadcast_arrays(*part)) for part in parts], axis=1).T
-    gyroscope, accelerometer, magnetometer, truth, rates_at_end = np.split(
-        columns, (3, 6, 9, 13), axis=1)
+    gyroscope, accelerometer, magnetometer, truth, rates = np.split(
+        np.concatenate(parts, axis=1).T, (3, 6, 9, 13), axis=1)
     if scenario.noisy:
         magnetometer = magnetometer + FIELD_NOISE * random.standard_normal(magnetometer.shape)
     period = period_ns / NANOSECONDS
-    t = period * np.arange(1, len(columns) + 1)
+    t = period * np.arange(1, len(truth) + 1)
     stamps = t + scenario.jitter * random.standard_normal(len(t))
-    run = Run(scenario, seed, stamps, np.full(len(t), period), gyroscope + scenario.bias,
-              accelerometer, magnetometer, truth, rates_at_end, values)
+    stamps[0] = t[0]            # some filters take the first step for all of them
+    run = Run(f'{scenario.name} at {scenario.rate:g} Hz, seed {seed}', stamps,
+              np.full(len(t), period), truth, rates, gyroscope + scenario.bias, accelerometer,
+              magnetometer)
     if not (scenario.jitter or scenario.drop_rate):
         return run
     kept = np.flatnonzero(random.random(len(t)) >= scenario.drop_rate)
+    kept[0] = 0
     run = run.part(kept)
     return replace(run, dt=np.diff(run.t, prepend=0.0))
+
+
+def _readings(device: Imu, halves: States, steps: range) -> Reals:
+    """
+    Return what an IMU reads, attitude and rates at the ends of steps, (16, n).
+
+    halves : states at the begin, the middle and the end of each step
+    steps : their ends [ns]
+    """
+    rates, force = (np.stack(np.broadcast_arrays(*vector, np.empty(len(halves)))[:3])
+                    for vector in device.true(halves))
+    # Simpson's rule.
+    mean = (rates[:, :-2:2] + 4.0 * rates[:, 1::2] + rates[:, 2::2]) / 6.0
+    gyroscope, accelerometer = device.sensor(steps.step).read(
+        ((mean[0], mean[1], mean[2]), (force[0, 2::2], force[1, 2::2], force[2, 2::2])), steps)
+    x, y, z, w = (column[2::2] for column in device.orientation(halves))
+    return np.stack([*gyroscope, *accelerometer, *attitude.in_body((x, y, z, w), FIELD),
+                     x, y, z, w, *rates[:, 2::2]])

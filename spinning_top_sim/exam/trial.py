@@ -4,13 +4,13 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spinning_top_sim.exam.measures import Errors, errors_of
-from spinning_top_sim.exam.scenarios import Reals, Run
+from spinning_top_sim.exam.scenarios import Reals, Run, Truth
 
 # A covariance and a bias are read after so many updates.
 READ_EVERY = 10
@@ -54,14 +54,14 @@ class InvalidOutputError(Exception):
 @dataclass(frozen=True)
 class Outcome:
     """
-    What a filter said along a run.
+    What a filter said along a motion.
 
     estimates : q(world <- sensor) (n, 4), of norm 1
     read : numbers of the samples after which covariance and bias were read (m,)
     covariances, biases : (m, 3, 3) [rad^2] and (m, 3) [rad/s]; None if the filter has none
     """
 
-    run: Run
+    run: Truth
     estimates: Reals
     read: NDArray[np.int64]
     covariances: Reals | None
@@ -144,8 +144,7 @@ def _quaternions(said: list[object]) -> Reals:
         rows = np.empty(0)
     if rows.shape != (len(said), 4):
         for k, one in enumerate(said):
-            shape = np.shape(one) if one is not None else None      # type: ignore[arg-type]
-            if shape != (4,):
+            if (shape := _shape(one)) != (4,):
                 raise InvalidOutputError(
                     f'update {k + 1} returns {_short(one)}'
                     + (f' of shape {shape}' if shape else '') + ': must be 4 numbers x, y, z, w')
@@ -161,6 +160,13 @@ def _quaternions(said: list[object]) -> Reals:
     return unit
 
 
+def _shape(value: Any) -> tuple[int, ...] | None:
+    try:
+        return np.shape(value)
+    except ValueError:          # rows of several lengths
+        return None
+
+
 def _short(value: object) -> str:
     text = ' '.join(str(value).split())
     return text if len(text) < 80 else f'{text[:77]}...'
@@ -168,7 +174,7 @@ def _short(value: object) -> str:
 
 def _checked(name: str, values: list[object], shape: tuple[int, ...]) -> Reals | None:
     """Return what a filter says of itself (m, ...), None if it says nothing."""
-    if any(np.shape(value) == () for value in values):     # type: ignore[arg-type]
+    if any(_shape(value) == () for value in values):
         return None
     for value in values:
         array = np.asarray(value)

@@ -69,11 +69,11 @@ class TwiceCovariance(ReferenceFilter):
     covariance = property(lambda self: 2.0 * self._p[:3, :3])
 
 
-class MirroredAxis(ReferenceFilter):
-    """One axis of the gyroscope has the wrong sign."""
+class Mirrored(ReferenceFilter):
+    """The gyroscope has the wrong sign."""
 
     def update(self, gyroscope, accelerometer, magnetometer, dt):
-        return super().update(gyroscope * (1.0, 1.0, -1.0), accelerometer, magnetometer, dt)
+        return super().update(-gyroscope, accelerometer, magnetometer, dt)
 
 
 class NotANumber(ReferenceFilter):
@@ -86,4 +86,4 @@ FAULTY = {
     'conjugated': Conjugated, 'component_order': WFirst, 'frame_ned': NorthEastDown,
     'gravity_sign': GravityDown, 'lever_arm': TakesForceForGravity, 'stamp_offset': Late,
     'no_bias_estimate': WithoutBias, 'covariance_small': HalfCovariance,
-    'covariance_large': TwiceCovariance, 'diverges': MirroredAxis, 'invalid_output': NotANumber}
+    'covariance_large': TwiceCovariance, 'diverges': Mirrored, 'invalid_output': NotANumber}
