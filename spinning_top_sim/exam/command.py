@@ -41,7 +41,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--truth', help='topic of the truth; default: ground_truth/imu, ground_truth/odom or pose')
     add('--heading', action='store_true',
         help='the heading must be right, not only steady: the filter has a magnetometer')
-    add('--filter', choices=FILTERS, help='examine a published filter')
+    add('--filter', choices=FILTERS, metavar='NAME',
+        help=f'examine a published filter: {", ".join(FILTERS)}')
     add('--level', choices=SEEDS, default='quick', help='of the exam of a filter')
     add('--imu', metavar='FILE', help='parameter file of the IMU, as in config/imu')
     add('--seeds', type=int, metavar='N', help='number of noisy runs')

@@ -144,16 +144,14 @@ def explain(outcome: Outcome, absolute: bool,
     before = error_of(outcome, absolute)
     if before < GROSS:
         return None
-    tried: list[tuple[float, Hypothesis]] = []
-    for hypothesis in READINGS:
-        errors = errors_of(hypothesis.read(outcome.estimates), outcome.run.truth)
-        tried.append((rms(errors.attitude(absolute)), hypothesis))
-    if again is not None:
-        tried += [(error_of(again(hypothesis), absolute), hypothesis) for hypothesis in REPEATED]
+    tried = [(rms(errors_of(one.read(outcome.estimates), outcome.run.truth).attitude(absolute)),
+              one) for one in READINGS]
+    if again is not None and min(error for error, _ in tried) > EXPLAINED * before:
+        tried += [(error_of(again(one), absolute), one) for one in REPEATED]
     after, best = min(tried, key=lambda pair: pair[0])
     if after > EXPLAINED * before:
         return None
-    text = (f'{best.text}, the error falls from {_degrees(before)} to {_degrees(after)}')
+    text = f'{best.text}, the error falls from {_degrees(before)} to {_degrees(after)}'
     if not absolute and best in (NED_WORLD, GRAVITY_SIGN):
         best = best._replace(faults=('frame_ned', 'gravity_sign'))
         text += '; the two cannot be told apart without a heading'

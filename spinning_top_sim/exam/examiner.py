@@ -4,6 +4,7 @@
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -91,7 +92,8 @@ class _Exam:
         if not self.faults:
             self._guard(self._judge_divergence)
         if 'diverges' not in [one.name for one in self.faults]:     # else the rest says nothing
-            for part in (self._judge_integration, self._judge_lever_arm, self._judge_bias):
+            for part in (self._judge_integration, partial(self._judge_lever_arm, noisy[0]),
+                         self._judge_bias):
                 self._guard(part)
         for scenario in extra:
             outcome = self._try(scenario, self._seeds[0])
@@ -150,8 +152,7 @@ class _Exam:
 
     def _judge_divergence(self) -> None:
         """Look at the errors without noise, bias and lever arm."""
-        self._add(diagnosis.divergence(self._run(scenarios.PIVOT, self._seeds[0]),
-                                       self._absolute))
+        self._add(diagnosis.divergence(self._pivot, self._absolute))
 
     def _noisy_runs(self) -> list[Outcome]:
         """Return the outcomes on the slow motion, a misreading that explains them undone."""
@@ -199,24 +200,28 @@ class _Exam:
             diagnosis.error_of(outcomes[0], absolute), diagnosis.error_of(corrected, absolute),
             finer[0].rate))
 
-    def _judge_lever_arm(self) -> None:
+    @cached_property
+    def _pivot(self) -> Outcome:
+        """What the filter says without noise, bias and lever arm."""
+        return self._run(scenarios.PIVOT, self._seeds[0])
+
+    def _judge_lever_arm(self, noisy: Outcome) -> None:
         """Compare the attitudes with and without a lever arm, and with and without noise."""
         seed = self._seeds[0]
         still, moving = (scenarios.record(scenario, self._imu, seed)
                          for scenario in (scenarios.PIVOT, scenarios.LEVER_ARM))
         # The filter has settled before, so that this is no matter of its start.
         begin = len(still.t) // 3
-        moving = replace(moving, accelerometer=np.concatenate(
-            (still.accelerometer[:begin], moving.accelerometer[begin:])))
-        pivot, arm = (self._follow(run).later() for run in (still, moving))
+        arm = self._follow(replace(moving, accelerometer=np.concatenate(
+            (still.accelerometer[:begin], moving.accelerometer[begin:])))).later()
+        pivot = self._pivot.later()
         effect = rms(measures.errors_of(arm.estimates, pivot.estimates).tilt)
         self.measures['lever_arm_deg'] = math.degrees(effect)
         self._add(diagnosis.lever_arm_fault(
             effect, math.hypot(*scenarios.LEVER_ARM.values['imu.lever_arm'])))
         density = self._imu.get('imu.accelerometer_noise_density', 0.0)
         if density:
-            noisy = self._run(scenarios.SLOW, seed).later()
-            tilt = rms(measures.errors_of(noisy.estimates, pivot.estimates).tilt)
+            tilt = rms(measures.errors_of(noisy.later().estimates, pivot.estimates).tilt)
             sample = density * math.sqrt(scenarios.SLOW.rate) / scenarios.GRAVITY
             self.measures['noise_gain'] = tilt / (math.sqrt(2.0) * sample)
 

@@ -26,6 +26,7 @@ from spinning_top_sim.recording.reader import LogReader, LogTopic
 TRUTHS = ('ground_truth/imu', 'ground_truth/odom', 'pose')
 OF_SENSOR = 'ground_truth/imu'
 LONGEST_GAP_S = 0.1             # of the truth, for attitudes between two of its samples
+NO_ORIENTATION = -1.0           # sensor_msgs/Imu has it in the covariance
 FEWEST = 100                    # attitudes that say something
 
 
@@ -158,10 +159,12 @@ def _decode(data: bytes, layout: Layout, name: str) -> tuple[int, Reals, Reals]:
         if layout.covariance:
             size = layout.covariance
             matrix = np.frombuffer(data, f'{order}f8', size * size, at + 32).reshape(size, size)
-            if matrix[0, 0] >= 0.0 and np.any(matrix[-3:, -3:]):    # sensor_msgs: 0 is unknown
+            if matrix[0, 0] == NO_ORIENTATION:
+                raise ValueError('it has no orientation')
+            if np.any(matrix[-3:, -3:]):    # sensor_msgs: 0 is unknown
                 covariance = matrix[-3:, -3:]
     except (struct.error, ValueError) as error:
-        raise ValueError(f'a message of {name} cannot be decoded: {error}') from error
+        raise ValueError(f'a message of {name} cannot be read: {error}') from error
     return seconds * 10 ** 9 + nanoseconds, quaternion, covariance
 
 

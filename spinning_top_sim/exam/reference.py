@@ -2,6 +2,7 @@
 """A filter without the faults that the exam looks for: it is what the exam itself is tested on."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from spinning_top_sim.exam.scenarios import CALIBRATED, FIELD, FIELD_NOISE, GRAV
 LARGEST_DEVIATION = 5.0
 # What is assumed of it then [m/s^2], and for how long [s].
 DISTURBED, DISTURBED_S = 0.5 * GRAVITY, 2.0
+UP = np.array((0.0, 0.0, GRAVITY))
 
 
 class ReferenceFilter:
@@ -62,9 +64,10 @@ class ReferenceFilter:
             self._disturbed_s = DISTURBED_S
         if self._disturbed_s > 0.0:
             variance = DISTURBED ** 2
-        self._correct(accelerometer, np.array((0.0, 0.0, GRAVITY)), variance)
+        pairs = [(accelerometer, UP, variance)]
         if magnetometer is not None:
-            self._correct(magnetometer, self._field, self._field_variance)
+            pairs.append((magnetometer, self._field, self._field_variance))
+        self._correct(pairs)
         return self._quaternion.copy()
 
     def predict(self, rates: Reals, dt: float) -> None:
@@ -81,17 +84,21 @@ class ReferenceFilter:
         """Return a quaternion after a turn by a rotation vector in the frame of the sensor."""
         return product(quaternion, exponential(turn))
 
-    def _correct(self, reading: Reals, world: Reals, variance: float) -> None:
-        """Compare a vector with what it is in the world; both have the same unit."""
-        expected = matrix_of(self._quaternion).T @ world
-        h = np.zeros((3, 6))
-        h[:, :3] = _cross(expected)
-        gain = np.linalg.solve(h @ self._p @ h.T + variance * np.eye(3), h @ self._p).T
-        change = gain @ (reading - expected)
+    def _correct(self, pairs: Sequence[tuple[Reals, Reals, float]]) -> None:
+        """Compare readings with the vectors in the world that they are of; each has a variance."""
+        into_sensor = matrix_of(self._quaternion).T
+        expected = [into_sensor @ world for _, world, _ in pairs]
+        h = np.concatenate([_cross(vector) for vector in expected])
+        residual = np.concatenate([reading for reading, _, _ in pairs]) - np.concatenate(expected)
+        with_reading = self._p[:, :3] @ h.T
+        innovation = h @ with_reading[:3]
+        innovation.flat[::len(h) + 1] += np.repeat([variance for _, _, variance in pairs], 3)
+        gain = with_reading @ np.linalg.inv(innovation)
+        change = gain @ residual
         self._quaternion = product(self._quaternion, exponential(change[:3]))
         self.bias = self.bias + change[3:]
-        kept = np.eye(6) - gain @ h
-        self._p = kept @ self._p @ kept.T + variance * gain @ gain.T
+        p = self._p - gain @ with_reading.T
+        self._p = 0.5 * (p + p.T)       # else rounding makes it indefinite
 
 
 def product(p: Reals, q: Reals) -> Reals:

@@ -69,7 +69,7 @@ PIVOT = replace(LEVER_ARM, name='pivot', values={
 # Fast steady precession.  The errors of a step are odd in the rates: where these change their
 # sign, no estimate of a bias can hide them.
 FAST = Scenario('fast', {'spin.l3': 1.6, 'spin.lz': 1.7816, 'initial.theta': 0.5236},
-                duration=12.0, reversals=(3.0, 6.0, 9.0), noisy=False)
+                duration=8.0, reversals=(2.0, 4.0, 6.0), noisy=False)
 # Small waves through the upward vertical, and a top that falls from it.
 POLE = Scenario('pole', {'spin.l3': 1.6, 'spin.lz': 1.6, 'initial.theta': 0.0,
                          'initial.theta_dot': 2.0})

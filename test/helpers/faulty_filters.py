@@ -1,59 +1,62 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The reference filter of the exam, with one fault each."""
+"""Filters with one fault each, for the exam to find."""
 
 from collections import deque
+from functools import partial
 
 import numpy as np
 
-from spinning_top_sim.exam import reference
-from spinning_top_sim.exam.reference import ReferenceFilter
+from spinning_top_sim.exam.reference import ReferenceFilter, product
+
+HALF = 0.5 ** 0.5
+
+
+class Misreading:
+    """Another filter, of which readings or attitudes are taken for what they are not."""
+
+    def __init__(self, make_filter, rates=1.0, force=1.0, said=lambda q: q):
+        self._filter = make_filter()
+        self._rates, self._force, self._said = rates, force, said
+
+    def __getattr__(self, name):
+        return getattr(self._filter, name)
+
+    def update(self, gyroscope, accelerometer, magnetometer, dt):
+        return self._said(self._filter.update(self._rates * gyroscope, self._force * accelerometer,
+                                              magnetometer, dt))
+
+
+class Late(Misreading):
+    """Its attitudes are 50 ms old."""
+
+    def __init__(self, make_filter):
+        super().__init__(make_filter)
+        self._kept = deque()
+
+    def update(self, gyroscope, accelerometer, magnetometer, dt):
+        self._kept.append(super().update(gyroscope, accelerometer, magnetometer, dt))
+        return self._kept.popleft() if len(self._kept) > round(0.05 / dt) else self._kept[0]
+
+
+# What every filter may misread.
+MISREADINGS = {
+    'gyroscope_units': partial(Misreading, rates=np.pi / 180.0),
+    'conjugated': partial(Misreading, said=lambda q: q * (-1.0, -1.0, -1.0, 1.0)),
+    'component_order': partial(Misreading, said=lambda q: q[[3, 0, 1, 2]]),
+    'frame_ned': partial(Misreading, said=partial(product, np.array((HALF, HALF, 0.0, 0.0)))),
+    'gravity_sign': partial(Misreading, force=-1.0),
+    'stamp_offset': Late,
+    'diverges': partial(Misreading, rates=-1.0),
+    'invalid_output': partial(Misreading, said=lambda q: q * np.nan)}
 
 
 class FirstOrder(ReferenceFilter):
     def integrate(self, quaternion, turn):
-        return reference.product(quaternion, np.array((*(0.5 * turn), 1.0)))
-
-
-class DegreesPerSecond(ReferenceFilter):
-    def update(self, gyroscope, accelerometer, magnetometer, dt):
-        return super().update(np.radians(gyroscope), accelerometer, magnetometer, dt)
-
-
-class Conjugated(ReferenceFilter):
-    def update(self, *readings):
-        return super().update(*readings) * (-1.0, -1.0, -1.0, 1.0)
-
-
-class WFirst(ReferenceFilter):
-    def update(self, *readings):
-        return super().update(*readings)[[3, 0, 1, 2]]
-
-
-class NorthEastDown(ReferenceFilter):
-    def update(self, *readings):
-        half = np.array((0.5 ** 0.5, 0.5 ** 0.5, 0.0, 0.0))
-        return reference.product(half, super().update(*readings))
-
-
-class GravityDown(ReferenceFilter):
-    def update(self, gyroscope, accelerometer, magnetometer, dt):
-        return super().update(gyroscope, -accelerometer, magnetometer, dt)
+        return product(quaternion, np.array((*(0.5 * turn), 1.0)))
 
 
 class TakesForceForGravity(ReferenceFilter):
     is_gravity_trusted = True
-
-
-class Late(ReferenceFilter):
-    """Its attitudes are 50 ms old."""
-
-    def __init__(self):
-        super().__init__()
-        self._said = deque()
-
-    def update(self, gyroscope, accelerometer, magnetometer, dt):
-        self._said.append(super().update(gyroscope, accelerometer, magnetometer, dt))
-        return self._said.popleft() if len(self._said) > round(0.05 / dt) else self._said[0]
 
 
 class WithoutBias(ReferenceFilter):
@@ -69,21 +72,9 @@ class TwiceCovariance(ReferenceFilter):
     covariance = property(lambda self: 2.0 * self._p[:3, :3])
 
 
-class Mirrored(ReferenceFilter):
-    """The gyroscope has the wrong sign."""
-
-    def update(self, gyroscope, accelerometer, magnetometer, dt):
-        return super().update(-gyroscope, accelerometer, magnetometer, dt)
-
-
-class NotANumber(ReferenceFilter):
-    def update(self, gyroscope, accelerometer, magnetometer, dt):
-        return super().update(gyroscope, accelerometer, magnetometer, dt) * np.nan
-
-
+# The reference filter with each fault.
 FAULTY = {
-    'first_order_integration': FirstOrder, 'gyroscope_units': DegreesPerSecond,
-    'conjugated': Conjugated, 'component_order': WFirst, 'frame_ned': NorthEastDown,
-    'gravity_sign': GravityDown, 'lever_arm': TakesForceForGravity, 'stamp_offset': Late,
+    'first_order_integration': FirstOrder, 'lever_arm': TakesForceForGravity,
     'no_bias_estimate': WithoutBias, 'covariance_small': HalfCovariance,
-    'covariance_large': TwiceCovariance, 'diverges': Mirrored, 'invalid_output': NotANumber}
+    'covariance_large': TwiceCovariance,
+    **{name: partial(misread, ReferenceFilter) for name, misread in MISREADINGS.items()}}
