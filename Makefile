@@ -47,8 +47,9 @@ help:
 	@echo 'make test    run the tests; TESTS=... selects some, ARGS=... goes to pytest,'
 	@echo '             which has WORKERS=$(WORKERS) processes (0: its own, for ARGS=--pdb)'
 	@echo 'make stress  kill 200 recording nodes (KILLS=...), try random logs, parameters,'
-	@echo '             commands, service calls and disk faults (each SECONDS=600), then'
-	@echo '             100 000 random tops (STRESS=...) with both solvers; two hours'
+	@echo '             commands, service calls, disk faults and the statistics of the'
+	@echo '             sensors (each SECONDS=600), then 100 000 random tops (STRESS=...)'
+	@echo '             with both solvers; two hours'
 	@echo 'make performance'
 	@echo '             measure node, start-up, a long run, solvers and simulate, and write'
 	@echo '             docs/performance.md; an hour and a half, in .venv-benchmark'
@@ -98,7 +99,7 @@ KILLS ?= 200
 SECONDS ?= 600
 stress: dependencies
 	KILLS=$(KILLS) '$(VENV)/bin/pytest' -q test/test_kill.py
-	for part in logs values nodes services disk; do \
+	for part in logs values nodes services disk sensor; do \
 	    '$(VENV)/bin/python' test/stress $$part --seconds $(SECONDS) || failed=1; \
 	done; \
 	'$(VENV)/bin/python' test/stress tops --count $(STRESS) && test -z "$$failed"

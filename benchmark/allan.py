@@ -35,6 +35,11 @@ KINDS = (('gyroscope', 'rad/s'), ('accelerometer', 'm/s²'))
 COMMANDED = {'imu.gyroscope_noise_density': 1e-3, 'imu.gyroscope_random_walk': 5e-3,
              'imu.accelerometer_noise_density': 2e-2, 'imu.accelerometer_random_walk': 4e-2}
 PRESET = 'adis16470'
+# A flicker bias whose band has thousands of independent averages in three hours.
+BAND = (0.05, 5.0)
+FLICKER = {'imu.gyroscope_bias_instability': 1e-3, 'imu.accelerometer_bias_instability': 2e-2,
+           'imu.bias_instability_band': BAND}
+FLAT = 0.10
 # Longest averaging time [s]: longer ones have few independent averages.
 LONGEST = 128.0
 STRETCH_NS = 600 * 10 ** 9
@@ -57,13 +62,14 @@ def main() -> None:
                    for i, pair in enumerate(found)]
         rows += compared(seed, COMMANDED, found)
     preset = {name: value for name, value in read_scene(
-        ROOT / f'config/imu/{PRESET}.yaml').items() if name.endswith(('_density', '_walk'))}
+        ROOT / f'config/imu/{PRESET}.yaml').items() if name.endswith(('_density', '_instability'))}
     preset_rows = []
     for seed in seeds:
         raw, bias = simulate({**preset, 'seed': seed}, options.hours)
         noises = [fit(*allan(axis))[0] for axis in (raw - bias).T]
-        walks = [fit(*allan(axis, 4.0 * PERIOD))[1] for axis in bias.T]
-        preset_rows += compared(seed, preset, list(zip(noises, walks, strict=True)))
+        flats = [flat_of(*allan(axis)) for axis in bias.T]
+        preset_rows += compared(seed, preset, list(zip(noises, flats, strict=True)), 'B')
+    tau, flicker, ends = flicker_over_band(seeds, options.hours)
     assert curves is not None
     draw(curves, options.hours)
     worst = max(float(row[-1].rstrip(' %')) for row in (*rows, *preset_rows)) / 100.0
@@ -76,7 +82,16 @@ def main() -> None:
                             else 'NOT all within'),
         '## Readings\n', FROM_READINGS.format(noise=spread[0], walk=spread[1]),
         report.table(heads, rows),
-        f'## The preset {PRESET}\n', FROM_BIAS, report.table(heads, preset_rows)]))
+        f'## The preset {PRESET}\n', FROM_BIAS, report.table(heads, preset_rows),
+        '## Bias instability\n', FROM_FLICKER.format(
+            band=BAND, flat=FLAT, seeds=len(seeds), axes=6 * len(seeds),
+            worst=np.abs(flicker - 1.0).max()),
+        report.table(('tau [s]', 'Allan deviation over the parameter', 'smallest axis',
+                      'largest axis'),
+                     [[f'{t:.3g}', f'{f:.3f}', f'{low:.3f}', f'{high:.3f}']
+                      for t, f, (low, high) in zip(tau, flicker, ends, strict=True)])]))
+    if np.abs(flicker - 1.0).max() >= FLAT:
+        raise SystemExit(f'the bias instability is not flat: {flicker}')
     if worst >= LIMIT:
         raise SystemExit(f'off by {worst:.1%}: more than {LIMIT:.0%}')
 
@@ -101,9 +116,16 @@ standard deviation of the relative error over seeds and axes is {noise:.2%} for 
 for K.
 """
 FROM_BIAS = """\
-The random walks of a real device are below the white noise for seconds. Here N is estimated from
-`imu/data_raw` minus `ground_truth/imu_bias`, and K from `ground_truth/imu_bias`, over averages of
-up to 4 samples.
+The bias instability of a real device is below the white noise for seconds. Here N is estimated
+from `imu/data_raw` minus `ground_truth/imu_bias`, and B, the flat of the Allan deviation, from
+`ground_truth/imu_bias`, over averages of 1 s and more.
+"""
+FROM_FLICKER = """\
+The parameter is the flat of the Allan deviation; the coefficient B of IEEE Std 952 is that over
+0.664. The bias is a sum of Gauss-Markov processes. Over the band `imu.bias_instability_band`, here
+{band[0]:g} s to {band[1]:g} s, the Allan deviation of `ground_truth/imu_bias` is within {flat:.0%}
+of the parameter; the largest difference is {worst:.1%}. The table has the root mean square over
+{seeds} seeds and six axes each, and the extremes of these {axes} curves.
 """
 
 
@@ -148,21 +170,43 @@ def fit(tau: np.ndarray, deviation: np.ndarray, count: int) -> tuple[float, floa
     return float(noise), float(walk)
 
 
-def commanded_of(values: dict[str, float], kind: str) -> tuple[float, float]:
-    """Return N and K of a kind of axes."""
-    return values[f'imu.{kind}_noise_density'], values[f'imu.{kind}_random_walk']
+def flat_of(tau: np.ndarray, deviation: np.ndarray, count: int) -> float:
+    """Return the mean Allan deviation from 1 s on, weighted by the independent averages."""
+    late = tau >= 1.0
+    return float(np.average(deviation[late], weights=1.0 / tau[late]))
+
+
+def flicker_over_band(seeds: Sequence[int], hours: float) -> tuple[
+        np.ndarray, np.ndarray, list[tuple[float, float]]]:
+    """Return averaging times, Allan deviations over the parameter, and extremes of the axes."""
+    tau = np.unique(np.round(np.geomspace(*BAND, 9) / PERIOD)) * PERIOD
+    curves = []
+    for seed in seeds:
+        _, bias = simulate({**FLICKER, 'seed': seed}, hours)
+        for i, axis in enumerate(bias.T):
+            _, deviation, _, _ = allantools.oadev(axis, rate=RATE, data_type='freq', taus=tau)
+            curves.append(deviation / FLICKER[f'imu.{KINDS[i // 3][0]}_bias_instability'])
+    found = np.array(curves)
+    return (tau, np.sqrt(np.mean(found ** 2, axis=0)),
+            list(zip(found.min(axis=0), found.max(axis=0), strict=True)))
+
+
+def commanded_of(values: dict[str, float], kind: str, second: str = 'K') -> tuple[float, float]:
+    """Return N, and K or B, of a kind of axes."""
+    name = {'K': 'random_walk', 'B': 'bias_instability'}[second]
+    return values[f'imu.{kind}_noise_density'], values[f'imu.{kind}_{name}']
 
 
 def compared(seed: int, commanded: dict[str, float], found: Sequence[tuple[float, float]],
-             ) -> list[list[str]]:
-    """Return a row for each kind of axes and each density."""
+             second: str = 'K') -> list[list[str]]:
+    """Return a row for each kind of axes and each figure: N, and K or B."""
     rows = []
     for i, (kind, unit) in enumerate(KINDS):
-        for j, (symbol, per) in enumerate((('N', '√s'), ('K', '/√s'))):
-            right = commanded_of(commanded, kind)[j]
+        for j, (symbol, per) in enumerate((('N', ' √s'), (second, ' /√s' * (second == 'K')))):
+            right = commanded_of(commanded, kind, second)[j]
             axes = [one[j] for one in found[3 * i:3 * i + 3]]
             worst = max(abs(value / right - 1.0) for value in axes)
-            rows.append([str(seed), kind, f'{symbol} [{unit} {per}]', f'{right:.4g}',
+            rows.append([str(seed), kind, f'{symbol} [{unit}{per}]', f'{right:.4g}',
                          *(f'{value:.4g}' for value in axes), f'{100.0 * worst:.2f} %'])
             print(rows[-1], flush=True)
     return rows

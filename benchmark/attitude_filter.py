@@ -52,7 +52,7 @@ def example() -> ModuleType:
 
 
 FILTERS = example()
-NAMES = tuple(FILTERS.FILTERS)
+NAMES = tuple(name for name in FILTERS.FILTERS if name not in FILTERS.NINE_AXES)
 
 
 def main() -> None:

@@ -5,7 +5,7 @@
 from pathlib import Path
 
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, all_streams
+from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING, all_streams
 
 HEAD = """<!-- Written by docs/interface.py from the code. -->
 # Interface of sim_node
@@ -30,10 +30,14 @@ AFTER_TOPICS = """| `/diagnostics` | diagnostic_msgs/msg/DiagnosticArray | 1 | y
   upwards at rest; `orientation_covariance[0]` = −1, because it has no orientation.
 - `imu/data`: the same with the orientation of the IMU in the world. There is one IMU, which takes a
   sample every 1/`imu.rate`: at other rates a reading has the white noise of the newest sample.
+  [sensor.md](sensor.md) has the errors of all sensors.
+- `imu/mag`, `ground_truth/mag`: the magnetic field [T] in `imu.frame_id`.
 - `ground_truth/imu_bias`: the bias that the readings contain. It depends on time and `seed` alone, and
   changes every millisecond.
-- `ground_truth/imu`, `ground_truth/odom`: noise-free, with covariances of 0. The twist of the odometry
-  is in the body frame.
+- `ground_truth/imu_timing`: one labelled dimension, {timing}. It has
+  the stamp and the true time of each sample of `imu/data_raw`, and how often it was sent.
+- `ground_truth/imu`, `ground_truth/odom`: noise-free. The twist of the odometry is in the body frame.
+- What is exact has the variance 1e-18 in SI units: in sensor_msgs a covariance of zeros means unknown.
 - `~/invariants`: one labelled dimension, {invariants}. Drifts are relative to the value at the start of
   the motion; the orientation error [rad] is the angle to the exact solution.
 - `markers`: in `world_frame`, so that no TF is needed. A cylinder with the mass and the moments of inertia
@@ -74,11 +78,13 @@ def page() -> str:
     values = parameters.checked({})
     lines = [HEAD]
     for stream in all_streams(values):
-        rate, on = values[f'{stream.parameter}.rate'], values[f'{stream.parameter}.enabled']
+        rate, on = values[stream.rate_parameter], values[f'{stream.parameter}.enabled']
         lines.append(f'| `{stream.topic}` | {stream.type_name} | {rate:g} | '
-                     f'{"yes" if on else "no"} | `{stream.parameter}.enabled`, `.rate` |\n')
+                     f'{"yes" if on else "no"} | `{stream.parameter}.enabled`, '
+                     f'`{stream.rate_parameter.removeprefix(stream.parameter)}` |\n')
     lines.append(AFTER_TOPICS.format(joints=', '.join(f'`{name}`' for name in JOINTS),
-                                     invariants=', '.join(f'`{name}`' for name in INVARIANTS)))
+                                     invariants=', '.join(f'`{name}`' for name in INVARIANTS),
+                                     timing=', '.join(f'`{name}`' for name in TIMING)))
     for parameter in parameters.TABLE:
         default = parameter.default
         shown = 'unset' if default is None else list(default) if isinstance(

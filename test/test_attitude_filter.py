@@ -22,6 +22,7 @@ LOGS = {
     'pivot': ['-p', f'imu.rpy:={list(MOUNTING)}'],
     'pivot at 100 Hz': ['-p', 'imu.rate:=100.0'],
     'lever arm': ['-p', f'imu.rpy:={list(MOUNTING)}', '-p', 'imu.lever_arm:=[0.1, 0.0, 0.0]'],
+    'nine axes': ['-p', f'imu.rpy:={list(MOUNTING)}', '-p', 'mag.enabled:=true'],
     'noise': ['--params', str(ROOT / 'config/imu/bmi088.yaml')],
 }
 
@@ -71,6 +72,24 @@ def test_the_error_of_vqf_falls_with_the_square_of_the_step(example, logs):
     coarse = summaries(example, logs['pivot at 100 Hz'], ['vqf'])['vqf']
     assert coarse.tilt_rms / fine.tilt_rms == pytest.approx(4.0, abs=0.5)
     assert coarse.heading_rate / fine.heading_rate == pytest.approx(4.0, abs=0.5)
+
+
+def test_nine_axes_know_the_heading(example, logs):
+    """Measured: 0.009 degrees with 200 Hz and 100 Hz, 0.002 with 1 kHz."""
+    found = summaries(example, logs['nine axes'], ['vqf9', 'vqf'])
+    assert found['vqf9'].compared == 3000 and found['vqf9'].tilt_max < 0.01
+    assert found['vqf9'].heading_max < 0.03
+    assert math.isnan(found['vqf'].heading_max)
+
+
+def test_a_wrong_declination_is_a_wrong_heading(example, logs):
+    found = summaries(example, logs['nine axes'], ['vqf9'], declination=0.0)['vqf9']
+    assert found.heading_max == pytest.approx(math.degrees(math.atan2(1.57, 21.02)), abs=0.03)
+
+
+def test_a_log_without_a_magnetometer_is_named(example, logs):
+    with pytest.raises(ValueError, match='has no topic /imu/mag'):
+        example.compare(logs['pivot'], ['vqf9'])
 
 
 def test_a_lever_arm_misleads_what_takes_the_accelerometer_for_still(example, logs):

@@ -27,7 +27,16 @@ COMMON = {
     'markers.trace_length': 0.3, 'markers.trace_points': 12,
     'pose.rate': 333.0, 'imu.rate': 500.0, 'imu_data.rate': 77.7, 'ground_truth_imu.rate': 500.0}
 MOUNTED = {'imu.lever_arm': (0.1, -0.2, 0.3), 'imu.rpy': (0.1, 0.2, 0.3),
-           'imu.accelerometer_range': 40.0, 'imu.gyroscope_resolution': 1e-3}
+           'imu.accelerometer_range': 40.0, 'imu.gyroscope_resolution': 1e-3,
+           'imu.gyroscope_M': (1.1, 0.01, 0.0, 0.02, 0.9, 0.03, 0.0, 0.04, 1.0),
+           'imu.accelerometer_M': (0.9, 0.0, 0.01, 0.0, 1.1, 0.0, 0.02, 0.0, 1.0),
+           'imu.gyroscope_A': (1e-3, 0.0, 2e-3, 0.0, 3e-3, 0.0, 0.0, 0.0, 1e-3),
+           'imu.gyroscope_bias_stddev': 0.1, 'imu.gyroscope_bias_correlation_time': 0.3,
+           'imu.accelerometer_bias_instability': 0.02, 'imu.orientation_stddev': (0.1, 0.2, 0.05),
+           'imu.stamp_offset': 0.01, 'imu.stamp_jitter': 1e-3, 'imu.clock_drift': -80.0,
+           'imu.drop_rate': 0.1, 'imu.duplicate_rate': 0.1, 'mag.noise_density': 1e-7,
+           'mag.random_walk': 1e-7, 'mag.hard_iron': (1e-5, 0.0, -2e-5), 'mag.resolution': 1.5e-7,
+           'mag.soft_iron': (1.1, 0.0, 0.1, 0.0, 0.9, 0.0, 0.1, 0.0, 1.0), 'mag.rate': 125.0}
 SCENES = {
     'cusps': {},
     'a sensor elsewhere': {**scene_parameters('looping'), **MOUNTED},

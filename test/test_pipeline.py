@@ -45,7 +45,7 @@ def test_samples_are_on_the_grid_and_in_order_of_time():
     all_times = [t_ns for _, t_ns, _ in taken]
     assert all_times == sorted(all_times)
     for one in simulation.streams:
-        period = round(SECOND / parameters.checked({})[f'{one.parameter}.rate'])
+        period = round(SECOND / parameters.checked({})[one.rate_parameter])
         assert times(taken, one.topic) == list(range(0, 2 * SECOND + 1, period))
 
 

@@ -19,11 +19,21 @@ from spinning_top_sim.tools.simulate import main
 HUGE, TINY = 1e300, 1e-300
 REFUSED = [
     ('status_period', 1e10), ('status_period', TINY), ('duration', HUGE), ('duration', TINY),
-    *((f'{name}.rate', TINY) for name, *_ in parameters.STREAM_DEFAULTS),
+    *((f'{name}.rate', TINY) for name, rate, *_ in parameters.STREAM_DEFAULTS
+      if rate),
     ('tick_rate', TINY), ('time_scale', TINY), ('max_error', HUGE),
     *((f'imu.{kind}_{name}', value) for kind in ('gyroscope', 'accelerometer')
-      for name in ('noise_density', 'random_walk', 'turn_on_bias', 'range', 'resolution')
+      for name in ('noise_density', 'random_walk', 'turn_on_bias', 'bias_stddev',
+                   'bias_instability', 'range', 'resolution')
       for value in (HUGE, 1e200, TINY)),
+    *((f'imu.{name}', (*8 * (0.0,), HUGE)) for name in (
+        'gyroscope_M', 'gyroscope_A', 'accelerometer_M')),
+    *((f'imu.{name}', value) for name in ('stamp_offset', 'clock_drift') for value in (
+        HUGE, -HUGE)),
+    *((f'imu.{name}', value) for name in ('drop_rate', 'duplicate_rate') for value in (-0.1, 1.0)),
+    ('imu.stamp_jitter', -1e-9), ('imu.orientation_stddev', (0.0, 0.0, 1.1)),
+    ('imu.gyroscope_bias_correlation_time', 0.0), ('imu.bias_instability_band', (0.0, 1.0)),
+    ('mag.field', (HUGE, 0.0, 0.0)), ('mag.resolution', TINY), ('mag.soft_iron', 9 * (HUGE,)),
     ('imu.lever_arm', (0.0, HUGE, 0.0)), ('imu.rpy', (0.0, 0.0, -HUGE)),
     ('top.mass', HUGE), ('top.com_distance', -HUGE), ('top.lambda1', HUGE),
     ('top.lambda3', 1e200), ('top.gravity', HUGE), ('initial.theta_dot', 1e18),

@@ -21,7 +21,7 @@ from geometry_msgs.msg import PoseStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.serialization import deserialize_message, serialize_message  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
-from sensor_msgs.msg import Imu, JointState  # noqa: E402
+from sensor_msgs.msg import Imu, JointState, MagneticField  # noqa: E402
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String  # noqa: E402
 
 from spinning_top_sim.streams import messages, parameters  # noqa: E402
@@ -31,6 +31,7 @@ SECOND = 1_000_000_000
 STAMPS = (0, 1, SECOND - 1, SECOND, 1_700_000_000 * SECOND + 123_456_789, -1, -SECOND,
           -2 ** 31 * SECOND, (2 ** 31 - 1) * SECOND + SECOND - 1)
 FRAMES = ('', *('abcdefghijklmnopq'[:length] for length in range(1, 17)), 'θ/world', 'x' * 300)
+RATES, FORCE = messages.diagonal(*3 * (1e-6,)), messages.diagonal(*3 * (4e-4,))
 NUMBERS = (0.0, -0.0, 1.5, -math.pi, 5e-324, 1.7976931348623157e308, math.inf, -1e-9)
 
 
@@ -94,9 +95,9 @@ def test_pose_stamped_is_what_ros_serializes(frame):
 
 @pytest.mark.parametrize('frame', FRAMES)
 @pytest.mark.parametrize('orientation', [messages.UNKNOWN_ORIENTATION, messages.EXACT,
-                                         messages.diagonal(2.5e-5)])
+                                         messages.diagonal(2.5e-5, 1e-4, 0.25)])
 def test_imu_is_what_ros_serializes(frame, orientation):
-    template = messages.imu(frame, orientation, messages.diagonal(1e-6), messages.diagonal(4e-4))
+    template = messages.imu(frame, orientation, RATES, FORCE)
     for stamp_ns in STAMPS:
         message = Imu()
         message.header.frame_id = frame
@@ -106,9 +107,25 @@ def test_imu_is_what_ros_serializes(frame, orientation):
         set_xyz(message.angular_velocity, values[4:7])
         set_xyz(message.linear_acceleration, values[7:])
         message.orientation_covariance = orientation
-        message.angular_velocity_covariance = messages.diagonal(1e-6)
-        message.linear_acceleration_covariance = messages.diagonal(4e-4)
+        message.angular_velocity_covariance = RATES
+        message.linear_acceleration_covariance = FORCE
         assert_same(template.encode_one(stamp_ns, values[:4], values[4:7], values[7:]), message)
+
+
+@pytest.mark.parametrize('frame', FRAMES)
+def test_magnetic_field_is_what_ros_serializes(frame):
+    for stamp_ns in STAMPS:
+        message = MagneticField(magnetic_field_covariance=messages.diagonal(*numbers(3)))
+        message.header.frame_id = frame
+        set_stamp(message.header.stamp, stamp_ns)
+        set_xyz(message.magnetic_field, numbers(5)[2:])
+        assert_same(messages.magnetic_field(frame).encode_one(
+            stamp_ns, numbers(5)[2:], messages.diagonal(*numbers(3))), message)
+
+
+def test_no_covariance_is_zero_which_means_unknown():
+    assert messages.EXACT == (1e-18, 0.0, 0.0, 0.0, 1e-18, 0.0, 0.0, 0.0, 1e-18)
+    assert messages.diagonal(4.0, 0.0) == (4.0, 0.0, 0.0, 1e-18)
 
 
 @pytest.mark.parametrize('frame', FRAMES[:9])
@@ -116,6 +133,7 @@ def test_odometry_is_what_ros_serializes(frame):
     for child, stamp_ns in itertools.product(FRAMES[:9], STAMPS):
         template = messages.odometry(frame, child)
         message = Odometry(child_frame_id=child)
+        message.pose.covariance = message.twist.covariance = messages.diagonal(*6 * (0.0,))
         message.header.frame_id = frame
         set_stamp(message.header.stamp, stamp_ns)
         values = numbers(7)
@@ -223,11 +241,11 @@ NOISE = {'imu.gyroscope_noise_density': 1e-3, 'imu.accelerometer_noise_density':
 
 
 @pytest.mark.parametrize(('values', 'reading'), [
-    ({}, (0.0, 0.0)),
+    ({}, (1e-18, 1e-18)),
     # density^2 x rate of the IMU + resolution^2/12, of angular velocity and linear acceleration
     (NOISE, (1e-6 * 200.0 + 1e-4 / 12.0, 4e-4 * 200.0 + 0.09 / 12.0))])
 def test_imu_covariances_follow_rep_145(values, reading):
-    """No orientation estimate: first element -1; all others are what is known, or 0."""
+    """No orientation estimate: first element -1; all others are what is known."""
     simulation = Simulation(parameters.checked(values))
     states = simulation.state()
     by_topic = {stream.topic: deserialize_message(
@@ -236,15 +254,15 @@ def test_imu_covariances_follow_rep_145(values, reading):
     for topic in ('imu/data_raw', 'ground_truth/imu_bias'):
         assert by_topic[topic].orientation_covariance[0] == -1.0, topic
     for topic in ('imu/data', 'ground_truth/imu'):
-        assert by_topic[topic].orientation_covariance[0] == 0.0, topic
+        assert by_topic[topic].orientation_covariance[::4].tolist() == 3 * [1e-18], topic
         orientation = by_topic[topic].orientation
         assert math.hypot(orientation.x, orientation.y, orientation.z,
                           orientation.w) == pytest.approx(1.0, abs=1e-15)
-    variances = {'imu/data_raw': reading, 'imu/data': reading, 'ground_truth/imu': (0.0, 0.0),
-                 'ground_truth/imu_bias': (0.0, 0.0)}
+    variances = {'imu/data_raw': reading, 'imu/data': reading, 'ground_truth/imu': (1e-18, 1e-18),
+                 'ground_truth/imu_bias': (1e-18, 1e-18)}
     assert set(by_topic) == set(variances)
     for topic, message in by_topic.items():
-        assert not any(message.orientation_covariance[1:]), topic
+        assert not any(message.orientation_covariance[k] for k in range(9) if k % 4), topic
         for covariance, variance in zip((message.angular_velocity_covariance,
                                          message.linear_acceleration_covariance),
                                         variances[topic], strict=True):

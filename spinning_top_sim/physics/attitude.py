@@ -36,6 +36,14 @@ def quaternion_of_angles(phi: Column, theta: Column, psi: Column) -> Quaternion:
             cosine * np.sin(half_sum), cosine * np.cos(half_sum))
 
 
+def quaternion_of_vector(v: Vector) -> Quaternion:
+    """Return the rotation by |v| [rad] about v."""
+    x, y, z = v
+    half = 0.5 * np.sqrt(x * x + y * y + z * z)
+    scale = 0.5 * np.sinc(half / np.pi)
+    return scale * x, scale * y, scale * z, np.cos(half)
+
+
 def product(p: Quaternion, q: Quaternion) -> Quaternion:
     """Return the quaternion product p q: first the rotation q, then p."""
     (a, b, c, d), (x, y, z, w) = p, q

@@ -4,30 +4,29 @@ The inertial measurement unit: where it sits on the body, and what it adds to th
 
 The errors follow kalibr's model, with its names and units.  Conventions: REP-145 (at rest an
 accelerometer reads +g upwards), REP-103 (x, y, z right-handed), URDF roll-pitch-yaw.
+docs/sensor.md has the whole chain.
 """
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.attitude import Quaternion, Vector
+from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.states import States
+from spinning_top_sim.streams.parameters import IDENTITY
 
-# Six columns or rows: three axes of the gyroscope, three of the accelerometer.
+if TYPE_CHECKING:
+    from spinning_top_sim.streams.noise import SensorNoise
+
+# Six columns: three axes of the gyroscope, three of the accelerometer.
 Rows = NDArray[np.float64]
 NO_ERRORS = np.zeros((6, 1))
-# The bias changes this often, whatever the rate of the IMU.
-WALK_STEP_NS = 1_000_000
-# Random numbers are drawn for so many samples, or steps of the walk, together.
-DRAWN_TOGETHER = 512
-# What a draw is for.
-WHITE, TURN_ON, WALK_STEPS, WALK_ENDS = range(4)
 
 
 class Imu:
@@ -71,9 +70,11 @@ class Sensor:
     newest sample, so that all streams agree where they have a time in common.
 
     rate_variance, force_variance : of white noise and rounding together
+    orientation_variances : about the axes of the IMU [rad^2]
 
     (kalibr, "IMU Noise Model"; N. Trawny, S. Roumeliotis, "Indirect Kalman filter for 3D attitude
-    estimation", 2005, eqs. 133, 140)
+    estimation", 2005, eqs. 133, 140; for the matrices J. Rehder et al., "Extending kalibr", ICRA
+    2016)
     """
 
     def __init__(self, values: Mapping[str, Any], period_ns: int) -> None:
@@ -81,53 +82,116 @@ class Sensor:
             rate, force = values[f'imu.gyroscope_{name}'], values[f'imu.accelerometer_{name}']
             return np.repeat((rate, force), 3)[:, np.newaxis]
 
-        self._seed, self._period_ns = values['seed'], period_ns
-        # Deviations of a sample's noise, and of the change of the bias in a step of its walk.
-        self._white = six('noise_density') / math.sqrt(period_ns * 1e-9)
-        self._walk = six('random_walk') * math.sqrt(WALK_STEP_NS * 1e-9)
-        # + 0.0: no bias is -0, and below no reading.
-        self._turn_on = six('turn_on_bias') * _normal(self._seed, TURN_ON, 0, 1).T + 0.0
-        self._resolution = six('resolution')
-        self._limit = [_largest_reading(*pair) for pair in zip(
-            six('range')[:, 0].tolist(), self._resolution[:, 0].tolist(), strict=True)]
-        self._is_perfect = not any(map(np.any, (
-            self._white, self._walk, self._turn_on, six('range'), self._resolution)))
-        variances = self._white ** 2 + self._resolution ** 2 / 12.0
+        self._rate_matrix, self._force_matrix = (
+            values[f'imu.{kind}_M'] for kind in ('gyroscope', 'accelerometer'))
+        self._g_sensitivity = values['imu.gyroscope_A']
+        white = six('noise_density') / math.sqrt(period_ns * 1e-9)
+        resolution, limit = six('resolution'), six('range')
+        self._converters = [Converter(*pair) for pair in zip(
+            resolution[:, 0].tolist(), limit[:, 0].tolist(), strict=True)]
+        variances = white ** 2 + resolution ** 2 / 12.0
         self.rate_variance, self.force_variance = variances[[0, 3], 0].tolist()
-        self._newest: tuple[range, Rows, Rows] = range(0), NO_ERRORS, NO_ERRORS
+        is_noisy = any(six(name).any() for name in (
+            'noise_density', 'turn_on_bias', 'random_walk', 'bias_stddev', 'bias_instability'))
+        self._noise = _noise(values, period_ns, white) if is_noisy else None
+        deviations = values['imu.orientation_stddev']
+        self.orientation_variances = tuple(deviation ** 2 for deviation in deviations)
+        self._orientation_noise = (_orientation_noise(values['seed'], period_ns, deviations)
+                                   if any(deviations) else None)
+        self._is_perfect = not (
+            is_noisy or resolution.any() or limit.any() or any(self._g_sensitivity)
+            or (*self._rate_matrix, *self._force_matrix) != 2 * IDENTITY)
 
     def read(self, exact: tuple[Vector, Vector], times: range) -> tuple[Vector, Vector]:
         """Return the readings [rad/s], [m/s^2] at these times [ns] of what is exact there."""
         if self._is_perfect:
             return exact
-        rows = []
-        for value, white, bias, limit, (step,) in zip(
-                itertools.chain(*exact), *self._errors(times), self._limit, self._resolution,
-                strict=True):
-            reading = value + white + bias
-            if step:
-                reading = (np.rint(reading / step) + 0.0) * step
-            rows.append(np.clip(reading, -limit, limit))
-        return tuple(rows[:3]), tuple(rows[3:])
+        white, bias = self._errors(times)
+        # The chain of docs/sensor.md: matrices, g-sensitivity, bias, noise, rounding, range.
+        rows = [converter.convert(value + one_bias + one_white)
+                for value, one_bias, one_white, converter in zip(
+                    itertools.chain(*self._distorted(*exact)), bias, white, self._converters,
+                    strict=True)]
+        return (rows[0], rows[1], rows[2]), (rows[3], rows[4], rows[5])
+
+    def orientation(self, exact: Quaternion, times: range) -> Quaternion:
+        """Return the orientation as the IMU estimates it; its error is in the IMU's frame."""
+        if self._orientation_noise is None:
+            return exact
+        (x, y, z), _ = self._orientation_noise.at(times)
+        return attitude.product(exact, attitude.quaternion_of_vector((x, y, z)))
 
     def bias(self, times: range) -> tuple[Vector, Vector]:
         """Return the bias at these times [ns]: [rad/s], [m/s^2]."""
         _, bias = self._errors(times)
         return tuple(bias[:3]), tuple(bias[3:])
 
+    def _distorted(self, rates: Vector, force: Vector) -> tuple[Vector, Vector]:
+        """Return rates and force by scale, misalignment and g-sensitivity (kalibr's M and A)."""
+        read_rates, read_force = (transformed(self._rate_matrix, rates),
+                                  transformed(self._force_matrix, force))
+        if any(self._g_sensitivity):
+            x, y, z = transformed(self._g_sensitivity, force)
+            read_rates = read_rates[0] + x, read_rates[1] + y, read_rates[2] + z
+        return read_rates, read_force
+
     def _errors(self, times: range) -> tuple[Rows, Rows]:
         """Return white noise and bias at these times, (6, n) or (6, 1) each."""
-        if self._newest[0] != times:      # streams of one rate ask for the same ones
-            t_ns = np.arange(times.start, times.stop, times.step)
-            white, bias = NO_ERRORS, self._turn_on
-            if self._white.any():
-                white = self._white * _rows(
-                    partial(_normal, self._seed, WHITE), t_ns // self._period_ns)
-            if self._walk.any():
-                bias = bias + self._walk * _rows(
-                    partial(_walk, self._seed), t_ns // WALK_STEP_NS)
-            self._newest = times, white, bias
-        return self._newest[1:]
+        return self._noise.at(times) if self._noise else (NO_ERRORS, NO_ERRORS)
+
+
+def _noise(values: Mapping[str, Any], period_ns: int, white: Rows) -> 'SensorNoise':
+    """Return the noise of an IMU whose white noise has these standard deviations, (6, 1)."""
+    from spinning_top_sim.streams import noise  # noqa: PLC0415 - not for a perfect IMU
+
+    def six(name: str) -> tuple[float, ...]:
+        return (*3 * (values[f'imu.gyroscope_{name}'],),
+                *3 * (values[f'imu.accelerometer_{name}'],))
+
+    seed, path = values['seed'], partial(noise.Path, values['seed'])
+    paths = []
+    if any(walk := six('random_walk')):
+        paths.append(path(noise.Purpose.WALK, (6 * (math.inf,),), (walk,)))
+    if any(deviation := six('bias_stddev')):
+        paths.append(path(noise.Purpose.GAUSS_MARKOV, (six('bias_correlation_time'),),
+                          (deviation,)))
+    if any(flat := six('bias_instability')):
+        parts = noise.flicker_parts(*values['imu.bias_instability_band'])
+        paths.append(path(noise.Purpose.FLICKER, tuple(6 * (time,) for time, _ in parts),
+                          tuple(tuple(part * one for one in flat) for _, part in parts)))
+    turn_on = np.array(six('turn_on_bias'))[:, np.newaxis] * noise.constant(
+        seed, noise.Purpose.TURN_ON, 6)
+    return noise.SensorNoise(seed, noise.Purpose.WHITE, period_ns, white, turn_on, paths)
+
+
+def _orientation_noise(seed: int, period_ns: int, deviations: Sequence[float]) -> 'SensorNoise':
+    from spinning_top_sim.streams import noise  # noqa: PLC0415 - not for a perfect IMU
+
+    return noise.SensorNoise(seed, noise.Purpose.ORIENTATION, period_ns,
+                             np.array(deviations)[:, np.newaxis], np.zeros((3, 1)), ())
+
+
+class Converter:
+    """What turns a value into a reading: rounded to the resolution, then cut at the range."""
+
+    def __init__(self, resolution: float, limit: float) -> None:
+        self._step, self._limit = resolution, _largest_reading(limit, resolution)
+
+    def convert(self, value: Column) -> Column:
+        """Return the readings of these values, (n,)."""
+        if self._step:
+            # + 0.0: no reading is -0.
+            value = (np.rint(value / self._step) + 0.0) * self._step
+        return np.clip(value, -self._limit, self._limit)
+
+
+def transformed(matrix: Sequence[float], vector: Vector) -> Vector:
+    """Return a matrix, given row by row, times a vector; the identity changes no bit of it."""
+    if tuple(matrix) == IDENTITY:
+        return vector
+    x, y, z = vector
+    a, b, c, d, e, f, g, h, i = matrix
+    return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
 
 
 def _largest_reading(limit: float, step: float) -> float:
@@ -138,53 +202,6 @@ def _largest_reading(limit: float, step: float) -> float:
         return limit
     count = math.floor(limit / step)
     return (count if count * step <= limit else count - 1) * step
-
-
-def _rows(block: Callable[[int], Rows], numbers: NDArray[np.int64]) -> Rows:
-    """Return the samples of these ascending numbers, (6, n), from blocks of them."""
-    edges = np.flatnonzero(np.diff(numbers // DRAWN_TOGETHER)) + 1
-    return np.concatenate([block(int(part[0]) // DRAWN_TOGETHER)[part % DRAWN_TOGETHER]
-                           for part in np.split(numbers, edges)]).T
-
-
-@lru_cache(8)
-def _normal(seed: int, purpose: int, number: int, count: int = DRAWN_TOGETHER) -> Rows:
-    """
-    Draw normal numbers (count, 6) that depend on nothing else that is drawn.
-
-    Philox is counter-based (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC11).
-    """
-    return np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, purpose, number])
-                               ).standard_normal((count, 6))
-
-
-@lru_cache(4)
-def _walk(seed: int, block: int) -> Rows:
-    """Return a random walk in a block of steps, (512, 6): a Brownian bridge between its ends."""
-    begin, end = _walk_end(seed, block), _walk_end(seed, block + 1)
-    steps: Rows = _normal(seed, WALK_STEPS, block)
-    missing: Rows = end - begin - steps.sum(axis=0)
-    steps = steps + missing / DRAWN_TOGETHER
-    return begin + (np.cumsum(steps, axis=0) - steps)
-
-
-@lru_cache(256)
-def _walk_end(seed: int, block: int) -> Rows:
-    """
-    Return the random walk where a block begins, (6,), by way of some log2(block) others.
-
-    Its ends at powers of two follow from one another, and half-way between two that are known
-    lies their mean and a normal number (P. Levy's construction of Brownian motion).
-    """
-    if block == 0:
-        return np.zeros(6)
-    normal: Rows = _normal(seed, WALK_ENDS, block, 1)[0]
-    apart = block & -block          # the largest power of two that divides it
-    if block == apart:
-        before = block // 2
-        return _walk_end(seed, before) + math.sqrt((block - before) * DRAWN_TOGETHER) * normal
-    middle = 0.5 * (_walk_end(seed, block - apart) + _walk_end(seed, block + apart))
-    return middle + math.sqrt(0.5 * apart * DRAWN_TOGETHER) * normal
 
 
 def _quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:

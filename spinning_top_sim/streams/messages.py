@@ -11,16 +11,22 @@ from collections.abc import Sequence
 from spinning_top_sim.streams.cdr import CdrWriter, Template
 
 UNKNOWN_ORIENTATION = (-1.0,) + 8 * (0.0,)      # REP-145: no orientation in this message
-EXACT = 9 * (0.0,)
+# Stands for exact, in SI units: a covariance of zeros means unknown (sensor_msgs/Imu).
+EXACT_VARIANCE = 1e-18
 CYLINDER, LINE_STRIP, LINE_LIST = 3, 4, 5       # visualization_msgs/Marker
 BODY_COLOR = (0.20, 0.40, 0.70, 1.0)            # red, green, blue, alpha
 AXIS_COLOR = (0.95, 0.75, 0.20, 1.0)
 TRACE_COLOR = (0.90, 0.30, 0.20, 1.0)
 
 
-def diagonal(variance: float) -> tuple[float, ...]:
-    """Return a row-major 3 x 3 covariance."""
-    return (variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, variance)
+def diagonal(*variances: float) -> tuple[float, ...]:
+    """Return a row-major covariance with these variances; 0 becomes EXACT_VARIANCE."""
+    count = len(variances)
+    return tuple(variances[row] or EXACT_VARIANCE if row == column else 0.0
+                 for row in range(count) for column in range(count))
+
+
+EXACT = diagonal(0.0, 0.0, 0.0)
 
 
 def pose_stamped(frame_id: str) -> Template:
@@ -55,15 +61,24 @@ def imu(frame_id: str, *covariances: Sequence[float]) -> Template:
     return Template(writer)
 
 
+def magnetic_field(frame_id: str) -> Template:
+    """sensor_msgs/MagneticField; fields: the field, its covariance."""
+    writer = CdrWriter()
+    writer.header(frame_id)
+    writer.field(3)
+    writer.field(9)
+    return Template(writer)
+
+
 def odometry(frame_id: str, child_frame_id: str) -> Template:
-    """nav_msgs/Odometry of a fixed point, covariances zero; fields: orientation, body rates."""
+    """nav_msgs/Odometry of a fixed point, exact; fields: orientation, body rates."""
     writer = CdrWriter()
     writer.header(frame_id)
     writer.string(child_frame_id)
     for count in (4, 3):
         writer.append('d', 0.0, 0.0, 0.0)           # position, linear velocity: the pivot rests
         writer.field(count)
-        writer.append('d', *(36 * (0.0,)))
+        writer.append('d', *diagonal(*(6 * (0.0,))))
     return Template(writer)
 
 

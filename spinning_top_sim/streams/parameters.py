@@ -9,7 +9,7 @@ The defaults are the cusp scene: a bicycle wheel on a pivot, spun about its axis
 import contextlib
 import enum
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -112,18 +112,21 @@ class Parameter:
                 and not (self.smallest and 0 < number < self.smallest))
 
 
-# name, default rate [Hz], on by default, what it is
-STREAM_DEFAULTS = (
+# name, default rate [Hz], on by default, what it is; without a rate of its own it has `imu.rate`
+STREAM_DEFAULTS: tuple[tuple[str, float | None, bool, str], ...] = (
     ('pose', 100.0, True, 'pose (geometry_msgs/PoseStamped)'),
     ('joint_states', 100.0, True, 'joint_states (sensor_msgs/JointState)'),
     ('imu', 200.0, True, 'imu/data_raw and ground_truth/imu_bias (sensor_msgs/Imu)'),
     ('imu_data', 200.0, False, 'imu/data (sensor_msgs/Imu with orientation)'),
     ('ground_truth_imu', 200.0, True, 'ground_truth/imu (sensor_msgs/Imu, noise-free)'),
+    ('imu_timing', None, False, 'ground_truth/imu_timing (std_msgs/Float64MultiArray)'),
+    ('mag', 100.0, False, 'imu/mag and ground_truth/mag (sensor_msgs/MagneticField)'),
     ('ground_truth_odom', 100.0, True, 'ground_truth/odom (nav_msgs/Odometry)'),
     ('invariants', 10.0, True, '~/invariants (std_msgs/Float64MultiArray)'),
     ('markers', 20.0, False, 'markers (visualization_msgs/MarkerArray)'),
     ('clock', 100.0, False, '/clock (rosgraph_msgs/Clock)'),
 )
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 HIGHEST_RATE = 10_000.0
 # Values of physics up to here have squares and products that doubles hold.
 LARGEST = 1e30
@@ -136,22 +139,33 @@ _at_start = partial(Parameter, effect=Effect.START)
 _at_recording = partial(Parameter, effect=Effect.RECORDING)
 
 
-def _stream(name: str, rate: float, enabled: bool, text: str) -> tuple[Parameter, Parameter]:
-    return (_at_once(f'{name}.enabled', enabled, f'Whether there is {text}; a recording keeps '
-                      'the streams that it began with'),
-            _at_once(f'{name}.rate', rate, f'Rate of {text}', 'Hz', 1e-6, HIGHEST_RATE))
+def _stream(name: str, rate: float | None, enabled: bool, text: str) -> Iterator[Parameter]:
+    yield _at_once(f'{name}.enabled', enabled, f'Whether there is {text}; a recording keeps '
+                   'the streams that it began with')
+    if rate is not None:
+        yield _at_once(f'{name}.rate', rate, f'Rate of {text}', 'Hz', 1e-6, HIGHEST_RATE)
 
 
 def _axes(kind: str, unit: str, walk_unit: str) -> list[Parameter]:
-    """Return the error model of three axes; names and units of the first two are kalibr's."""
-    return [
+    """Return the error model of three axes; names and units as kalibr has them."""
+    errors = [
         _at_reset(f'imu.{kind}_{name}', 0.0, text, unit_text, 0.0, 1e12, smallest=1e-12)
         for name, text, unit_text in (
             ('noise_density', f'White noise of the {kind}, 0 = none', f'{unit}/sqrt(Hz)'),
             ('random_walk', f'Random walk of the bias of the {kind}, 0 = none', walk_unit),
             ('turn_on_bias', f'Standard deviation of the bias of the {kind} at the start', unit),
+            ('bias_stddev', f'Standard deviation of a Gauss-Markov bias of the {kind}, 0 = none',
+             unit),
+            ('bias_instability', f'Flat of the Allan deviation of a flicker bias of the {kind}, '
+             '0 = none', unit),
             ('range', f'Largest reading of the {kind}, 0 = unlimited', unit),
             ('resolution', f'Smallest step of the readings of the {kind}, 0 = none', unit))]
+    return [
+        _at_reset(f'imu.{kind}_M', IDENTITY, f'Scale and misalignment of the {kind}, row by '
+                  'row', '', -1e6, 1e6),
+        *errors,
+        _at_reset(f'imu.{kind}_bias_correlation_time', 100.0,
+                  f'Correlation time of the Gauss-Markov bias of the {kind}', 's', 0.01, LONGEST)]
 
 
 TABLE: tuple[Parameter, ...] = (
@@ -196,6 +210,34 @@ TABLE: tuple[Parameter, ...] = (
               'yaw about fixed axes', 'rad', -1e6, 1e6),
     *_axes('gyroscope', 'rad/s', 'rad/s^2/sqrt(Hz)'),
     *_axes('accelerometer', 'm/s^2', 'm/s^3/sqrt(Hz)'),
+    _at_reset('imu.gyroscope_A', 9 * (0.0,), 'Sensitivity of the gyroscope to specific force, row '
+              'by row', '(rad/s)/(m/s^2)', -1e6, 1e6),
+    _at_reset('imu.bias_instability_band', (1.0, 1000.0), 'Shortest and longest averaging time '
+              'with the flat of the flicker bias', 's', 0.01, 1e6),
+    _at_reset('imu.orientation_stddev', (0.0, 0.0, 0.0), 'Standard deviation of the noise of the '
+              'orientation in imu/data, about the axes of the IMU', 'rad', 0.0, 1.0,
+              smallest=1e-12),
+    _at_reset('imu.stamp_offset', 0.0, 'Added to the stamps of imu/data_raw and imu/data', 's',
+              -1.0, 1.0),
+    _at_reset('imu.stamp_jitter', 0.0, 'Standard deviation of the noise of these stamps, cut at '
+              '0.45 periods', 's', 0.0, 1.0),
+    _at_reset('imu.clock_drift', 0.0, 'How much faster than simulated time these stamps go',
+              'ppm', -1e4, 1e4),
+    _at_reset('imu.drop_rate', 0.0, 'Share of the samples that are lost', '', 0.0, 0.99),
+    _at_reset('imu.duplicate_rate', 0.0, 'Share of the other samples that are sent twice', '', 0.0,
+              0.99),
+    _at_reset('mag.field', (1.57e-6, 21.02e-6, -43.99e-6), 'Magnetic field in the world, east, '
+              'north, up; default: WMM2025 in Munich, 2026', 'T', -1e3, 1e3),
+    _at_reset('mag.soft_iron', IDENTITY, 'Soft iron, row by row: the field is multiplied by it',
+              '', -1e6, 1e6),
+    _at_reset('mag.hard_iron', (0.0, 0.0, 0.0), 'Hard iron, added to the field in the frame of '
+              'the IMU', 'T', -1e3, 1e3),
+    *(_at_reset(f'mag.{name}', 0.0, text, unit, 0.0, 1e3, smallest=1e-18)
+      for name, text, unit in (
+          ('noise_density', 'White noise of the magnetometer, 0 = none', 'T/sqrt(Hz)'),
+          ('random_walk', 'Random walk of its bias, 0 = none', 'T/s/sqrt(Hz)'),
+          ('range', 'Its largest reading, 0 = unlimited', 'T'),
+          ('resolution', 'Smallest step of its readings, 0 = none', 'T'))),
     _at_reset('markers.trace_length', 4.0, 'How far back the trace of the tip goes, 0 = no trace',
               's', 0.0, 3600.0),
     _at_reset('markers.trace_points', 200, 'Points of the trace, evenly spaced in time', '', 1,
@@ -233,6 +275,10 @@ def checked(values: Mapping[str, Value]) -> dict[str, Value]:
         if name not in ('all', *names):
             raise ValueError(f'record.streams = {list(result["record.streams"])!r}: {name!r} '
                              f'is no stream; must be all or some of {", ".join(names)}')
+    shortest, longest = result['imu.bias_instability_band']
+    if not shortest < longest:
+        raise ValueError(f'imu.bias_instability_band = {[shortest, longest]!r}: the second number '
+                         'must be larger than the first')
     top_of(result)
     start_state(result)
     return result

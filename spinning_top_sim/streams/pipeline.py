@@ -262,8 +262,9 @@ class Simulation:
             for stream in self.streams:
                 times = stream.times(self.now_ns, until_ns)
                 if stream.log_index is not None and times:
-                    stamps_ns = self.epoch_ns + np.arange(times.start, times.stop, times.step)
-                    send(stream, stamps_ns, stream.encode(states(times), self.epoch_ns, times))
+                    rows = stream.encode(states(times), self.epoch_ns, times)
+                    if len(rows):
+                        send(stream, self.epoch_ns + stream.sent_ns(times), rows)
             self.now_ns = max(self.now_ns, until_ns)
             segment.release(self.now_ns)
 

@@ -180,7 +180,7 @@ class Schedule:
             yield
             data = stream.encode(states(times), self.epoch_ns, times).tobytes()
             size = len(stream.template)
-            for number, t_ns in enumerate(times):
+            for number, t_ns in enumerate(stream.sent_ns(times).tolist()):
                 places, messages = instants.setdefault(t_ns, ([], []))
                 places.append(place)
                 messages.append(data[number * size:(number + 1) * size])

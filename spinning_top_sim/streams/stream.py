@@ -33,7 +33,12 @@ class Stream:
         self.on_change: Callable[[], None] = lambda: None
         self.sent = self.skipped = 0
         self._skipped_until_ns = 0
-        self.period_ns = period_ns(values[f'{self.parameter}.rate'])
+        self.period_ns = period_ns(values[self.rate_parameter])
+
+    @property
+    def rate_parameter(self) -> str:
+        """Name of the parameter that is its rate."""
+        return f'{self.parameter}.rate'
 
     @property
     def publish(self) -> Callable[[bytes], object] | None:
@@ -52,11 +57,11 @@ class Stream:
     @property
     def at_once(self) -> tuple[str, ...]:
         """Names of the parameters that `apply` takes over; a run is replayed by them."""
-        return (f'{self.parameter}.rate',)
+        return (self.rate_parameter,)
 
     def apply(self, changes: Mapping[str, Any]) -> None:
         """Take over new values of parameters, of those in `at_once` that are among them."""
-        rate = changes.get(f'{self.parameter}.rate')
+        rate = changes.get(self.rate_parameter)
         if rate is not None and period_ns(rate) != self.period_ns:
             self.period_ns = period_ns(rate)
             self.on_change()
@@ -82,8 +87,12 @@ class Stream:
             self._skipped_until_ns = before_ns
             self.on_change()
 
+    def sent_ns(self, times: range) -> NDArray[np.int64]:
+        """Return the times of the messages of these samples: some may be lost, some repeated."""
+        return np.arange(times.start, times.stop, times.step)
+
     def encode(self, states: States, epoch_ns: int, times: range) -> NDArray[np.uint8]:
-        """Return messages of states at times [ns]; epoch_ns is t = 0; see `Template.encode`."""
+        """Return messages, at `sent_ns`, of states at times [ns]; see `Template.encode`."""
         stamps_ns = np.arange(epoch_ns + times.start, epoch_ns + times.stop, times.step)
         return self.template.encode(stamps_ns, *self.fields(states, times))
 

@@ -4,7 +4,8 @@
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import Any
+from functools import cached_property, lru_cache, partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +18,17 @@ from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.segment import Segment
 from spinning_top_sim.streams.stream import Stream, period_ns
 
+if TYPE_CHECKING:
+    from spinning_top_sim.streams.magnetometer import Magnetometer
+    from spinning_top_sim.streams.timing import Timing
+
 JOINTS = ('precession_joint', 'nutation_joint', 'spin_joint')
 INVARIANTS = ('energy', 'l3', 'lz', 'energy_drift', 'l3_drift', 'lz_drift',
               'quaternion_norm_error', 'orientation_error')
+TIMING = ('stamp_sec', 'stamp_nanosec', 'true_sec', 'true_nanosec', 'copies')
+# Parameters of what goes wrong with the messages of the IMU.
+TIMING_FAULTS = ('imu.stamp_offset', 'imu.stamp_jitter', 'imu.clock_drift', 'imu.drop_rate',
+                 'imu.duplicate_rate')
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -75,11 +84,13 @@ class ImuStream(Stream):
     def _template(self, imu_rate: float) -> Template:
         """Use the sensor of this rate: a density says how much noise a sample has at a rate."""
         self._sensor = self._imu.sensor(period_ns(imu_rate))
-        variances = self._sensor.rate_variance, self._sensor.force_variance
+        sensor = self._sensor
+        variances = (sensor.orientation_variances, 3 * (sensor.rate_variance,),
+                     3 * (sensor.force_variance,)) if self.is_noisy else 3 * (3 * (0.0,),)
+        orientation, *others = (messages.diagonal(*three) for three in variances)
         return messages.imu(
             self._frame_id,
-            messages.EXACT if self.has_orientation else messages.UNKNOWN_ORIENTATION,
-            *(messages.diagonal(variance if self.is_noisy else 0.0) for variance in variances))
+            orientation if self.has_orientation else messages.UNKNOWN_ORIENTATION, *others)
 
 
 class ImuRaw(ImuStream):
@@ -87,15 +98,34 @@ class ImuRaw(ImuStream):
 
     parameter, topic, has_orientation, is_noisy = 'imu', 'imu/data_raw', False, True
 
+    def __init__(self, values: Mapping[str, Any], imu: Imu) -> None:
+        super().__init__(values, imu)
+        self._timing = _timing(values) if any(map(values.get, TIMING_FAULTS)) else None
+
+    def sent_ns(self, times: range) -> NDArray[np.int64]:
+        t_ns = super().sent_ns(times)
+        return np.repeat(t_ns, self._timing.copies(t_ns, self.period_ns)) if self._timing else t_ns
+
+    def encode(self, states: States, epoch_ns: int, times: range) -> NDArray[np.uint8]:
+        if self._timing is None:
+            return super().encode(states, epoch_ns, times)
+        t_ns = super().sent_ns(times)
+        rows = self.template.encode(self._timing.stamps_ns(epoch_ns, t_ns, self.period_ns),
+                                    *self.fields(states, times))
+        return np.repeat(rows, self._timing.copies(t_ns, self.period_ns), axis=0)
+
     def fields(self, states: States, times: range) -> Sequence[Field]:
-        orientation = self._imu.orientation(states) if self.has_orientation else IDENTITY
-        return (orientation, *self._sensor.read(self._imu.true(states), times))
+        return (IDENTITY, *self._sensor.read(self._imu.true(states), times))
 
 
 class ImuData(ImuRaw):
-    """What the sensor reads, with the exact orientation of its frame."""
+    """What the sensor reads, with the orientation of its frame."""
 
     parameter, topic, has_orientation = 'imu_data', 'imu/data', True
+
+    def fields(self, states: States, times: range) -> Sequence[Field]:
+        _, *readings = super().fields(states, times)
+        return (self._sensor.orientation(self._imu.orientation(states), times), *readings)
 
 
 class ImuBias(ImuStream):
@@ -105,6 +135,67 @@ class ImuBias(ImuStream):
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         return (IDENTITY, *self._sensor.bias(times))
+
+
+class ImuTiming(Stream):
+    """The stamp and the true time of each sample of the IMU, and how often it was sent."""
+
+    parameter, topic, type_name = ('imu_timing', 'ground_truth/imu_timing',
+                                   'std_msgs/msg/Float64MultiArray')
+    rate_parameter = 'imu.rate'
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self._values = values
+        super().__init__(values, messages.float64_multi_array(TIMING))
+
+    @cached_property
+    def _timing(self) -> 'Timing':
+        return _timing(self._values)
+
+    def encode(self, states: States, epoch_ns: int, times: range) -> NDArray[np.uint8]:
+        t_ns = self.sent_ns(times)
+        true_ns = epoch_ns + t_ns
+        stamps_ns = self._timing.stamps_ns(epoch_ns, t_ns, self.period_ns)
+        columns = (*np.divmod(stamps_ns, NANOSECONDS), *np.divmod(true_ns, NANOSECONDS),
+                   self._timing.copies(t_ns, self.period_ns))
+        return self.template.encode(true_ns, [column.astype(np.float64) for column in columns])
+
+
+def _timing(values: Mapping[str, Any]) -> 'Timing':
+    from spinning_top_sim.streams.timing import Timing  # noqa: PLC0415 - not without faults
+
+    return Timing(values)
+
+
+class Mag(Stream):
+    """What the magnetometer reads (REP-145)."""
+
+    parameter, topic, type_name = 'mag', 'imu/mag', 'sensor_msgs/msg/MagneticField'
+
+    def __init__(self, values: Mapping[str, Any], imu: Imu) -> None:
+        self._imu, self._sensor = imu, lru_cache(2)(partial(_magnetometer, values))
+        super().__init__(values, messages.magnetic_field(values['imu.frame_id']))
+
+    def fields(self, states: States, times: range) -> Sequence[Field]:
+        sensor = self._sensor(self.period_ns)
+        exact = sensor.true(self._imu.orientation(states))
+        return sensor.read(exact, times), messages.diagonal(*3 * (sensor.variance,))
+
+
+class GroundTruthMag(Mag):
+    """What a perfect magnetometer reads."""
+
+    topic = 'ground_truth/mag'
+
+    def fields(self, states: States, times: range) -> Sequence[Field]:
+        exact = self._sensor(self.period_ns).true(self._imu.orientation(states))
+        return exact, messages.EXACT
+
+
+def _magnetometer(values: Mapping[str, Any], period_ns: int) -> 'Magnetometer':
+    from spinning_top_sim.streams.magnetometer import Magnetometer  # noqa: PLC0415 - off by default
+
+    return Magnetometer(values, period_ns)
 
 
 class GroundTruthImu(ImuStream):
@@ -214,5 +305,6 @@ def all_streams(values: Mapping[str, Any]) -> list[Stream]:
     return [Clock(values, messages.clock()), Pose(values, messages.pose_stamped(world)),
             JointStates(values, messages.joint_state(JOINTS)), ImuRaw(values, imu),
             ImuData(values, imu), ImuBias(values, imu), GroundTruthImu(values, imu),
+            ImuTiming(values), Mag(values, imu), GroundTruthMag(values, imu),
             GroundTruthOdometry(values, messages.odometry(world, body)),
             Invariants(values, messages.float64_multi_array(INVARIANTS)), Markers(values)]

@@ -39,6 +39,7 @@ FIELDS = {
     'geometry_msgs/msg/PoseStamped': ('pose.orientation',),
     'sensor_msgs/msg/JointState': ('position', 'velocity'),
     'sensor_msgs/msg/Imu': ('orientation', 'angular_velocity', 'linear_acceleration'),
+    'sensor_msgs/msg/MagneticField': ('magnetic_field', 'magnetic_field_covariance'),
     'nav_msgs/msg/Odometry': ('pose.pose.orientation', 'twist.twist.angular'),
     'std_msgs/msg/Float64MultiArray': ('data',),
     'visualization_msgs/msg/MarkerArray': (
