@@ -21,7 +21,7 @@ from pathlib import Path
 
 from spinning_top_sim.exam.adapters import FILTERS
 from spinning_top_sim.exam.examiner import SEEDS, examine
-from spinning_top_sim.exam.log import examine_log
+from spinning_top_sim.exam.log import NORTHS, examine_log
 from spinning_top_sim.exam.report import Report
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.tools import cli
@@ -39,8 +39,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add('log', type=Path, nargs='?', help='an MCAP file with the attitudes and the truth')
     add('--topic', help='of the attitudes in the log')
     add('--truth', help='topic of the truth; default: ground_truth/imu, ground_truth/odom or pose')
-    add('--heading', action='store_true',
-        help='the heading must be right, not only steady: the filter has a magnetometer')
+    add('--heading', choices=NORTHS, help='the heading in the log must be right, from true or '
+        'magnetic north; default: it must be steady')
     add('--filter', choices=FILTERS, metavar='NAME',
         help=f'examine a published filter: {", ".join(FILTERS)}')
     add('--level', choices=SEEDS, default='quick', help='of the exam of a filter')

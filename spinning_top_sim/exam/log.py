@@ -7,6 +7,7 @@ misreadings of them, a wrong stamp, the covariance, and whether they diverge.
 """
 
 import json
+import math
 import struct
 from pathlib import Path
 from typing import NamedTuple
@@ -21,10 +22,12 @@ from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.scenarios import Reals, Truth
 from spinning_top_sim.exam.trial import NORM_TOLERANCE, Outcome
 from spinning_top_sim.recording.reader import LogReader, LogTopic
+from spinning_top_sim.streams.messages import EXACT_VARIANCE
 
 # Of the sensor, and of the body; the first that the log has is the truth.
 TRUTHS = ('ground_truth/imu', 'ground_truth/odom', 'pose')
 OF_SENSOR = 'ground_truth/imu'
+NORTHS = TRUE, MAGNETIC = 'true', 'magnetic'
 LONGEST_GAP_S = 0.1             # of the truth, for attitudes between two of its samples
 NO_ORIENTATION = -1.0           # sensor_msgs/Imu has it in the covariance
 FEWEST = 100                    # attitudes that say something
@@ -60,27 +63,33 @@ class Attitudes(NamedTuple):
 
 
 def examine_log(path: Path, topic: str, truth: str | None = None,
-                heading: bool = False) -> Report:
+                north: str | None = None) -> Report:
     """
     Examine the attitudes of a topic.
 
     path : an MCAP file
     topic : of the attitudes q(world <- sensor), of a type of LAYOUTS
     truth : topic of the truth; default: the first of TRUTHS
-    heading : whether the heading must be right, as with a magnetometer, or only steady
+    north : from which the heading counts, one of NORTHS; None: the heading needs only be steady
 
     Raises LogError for what is no log, and ValueError for one without these topics or with too
     few attitudes.
     """
+    heading = north is not None
     with LogReader(path) as reader:
         said = _read(reader, _topic(reader, topic))
         true_topic = (_topic(reader, truth) if truth else _first_truth(reader))
         true = _read(reader, true_topic)
-        if not true_topic.name.endswith(OF_SENSOR):
-            provenance = reader.metadata.get('spinning_top_sim', {})
-            rpy = json.loads(provenance.get('parameters', '{}')).get('imu.rpy', (0.0, 0.0, 0.0))
-            mounted = Rotation.from_quat(true.quaternions) * Rotation.from_euler('xyz', rpy)
-            true = true._replace(quaternions=mounted.as_quat())
+        values = json.loads(reader.metadata.get('spinning_top_sim', {}).get('parameters', '{}'))
+    turns = Rotation.from_quat(true.quaternions)
+    if not true_topic.name.endswith(OF_SENSOR):
+        turns = turns * Rotation.from_euler('xyz', values.get('imu.rpy', (0.0, 0.0, 0.0)))
+    if north == MAGNETIC:
+        if 'mag.field' not in values:
+            raise ValueError(f'{path} does not say where magnetic north is')
+        east_part, north_part, _ = values['mag.field']
+        turns = Rotation.from_euler('z', math.atan2(east_part, north_part)) * turns
+    true = true._replace(quaternions=turns.as_quat())
     bad = np.abs(np.linalg.norm(said.quaternions, axis=1) - 1.0)
     wrong = np.flatnonzero(~(bad <= NORM_TOLERANCE))
     subject = f'{topic} of {path.name}'
@@ -161,7 +170,8 @@ def _decode(data: bytes, layout: Layout, name: str) -> tuple[int, Reals, Reals]:
             matrix = np.frombuffer(data, f'{order}f8', size * size, at + 32).reshape(size, size)
             if matrix[0, 0] == NO_ORIENTATION:
                 raise ValueError('it has no orientation')
-            if np.any(matrix[-3:, -3:]):    # sensor_msgs: 0 is unknown
+            # 0 is unknown (sensor_msgs), and our own streams say so of what is exact.
+            if np.max(matrix[-3:, -3:]) > EXACT_VARIANCE:
                 covariance = matrix[-3:, -3:]
     except (struct.error, ValueError) as error:
         raise ValueError(f'a message of {name} cannot be read: {error}') from error
@@ -169,12 +179,17 @@ def _decode(data: bytes, layout: Layout, name: str) -> tuple[int, Reals, Reals]:
 
 
 def _beside(name: str, said: Attitudes, true: Attitudes) -> Outcome:
-    """Return attitudes beside the truth of their stamps, interpolated between its samples."""
-    inside = (said.stamps_ns >= true.stamps_ns[0]) & (said.stamps_ns <= true.stamps_ns[-1])
-    stamps = said.stamps_ns[inside]
-    after = np.clip(np.searchsorted(true.stamps_ns, stamps), 1, len(true.stamps_ns) - 1)
-    near = true.stamps_ns[after] - true.stamps_ns[after - 1] <= LONGEST_GAP_S * 1e9
-    stamps = stamps[near]
+    """
+    Return attitudes beside the truth of their stamps.
+
+    If there are enough, those with a sample of the truth; else it is interpolated.
+    """
+    after = np.clip(np.searchsorted(true.stamps_ns, said.stamps_ns), 1, len(true.stamps_ns) - 1)
+    chosen = np.isin(said.stamps_ns, true.stamps_ns)
+    if np.count_nonzero(chosen) < FEWEST:
+        chosen = ((said.stamps_ns >= true.stamps_ns[0]) & (said.stamps_ns <= true.stamps_ns[-1])
+                  & (true.stamps_ns[after] - true.stamps_ns[after - 1] <= LONGEST_GAP_S * 1e9))
+    stamps = said.stamps_ns[chosen]
     if len(stamps) < FEWEST:
         raise ValueError(f'{name} has {len(stamps)} attitudes at times of the truth: must have '
                          f'{FEWEST} at least')
@@ -186,11 +201,11 @@ def _beside(name: str, said: Attitudes, true: Attitudes) -> Outcome:
     step = (turns[:-1].inv() * turns[1:]).as_rotvec() / np.diff(times)[:, np.newaxis]
     middle = 0.5 * (times[1:] + times[:-1])
     rates = np.stack([np.interp(t, middle, column) for column in step.T], axis=1)
-    covariances = said.covariances[inside][near]
+    covariances = said.covariances[chosen]
     known = bool(np.all(np.isfinite(covariances)))
     t = t - t[0]
     return Outcome(Truth(name, t, np.diff(t, prepend=t[0] - (t[1] - t[0])), truth.as_quat(),
-                         rates), said.quaternions[inside][near], np.arange(len(t)),
+                         rates), said.quaternions[chosen], np.arange(len(t)),
                    covariances if known else None, None)
 
 

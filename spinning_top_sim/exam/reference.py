@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.exam.scenarios import CALIBRATED, FIELD, FIELD_NOISE, GRAVITY, Reals
+from spinning_top_sim.exam.scenarios import CALIBRATED, FIELD, GRAVITY, Reals
 
 # A specific force whose size is this far from gravity [standard deviations] is no gravity.
 LARGEST_DEVIATION = 5.0
@@ -26,7 +26,7 @@ class ReferenceFilter:
 
     gyroscope_density : [rad/s/sqrt(Hz)]
     accelerometer_density : [m/s^2/sqrt(Hz)]
-    field, field_noise : in the world, east, north, up, and standard deviation of a sample [T]
+    field, field_density : in the world, east, north, up [T], and of its noise [T/sqrt(Hz)]
     bias_stddev : of the gyroscope's bias before it is estimated [rad/s]
     """
 
@@ -34,10 +34,11 @@ class ReferenceFilter:
 
     def __init__(self, gyroscope_density: float = CALIBRATED['imu.gyroscope_noise_density'],
                  accelerometer_density: float = CALIBRATED['imu.accelerometer_noise_density'],
-                 field: tuple[float, float, float] = FIELD, field_noise: float = FIELD_NOISE,
+                 field: tuple[float, float, float] = FIELD,
+                 field_density: float = CALIBRATED['mag.noise_density'],
                  bias_stddev: float = 0.02) -> None:
         self._densities = gyroscope_density, accelerometer_density
-        self._field, self._field_variance = np.array(field), field_noise ** 2
+        self._field, self._field_density = np.array(field), field_density
         self._quaternion = np.empty(0)      # before the first update
         self._p = np.diag([0.5 ** 2] * 3 + [bias_stddev ** 2] * 3)
         self._disturbed_s = 0.0
@@ -66,7 +67,7 @@ class ReferenceFilter:
             variance = DISTURBED ** 2
         pairs = [(accelerometer, UP, variance)]
         if magnetometer is not None:
-            pairs.append((magnetometer, self._field, self._field_variance))
+            pairs.append((magnetometer, self._field, self._field_density ** 2 / dt))
         self._correct(pairs)
         return self._quaternion.copy()
 

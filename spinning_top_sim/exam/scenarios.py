@@ -12,22 +12,25 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.imu import Imu
+from spinning_top_sim.streams.magnetometer import Magnetometer
 from spinning_top_sim.streams.pipeline import Simulation
 
 Reals = NDArray[np.float64]
 
-# Noise densities of config/imu/bmi088.yaml, without its turn-on bias: a calibrated device.
-CALIBRATED: Mapping[str, Any] = {'imu.gyroscope_noise_density': 1.72779e-4,
-                                 'imu.accelerometer_noise_density': 1.21360e-3}
 # East, north, up [T]: the strength and dip of mid-latitudes.  North is magnetic north, so that
 # the heading of a filter needs no declination.
 FIELD = (0.0, 20e-6, -43e-6)
-FIELD_NOISE = 0.2e-6            # of a sample of the magnetometer [T]
+# Noise densities of config/imu/bmi088.yaml, without its turn-on bias: a calibrated device.  The
+# magnetometer has a noise of 0.2 uT in 100 samples a second.
+CALIBRATED: Mapping[str, Any] = {
+    'imu.gyroscope_noise_density': 1.72779e-4, 'imu.accelerometer_noise_density': 1.21360e-3,
+    'mag.noise_density': 2e-8}
+# What an IMU without noise has of its parameters.
+OF_PLACE = ('imu.lever_arm', 'imu.rpy', 'mag.field')
 GRAVITY = 9.80665
 
 
@@ -120,40 +123,38 @@ class Run(Truth):
 
 def record(scenario: Scenario, imu: Mapping[str, Any], seed: int) -> Run:
     """
-    Simulate a scenario with these parameters of an IMU.
+    Simulate a scenario with these parameters of an IMU and its magnetometer.
 
     Raises ValueError for parameters that are not allowed.
     """
     random = np.random.default_rng(seed)
     phi, psi = random.uniform(-np.pi, np.pi, 2).tolist()
-    given = {**imu, **scenario.values} if scenario.noisy else {
-        **{name: value for name, value in imu.items() if name in ('imu.lever_arm', 'imu.rpy')},
-        **scenario.values}
-    values = parameters.checked({'initial.phi': phi, 'initial.psi': psi, 'seed': seed,
-                                 'solver.method': 'exact', **given})
+    given = imu if scenario.noisy else {name: imu[name] for name in OF_PLACE if name in imu}
+    values = parameters.checked({
+        'initial.phi': phi, 'initial.psi': psi, 'seed': seed, 'solver.method': 'exact',
+        'mag.field': FIELD, **given, **scenario.values})
     simulation, device = Simulation(values), Imu(values)
     period_ns = 2 * round(0.5 * NANOSECONDS / scenario.rate)
+    magnetometer = Magnetometer(values, period_ns)
     end_ns = round(scenario.duration * scenario.rate) * period_ns
     parts, begin_ns = [], 0
     for stop_ns in (*(round(t * scenario.rate) * period_ns for t in scenario.reversals), end_ns):
         steps = range(begin_ns + period_ns, stop_ns + 1, period_ns)
         halves = simulation.segment.states(range(begin_ns, stop_ns + 1, period_ns // 2))
-        parts.append(_readings(device, halves, steps))
+        parts.append(_readings(device, magnetometer, halves, steps))
         if stop_ns < end_ns:
             simulation.skip_to(stop_ns)
             simulation.command(-simulation.l3, -simulation.lz)
         begin_ns = stop_ns
-    gyroscope, accelerometer, magnetometer, truth, rates = np.split(
+    gyroscope, accelerometer, field, truth, rates = np.split(
         np.concatenate(parts, axis=1).T, (3, 6, 9, 13), axis=1)
-    if scenario.noisy:
-        magnetometer = magnetometer + FIELD_NOISE * random.standard_normal(magnetometer.shape)
     period = period_ns / NANOSECONDS
     t = period * np.arange(1, len(truth) + 1)
     stamps = t + scenario.jitter * random.standard_normal(len(t))
     stamps[0] = t[0]            # some filters take the first step for all of them
     run = Run(f'{scenario.name} at {scenario.rate:g} Hz, seed {seed}', stamps,
               np.full(len(t), period), truth, rates, gyroscope + scenario.bias, accelerometer,
-              magnetometer)
+              field)
     if not (scenario.jitter or scenario.drop_rate):
         return run
     kept = np.flatnonzero(random.random(len(t)) >= scenario.drop_rate)
@@ -162,7 +163,7 @@ def record(scenario: Scenario, imu: Mapping[str, Any], seed: int) -> Run:
     return replace(run, dt=np.diff(run.t, prepend=0.0))
 
 
-def _readings(device: Imu, halves: States, steps: range) -> Reals:
+def _readings(device: Imu, magnetometer: Magnetometer, halves: States, steps: range) -> Reals:
     """
     Return what an IMU reads, attitude and rates at the ends of steps, (16, n).
 
@@ -176,5 +177,5 @@ def _readings(device: Imu, halves: States, steps: range) -> Reals:
     gyroscope, accelerometer = device.sensor(steps.step).read(
         ((mean[0], mean[1], mean[2]), (force[0, 2::2], force[1, 2::2], force[2, 2::2])), steps)
     x, y, z, w = (column[2::2] for column in device.orientation(halves))
-    return np.stack([*gyroscope, *accelerometer, *attitude.in_body((x, y, z, w), FIELD),
-                     x, y, z, w, *rates[:, 2::2]])
+    field = magnetometer.read(magnetometer.true((x, y, z, w)), steps)
+    return np.stack([*gyroscope, *accelerometer, *field, x, y, z, w, *rates[:, 2::2]])
