@@ -127,6 +127,7 @@ benchmark: performance
 	.venv-benchmark/bin/python benchmark/work_precision.py
 	.venv-benchmark/bin/python benchmark/allan.py
 	.venv-benchmark/bin/python benchmark/attitude_filter.py
+	.venv-benchmark/bin/python benchmark/exam.py
 
 $(VENV)/.peers: $(wildcard benchmark/requirements*.txt) $(VENV)/.deps-test
 	@echo 'Installing into $(VENV) the programs that the benchmarks compare with'

@@ -61,6 +61,7 @@ setup(
             'ahrs>=0.4,<0.5',
             'catkin_pkg>=1.0,<2',
             'docutils>=0.20,<1',
+            'imufusion>=1.3,<2',
             'matplotlib>=3.6,<4',
             'mcap-ros2-support>=0.5.5,<0.7',
             'pyarrow>=14,<30',
