@@ -13,6 +13,8 @@ from spinning_top_sim.exam import examine
 
 
 class Complementary:
+    """Rates in closed form, corrected towards the specific force."""
+
     def __init__(self) -> None:
         self.attitude = Rotation.identity()
 
