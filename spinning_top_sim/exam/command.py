@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Examine an attitude filter: its attitudes in a log beside the truth, or a
-published filter by name.
+Examine an attitude filter: its attitudes in a log beside the truth, a running
+node, or a published filter by name.
 
   examine run.mcap --topic /imu/data
+  examine --node "python examples/attitude_node.py" --topic imu/data
   examine --filter vqf --level full --page vqf.png
 
 exit codes:
@@ -37,10 +38,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('log', type=Path, nargs='?', help='an MCAP file with the attitudes and the truth')
-    add('--topic', help='of the attitudes in the log')
+    add('--topic', help='of the attitudes')
     add('--truth', help='topic of the truth; default: ground_truth/imu, ground_truth/odom or pose')
     add('--heading', choices=NORTHS, help='the heading in the log must be right, from true or '
         'magnetic north; default: it must be steady')
+    add('--node', metavar='COMMAND', help='examine a ROS node that reads imu/data_raw and '
+        'imu/mag; it is started for every run, and gets a sample when it has answered the one '
+        'before')
     add('--filter', choices=FILTERS, metavar='NAME',
         help=f'examine a published filter: {", ".join(FILTERS)}')
     add('--level', choices=SEEDS, default='quick', help='of the exam of a filter')
@@ -75,13 +79,19 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _report(arguments: argparse.Namespace) -> Report:
-    if (arguments.log is None) == (arguments.filter is None):
-        raise ValueError('give either a log and --topic, or --filter')
+    if [arguments.log, arguments.node, arguments.filter].count(None) != 2:
+        raise ValueError('give either a log and --topic, --node and --topic, or --filter')
+    if arguments.filter is None and arguments.topic is None:
+        raise ValueError('--topic: which topic has the attitudes?')
     if arguments.log is not None:
-        if arguments.topic is None:
-            raise ValueError('--topic: which topic of the log has the attitudes?')
         return examine_log(arguments.log, arguments.topic, arguments.truth, arguments.heading)
     imu = None if arguments.imu is None else read_scene(arguments.imu)
+    if arguments.node is not None:
+        from spinning_top_sim.exam.live import NodeExam  # noqa: PLC0415 - needs ROS
+
+        with NodeExam(arguments.node, arguments.topic) as node:
+            return examine(node.make_filter, arguments.level, imu, arguments.seeds,
+                           arguments.node)
     return examine(FILTERS[arguments.filter], arguments.level, imu, arguments.seeds,
                    arguments.filter)
 

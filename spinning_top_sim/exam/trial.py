@@ -108,6 +108,7 @@ def follow(make_filter: MakeFilter, run: Run, given: Input | None = None, read: 
     try:
         filter_ = make_filter()
         update = filter_.update
+        slowest = getattr(filter_, 'slowest', SLOWEST)
         begin = time.perf_counter()
         # The filter may keep or change what it gets.
         for k, (rate, force, field, dt) in enumerate(zip(
@@ -115,7 +116,7 @@ def follow(make_filter: MakeFilter, run: Run, given: Input | None = None, read: 
                 run.dt.tolist(), strict=True)):
             said.append(update(rate, force, field if magnetometer else None, dt))
             if k % READ_EVERY == READ_EVERY - 1:
-                _check_speed(time.perf_counter() - begin, k + 1, dt)
+                _check_speed(time.perf_counter() - begin, k + 1, dt, slowest)
                 numbers.append(k)
                 covariances.append(np.array(getattr(filter_, 'covariance', None), dtype=float))
                 biases.append(np.array(getattr(filter_, 'bias', None), dtype=float))
@@ -129,8 +130,8 @@ def follow(make_filter: MakeFilter, run: Run, given: Input | None = None, read: 
                    _checked('covariance', covariances, (3, 3)), _checked('bias', biases, (3,)))
 
 
-def _check_speed(spent: float, updates: int, dt: float) -> None:
-    if spent > 1.0 and spent > SLOWEST * updates * dt:
+def _check_speed(spent: float, updates: int, dt: float, slowest: float) -> None:
+    if spent > 1.0 and spent > slowest * updates * dt:
         raise InvalidOutputError(
             f'too slow: {1e3 * spent / updates:.3g} ms an update, and a sample comes every '
             f'{1e3 * dt:.3g} ms')
