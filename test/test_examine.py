@@ -108,11 +108,16 @@ def linear_filter(seed, factor=1.0):
 
 @pytest.mark.parametrize(('factor', 'expected'), [(1.0, None), (0.5, 'above'), (2.0, 'below')])
 def test_the_nees_of_a_linear_filter_is_in_its_band(factor, expected):
-    nees = measures.nees_of([linear_filter(seed, factor) for seed in range(3)], False)
+    runs = [linear_filter(seed, factor) for seed in range(3)]
+    nees = measures.nees_of(runs, False)
     low, high = nees.band()
     assert nees.degrees > 300
     assert expected == ('below' if nees.ratio < low else 'above' if nees.ratio > high else None)
     assert nees.ratio == pytest.approx(1.0 / factor, rel=0.2)
+    for _, _, covariances in runs:
+        covariances[:, 2, 2] = 0.0          # of the heading, of which the filter knows nothing
+    assert measures.nees_of(runs, False).ratio == pytest.approx(nees.ratio, rel=0.02)
+    assert measures.nees_of(runs, True) is None
 
 
 # ------------------------------------------------------------------------------------- faults
@@ -224,7 +229,7 @@ def test_a_run_that_fails_leaves_the_others():
 
 
 @pytest.mark.parametrize(('covariance', 'says'), [
-    (-np.eye(3), 'must be positive definite'), (np.eye(2), 'must be 3 x 3 finite numbers'),
+    (-np.eye(3), 'must have no negative eigenvalue'), (np.eye(2), 'must be 3 x 3 finite numbers'),
     (np.full((3, 3), math.nan), 'must be 3 x 3 finite numbers')])
 def test_a_wrong_covariance_is_told(covariance, says):
     class Wrong(Vqf):

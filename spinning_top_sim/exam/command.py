@@ -26,7 +26,6 @@ from spinning_top_sim.exam.log import NORTHS, examine_log
 from spinning_top_sim.exam.report import Report
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.tools import cli
-from spinning_top_sim.tools.scene_file import read_scene
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -85,14 +84,13 @@ def _report(arguments: argparse.Namespace) -> Report:
         raise ValueError('--topic: which topic has the attitudes?')
     if arguments.log is not None:
         return examine_log(arguments.log, arguments.topic, arguments.truth, arguments.heading)
-    imu = None if arguments.imu is None else read_scene(arguments.imu)
     if arguments.node is not None:
         from spinning_top_sim.exam.live import NodeExam  # noqa: PLC0415 - needs ROS
 
         with NodeExam(arguments.node, arguments.topic) as node:
-            return examine(node.make_filter, arguments.level, imu, arguments.seeds,
+            return examine(node.make_filter, arguments.level, arguments.imu, arguments.seeds,
                            arguments.node)
-    return examine(FILTERS[arguments.filter], arguments.level, imu, arguments.seeds,
+    return examine(FILTERS[arguments.filter], arguments.level, arguments.imu, arguments.seeds,
                    arguments.filter)
 
 

@@ -234,14 +234,15 @@ def bias_fault(effect: BiasEffect, absolute: bool) -> Fault | None:
 
 
 def consistency(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, measures.Nees]:
-    """Return the NEES of tilt and attitude, by what it is of; nothing without covariances."""
+    """Return the NEES of tilt and attitude by name, as far as there are covariances."""
     runs = [(one.estimates[one.read], one.run.truth[one.read], one.covariances)
             for outcome in outcomes for one in (outcome.later(0.75),)
             if one.covariances is not None]
     if not runs:
         return {}
-    found = {'tilt': measures.nees_of(runs, False)}
-    return found | {'attitude': measures.nees_of(runs, True)} if absolute else found
+    found = {what: measures.nees_of(runs, whole)
+             for what, whole in (('tilt', False), ('attitude', True))[:1 + absolute]}
+    return {what: nees for what, nees in found.items() if nees is not None}
 
 
 def covariance_fault(found: Mapping[str, measures.Nees]) -> Fault | None:

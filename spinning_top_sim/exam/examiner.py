@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.scenarios import Run, Scenario
 from spinning_top_sim.exam.trial import Input, InvalidOutputError, MakeFilter, Outcome, follow
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.tools.scene_file import read_scene
 
 # Seeds of the noisy runs.
 SEEDS = {'quick': range(3), 'full': range(10)}
@@ -29,7 +31,8 @@ EXTRA = (scenarios.POLE, scenarios.SATURATION, scenarios.DROPS, scenarios.COMMAN
 
 
 def examine(make_filter: MakeFilter, level: str = 'quick',
-            imu: Mapping[str, Any] | None = None, seeds: int | Iterable[int] | None = None,
+            imu: Mapping[str, Any] | str | Path | None = None,
+            seeds: int | Iterable[int] | None = None,
             subject: str | None = None) -> Report:
     """
     Examine an attitude filter.
@@ -38,14 +41,15 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     ----------
     make_filter : returns a new filter, see `trial.Filter`; it is called for every run
     level : 'quick', or 'full' with more seeds and motions
-    imu : parameters of the IMU by name, such as those of a file in config/imu; default: the noise
-        of a calibrated device, `scenarios.CALIBRATED`
+    imu : parameters of the IMU by name, or the path of a file of them, as in config/imu; default:
+        the noise of a calibrated device, `scenarios.CALIBRATED`
     seeds : of noise and start of the noisy runs, or how many; default: SEEDS of the level
     subject : name in the report; default: that of the filter's class
 
     Raises
     ------
     ValueError : for a level, parameter or seed that is not allowed
+    OSError : if the file cannot be read
 
     Notes
     -----
@@ -54,7 +58,8 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     """
     if level not in SEEDS:
         raise ValueError(f'level = {level!r}: must be one of {", ".join(SEEDS)}')
-    values = scenarios.CALIBRATED if imu is None else imu
+    values = (scenarios.CALIBRATED if imu is None else
+              imu if isinstance(imu, Mapping) else read_scene(imu))
     parameters.checked(values)
     numbers = list(SEEDS[level] if seeds is None else
                    range(seeds) if isinstance(seeds, int) else seeds)
@@ -104,7 +109,7 @@ class _Exam:
             self._add(diagnosis.divergence(noisy[0], self._absolute))
         consistency = diagnosis.consistency(noisy, self._absolute)
         if consistency:
-            nees = consistency['attitude' if self._absolute else 'tilt']
+            nees = [*consistency.values()][-1]
             low, high = nees.band()
             self.measures |= {'nees': nees.ratio, 'nees_low': low, 'nees_high': high}
             # An error that has another reason is no matter of the covariance.

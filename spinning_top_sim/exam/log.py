@@ -115,7 +115,7 @@ def examine_log(path: Path, topic: str, truth: str | None = None,
         faults.append(fault)
     consistency = diagnosis.consistency([corrected], heading)
     if consistency:
-        nees = consistency['attitude' if heading else 'tilt']
+        nees = [*consistency.values()][-1]
         low, high = nees.band()
         measured |= {'nees': nees.ratio, 'nees_low': low, 'nees_high': high}
         if not faults and (fault := diagnosis.covariance_fault(consistency)) is not None:

@@ -131,7 +131,7 @@ class Nees(NamedTuple):
         return float(low), float(high)
 
 
-def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees:
+def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees | None:
     """
     Compare errors with the covariances that a filter states (Bar-Shalom et al. 2001, 5.4.2).
 
@@ -141,15 +141,20 @@ def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees:
 
     runs : estimates (n, 4), truth (n, 4) and covariances (n, 3, 3) [rad^2] of each
     absolute : False leaves out the heading
+
+    Returns None for covariances that cannot be inverted, as of a filter that knows no heading.
     """
     found = []
     for in_sensor in (True, False):
-        rows = [_normalised_squares(*run, absolute, in_sensor) for run in runs]
+        try:
+            rows = [_normalised_squares(*run, absolute, in_sensor) for run in runs]
+        except np.linalg.LinAlgError:
+            continue
         values = np.stack([row[:min(map(len, rows))] for row in rows])
         dimensions = 3 if absolute else 2
         independent = values.size / _autocorrelation_time(values)
         found.append(Nees(float(np.mean(values)) / dimensions, dimensions * independent))
-    return min(found, key=lambda nees: abs(math.log(max(nees.ratio, 1e-300))))
+    return min(found, key=lambda nees: abs(math.log(max(nees.ratio, 1e-300))), default=None)
 
 
 def _normalised_squares(estimates: Reals, truth: Reals, covariances: Reals, absolute: bool,
@@ -165,6 +170,9 @@ def _normalised_squares(estimates: Reals, truth: Reals, covariances: Reals, abso
         vertical = est.apply(true.inv().apply((0.0, 0.0, 1.0)))
         vector = np.stack((-vertical[:, 1], vertical[:, 0]), axis=1)
         covariances = covariances[:, :2, :2]
+    eigenvalues = np.linalg.eigvalsh(covariances)
+    if np.any(eigenvalues[:, 0] <= 1e-12 * eigenvalues[:, -1]):
+        raise np.linalg.LinAlgError('no inverse')
     solved = np.linalg.solve(covariances, vector[:, :, np.newaxis])[:, :, 0]
     squares: Reals = np.sum(vector * solved, axis=1)
     return squares

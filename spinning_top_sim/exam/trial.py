@@ -182,7 +182,9 @@ def _checked(name: str, values: list[object], shape: tuple[int, ...]) -> Reals |
         if array.shape != shape or not np.all(np.isfinite(array)):
             raise InvalidOutputError(f'{name} is {_short(array.tolist())}: must be '
                                      f'{" x ".join(map(str, shape))} finite numbers')
-        if name == 'covariance' and np.min(np.linalg.eigvalsh(0.5 * (array + array.T))) <= 0.0:
-            raise InvalidOutputError(f'covariance is {_short(array.tolist())}: must be positive '
-                                     'definite')
+        if name == 'covariance':
+            eigenvalues = np.linalg.eigvalsh(0.5 * (array + array.T))
+            if eigenvalues[-1] <= 0.0 or eigenvalues[0] < -1e-9 * eigenvalues[-1]:
+                raise InvalidOutputError(f'covariance is {_short(array.tolist())}: must have no '
+                                         'negative eigenvalue')
     return np.array(values)
