@@ -25,6 +25,7 @@ GROSS = np.radians(3.0)         # of a filter that may misread something
 DIVERGED = np.radians(10.0)
 EXPLAINED = 0.25                # of the error is left where its cause is undone
 FIRST_ORDER = np.radians(0.2)   # on the fast motion
+FIRST_ORDER_LEFT = 0.5          # of that error, with rates for which such steps are right
 LEVER_ARM = np.radians(1.0)     # between the attitudes with and without the lever arm
 AHEAD, DELAYED = -1.5, 0.75     # steps: a filter that corrects before its step is ahead by one
 BIAS_LEFT_S = 0.05              # error for the bias that causes it [rad/(rad/s)]
@@ -174,7 +175,7 @@ def stamp_fault(outcome: Outcome, absolute: bool) -> tuple[measures.Offset, Faul
 
 def first_order_fault(before: float, after: float, rate: float) -> Fault | None:
     """Judge errors on the fast motion [rad], as it is and for what a first-order step leaves."""
-    if before < FIRST_ORDER or after > EXPLAINED * before:
+    if before < FIRST_ORDER or after > FIRST_ORDER_LEFT * before:
         return None
     return Fault('first_order_integration',
                  f'at {rate:g} Hz, with rates tan(|w| dt/2)/(|w| dt/2) times as large, the error '
@@ -243,6 +244,16 @@ def consistency(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, measur
     found = {what: measures.nees_of(runs, whole)
              for what, whole in (('tilt', False), ('attitude', True))[:1 + absolute]}
     return {what: nees for what, nees in found.items() if nees is not None}
+
+
+def nees_marks(found: Mapping[str, measures.Nees]) -> dict[str, float]:
+    """Return the measures of what `consistency` returns."""
+    marked: dict[str, float] = {}
+    for what, nees in found.items():
+        name = 'nees' if what == 'tilt' else 'nees_attitude'
+        low, high = nees.band()
+        marked |= {name: nees.ratio, f'{name}_low': low, f'{name}_high': high}
+    return marked
 
 
 def covariance_fault(found: Mapping[str, measures.Nees]) -> Fault | None:

@@ -108,12 +108,9 @@ class _Exam:
         if not self.faults:
             self._add(diagnosis.divergence(noisy[0], self._absolute))
         consistency = diagnosis.consistency(noisy, self._absolute)
-        if consistency:
-            nees = [*consistency.values()][-1]
-            low, high = nees.band()
-            self.measures |= {'nees': nees.ratio, 'nees_low': low, 'nees_high': high}
-            # An error that has another reason is no matter of the covariance.
-            self._add(None if self.faults else diagnosis.covariance_fault(consistency))
+        self.measures |= diagnosis.nees_marks(consistency)
+        if not self.faults:         # else the errors have another reason
+            self._add(diagnosis.covariance_fault(consistency))
 
     def _add(self, fault: Fault | None) -> None:
         if fault is not None:

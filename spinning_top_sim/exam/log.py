@@ -114,12 +114,9 @@ def examine_log(path: Path, topic: str, truth: str | None = None,
     if not faults and (fault := diagnosis.divergence(outcome, heading)) is not None:
         faults.append(fault)
     consistency = diagnosis.consistency([corrected], heading)
-    if consistency:
-        nees = [*consistency.values()][-1]
-        low, high = nees.band()
-        measured |= {'nees': nees.ratio, 'nees_low': low, 'nees_high': high}
-        if not faults and (fault := diagnosis.covariance_fault(consistency)) is not None:
-            faults.append(fault)
+    measured |= diagnosis.nees_marks(consistency)
+    if not faults and (fault := diagnosis.covariance_fault(consistency)) is not None:
+        faults.append(fault)
     return Report(subject, list(diagnosis.in_order(faults)), measured, [outcome])
 
 

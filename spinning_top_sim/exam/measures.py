@@ -135,8 +135,9 @@ def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees 
     """
     Compare errors with the covariances that a filter states (Bar-Shalom et al. 2001, 5.4.2).
 
-    Errors of one run are correlated, and count for fewer independent ones by the integrated
-    autocorrelation time.  The covariance may be about the axes of the sensor or of the world: what
+    Errors of one run are correlated.  Tilts count for fewer independent ones by the integrated
+    autocorrelation time; the heading moves so slowly that attitudes of a run count as one.  The
+    covariance may be about the axes of the sensor or of the world: what
     suits it better counts.
 
     runs : estimates (n, 4), truth (n, 4) and covariances (n, 3, 3) [rad^2] of each
@@ -144,21 +145,26 @@ def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees 
 
     Returns None for covariances that cannot be inverted, as of a filter that knows no heading.
     """
+    dimensions = 3 if absolute else 2
     found = []
     for in_sensor in (True, False):
         try:
-            rows = [_normalised_squares(*run, absolute, in_sensor) for run in runs]
+            parts = [_normalised_squares(*run, absolute, in_sensor) for run in runs]
         except np.linalg.LinAlgError:
             continue
-        values = np.stack([row[:min(map(len, rows))] for row in rows])
-        dimensions = 3 if absolute else 2
-        independent = values.size / _autocorrelation_time(values)
-        found.append(Nees(float(np.mean(values)) / dimensions, dimensions * independent))
-    return min(found, key=lambda nees: abs(math.log(max(nees.ratio, 1e-300))), default=None)
+        shortest = min(len(squares) for squares, _ in parts)
+        values = np.stack([squares[:shortest] for squares, _ in parts])
+        mean = max(float(np.mean(values)), 1e-300)
+        independent = len(runs) if absolute else values.size / _autocorrelation_time(values)
+        # The better axes have the greater likelihood, whatever factor the covariances are off by.
+        unlikely = dimensions * math.log(mean) + float(np.mean([size for _, size in parts]))
+        found.append((unlikely, Nees(mean / dimensions, dimensions * independent)))
+    return min(found)[1] if found else None
 
 
 def _normalised_squares(estimates: Reals, truth: Reals, covariances: Reals, absolute: bool,
-                        in_sensor: bool) -> Reals:
+                        in_sensor: bool) -> tuple[Reals, float]:
+    """Return e^T P^-1 e of the errors (n,), and the mean logarithm of the determinant of P."""
     est, true = Rotation.from_quat(estimates), Rotation.from_quat(truth)
     if in_sensor:
         turn = est.as_matrix()
@@ -174,8 +180,7 @@ def _normalised_squares(estimates: Reals, truth: Reals, covariances: Reals, abso
     if np.any(eigenvalues[:, 0] <= 1e-12 * eigenvalues[:, -1]):
         raise np.linalg.LinAlgError('no inverse')
     solved = np.linalg.solve(covariances, vector[:, :, np.newaxis])[:, :, 0]
-    squares: Reals = np.sum(vector * solved, axis=1)
-    return squares
+    return np.sum(vector * solved, axis=1), float(np.mean(np.sum(np.log(eigenvalues), axis=1)))
 
 
 def _autocorrelation_time(values: Reals) -> float:
