@@ -143,6 +143,17 @@ def test_the_law_of_a_flicker_bias_is_flat_for_every_band(lowest):
         assert np.sqrt(variance) == pytest.approx(1.0, rel=0.06)
 
 
+def test_a_jump_of_three_years_draws_few_numbers(monkeypatch):
+    """By way of some log2 of the blocks before, for each of three paths."""
+    draws, philox = [], np.random.Philox
+    monkeypatch.setattr(np.random, 'Philox',
+                        lambda **keys: (draws.append(keys), philox(**keys))[1])
+    begin = 94_608_000 * SECOND
+    there = read({**ALL_BIASES, 'seed': 77}, range(begin, begin + SECOND, MILLISECOND))
+    assert 3 * 20 < len(draws) < 3 * 100
+    assert np.isfinite(there).all() and np.std(there, axis=0).min() > 0.0
+
+
 ALL_BIASES = {f'imu.{kind}_{name}': value for kind in ('gyroscope', 'accelerometer')
               for name, value in (('random_walk', 1e-2), ('bias_stddev', 0.1),
                                   ('turn_on_bias', 0.2), ('bias_instability', 0.05))}

@@ -133,3 +133,33 @@ def test_without_faults_the_labels_say_so(tmp_path):
     stamps, true, copies = labels(log['ground_truth/imu_timing'][2])
     assert np.array_equal(stamps, true) and np.array_equal(true, log['imu/data_raw'][0])
     assert copies.tolist() == 101 * [1]
+
+
+# -------------------------------------------------------------------------------------------- live
+
+def test_a_node_with_all_errors_records_a_log_that_is_verified(peer, tmp_path):
+    """Rates change while it runs; what is not allowed is refused with the reason."""
+    pytest.importorskip('rclpy')
+    from helpers.node_harness import SimNode
+    from sensor_msgs.msg import Imu, MagneticField
+
+    from spinning_top_sim.tools.inspect import main as inspect
+
+    errors = {**FAULTS, 'imu.gyroscope_bias_instability': 1e-3,
+              'imu.orientation_stddev': [0.1] * 3,
+              'imu.accelerometer_bias_stddev': 0.1, 'mag.noise_density': 1e-7,
+              'imu.gyroscope_A': [1e-3] * 9, 'mag.hard_iron': [1e-5, 0.0, 0.0]}
+    with SimNode(tmp_path, {**errors, 'imu_timing.enabled': True, 'imu_data.enabled': True,
+                            'mag.enabled': True, 'record.enabled': True}) as node:
+        peer.listen(node.topic('imu/mag'), MagneticField).wait(20)
+        raw = peer.listen(node.topic('imu/data_raw'), Imu).wait(20)
+        refused, = peer.set_each(node, imu__bias_instability_band=[5.0, 1.0])
+        assert not refused.successful
+        assert 'imu.bias_instability_band = [5.0, 1.0]: the second number' in refused.reason
+        for rate in (333.0, 50.0):
+            changed = peer.set_each(node, imu__rate=rate, mag__rate=0.5 * rate)
+            assert all(one.successful for one in changed)
+            raw.wait_more(10)
+        assert node.end() == 0
+    log, = node.folder.glob('*.mcap')
+    assert inspect([str(log), '--verify']) == 0
