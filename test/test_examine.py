@@ -22,6 +22,7 @@ from spinning_top_sim.exam.diagnosis import FAULTS
 from spinning_top_sim.exam.log import examine_log
 from spinning_top_sim.exam.pytest_plugin import pass_exam  # noqa: F401, a fixture
 from spinning_top_sim.exam.reference import ReferenceFilter
+from spinning_top_sim.exam.trial import follow
 from spinning_top_sim.tools.simulate import main as simulate
 
 pytest.importorskip('vqf')
@@ -118,6 +119,20 @@ def test_the_nees_of_a_linear_filter_is_in_its_band(factor, expected):
         covariances[:, 2, 2] = 0.0          # of the heading, of which the filter knows nothing
     assert measures.nees_of(runs, False).ratio == pytest.approx(nees.ratio, rel=0.02)
     assert measures.nees_of(runs, True) is None
+
+
+def test_covariances_may_be_about_the_axes_of_the_world():
+    said = follow(ReferenceFilter, scenarios.record(scenarios.SLOW, scenarios.CALIBRATED, 1))
+    said = said.later(0.75)
+    estimates, truth = said.estimates[said.read], said.run.truth[said.read]
+    turn = Rotation.from_quat(estimates).as_matrix()
+    for factor in (0.5, 1.0, 2.0):
+        of_sensor = factor * said.covariances
+        of_world = turn @ of_sensor @ turn.transpose(0, 2, 1)
+        for absolute in (False, True):
+            nees = [measures.nees_of([(estimates, truth, covariances)], absolute)
+                    for covariances in (of_sensor, of_world)]
+            assert nees[0].ratio == pytest.approx(nees[1].ratio, rel=1e-6)
 
 
 # ------------------------------------------------------------------------------------- faults

@@ -137,8 +137,7 @@ def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees 
 
     Errors of one run are correlated.  Tilts count for fewer independent ones by the integrated
     autocorrelation time; the heading moves so slowly that attitudes of a run count as one.  The
-    covariance may be about the axes of the sensor or of the world: what
-    suits it better counts.
+    covariance may be about the axes of the sensor or of the world: what suits it better counts.
 
     runs : estimates (n, 4), truth (n, 4) and covariances (n, 3, 3) [rad^2] of each
     absolute : False leaves out the heading
