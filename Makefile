@@ -129,6 +129,7 @@ benchmark: performance
 	.venv-benchmark/bin/python benchmark/increments.py
 	.venv-benchmark/bin/python benchmark/attitude_filter.py
 	.venv-benchmark/bin/python benchmark/ensemble.py
+	.venv-benchmark/bin/python benchmark/exam.py
 
 $(VENV)/.peers: $(wildcard benchmark/requirements*.txt) $(VENV)/.deps-test
 	@echo 'Installing into $(VENV) the programs that the benchmarks compare with'

@@ -17,6 +17,7 @@ EXECUTABLES = {
     'recover': 'spinning_top_sim.tools.cli:recover',
     'inspect': 'spinning_top_sim.tools.cli:inspect',
     'ensemble': 'spinning_top_sim.tools.cli:ensemble',
+    'examine': 'spinning_top_sim.tools.cli:examine',
 }
 
 DATA_FILES = {
@@ -62,6 +63,7 @@ setup(
             'catkin_pkg>=1.0,<2',
             'distributed>=2024.5,<2028',
             'docutils>=0.20,<1',
+            'imufusion>=1.3,<2',
             'matplotlib>=3.6,<4',
             'mcap-ros2-support>=0.5.5,<0.7',
             'pyarrow>=14,<30',
@@ -73,11 +75,13 @@ setup(
             'yourdfpy>=0.0.60,<0.1',
         ],
         'parquet': ['pyarrow>=14,<30'],
-        'exam': ['distributed>=2024.5,<2028', 'pyarrow>=14,<30'],     # ensembles
         'plot': ['matplotlib>=3.6,<4'],     # inspect --plot, docs/figures.py
         # examples/attitude_filter.py
         'examples': ['ahrs>=0.4,<0.5', 'matplotlib>=3.6,<4', 'rosbags>=0.10.11,<0.12',
                      'vqf>=2.1,<3'],
+        # Ensembles, and the filters that `examine` knows by name; gtsam is another, and not needed.
+        'exam': ['ahrs>=0.4,<0.5', 'distributed>=2024.5,<2028', 'imufusion>=1.3,<2',
+                 'pyarrow>=14,<30', 'vqf>=2.1,<3'],
         # Narrow ranges: a new release reports new faults.
         'lint': [
             'mypy>=2.4.1,<2.5',

@@ -17,6 +17,7 @@ MAY_IMPORT = {
     'streams': {'physics', 'solvers'},
     'recording': set(),
     'tools': {'physics', 'solvers', 'streams', 'recording'},
+    'exam': {'physics', 'solvers', 'streams', 'recording', 'tools'},
     'nodes': {'physics', 'solvers', 'streams', 'recording', 'tools'},
 }
 ROS = {'rclpy', 'launch', 'launch_ros', 'rcl_interfaces', 'ament_index_python', 'std_msgs',
@@ -27,6 +28,7 @@ MAY_NOT_IMPORT = {
     'streams': ROS | {'scipy', 'mcap', 'os', 'pathlib'},
     'recording': {'rclpy', 'scipy'},
     'tools': {'rclpy'},
+    'exam': set(),
     'nodes': {'scipy'},
 }
 MODULES = {'.'.join(path.relative_to(PACKAGE.parent).with_suffix('').parts): path
@@ -68,6 +70,12 @@ def test_a_room_imports_only_what_it_may(name):
         assert others <= MAY_IMPORT[name], module
         top_level = {imported_name.split('.')[0] for imported_name in imported(path)}
         assert not top_level & MAY_NOT_IMPORT[name], module
+
+
+def test_one_module_of_the_exam_needs_ros():
+    needs = {module for module, path in MODULES.items() if room(module) == 'exam'
+             and any(name.split('.')[0] in ROS for name in imported(path))}
+    assert needs == {f'{NAME}.exam.live'}
 
 
 def test_every_folder_is_a_room():

@@ -17,17 +17,17 @@ LINE_EVERY_S = 10.0         # of progress, without a terminal
 GAP = '  '                  # before each column of a table
 
 
-def _start(name: str) -> int:
+def _start(module: str) -> int:
     """Import a tool and run it; return its exit code, also if Ctrl-C interrupts the imports."""
     try:
-        return importlib.import_module(f'spinning_top_sim.tools.{name}').main()
+        return importlib.import_module(f'spinning_top_sim.{module}').main()
     except KeyboardInterrupt:
         return INTERRUPTED
 
 
 # The executables.
-simulate, inspect, recover, ensemble = (
-    partial(_start, name) for name in ('simulate', 'inspect', 'recover', 'ensemble'))
+simulate, inspect, recover, ensemble, examine = (partial(_start, module) for module in (
+    'tools.simulate', 'tools.inspect', 'tools.recover', 'tools.ensemble', 'exam.command'))
 
 
 def run(name: str, help_text: str | None, argv: Sequence[str] | None,

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Published attitude filters in the form that the exam takes; `pip install 'spinning_top_sim[exam]'`.
+
+Each has the settings that its package comes with, and starts from the attitude that its first
+readings show.  With `magnetic=False` it does not get the magnetometer.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim.exam.reference import ReferenceFilter, from_two_vectors
+from spinning_top_sim.exam.scenarios import FIELD, GRAVITY, Reals
+from spinning_top_sim.exam.trial import Filter
+
+W_FIRST, W_LAST = [3, 0, 1, 2], [1, 2, 3, 0]
+# From axes north, west, up to east, north, up.
+FROM_NWU = Rotation.from_euler('z', 90.0, degrees=True)
+
+
+class Vqf:
+    """VQF (Laidig and Seel 2023), package vqf.  Its period is fixed: lost samples are repeated."""
+
+    def __init__(self, magnetic: bool = True) -> None:
+        self._magnetic, self._period = magnetic, 0.0
+
+    def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
+               dt: float) -> Reals:
+        """See `trial.Filter`."""
+        if not self._period:
+            from vqf import VQF  # noqa: PLC0415
+
+            self._filter, self._period = VQF(dt), dt
+        uses_field = self._magnetic and magnetometer is not None
+        for _ in range(max(1, round(dt / self._period))):
+            self._filter.update(gyroscope, accelerometer, *([magnetometer] * uses_field))
+        said: Reals = (self._filter.getQuat9D() if uses_field else self._filter.getQuat6D())
+        return said[W_LAST]
+
+    @property
+    def bias(self) -> Reals:
+        """Of the gyroscope [rad/s]."""
+        bias: Reals = self._filter.getBiasEstimate()[0]
+        return bias
+
+
+class Ahrs:
+    """
+    Madgwick's and Mahony's filter and the EKF of the package ahrs (M. Garcia 2020).
+
+    Madgwick's takes north for its x axis.  The EKF calls a frame NED in which the accelerometer
+    reads +g along z at rest, which is up here.
+    """
+
+    def __init__(self, name: str, magnetic: bool = True) -> None:
+        from ahrs import filters  # noqa: PLC0415
+
+        self._name, self._magnetic = name, magnetic
+        if name == 'EKF':
+            self._filter = filters.EKF(magnetic_ref=list(FIELD))
+        else:
+            self._filter = getattr(filters, name)()
+        if name == 'Madgwick' and magnetic:
+            self._filter.gain = self._filter.gain_marg
+        self._turn = FROM_NWU if name == 'Madgwick' and magnetic else Rotation.identity()
+        self._attitude: Reals | None = None
+
+    def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
+               dt: float) -> Reals:
+        """See `trial.Filter`."""
+        uses_field = self._magnetic and magnetometer is not None
+        readings = [gyroscope, accelerometer, *([magnetometer] * uses_field)]
+        if self._attitude is None:
+            start = from_two_vectors(accelerometer, magnetometer if uses_field else None)
+            self._attitude = (self._turn.inv() * Rotation.from_quat(start)).as_quat()[W_FIRST]
+        elif self._name == 'EKF':
+            # It asks this attribute, not its argument, whether there is a magnetometer.
+            self._filter.mag = np.empty(0) if uses_field else None
+            self._attitude = self._filter.update(self._attitude, *readings, dt=dt)
+        elif uses_field:
+            self._attitude = self._filter.updateMARG(self._attitude, *readings, dt=dt)
+        else:
+            self._attitude = self._filter.updateIMU(self._attitude, *readings, dt=dt)
+        said = np.asarray(self._attitude)[W_LAST]
+        turned: Reals = (self._turn * Rotation.from_quat(said)).as_quat()
+        return turned
+
+
+class Imufusion:
+    """Madgwick's later filter (thesis of 2014, ch. 7), package imufusion; deg/s and g."""
+
+    def __init__(self, magnetic: bool = True) -> None:
+        import imufusion  # noqa: PLC0415
+
+        self._magnetic = magnetic
+        self._filter: Any = imufusion.Ahrs()
+        settings = imufusion.AhrsSettings()
+        settings.convention = imufusion.CONVENTION_ENU
+        self._filter.set_settings(settings)
+
+    def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
+               dt: float) -> Reals:
+        """See `trial.Filter`."""
+        self._filter.set_sample_period(dt)
+        rates, force = np.degrees(gyroscope), accelerometer / GRAVITY
+        if self._magnetic and magnetometer is not None:
+            self._filter.update(rates, force, 1e6 * magnetometer)
+        else:
+            self._filter.update_no_magnetometer(rates, force)
+        said: Reals = np.asarray(self._filter.get_quaternion(), dtype=float)[W_LAST]
+        return said / np.linalg.norm(said)
+
+
+class Gtsam:
+    """Rotations preintegrated by gtsam: it only integrates the rates (Forster et al. 2017)."""
+
+    def __init__(self) -> None:
+        import gtsam  # noqa: PLC0415
+
+        self._integrated: Any = gtsam.PreintegratedRotation(gtsam.PreintegratedRotationParams())
+        self._start: Rotation | None = None
+
+    def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
+               dt: float) -> Reals:
+        """See `trial.Filter`."""
+        if self._start is None:
+            self._start = Rotation.from_quat(from_two_vectors(accelerometer, magnetometer))
+        else:
+            self._integrated.integrateGyroMeasurement(gyroscope, np.zeros(3), dt)
+        turned = Rotation.from_matrix(self._integrated.deltaRij().matrix())
+        said: Reals = (self._start * turned).as_quat()
+        return said
+
+
+# By name; those with six axes do not get the magnetometer.
+FILTERS: dict[str, Callable[[], Filter]] = {
+    'reference': ReferenceFilter,
+    'vqf': Vqf, 'vqf-6d': partial(Vqf, magnetic=False),
+    'madgwick': partial(Ahrs, 'Madgwick'), 'madgwick-6d': partial(Ahrs, 'Madgwick', False),
+    'mahony': partial(Ahrs, 'Mahony'), 'mahony-6d': partial(Ahrs, 'Mahony', False),
+    'ekf': partial(Ahrs, 'EKF'), 'ekf-6d': partial(Ahrs, 'EKF', False),
+    'imufusion': Imufusion, 'imufusion-6d': partial(Imufusion, False),
+    'gtsam': Gtsam,
+}

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The exam of a ROS node: it gets one sample at a time, and the next one when it has answered.
+
+So the verdict does not depend on the load of the machine.  The node is started for every run.
+"""
+
+import contextlib
+import os
+import shlex
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import rclpy
+from numpy.typing import NDArray
+from rclpy.context import Context
+from rclpy.executors import Executor, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Imu, MagneticField
+
+NANOSECONDS = 1_000_000_000
+IMU_TOPIC, FIELD_TOPIC = 'imu/data_raw', 'imu/mag'
+PATIENCE_S = 20.0               # for a node to start, and for an answer
+FIRST_PATIENCE_S, UNANSWERED = 1.0, 5       # some nodes do not answer their first samples
+START_NS = NANOSECONDS          # in ROS a stamp of 0 is "no time"
+FRAME = 'imu_link'
+
+
+class NodeExam(contextlib.AbstractContextManager['NodeExam']):
+    """
+    Starts a node for every run: `examine(node_exam.make_filter)`.
+
+    command : of the node, which reads `imu/data_raw` and `imu/mag`
+    topic : sensor_msgs/Imu with the attitudes that it publishes, each with the stamp of its sample
+    """
+
+    def __init__(self, command: str, topic: str) -> None:
+        self._command, self._topic = shlex.split(command), topic
+        self._context = Context()
+        rclpy.init(context=self._context)
+        self._node = Node('examine', context=self._context, parameter_overrides=[
+            Parameter('use_sim_time', value=False)])
+        self._executor: Executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        profile = QoSProfile(depth=100)
+        self.clock, self.imu, self.field = (
+            self._node.create_publisher(kind, name, profile) for kind, name in (
+                (Clock, '/clock'), (Imu, IMU_TOPIC), (MagneticField, FIELD_TOPIC)))
+        self.said: dict[int, Any] = {}
+        self._subscription = self._node.create_subscription(Imu, topic, self._take, profile)
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __exit__(self, *exception: object) -> None:
+        self._end_process()
+        self._executor.shutdown()
+        self._node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+    def make_filter(self) -> 'NodeFilter':
+        """End the node and start it again.  Raises RuntimeError if it does not start."""
+        self._end_process()
+        self.said.clear()
+        self._process = subprocess.Popen(self._command, start_new_session=True)
+        if not self.wait(lambda: self.imu.get_subscription_count()
+                         and self._node.count_publishers(self._topic), PATIENCE_S):
+            raise RuntimeError(f'the node does not read {IMU_TOPIC} and publish {self._topic} '
+                               f'within {PATIENCE_S:g} s')
+        return NodeFilter(self)
+
+    def wait(self, condition: Callable[[], object], seconds: float) -> bool:
+        """Spin until a condition holds; return False after so long.  A node that ends raises."""
+        end = time.monotonic() + seconds
+        while not condition():
+            if time.monotonic() > end:
+                return False
+            if self._process is not None and self._process.poll() is not None:
+                raise RuntimeError(f'the node has ended with {self._process.returncode}')
+            self._executor.spin_once(timeout_sec=0.05)
+        return True
+
+    def _take(self, message: Any) -> None:
+        stamp = message.header.stamp
+        self.said[stamp.sec * NANOSECONDS + stamp.nanosec] = message
+
+    def _end_process(self) -> None:
+        process, self._process = self._process, None
+        if process is None:
+            return
+        for number in (signal.SIGINT, signal.SIGKILL):
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, number)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(5.0)
+                break
+        # Its endpoints leave the graph, so that the next node is not taken for this one.
+        self.wait(lambda: not self.imu.get_subscription_count()
+                  and not self._node.count_publishers(self._topic), PATIENCE_S)
+
+
+class NodeFilter:
+    """A running node as a filter, see `trial.Filter`."""
+
+    slowest = float('inf')      # it waits itself
+
+    def __init__(self, exam: NodeExam) -> None:
+        self._exam = exam
+        self._now_ns = START_NS
+        self._answered = self._sent = 0
+        self.covariance: NDArray[np.float64] | None = None
+
+    def update(self, gyroscope: NDArray[np.float64], accelerometer: NDArray[np.float64],
+               magnetometer: NDArray[np.float64] | None, dt: float) -> NDArray[np.float64]:
+        """Publish the readings, and wait for the attitude with their stamp."""
+        exam, said = self._exam, self._exam.said
+        self._now_ns += round(dt * NANOSECONDS)
+        self._sent += 1
+        clock, imu = Clock(), Imu()
+        clock.clock.sec, clock.clock.nanosec = divmod(self._now_ns, NANOSECONDS)
+        imu.header.stamp, imu.header.frame_id = clock.clock, FRAME
+        imu.orientation_covariance[0] = -1.0
+        for vector, values in ((imu.angular_velocity, gyroscope),
+                               (imu.linear_acceleration, accelerometer)):
+            vector.x, vector.y, vector.z = values.tolist()
+        exam.clock.publish(clock)
+        if magnetometer is not None:
+            field = MagneticField(header=imu.header)
+            (field.magnetic_field.x, field.magnetic_field.y,
+             field.magnetic_field.z) = magnetometer.tolist()
+            exam.field.publish(field)
+        exam.imu.publish(imu)
+        patience = PATIENCE_S if self._answered else FIRST_PATIENCE_S
+        if not exam.wait(lambda: self._now_ns in said, patience):
+            if self._answered or self._sent > UNANSWERED:
+                raise RuntimeError(f'no attitude has the stamp {self._now_ns * 1e-9:.9f} s of '
+                                   f'its sample within {patience:g} s')
+            return np.array((0.0, 0.0, 0.0, 1.0))
+        self._answered += 1
+        message = said.pop(self._now_ns)
+        said.clear()
+        matrix = np.array(message.orientation_covariance).reshape(3, 3)
+        self.covariance = matrix if matrix[0, 0] > 0.0 else None
+        q = message.orientation
+        return np.array((q.x, q.y, q.z, q.w))

@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The exam of a log: attitudes that some node has published, beside the truth.
+
+The readings cannot be given to the filter again.  What is judged is what the attitudes show:
+misreadings of them, a wrong stamp, the covariance, and whether they diverge.
+"""
+
+import json
+import math
+import struct
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from spinning_top_sim.exam import diagnosis
+from spinning_top_sim.exam.diagnosis import Fault
+from spinning_top_sim.exam.report import Report
+from spinning_top_sim.exam.scenarios import Reals, Truth
+from spinning_top_sim.exam.trial import NORM_TOLERANCE, Outcome
+from spinning_top_sim.recording.reader import LogReader, LogTopic
+from spinning_top_sim.streams.messages import EXACT_VARIANCE
+
+# Of the sensor, and of the body; the first that the log has is the truth.
+TRUTHS = ('ground_truth/imu', 'ground_truth/odom', 'pose')
+OF_SENSOR = 'ground_truth/imu'
+NORTHS = TRUE, MAGNETIC = 'true', 'magnetic'
+LONGEST_GAP_S = 0.1             # of the truth, for attitudes between two of its samples
+NO_ORIENTATION = -1.0           # sensor_msgs/Imu has it in the covariance
+FEWEST = 100                    # attitudes that say something
+
+
+class Layout(NamedTuple):
+    """
+    Where the attitude is in a message after its header.
+
+    strings, skipped : that come before the quaternion; of the skipped ones each has 8 bytes
+    covariance : rows of the matrix after the quaternion; the last three are of turns.  0: none
+    """
+
+    strings: int
+    skipped: int
+    covariance: int
+
+
+LAYOUTS = {
+    'sensor_msgs/msg/Imu': Layout(0, 0, 3),
+    'geometry_msgs/msg/QuaternionStamped': Layout(0, 0, 0),
+    'geometry_msgs/msg/PoseStamped': Layout(0, 3, 0),
+    'geometry_msgs/msg/PoseWithCovarianceStamped': Layout(0, 3, 6),
+    'nav_msgs/msg/Odometry': Layout(1, 3, 6)}
+
+
+class Attitudes(NamedTuple):
+    """Stamps (n,) [ns], quaternions (n, 4), covariances (n, 3, 3), NaN where unknown."""
+
+    stamps_ns: NDArray[np.int64]
+    quaternions: Reals
+    covariances: Reals
+
+
+def examine_log(path: Path, topic: str, truth: str | None = None,
+                north: str | None = None) -> Report:
+    """
+    Examine the attitudes of a topic.
+
+    path : an MCAP file
+    topic : of the attitudes q(world <- sensor), of a type of LAYOUTS
+    truth : topic of the truth; default: the first of TRUTHS
+    north : from which the heading counts, one of NORTHS; None: the heading needs only be steady
+
+    Raises LogError for what is no log, and ValueError for one without these topics or with too
+    few attitudes.
+    """
+    heading = north is not None
+    with LogReader(path) as reader:
+        said = _read(reader, _topic(reader, topic))
+        true_topic = (_topic(reader, truth) if truth else _first_truth(reader))
+        true = _read(reader, true_topic)
+        values = json.loads(reader.metadata.get('spinning_top_sim', {}).get('parameters', '{}'))
+    turns = Rotation.from_quat(true.quaternions)
+    if not true_topic.name.endswith(OF_SENSOR):
+        turns = turns * Rotation.from_euler('xyz', values.get('imu.rpy', (0.0, 0.0, 0.0)))
+    if north == MAGNETIC:
+        if 'mag.field' not in values:
+            raise ValueError(f'{path} does not say where magnetic north is')
+        east_part, north_part, _ = values['mag.field']
+        turns = Rotation.from_euler('z', math.atan2(east_part, north_part)) * turns
+    true = true._replace(quaternions=turns.as_quat())
+    bad = np.abs(np.linalg.norm(said.quaternions, axis=1) - 1.0)
+    wrong = np.flatnonzero(~(bad <= NORM_TOLERANCE))
+    subject = f'{topic} of {path.name}'
+    if len(wrong):
+        k = int(wrong[0])
+        return Report(subject, [Fault(
+            'invalid_output', f'{len(wrong)} of {len(bad)} messages have no unit quaternion; the '
+            f'first, at {said.stamps_ns[k] * 1e-9:.9f} s, has {said.quaternions[k].tolist()}')],
+            {})
+    outcome = _beside(topic, said, true)
+    settled = outcome.later()
+    faults = []
+    found = diagnosis.explain(settled, heading, None)
+    if found is not None:
+        faults = [Fault(name, found.text) for name in found.faults]
+        corrected = _with(outcome, found.read(outcome.estimates))
+    else:
+        corrected = outcome
+    offset, fault = diagnosis.stamp_fault(corrected.later(), heading)
+    measured = {**diagnosis.marks([outcome], heading), 'stamp_offset_s': offset.seconds}
+    faults += [fault] if fault is not None else []
+    if not faults and (fault := diagnosis.divergence(outcome, heading)) is not None:
+        faults.append(fault)
+    consistency = diagnosis.consistency([corrected], heading)
+    measured |= diagnosis.nees_marks(consistency)
+    if not faults and (fault := diagnosis.covariance_fault(consistency)) is not None:
+        faults.append(fault)
+    return Report(subject, list(diagnosis.in_order(faults)), measured, [outcome])
+
+
+def _topic(reader: LogReader, name: str) -> LogTopic:
+    for topic in reader.topics:
+        if topic.name.lstrip('/') == name.lstrip('/'):
+            if topic.type_name not in LAYOUTS:
+                raise ValueError(f'{topic.name} has the type {topic.type_name or "unknown"}: must '
+                                 f'be one of {", ".join(LAYOUTS)}')
+            return topic
+    raise ValueError(f'{reader.path} has no topic {name}; it has '
+                     f'{", ".join(topic.name for topic in reader.topics) or "none"}')
+
+
+def _first_truth(reader: LogReader) -> LogTopic:
+    for name in TRUTHS:
+        for topic in reader.topics:
+            if f'/{topic.name}'.endswith(f'/{name}'):
+                return topic
+    raise ValueError(f'{reader.path} has no topic {", ".join(TRUTHS)}: name one by --truth')
+
+
+def _read(reader: LogReader, topic: LogTopic) -> Attitudes:
+    """Return the attitudes of a topic by ascending stamps, the first of each."""
+    layout = LAYOUTS[topic.type_name]
+    rows = [_decode(message.data, layout, topic.name) for message in reader.messages([topic.name])]
+    if len(rows) < FEWEST:
+        raise ValueError(f'{topic.name} has {len(rows)} messages: must have {FEWEST} at least')
+    stamps, first = np.unique([stamp for stamp, _, _ in rows], return_index=True)
+    return Attitudes(stamps, np.array([rows[k][1] for k in first]),
+                     np.array([rows[k][2] for k in first]))
+
+
+def _decode(data: bytes, layout: Layout, name: str) -> tuple[int, Reals, Reals]:
+    """Return stamp [ns], quaternion and covariance of a message in CDR (OMG DDS-XTypes, XCDR1)."""
+    order = '<' if data[1:2] == b'\1' else '>'
+    try:
+        seconds, nanoseconds = struct.unpack_from(f'{order}iI', data, 4)
+        at = 12
+        for _ in range(1 + layout.strings):         # first the frame
+            at += -at % 4
+            at += 4 + struct.unpack_from(f'{order}I', data, at)[0]
+        at += (4 - at) % 8 + 8 * layout.skipped     # aligned after the four bytes of the head
+        quaternion = np.frombuffer(data, f'{order}f8', 4, at)
+        covariance = np.full((3, 3), np.nan)
+        if layout.covariance:
+            size = layout.covariance
+            matrix = np.frombuffer(data, f'{order}f8', size * size, at + 32).reshape(size, size)
+            if matrix[0, 0] == NO_ORIENTATION:
+                raise ValueError('it has no orientation')
+            # 0 is unknown (sensor_msgs), and our own streams say so of what is exact.
+            if np.max(matrix[-3:, -3:]) > EXACT_VARIANCE:
+                covariance = matrix[-3:, -3:]
+    except (struct.error, ValueError) as error:
+        raise ValueError(f'a message of {name} cannot be read: {error}') from error
+    return seconds * 10 ** 9 + nanoseconds, quaternion, covariance
+
+
+def _beside(name: str, said: Attitudes, true: Attitudes) -> Outcome:
+    """
+    Return attitudes beside the truth of their stamps.
+
+    If there are enough, those with a sample of the truth; else it is interpolated.
+    """
+    after = np.clip(np.searchsorted(true.stamps_ns, said.stamps_ns), 1, len(true.stamps_ns) - 1)
+    chosen = np.isin(said.stamps_ns, true.stamps_ns)
+    if np.count_nonzero(chosen) < FEWEST:
+        chosen = ((said.stamps_ns >= true.stamps_ns[0]) & (said.stamps_ns <= true.stamps_ns[-1])
+                  & (true.stamps_ns[after] - true.stamps_ns[after - 1] <= LONGEST_GAP_S * 1e9))
+    stamps = said.stamps_ns[chosen]
+    if len(stamps) < FEWEST:
+        raise ValueError(f'{name} has {len(stamps)} attitudes at times of the truth: must have '
+                         f'{FEWEST} at least')
+    times = (true.stamps_ns - true.stamps_ns[0]) * 1e-9
+    turns = Rotation.from_quat(true.quaternions)
+    t = (stamps - true.stamps_ns[0]) * 1e-9
+    truth = Slerp(times, turns)(t)
+    # By the difference of the samples on either side.
+    step = (turns[:-1].inv() * turns[1:]).as_rotvec() / np.diff(times)[:, np.newaxis]
+    middle = 0.5 * (times[1:] + times[:-1])
+    rates = np.stack([np.interp(t, middle, column) for column in step.T], axis=1)
+    covariances = said.covariances[chosen]
+    known = bool(np.all(np.isfinite(covariances)))
+    t = t - t[0]
+    return Outcome(Truth(name, t, np.diff(t, prepend=t[0] - (t[1] - t[0])), truth.as_quat(),
+                         rates), said.quaternions[chosen], np.arange(len(t)),
+                   covariances if known else None, None)
+
+
+def _with(outcome: Outcome, estimates: Reals) -> Outcome:
+    return Outcome(outcome.run, estimates, outcome.read, outcome.covariances, outcome.biases)

@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A fixture for pytest: `pytest_plugins = ['spinning_top_sim.exam.pytest_plugin']`."""
+
+from collections.abc import Callable, Iterable
+
+import pytest
+
+from spinning_top_sim.exam.examiner import examine
+from spinning_top_sim.exam.report import Report
+
+
+@pytest.fixture
+def pass_exam() -> Callable[..., Report]:
+    """Return `examine` that fails the test if there are faults, except some that are known."""
+    def pass_exam(*arguments: object, known: Iterable[str] = (), **options: object) -> Report:
+        __tracebackhide__ = True
+        report = examine(*arguments, **options)     # type: ignore[arg-type]
+        if not set(report.faults) <= set(known):
+            pytest.fail(str(report), pytrace=False)
+        return report
+    return pass_exam

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The verdict on a filter, as text, JSON and JUnit XML."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from xml.etree import ElementTree
+
+from spinning_top_sim.exam.diagnosis import FAULTS, Fault
+from spinning_top_sim.exam.trial import Outcome
+
+
+@dataclass(frozen=True)
+class Report:
+    """
+    What an exam has found.
+
+    subject : what was examined
+    found : the faults with their evidence
+    measures : by name; docs/exam.md defines them.  NaN: could not be measured
+    outcomes : of the runs, for pictures
+    """
+
+    subject: str
+    found: Sequence[Fault]
+    measures: Mapping[str, float]
+    outcomes: Sequence[Outcome] = field(default=(), repr=False)
+
+    @property
+    def passed(self) -> bool:
+        """Whether no fault was found."""
+        return not self.found
+
+    @property
+    def faults(self) -> list[str]:
+        """Names of the faults, of `diagnosis.FAULTS`."""
+        return [fault.name for fault in self.found]
+
+    def __str__(self) -> str:
+        lines = [f'{self.subject}: {"passed" if self.passed else ", ".join(self.faults)}']
+        lines += [f'  {fault.name}: {fault.evidence}' for fault in self.found]
+        lines += [f'  {name:<26}{value:>12.4g}' for name, value in self.measures.items()
+                  if not math.isnan(value)]
+        return '\n'.join(lines)
+
+    def as_json(self) -> str:
+        """Return everything as JSON; what is not finite is null."""
+        return json.dumps({
+            'subject': self.subject, 'passed': self.passed, 'faults': self.faults,
+            'evidence': {fault.name: fault.evidence for fault in self.found},
+            'measures': {name: value if math.isfinite(value) else None
+                         for name, value in self.measures.items()}}, indent=2)
+
+    def as_junit(self) -> str:
+        """Return a test suite of JUnit XML with a test case for each fault of FAULTS."""
+        suite = ElementTree.Element('testsuite', name=f'examine {self.subject}',
+                                    tests=str(len(FAULTS)), failures=str(len(self.found)),
+                                    errors='0', skipped='0')
+        properties = ElementTree.SubElement(suite, 'properties')
+        for name, value in self.measures.items():
+            ElementTree.SubElement(properties, 'property', name=name, value=f'{value:.9g}')
+        evidence = {fault.name: fault.evidence for fault in self.found}
+        for name in FAULTS:
+            case = ElementTree.SubElement(suite, 'testcase', classname='examine', name=name)
+            if name in evidence:
+                failure = ElementTree.SubElement(case, 'failure', message=evidence[name])
+                failure.text = evidence[name]
+        ElementTree.indent(suite)
+        return ElementTree.tostring(suite, encoding='unicode', xml_declaration=True) + '\n'

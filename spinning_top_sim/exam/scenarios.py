@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The motions of the exam, and what an IMU on them reads.
+
+Each motion shows a fault that the others hide.  A seed decides the noise, and varies the start.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.physics.states import States
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.imu import Imu
+from spinning_top_sim.streams.magnetometer import Magnetometer
+from spinning_top_sim.streams.pipeline import Simulation
+
+Reals = NDArray[np.float64]
+
+# East, north, up [T]: the strength and dip of mid-latitudes.  North is magnetic north, so that
+# the heading of a filter needs no declination.
+FIELD = (0.0, 20e-6, -43e-6)
+# Noise densities of config/imu/bmi088.yaml, without its turn-on bias: a calibrated device.  The
+# magnetometer has a noise of 0.2 uT in 100 samples a second.
+CALIBRATED: Mapping[str, Any] = {
+    'imu.gyroscope_noise_density': 1.72779e-4, 'imu.accelerometer_noise_density': 1.21360e-3,
+    'mag.noise_density': 2e-8}
+# What an IMU without noise has of its parameters.
+OF_PLACE = ('imu.lever_arm', 'imu.rpy', 'mag.field')
+GRAVITY = 9.80665
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """
+    One motion and the IMU on it.
+
+    values : parameters of the simulation that differ from their defaults
+    duration, rate : of the run [s], [Hz]
+    reversals : times at which the momenta change their sign, by an impulsive torque [s]
+    bias : of the gyroscope, added to what the IMU has itself (3,) [rad/s]
+    noisy : whether the IMU has its errors
+    drop_rate : share of the samples that never come
+    jitter : standard deviation of the stamps [s]
+    """
+
+    name: str
+    values: Mapping[str, Any]
+    duration: float = 40.0
+    rate: float = 100.0
+    reversals: tuple[float, ...] = ()
+    bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    noisy: bool = True
+    drop_rate: float = 0.0
+    jitter: float = 0.0
+
+
+# A wheel of 2 kg on a pivot 2 cm below its centre: 4 rad/s of spin, slow precession, and a
+# nutation of many degrees.  The rates are so low that the way of integrating them matters little.
+SLOW = Scenario('slow', {'top.com_distance': 0.02, 'spin.l3': 0.6, 'initial.theta': 0.7})
+# The wheel 15 cm from the pivot with 10.7 rad/s of spin: waves.
+WAVES = Scenario('waves', {'spin.l3': 1.6, 'spin.lz': 1.42, 'initial.theta': 0.5236})
+# 10 cm off the axis, where the centripetal acceleration of the slow wheel is a sixth of gravity.
+LEVER_ARM = replace(SLOW, name='lever_arm', noisy=False, values={
+    **SLOW.values, 'imu.lever_arm': (0.1, 0.0, 0.0)})
+PIVOT = replace(LEVER_ARM, name='pivot', values={
+    **SLOW.values, 'imu.lever_arm': (0.0, 0.0, 0.0)})
+# Fast steady precession.  The errors of a step are odd in the rates: where these change their
+# sign, no estimate of a bias can hide them.
+FAST = Scenario('fast', {'spin.l3': 1.6, 'spin.lz': 1.7816, 'initial.theta': 0.5236},
+                duration=8.0, reversals=(2.0, 4.0, 6.0), noisy=False)
+# Small waves through the upward vertical, and a top that falls from it.
+POLE = Scenario('pole', {'spin.l3': 1.6, 'spin.lz': 1.6, 'initial.theta': 0.0,
+                         'initial.theta_dot': 2.0})
+SATURATION = replace(WAVES, name='saturation', values={
+    **WAVES.values, 'imu.gyroscope_range': 10.6})
+DROPS = replace(WAVES, name='drops', drop_rate=0.05, jitter=0.5e-3)
+COMMAND = replace(WAVES, name='command', reversals=(20.0,))
+
+
+@dataclass(frozen=True)
+class Truth:
+    """
+    The true motion of a sensor at n times.
+
+    name : of the motion
+    t, dt : time and length of the step that ends there, by the stamps [s], (n,)
+    truth : q(world <- sensor) as x, y, z, w (n, 4)
+    rates : true angular velocity in the frame of the sensor (n, 3) [rad/s]
+    """
+
+    name: str
+    t: Reals
+    dt: Reals
+    truth: Reals
+    rates: Reals
+
+    def part(self, rows: slice | NDArray[np.int64]) -> Self:
+        """Return the motion at these times only."""
+        return replace(self, **{one.name: getattr(self, one.name)[rows] for one in fields(self)
+                                if one.name != 'name'})
+
+
+@dataclass(frozen=True)
+class Run(Truth):
+    """
+    What an IMU reads along a motion.
+
+    The gyroscope's reading is the mean over the step that ends, as of an integrating sensor; the
+    other readings are of its end.
+
+    gyroscope, accelerometer, magnetometer : in the frame of the IMU, (n, 3) [rad/s], [m/s^2], [T]
+    """
+
+    gyroscope: Reals
+    accelerometer: Reals
+    magnetometer: Reals
+
+
+def record(scenario: Scenario, imu: Mapping[str, Any], seed: int) -> Run:
+    """
+    Simulate a scenario with these parameters of an IMU and its magnetometer.
+
+    Raises ValueError for parameters that are not allowed.
+    """
+    random = np.random.default_rng(seed)
+    phi, psi = random.uniform(-np.pi, np.pi, 2).tolist()
+    given = imu if scenario.noisy else {name: imu[name] for name in OF_PLACE if name in imu}
+    values = parameters.checked({
+        'initial.phi': phi, 'initial.psi': psi, 'seed': seed, 'solver.method': 'exact',
+        'mag.field': FIELD, **given, **scenario.values})
+    simulation, device = Simulation(values), Imu(values)
+    period_ns = 2 * round(0.5 * NANOSECONDS / scenario.rate)
+    magnetometer = Magnetometer(values, period_ns)
+    end_ns = round(scenario.duration * scenario.rate) * period_ns
+    parts, begin_ns = [], 0
+    for stop_ns in (*(round(t * scenario.rate) * period_ns for t in scenario.reversals), end_ns):
+        steps = range(begin_ns + period_ns, stop_ns + 1, period_ns)
+        halves = simulation.segment.states(range(begin_ns, stop_ns + 1, period_ns // 2))
+        parts.append(_readings(device, magnetometer, halves, steps))
+        if stop_ns < end_ns:
+            simulation.skip_to(stop_ns)
+            simulation.command(-simulation.l3, -simulation.lz)
+        begin_ns = stop_ns
+    gyroscope, accelerometer, field, truth, rates = np.split(
+        np.concatenate(parts, axis=1).T, (3, 6, 9, 13), axis=1)
+    period = period_ns / NANOSECONDS
+    t = period * np.arange(1, len(truth) + 1)
+    stamps = t + scenario.jitter * random.standard_normal(len(t))
+    stamps[0] = t[0]            # some filters take the first step for all of them
+    run = Run(f'{scenario.name} at {scenario.rate:g} Hz, seed {seed}', stamps,
+              np.full(len(t), period), truth, rates, gyroscope + scenario.bias, accelerometer,
+              field)
+    if not (scenario.jitter or scenario.drop_rate):
+        return run
+    kept = np.flatnonzero(random.random(len(t)) >= scenario.drop_rate)
+    kept[0] = 0
+    run = run.part(kept)
+    return replace(run, dt=np.diff(run.t, prepend=0.0))
+
+
+def _readings(device: Imu, magnetometer: Magnetometer, halves: States, steps: range) -> Reals:
+    """
+    Return what an IMU reads, attitude and rates at the ends of steps, (16, n).
+
+    halves : states at the begin, the middle and the end of each step
+    steps : their ends [ns]
+    """
+    rates, force = (np.stack(np.broadcast_arrays(*vector, np.empty(len(halves)))[:3])
+                    for vector in device.true(halves))
+    # Simpson's rule.
+    mean = (rates[:, :-2:2] + 4.0 * rates[:, 1::2] + rates[:, 2::2]) / 6.0
+    gyroscope, accelerometer = device.sensor(steps.step).read(
+        ((mean[0], mean[1], mean[2]), (force[0, 2::2], force[1, 2::2], force[2, 2::2])), steps)
+    x, y, z, w = (column[2::2] for column in device.orientation(halves))
+    field = magnetometer.read(magnetometer.true((x, y, z, w)), steps)
+    return np.stack([*gyroscope, *accelerometer, *field, x, y, z, w, *rates[:, 2::2]])

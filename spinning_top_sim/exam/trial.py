@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A filter, fed with a run: what it says, and what is wrong with that."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from spinning_top_sim.exam.measures import Errors, errors_of
+from spinning_top_sim.exam.scenarios import Reals, Run, Truth
+
+# A covariance and a bias are read after so many updates.
+READ_EVERY = 10
+# A filter may take this many times as long as the run lasts, after a first second.
+SLOWEST = 2.0
+NORM_TOLERANCE = 1e-3
+
+
+class Filter(Protocol):
+    """
+    What the exam takes for an attitude filter.
+
+    It may also have `covariance` (3, 3), of the rotation vector from its attitude to the true one
+    [rad^2], and `bias` (3,), of the gyroscope [rad/s].  The exam reads both after updates.
+    """
+
+    def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
+               dt: float) -> ArrayLike:
+        """
+        Take the readings of a step; return the attitude at its end.
+
+        gyroscope : mean angular velocity over the step (3,) [rad/s]
+        accelerometer : specific force at its end (3,) [m/s^2], +g upwards at rest
+        magnetometer : field at its end (3,) [T]
+        dt : length of the step [s]
+
+        Returns q(world <- sensor) as x, y, z, w; x of the world is east, y north and z up.
+        """
+
+
+MakeFilter = Callable[[], Filter]
+# Takes gyroscope and accelerometer (n, 3) and the steps (n,); returns what to give instead.
+Input = Callable[[Reals, Reals, Reals], tuple[Reals, Reals]]
+Output = Callable[[Reals], Reals]
+
+
+class InvalidOutputError(Exception):
+    """What a filter returned, or that it raised an error, in one line."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """
+    What a filter said along a motion.
+
+    estimates : q(world <- sensor) (n, 4), of norm 1
+    read : numbers of the samples after which covariance and bias were read (m,)
+    covariances, biases : (m, 3, 3) [rad^2] and (m, 3) [rad/s]; None if the filter has none
+    """
+
+    run: Truth
+    estimates: Reals
+    read: NDArray[np.int64]
+    covariances: Reals | None
+    biases: Reals | None
+
+    @property
+    def errors(self) -> Errors:
+        """Tilt and heading errors [rad]."""
+        return errors_of(self.estimates, self.run.truth)
+
+    def later(self, fraction: float = 0.5) -> 'Outcome':
+        """Return the last part of the outcome: when the filter has settled."""
+        first = round(len(self.estimates) * (1.0 - fraction))
+        kept = self.read >= first
+        return replace(
+            self, run=self.run.part(slice(first, None)), estimates=self.estimates[first:],
+            read=self.read[kept] - first,
+            covariances=None if self.covariances is None else self.covariances[kept],
+            biases=None if self.biases is None else self.biases[kept])
+
+
+def same(estimates: Reals) -> Reals:
+    """Return what is given."""
+    return estimates
+
+
+def follow(make_filter: MakeFilter, run: Run, given: Input | None = None, read: Output = same,
+           magnetometer: bool = True) -> Outcome:
+    """
+    Feed a new filter with a run.
+
+    given, read : how the readings are changed before the filter gets them, and its attitudes after
+    magnetometer : False gives None
+
+    Raises InvalidOutputError for a filter that raises, returns no unit quaternion or is too slow.
+    """
+    gyroscope, accelerometer = run.gyroscope, run.accelerometer
+    if given is not None:
+        gyroscope, accelerometer = given(gyroscope, accelerometer, run.dt)
+    said: list[object] = []
+    numbers: list[int] = []
+    covariances: list[object] = []
+    biases: list[object] = []
+    try:
+        filter_ = make_filter()
+        update = filter_.update
+        slowest = getattr(filter_, 'slowest', SLOWEST)
+        begin = time.perf_counter()
+        # The filter may keep or change what it gets.
+        for k, (rate, force, field, dt) in enumerate(zip(
+                gyroscope.copy(), accelerometer.copy(), run.magnetometer.copy(),
+                run.dt.tolist(), strict=True)):
+            said.append(update(rate, force, field if magnetometer else None, dt))
+            if k % READ_EVERY == READ_EVERY - 1:
+                _check_speed(time.perf_counter() - begin, k + 1, dt, slowest)
+                numbers.append(k)
+                covariances.append(np.array(getattr(filter_, 'covariance', None), dtype=float))
+                biases.append(np.array(getattr(filter_, 'bias', None), dtype=float))
+    except InvalidOutputError:
+        raise
+    except Exception as error:
+        raise InvalidOutputError(
+            f'update {len(said) + 1} of {len(run.t)} raises {type(error).__name__}: {error}'
+        ) from error
+    return Outcome(run, read(_quaternions(said)), np.array(numbers),
+                   _checked('covariance', covariances, (3, 3)), _checked('bias', biases, (3,)))
+
+
+def _check_speed(spent: float, updates: int, dt: float, slowest: float) -> None:
+    if spent > 1.0 and spent > slowest * updates * dt:
+        raise InvalidOutputError(
+            f'too slow: {1e3 * spent / updates:.3g} ms an update, and a sample comes every '
+            f'{1e3 * dt:.3g} ms')
+
+
+def _quaternions(said: list[object]) -> Reals:
+    """Return what was said as unit quaternions (n, 4).  Raises InvalidOutputError."""
+    try:
+        rows = np.array(said, dtype=float)
+    except (TypeError, ValueError):
+        rows = np.empty(0)
+    if rows.shape != (len(said), 4):
+        for k, one in enumerate(said):
+            if (shape := _shape(one)) != (4,):
+                raise InvalidOutputError(
+                    f'update {k + 1} returns {_short(one)}'
+                    + (f' of shape {shape}' if shape else '') + ': must be 4 numbers x, y, z, w')
+        raise InvalidOutputError(f'update 1 returns {_short(said[0])}: must be 4 numbers')
+    norms = np.linalg.norm(rows, axis=1)
+    bad = np.flatnonzero(~(np.abs(norms - 1.0) <= NORM_TOLERANCE))
+    if len(bad):
+        k = int(bad[0])
+        what = (f'its norm is {norms[k]:.6g}' if np.isfinite(norms[k]) else 'it is not finite')
+        raise InvalidOutputError(f'update {k + 1} returns {_short(rows[k])}: {what}, and must '
+                                 'be 1')
+    unit: Reals = rows / norms[:, np.newaxis]
+    return unit
+
+
+def _shape(value: Any) -> tuple[int, ...] | None:
+    try:
+        return np.shape(value)
+    except ValueError:          # rows of several lengths
+        return None
+
+
+def _short(value: object) -> str:
+    text = ' '.join(str(value).split())
+    return text if len(text) < 80 else f'{text[:77]}...'
+
+
+def _checked(name: str, values: list[object], shape: tuple[int, ...]) -> Reals | None:
+    """Return what a filter says of itself (m, ...), None if it says nothing."""
+    if any(_shape(value) == () for value in values):
+        return None
+    for value in values:
+        array = np.asarray(value)
+        if array.shape != shape or not np.all(np.isfinite(array)):
+            raise InvalidOutputError(f'{name} is {_short(array.tolist())}: must be '
+                                     f'{" x ".join(map(str, shape))} finite numbers')
+        if name == 'covariance':
+            eigenvalues = np.linalg.eigvalsh(0.5 * (array + array.T))
+            if eigenvalues[-1] <= 0.0 or eigenvalues[0] < -1e-9 * eigenvalues[-1]:
+                raise InvalidOutputError(f'covariance is {_short(array.tolist())}: must have no '
+                                         'negative eigenvalue')
+    return np.array(values)

@@ -1,0 +1,426 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The exam of attitude filters: measures, faults by name, bad filters, logs, the command."""
+
+import json
+import math
+import re
+import time
+from dataclasses import replace
+from functools import partial
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from helpers.faulty_filters import FAULTY, MISREADINGS
+from helpers.reference import ROOT
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim.exam import examine, measures, scenarios
+from spinning_top_sim.exam.adapters import FILTERS, Vqf
+from spinning_top_sim.exam.command import main
+from spinning_top_sim.exam.diagnosis import FAULTS
+from spinning_top_sim.exam.log import examine_log
+from spinning_top_sim.exam.pytest_plugin import pass_exam  # noqa: F401, a fixture
+from spinning_top_sim.exam.reference import ReferenceFilter
+from spinning_top_sim.exam.trial import follow
+from spinning_top_sim.tools.simulate import main as simulate
+
+pytest.importorskip('vqf')
+
+# ----------------------------------------------------------------------------------- measures
+
+
+def test_tilt_and_heading_are_those_of_the_world():
+    truth = Rotation.from_euler('xyz', (0.4, 0.5, 0.6))
+    for axis, tilt, heading in (('x', 0.2, 0.0), ('y', 0.2, 0.0), ('z', 0.0, 0.2)):
+        estimate = Rotation.from_euler(axis, 0.2) * truth
+        errors = measures.errors_of(estimate.as_quat()[None], truth.as_quat()[None])
+        assert errors.tilt == pytest.approx(tilt, abs=1e-7)
+        assert errors.heading == pytest.approx(heading, abs=1e-7)
+
+
+def runs_at(factors, scenario):
+    scenario = replace(scenario, duration=4.0, reversals=(), noisy=False)
+    return [scenarios.record(replace(scenario, rate=100.0 * factor), {}, 1) for factor in factors]
+
+
+def moved(run, turns):
+    """Return the error at the end of turns (n, 3) [rad] from the true start."""
+    attitude = Rotation.from_quat(run.truth[0])
+    estimates = [attitude.as_quat()]
+    for turn in turns:
+        attitude = attitude * turn
+        estimates.append(attitude.as_quat())
+    return measures.moved(np.array(estimates), run.truth)[-1]
+
+
+def test_the_order_of_eulers_steps_is_1_and_that_of_mean_rates_in_closed_form_2():
+    factors = (1.0, 2.0, 4.0)
+    runs = runs_at(factors, scenarios.SLOW)
+    euler = [moved(run, [Rotation.from_quat((*(0.5 * dt * rate), 1.0))
+                         for rate, dt in zip(run.rates[:-1], run.dt[1:], strict=True)])
+             for run in runs]
+    closed = [moved(run, Rotation.from_rotvec(run.gyroscope[1:] * run.dt[1:, None]))
+              for run in runs]
+    assert measures.convergence_order(factors, euler) == pytest.approx(1.0, abs=0.1)
+    assert measures.convergence_order(factors, closed) == pytest.approx(2.0, abs=0.1)
+
+
+def test_the_gyroscope_reads_the_mean_over_its_step():
+    coarse, fine = runs_at((1.0, 16.0), scenarios.WAVES)
+    mean = fine.gyroscope.reshape(-1, 16, 3).mean(axis=1)
+    assert np.max(np.abs(coarse.gyroscope - mean)) < 1e-6
+    assert coarse.truth[-1] == pytest.approx(fine.truth[-1], abs=1e-12)
+    assert np.max(np.abs(coarse.rates - coarse.gyroscope)) > 0.01
+
+
+def test_a_delay_is_measured():
+    run, = runs_at((4.0,), scenarios.FAST)
+    offset = measures.time_offset(run.truth[:-4], run.truth[4:], run.rates[4:], True)
+    assert offset.seconds == pytest.approx(0.01, rel=0.01)
+    assert offset.after < 0.1 * offset.before
+
+
+def linear_filter(seed, factor=1.0):
+    """
+    Return attitudes, truth and covariances of a Kalman filter of small tilts: it is consistent.
+
+    Each tilt is a random walk of 0.002 rad a step, of which readings have an error of 0.01 rad.
+    """
+    random = np.random.default_rng(seed)
+    walk, noise, n = 0.002, 0.01, 4000
+    true = np.cumsum(walk * random.standard_normal((n, 2)), axis=0)
+    readings = true + noise * random.standard_normal((n, 2))
+    variance, tilt = 1.0, np.zeros(2)
+    said, variances = [], []
+    for reading in readings:
+        variance += walk ** 2
+        gain = variance / (variance + noise ** 2)
+        tilt = tilt + gain * (reading - tilt)
+        variance *= 1.0 - gain
+        said.append(tilt)
+        variances.append(variance)
+
+    def attitudes(tilts):
+        return Rotation.from_rotvec(np.column_stack((tilts, np.zeros(n)))).as_quat()[200:]
+    covariances = factor * np.array(variances)[200:, None, None] * np.eye(3)
+    return attitudes(np.array(said)), attitudes(true), covariances
+
+
+@pytest.mark.parametrize(('factor', 'expected'), [(1.0, None), (0.5, 'above'), (2.0, 'below')])
+def test_the_nees_of_a_linear_filter_is_in_its_band(factor, expected):
+    runs = [linear_filter(seed, factor) for seed in range(3)]
+    nees = measures.nees_of(runs, False)
+    low, high = nees.band()
+    assert nees.degrees > 300
+    assert expected == ('below' if nees.ratio < low else 'above' if nees.ratio > high else None)
+    assert nees.ratio == pytest.approx(1.0 / factor, rel=0.2)
+    for _, _, covariances in runs:
+        covariances[:, 2, 2] = 0.0          # of the heading, of which the filter knows nothing
+    assert measures.nees_of(runs, False).ratio == pytest.approx(nees.ratio, rel=0.02)
+    assert measures.nees_of(runs, True) is None
+
+
+def test_covariances_may_be_about_the_axes_of_the_world():
+    said = follow(ReferenceFilter, scenarios.record(scenarios.SLOW, scenarios.CALIBRATED, 1))
+    said = said.later(0.75)
+    estimates, truth = said.estimates[said.read], said.run.truth[said.read]
+    turn = Rotation.from_quat(estimates).as_matrix()
+    for factor in (0.5, 1.0, 2.0):
+        of_sensor = factor * said.covariances
+        of_world = turn @ of_sensor @ turn.transpose(0, 2, 1)
+        for absolute in (False, True):
+            nees = [measures.nees_of([(estimates, truth, covariances)], absolute)
+                    for covariances in (of_sensor, of_world)]
+            assert nees[0].ratio == pytest.approx(nees[1].ratio, rel=1e-6)
+
+
+# ------------------------------------------------------------------------------------- faults
+
+
+@pytest.mark.parametrize('name', MISREADINGS)
+def test_a_misreading_is_named_with_its_evidence(name):
+    report = examine(partial(MISREADINGS[name], Vqf), seeds=1)
+    assert report.faults == [name], report
+    assert not report.passed
+    assert name in str(report) and report.found[0].evidence in str(report)
+
+
+@pytest.mark.parametrize('name', sorted(set(FAULTY) - set(MISREADINGS)))
+def test_a_fault_of_the_method_is_named(name):
+    assert examine(FAULTY[name], seeds=3 if 'covariance' in name else 1).faults == [name]
+
+
+def test_every_fault_is_tried():
+    assert set(FAULTY) == set(FAULTS)
+
+
+def test_a_filter_without_faults_passes():
+    report = examine(ReferenceFilter)
+    assert report.passed and not report.faults, report
+    found = report.measures
+    assert found['tilt_rms_deg'] < 0.03 and found['convergence_s'] < 1.0
+    assert found['bias_found'] == pytest.approx(1.0, abs=0.01)
+    assert found['nees_low'] < found['nees'] < found['nees_high']
+
+
+def test_vqf_passes_with_and_without_magnetometer_and_twice_the_same(pass_exam):    # noqa: F811
+    report = pass_exam(Vqf)
+    assert pass_exam(Vqf).as_json() == report.as_json()
+    assert pass_exam(partial(Vqf, magnetic=False)).measures['heading_rms_deg'] < 0.1
+    assert report.measures['tilt_rms_deg'] < 0.05
+    assert 'nees' not in report.measures
+    with pytest.raises(pytest.fail.Exception, match='conjugated, the error falls'):
+        pass_exam(partial(MISREADINGS['conjugated'], Vqf), seeds=1)
+    pass_exam(partial(MISREADINGS['conjugated'], Vqf), seeds=1, known=['conjugated'])
+
+
+def test_without_heading_a_world_north_east_down_and_the_sign_of_gravity_are_the_same():
+    without = partial(Vqf, magnetic=False)
+    for name in ('frame_ned', 'gravity_sign'):
+        report = examine(partial(MISREADINGS[name], without), seeds=1)
+        assert report.faults == ['frame_ned', 'gravity_sign']
+        assert 'cannot be told apart' in report.found[0].evidence
+
+
+def test_a_full_exam_has_more_motions():
+    report = examine(Vqf, 'full', seeds=2)
+    assert report.passed
+    assert report.measures['tilt_rms_pole_deg'] < 0.1
+    assert report.measures['tilt_rms_command_deg'] < 0.1
+    assert report.measures['tilt_rms_saturation_deg'] > 5.0 * report.measures['tilt_rms_deg']
+    assert report.measures['tilt_rms_drops_deg'] > 5.0 * report.measures['tilt_rms_deg']
+
+
+def test_imufusion_takes_first_order_steps_and_does_not_estimate_a_bias():
+    pytest.importorskip('imufusion')
+    report = examine(FILTERS['imufusion'], seeds=1)
+    assert {'first_order_integration', 'no_bias_estimate'} <= set(report.faults)
+    assert report.measures['integration_error_deg'] > 0.5
+
+
+# -------------------------------------------------------------------------------- bad filters
+
+
+class Bad:
+    def __init__(self, said):
+        self._said = said
+
+    def update(self, *readings):
+        return self._said()
+
+
+def fail():
+    raise RuntimeError('no calibration')
+
+
+@pytest.mark.parametrize(('said', 'says'), [
+    (fail, 'update 1 of 200 raises RuntimeError: no calibration'),
+    (lambda: None, 'update 1 returns None: must be 4 numbers x, y, z, w'),
+    (lambda: (0.0, 0.0, 1.0), 'of shape (3,): must be 4 numbers'),
+    (lambda: 'north', 'update 1 returns north'),
+    (lambda: np.full(4, math.inf), 'it is not finite'),
+    (lambda: np.ones(4), 'its norm is 2, and must be 1'),
+    (lambda: time.sleep(0.05), ' ms an update, and a sample comes every 10 ms'),
+    (lambda: np.eye(4), 'of shape (4, 4)')])
+def test_a_filter_that_returns_no_attitude_is_told(said, says):
+    report = examine(partial(Bad, said), seeds=1)
+    assert report.faults == ['invalid_output']
+    assert says in str(report)
+    assert not report.measures
+
+
+def test_a_run_that_fails_leaves_the_others():
+    class Fragile(Vqf):
+        def update(self, gyroscope, accelerometer, magnetometer, dt):
+            if dt < 0.009:
+                raise ValueError('too fast for me')
+            return super().update(gyroscope, accelerometer, magnetometer, dt)
+
+    report = examine(Fragile, seeds=1)
+    assert report.faults == ['invalid_output']
+    assert 'fast at 200 Hz, seed 0: update 1 of' in str(report)
+    assert report.measures['tilt_rms_deg'] < 0.05 and 'bias_error_s' in report.measures
+
+
+@pytest.mark.parametrize(('covariance', 'says'), [
+    (-np.eye(3), 'must have no negative eigenvalue'), (np.eye(2), 'must be 3 x 3 finite numbers'),
+    (np.full((3, 3), math.nan), 'must be 3 x 3 finite numbers')])
+def test_a_wrong_covariance_is_told(covariance, says):
+    class Wrong(Vqf):
+        pass
+
+    Wrong.covariance = covariance
+    report = examine(Wrong, seeds=1)
+    assert report.faults == ['invalid_output'] and says in str(report)
+
+
+@pytest.mark.parametrize(('options', 'says'), [
+    ({'level': 'slow'}, "level = 'slow': must be one of quick, full"),
+    ({'imu': {'imu.colour': 1.0}}, 'imu.colour = 1.0: there is no such parameter'),
+    ({'seeds': 0}, 'seeds = 0: must be'), ({'seeds': [-1]}, 'must be'),
+    ({'seeds': [0.5]}, 'must be')])
+def test_wrong_arguments_are_refused(options, says):
+    with pytest.raises(ValueError, match=re.escape(says)):
+        examine(Vqf, **options)
+
+
+# --------------------------------------------------------------------------------------- logs
+
+
+@pytest.fixture(scope='module')
+def log(tmp_path_factory):
+    path = tmp_path_factory.mktemp('log') / 'run.mcap'
+    assert simulate(['--quiet', '-o', str(path), '--duration', '20', '-p',
+                     'imu_data.enabled:=true', '-p', 'imu.rpy:=[0.3, -0.2, 1.0]',
+                     '--params', str(ROOT / 'config/wavy.yaml')]) == 0
+    return path
+
+
+TYPES = ('sensor_msgs/msg/Imu', 'geometry_msgs/msg/QuaternionStamped',
+         'geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/PoseWithCovarianceStamped',
+         'nav_msgs/msg/Odometry')
+
+
+@pytest.fixture(scope='module')
+def beside(log, tmp_path_factory):
+    """Return what writes attitudes of a sensor beside its truth, as messages of another writer."""
+    from rosbags.typesys import Stores, get_typestore
+
+    from spinning_top_sim.recording.reader import LogReader
+    from spinning_top_sim.recording.rosbag2 import RecordedTopic
+    from spinning_top_sim.recording.writer import create_file
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with LogReader(log) as reader:
+        truth = [(message.log_time, message.data)
+                 for message in reader.messages(['/ground_truth/imu'])]
+
+    def filled(type_name, header, quaternion, variance):
+        q = store.types['geometry_msgs/msg/Quaternion'](*quaternion)
+        if type_name == 'geometry_msgs/msg/QuaternionStamped':
+            return store.types[type_name](header, q)
+        zero = store.types['geometry_msgs/msg/Vector3'](1.0, 2.0, 3.0)
+        if type_name == 'sensor_msgs/msg/Imu':
+            blank = np.zeros(9)
+            return store.types[type_name](header, q, (variance * np.eye(3)).ravel(), zero, blank,
+                                          zero, blank)
+        pose = store.types['geometry_msgs/msg/Pose'](
+            store.types['geometry_msgs/msg/Point'](1.0, 2.0, 3.0), q)
+        if type_name == 'geometry_msgs/msg/PoseStamped':
+            return store.types[type_name](header, pose)
+        matrix = np.diag([9.0] * 3 + [variance] * 3).ravel()
+        pose = store.types['geometry_msgs/msg/PoseWithCovariance'](pose, matrix)
+        if type_name.endswith('PoseWithCovarianceStamped'):
+            return store.types[type_name](header, pose)
+        twist = store.types['geometry_msgs/msg/TwistWithCovariance'](
+            store.types['geometry_msgs/msg/Twist'](zero, zero), np.zeros(36))
+        return store.types[type_name](header, 'sensor', pose, twist)
+
+    def write(said, type_name=TYPES[0], variance=0.0, delay_ns=0):
+        path = tmp_path_factory.mktemp('beside') / 'run.mcap'
+        file = create_file(path, [RecordedTopic('/ground_truth/imu', 'sensor_msgs/msg/Imu'),
+                                  RecordedTopic('/estimate', type_name)], {}, compression='zstd')
+        quaternions = []
+        for stamp_ns, data in truth:
+            file.append(0, stamp_ns, data)
+            q = store.deserialize_cdr(data, 'sensor_msgs/msg/Imu').orientation
+            quaternions.append((q.x, q.y, q.z, q.w))
+        for (stamp_ns, _), one in zip(truth, said(np.array(quaternions)), strict=True):
+            stamp = store.types['builtin_interfaces/msg/Time'](
+                *divmod(stamp_ns + delay_ns, 10 ** 9))
+            header = store.types['std_msgs/msg/Header'](stamp, 'a frame')
+            file.append(1, stamp_ns, bytes(store.serialize_cdr(
+                filled(type_name, header, one, variance), type_name)))
+        file.write_chunk()
+        file.finish()
+        return path
+    return write
+
+
+def disturbed(quaternions, deviation=0.01):
+    noise = deviation * np.random.default_rng(5).standard_normal((len(quaternions), 3))
+    return (Rotation.from_quat(quaternions) * Rotation.from_rotvec(noise)).as_quat()
+
+
+@pytest.mark.parametrize('type_name', TYPES)
+def test_attitudes_of_every_type_are_read(beside, type_name):
+    report = examine_log(beside(disturbed, type_name, variance=1e-4), 'estimate', north='true')
+    assert report.passed, report
+    assert report.measures['tilt_rms_deg'] == pytest.approx(math.degrees(0.01 * 2 ** 0.5),
+                                                            rel=0.05)
+    assert ('nees' in report.measures) == ('Covariance' in type_name or type_name in (
+        'sensor_msgs/msg/Imu', 'nav_msgs/msg/Odometry'))
+
+
+@pytest.mark.parametrize(('name', 'said', 'options'), [
+    ('conjugated', lambda q: q * (-1.0, -1.0, -1.0, 1.0), {}),
+    ('component_order', lambda q: np.roll(q, 1, axis=1), {}),
+    ('frame_ned', lambda q: (Rotation.from_quat((0.5 ** 0.5, 0.5 ** 0.5, 0.0, 0.0))
+                             * Rotation.from_quat(q)).as_quat(), {}),
+    ('stamp_offset', disturbed, {'delay_ns': 20_000_000}),
+    ('covariance_small', disturbed, {'variance': 0.5e-4}),
+    ('covariance_large', disturbed, {'variance': 2e-4}),
+    ('diverges', lambda q: np.roll(q, 100, axis=0), {}),
+    ('invalid_output', lambda q: q * np.where(np.arange(len(q)) == 777, np.nan, 1.0)[:, None],
+     {})])
+def test_faults_of_attitudes_in_a_log_are_named(beside, name, said, options):
+    report = examine_log(beside(said, **options), '/estimate', north='true')
+    assert report.faults == [name], report
+
+
+def test_the_command_judges_a_log(beside, log, tmp_path, capsys):
+    junit, page = tmp_path / 'junit.xml', tmp_path / 'page.png'
+    bad = beside(lambda q: q * (-1.0, -1.0, -1.0, 1.0))
+    assert main([str(bad), '--topic', '/estimate', '--heading', 'true', '--json', '--junit',
+                 str(junit), '--page', str(page)]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found['faults'] == ['conjugated'] and not found['passed']
+    assert found['measures']['convergence_s'] is None
+    suite = ElementTree.parse(junit).getroot()
+    assert suite.get('tests') == str(len(FAULTS)) and suite.get('failures') == '1'
+    assert [case.get('name') for case in suite if case.find('failure') is not None] == [
+        'conjugated']
+    assert page.read_bytes().startswith(b'\x89PNG')
+    # By the pose of the body and the mounting that the log has.
+    assert main([str(log), '--topic', '/imu/data', '--truth', '/pose', '--heading', 'true']) == 0
+    assert 'passed' in capsys.readouterr().out
+
+
+def test_the_heading_in_a_log_counts_from_the_north_that_is_asked_for(log, beside):
+    assert examine_log(log, '/imu/data', north='true').measures['heading_rms_deg'] < 1e-9
+    declination = math.degrees(math.atan2(1.57, 21.02))
+    assert examine_log(log, '/imu/data', north='magnetic').measures[
+        'heading_rms_deg'] == pytest.approx(declination, rel=1e-6)
+    with pytest.raises(ValueError, match='does not say where magnetic north is'):
+        examine_log(beside(disturbed), '/estimate', north='magnetic')
+
+
+def test_the_command_examines_a_published_filter(capsys):
+    assert main(['--filter', 'vqf', '--seeds', '1', '--imu',
+                 str(ROOT / 'config/imu/adis16470.yaml')]) == 0
+    assert 'vqf: passed' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(('arguments', 'code', 'says'), [
+    (['{log}', '--topic', '/nix'], 2, 'has no topic /nix; it has /pose'),
+    (['{log}', '--topic', '/joint_states'], 2, 'has the type sensor_msgs/msg/JointState'),
+    (['{log}', '--topic', '/imu/data_raw'], 2, 'it has no orientation'),
+    (['{log}'], 2, '--topic'), ([], 2, 'give either a log'),
+    (['nix.mcap', '--topic', '/a'], 1, 'nix.mcap'),
+    (['{log}', '--topic', '/pose', '--page', 'a.gif'], 2, 'must end in .png'),
+    (['--filter', 'vqf', '--seeds', '0'], 2, 'seeds = 0')])
+def test_wrong_arguments_of_the_command(log, capsys, arguments, code, says):
+    arguments = [argument.format(log=log) for argument in arguments]
+    try:
+        assert main(arguments) == code
+    except SystemExit as end:
+        assert end.code == code
+    assert says in capsys.readouterr().err
+
+
+def test_its_help_fits_into_80_columns(capsys, monkeypatch):
+    monkeypatch.setenv('COLUMNS', '80')
+    with pytest.raises(SystemExit, match='0'):
+        main(['--help'])
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
