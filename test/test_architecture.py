@@ -18,6 +18,7 @@ MAY_IMPORT = {
     'recording': set(),
     'tools': {'physics', 'solvers', 'streams', 'recording'},
     'nodes': {'physics', 'solvers', 'streams', 'recording', 'tools'},
+    'view': {'physics', 'solvers', 'streams', 'recording', 'tools', 'nodes'},
 }
 ROS = {'rclpy', 'launch', 'launch_ros', 'rcl_interfaces', 'ament_index_python', 'std_msgs',
        'geometry_msgs', 'sensor_msgs', 'diagnostic_msgs', 'std_srvs'}
@@ -27,7 +28,8 @@ MAY_NOT_IMPORT = {
     'streams': ROS | {'scipy', 'mcap', 'os', 'pathlib'},
     'recording': {'rclpy', 'scipy'},
     'tools': {'rclpy'},
-    'nodes': {'scipy'},
+    'nodes': {'scipy', 'viser'},
+    'view': {'scipy'},
 }
 MODULES = {'.'.join(path.relative_to(PACKAGE.parent).with_suffix('').parts): path
            for path in sorted(PACKAGE.rglob('*.py'))}
@@ -68,6 +70,17 @@ def test_a_room_imports_only_what_it_may(name):
         assert others <= MAY_IMPORT[name], module
         top_level = {imported_name.split('.')[0] for imported_name in imported(path)}
         assert not top_level & MAY_NOT_IMPORT[name], module
+
+
+def test_only_the_page_knows_viser_and_only_the_live_one_ros():
+    for module, path in MODULES.items():
+        top_level = {name.split('.')[0] for name in imported(path)}
+        assert 'viser' not in top_level or room(module) == 'view'
+        if room(module) == 'view':
+            # `view.command` only takes ROS arguments away.
+            assert not top_level & ROS - {'rclpy'} or module == f'{NAME}.view.live'
+            assert 'rclpy' not in top_level or module in {
+                f'{NAME}.view.live', f'{NAME}.view.command'}
 
 
 def test_every_folder_is_a_room():
