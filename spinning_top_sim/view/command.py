@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
+import signal
 import sys
 import webbrowser
 from collections.abc import Callable
@@ -63,11 +65,17 @@ def _show_logs(arguments: argparse.Namespace) -> int:
         raise ValueError(f'{len(arguments.log)} logs: must be one or two')
     from spinning_top_sim.view.log import Player, read_logs  # noqa: PLC0415
     logs = read_logs(arguments.log)
-    player = Player(_open_page(arguments, ' and '.join(map(str, arguments.log))), logs)
-    if arguments.html is not None:
-        cli.print_line(f'{arguments.html}: {player.write_html(arguments.html)}')
-    else:
-        player.play()
+    page = _open_page(arguments, ' and '.join(log.name for log in arguments.log))
+    try:
+        player = Player(page, logs)
+        if arguments.html is not None:
+            cli.print_line(f'{arguments.html}: {player.write_html(arguments.html)}')
+        else:
+            with contextlib.suppress(KeyboardInterrupt):
+                player.play()
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        page.close()
     return cli.OK
 
 
@@ -84,6 +92,7 @@ def _open_page(arguments: argparse.Namespace, title: str) -> Page:
     who = ('only this machine reaches it' if arguments.host == LOOPBACK else
            'whoever reaches this address can watch and command')
     cli.print_line(f'view: {page.address} ({who}), until Ctrl-C')
+    sys.stdout.flush()
     if not arguments.no_browser and _has_desktop():
         webbrowser.open(page.address)
     return page

@@ -4,7 +4,7 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -17,7 +17,8 @@ LONGEST_CHORD = 0.5             # of the trace, by its radius: what is longer is
 CURVE_POINTS = 400              # of a curve at most
 STEPS = 48                      # of a full circle
 ARROWS = ('angular momentum', 'angular velocity', 'specific force')
-CURVES = ('θ [deg]', "φ' [rad/s]", 'energy drift', 'orientation error [rad]')
+CURVES = ('θ [deg]', "φ' [rad/s]", 'log10 |energy drift|', 'log10 orientation error [rad]')
+LEAST = 1e-17                   # whose logarithm stands for 0
 Floats = NDArray[np.float32]
 
 
@@ -37,7 +38,7 @@ def sector(radius: float, low: float, high: float, begin: float,
     a = np.arange(count - 1)
     b, c, d = a + 1, a + count, a + count + 1       # the next one, and both on the upper ring
     bottom, top = np.full_like(a, 2 * count), np.full_like(a, 2 * count + 1)
-    faces: list[tuple[object, object, object]] = [
+    faces: list[tuple[ArrayLike, ArrayLike, ArrayLike]] = [
         (a, b, d), (a, d, c), (b, a, bottom), (c, d, top)]
     if end - begin < math.tau:          # the two plane sides
         last, low_centre, high_centre = count - 1, 2 * count, 2 * count + 1
@@ -135,7 +136,8 @@ def curve(track: Track, name: str, begin_ns: int, end_ns: int) -> tuple[NDArray[
     topic, column = {CURVES[1]: ('joint_states', 9), CURVES[2]: ('~/invariants', ENERGY_DRIFT),
                      CURVES[3]: ('~/invariants', ORIENTATION_ERROR)}[name]
     stamps_ns, rows = _thin(track.columns[topic], begin_ns, end_ns)
-    return stamps_ns, rows[:, column]
+    values = rows[:, column]
+    return stamps_ns, values if name == CURVES[1] else np.log10(np.maximum(np.abs(values), LEAST))
 
 
 def _thin(columns: Columns, begin_ns: int, end_ns: int) -> tuple[NDArray[np.int64], Rows]:

@@ -7,7 +7,7 @@ import io
 import math
 import socket
 from collections.abc import Sequence
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 import viser
@@ -26,6 +26,7 @@ TRACES = ((229, 77, 51), (40, 140, 70))
 BOUNDS, SPHERE = (120, 90, 170), (205, 205, 210)
 ARROW_COLOURS = ((20, 120, 60), (190, 60, 160), (230, 130, 20))
 CAMERAS = ('side', 'above', 'with the body')
+Value = TypeVar('Value')
 NO_SAMPLES = 'no samples yet'
 
 
@@ -48,7 +49,7 @@ class _Server(viser.ViserServer):
         """Refuse: viser would ask a server in the internet to pass the page on."""
 
 
-def set_value(handle: viser.GuiInputHandle[Any], value: object) -> None:
+def set_value(handle: viser.GuiInputHandle[Value], value: Value) -> None:
     """Show a value in an input; viser declares `value` without its setter."""
     handle.value = value        # type: ignore[misc]
 
@@ -113,10 +114,10 @@ class DrawnTop:
         if self._trace.visible:
             lines = model.trace(self.track, stamp_ns)
             self._trace.points = lines if len(lines) else np.zeros((1, 2, 3), np.float32)
-        for name, node in zip(model.ARROWS, self._arrows, strict=True):
-            if node.visible:
+        for name, arrow in zip(model.ARROWS, self._arrows, strict=True):
+            if arrow.visible:
                 vector = model.arrow(self.track, name, stamp_ns)
-                node.points = np.array([[(0.0, 0.0, 0.0), (
+                arrow.points = np.array([[(0.0, 0.0, 0.0), (
                     (0.0, 0.0, 0.0) if vector is None else vector)]], np.float32)
         motion = self.track.motion_at(stamp_ns)
         limits = motion.theta_range if motion else None
@@ -191,7 +192,7 @@ class Page:
                                  stroke=f'rgb{TRACES[k % len(TRACES)]}')
                     for k, track in enumerate(tracks))),
                 scales={'x': uplot.Scale(time=False), 'y': uplot.Scale(auto=True)},
-                height=130) for name in model.CURVES]
+                height=150) for name in model.CURVES]
 
     def _camera_position(self) -> tuple[float, float, float]:
         """Return where the chosen camera is; with the body it turns with the precession."""
