@@ -5,15 +5,12 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import viser
 
 from spinning_top_sim.physics.top import Top
 from spinning_top_sim.view.page import Page, set_value
-
-if TYPE_CHECKING:
-    from spinning_top_sim.view.live import LiveView
 
 TIME_SCALES = ('0.1', '0.25', '0.5', '1', '2', '5', '10')
 STEPS = 1000                    # of a slider
@@ -21,10 +18,20 @@ LEFT_ALONE_S = 1.0              # a slider that nobody has moved for so long fol
 NO_SCENE = '(as it was started)'
 
 
+class Commands(Protocol):
+    """What can be asked of a node; each returns what is said then, or raises with the reason."""
+
+    def call(self, name: str, *on: bool) -> str: ...
+    def set_parameters_together(self, values: Mapping[str, Any]) -> str: ...
+    def command(self, l3: float, lz: float) -> str: ...
+    def height(self) -> float | None: ...
+    def load_scene(self, name: str, paused: bool) -> str: ...
+
+
 class Controls:
     """The controls.  Their callbacks run in threads of viser, one of them at a time acts."""
 
-    def __init__(self, page: Page, node: 'LiveView', scenes: Sequence[str]) -> None:
+    def __init__(self, page: Page, node: Commands, scenes: Sequence[str]) -> None:
         self._page, self._node = page, node
         self._lock = threading.Lock()
         self._paused = False
@@ -70,13 +77,13 @@ class Controls:
                 self._act(action)
 
     def _on_slider(self, number: int) -> Callable[[viser.GuiEvent[Any]], None]:
-        def moved(event: viser.GuiEvent[Any]) -> None:
+        def _moved(event: viser.GuiEvent[Any]) -> None:
             if event.client is not None:
                 self._moved_at = time.monotonic()
                 self._wanted[number] = float(self._sliders[number].value)
                 # While one waits for its answer, a slider moves on: then its newest place counts.
                 self._act_on_sliders()
-        return moved
+        return _moved
 
     def _act_on_sliders(self) -> None:
         with self._lock:

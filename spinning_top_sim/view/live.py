@@ -122,6 +122,8 @@ class LiveView(Node):
             try:
                 self._draw_once()
             except Exception:
+                if not self.context.ok():       # a signal has ended it
+                    return
                 self.get_logger().error(traceback.format_exc(), throttle_duration_sec=5.0)
             time.sleep(max(due - time.monotonic(), 0.0))
 
@@ -181,9 +183,11 @@ class LiveView(Node):
         answered = threading.Event()
         future = client.call_async(request)
         future.add_done_callback(lambda _: answered.set())
-        if not answered.wait(ANSWER_S):
-            client.remove_pending_request(future)
-            raise RefusedError(f'{self._sim}/{name} has not answered within {ANSWER_S:g} s')
+        end = time.monotonic() + ANSWER_S
+        while not answered.wait(0.1):
+            if time.monotonic() > end or self._stopped:
+                client.remove_pending_request(future)
+                raise RefusedError(f'{self._sim}/{name} has not answered')
         return future.result()
 
     def call(self, name: str, *on: bool) -> str:

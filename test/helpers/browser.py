@@ -14,7 +14,7 @@ PATIENCE_MS = 60_000
 # WebGL by software.  The pictures are small, as the processor draws them.
 OPTIONS = ('--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader',
            '--enable-unsafe-swiftshader')
-SIZE = {'width': 480, 'height': 900}
+SIZE = {'width': 320, 'height': 400}
 
 
 def launch():
