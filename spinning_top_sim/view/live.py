@@ -93,10 +93,10 @@ class LiveView(Node):
         self._page.close()
 
     def _listen(self, topic: str, kind: type) -> None:
-        def receive(data: Any) -> None:         # serialized: `raw`
+        def _receive(data: Any) -> None:         # serialized: `raw`
             self._inbox.append((topic, data))
         self._listeners[topic] = self.create_subscription(
-            kind, topic.replace('~', NODE_NAME), receive, QOS, raw=True)
+            kind, topic.replace('~', NODE_NAME), _receive, QOS, raw=True)
 
     def _listen_as_needed(self) -> None:
         """Listen to the IMU only while the arrow that needs it is shown."""
