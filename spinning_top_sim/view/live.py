@@ -15,6 +15,7 @@ from typing import Any
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import ParameterEvent
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.client import Client
@@ -41,8 +42,8 @@ QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 INBOX = 2000                    # messages that wait for the next picture
 ANSWER_S = 5.0                  # a service that takes longer does not answer
 KEPT_NS = 2 * max(WINDOW_NS, model.TRACE_NS)
-KIND_OF = {'pose': PoseStamped, 'joint_states': JointState, '~/invariants': Float64MultiArray}
-FORCE = 'ground_truth/imu'
+KIND_OF = {'pose': PoseStamped, 'joint_states': JointState, '~/invariants': Float64MultiArray,
+           'ground_truth/odom': Odometry, 'ground_truth/imu': Imu}
 SPIN = ('spin.l3', 'spin.lz')
 # What a scene decides: where it does not, the default holds.
 OF_A_SCENE = ('top.', 'initial.', 'solver.', 'imu.')
@@ -66,8 +67,6 @@ class LiveView(Node):
         self._page = page
         self._inbox: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
         self._listeners: dict[str, Subscription] = {}
-        for topic, kind in KIND_OF.items():
-            self._listen(topic, kind)
         self._sim = self.resolve_topic_name(NODE_NAME)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, QOS)
         self.create_subscription(ParameterEvent, '/parameter_events', self._on_parameters, 10)
@@ -92,19 +91,27 @@ class LiveView(Node):
         self._thread.join(2.0 * ANSWER_S)
         self._page.close()
 
-    def _listen(self, topic: str, kind: type) -> None:
+    def _listen(self, topic: str) -> None:
         def _receive(data: Any) -> None:         # serialized: `raw`
             self._inbox.append((topic, data))
         self._listeners[topic] = self.create_subscription(
-            kind, topic.replace('~', NODE_NAME), _receive, QOS, raw=True)
+            KIND_OF[topic], topic.replace('~', NODE_NAME), _receive, QOS, raw=True)
 
     def _listen_as_needed(self) -> None:
-        """Listen to the IMU only while the arrow that needs it is shown."""
-        needed = self._page.arrows[model.ARROWS.index('specific force')].value
-        if needed and FORCE not in self._listeners:
-            self._listen(FORCE, Imu)
-        elif not needed and FORCE in self._listeners:
-            self.destroy_subscription(self._listeners.pop(FORCE))
+        """Listen to as little as is shown: each message costs the node some time."""
+        if self._track is None:
+            return
+        needed = {'~/invariants'}
+        if self._track.values['ground_truth_odom.enabled']:     # attitude and rates in one
+            needed |= {'ground_truth/odom'}
+        else:
+            needed |= {'pose', 'joint_states'}
+        if self._page.arrows[model.ARROWS.index('specific force')].value:
+            needed |= {'ground_truth/imu'}
+        for topic in needed - self._listeners.keys():
+            self._listen(topic)
+        for topic in self._listeners.keys() - needed:
+            self.destroy_subscription(self._listeners.pop(topic))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -117,8 +124,9 @@ class LiveView(Node):
             self._stale = True
 
     def _draw(self) -> None:
+        due = time.monotonic()
         while not self._stopped:
-            due = time.monotonic() + 1.0 / RATE
+            due = max(due + 1.0 / RATE, time.monotonic())       # a late picture moves no other
             try:
                 self._draw_once()
             except Exception:

@@ -179,8 +179,9 @@ class Player:
 
     def play(self) -> None:
         """Show pictures until KeyboardInterrupt."""
+        due = time.monotonic()
         while True:
-            due = time.monotonic() + 1.0 / RATE
+            due = max(due + 1.0 / RATE, time.monotonic())
             self.draw_next(float(self._speed.value) / RATE if self._plays else 0.0)
             time.sleep(max(due - time.monotonic(), 0.0))
 

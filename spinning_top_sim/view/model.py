@@ -8,7 +8,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.view.track import ENERGY_DRIFT, ORIENTATION_ERROR, Columns, Rows, Track
+from spinning_top_sim.view.track import (
+    ENERGY_DRIFT,
+    ORIENTATION_ERROR,
+    PRECESSION,
+    Columns,
+    Rows,
+    Track,
+)
 
 TRACE_NS = 10 * NANOSECONDS     # so far back goes the trace of the tip
 TRACE_POINTS = 1500             # of it at most
@@ -109,8 +116,8 @@ def arrow(track: Track, name: str, stamp_ns: int) -> Rows | None:
     Angular momentum and velocity are as long as the axis where they are those of the spin, the
     specific force where it is 1 g.
     """
-    topic = 'ground_truth/imu' if name == 'specific force' else 'joint_states'
-    sample = track.columns[topic].at(stamp_ns)
+    columns = track.columns['ground_truth/imu'] if name == 'specific force' else track.rates
+    sample = columns.at(stamp_ns)
     if sample is None:
         return None
     top, row, length = track.top, sample[1], abs(reach(track))
@@ -133,11 +140,12 @@ def curve(track: Track, name: str, begin_ns: int, end_ns: int) -> tuple[NDArray[
         x, y, z, w = _columns(rows)
         return stamps_ns, np.degrees(2.0 * np.arctan2(np.sqrt(x * x + y * y),
                                                       np.sqrt(z * z + w * w)))
-    topic, column = {CURVES[1]: ('joint_states', 9), CURVES[2]: ('~/invariants', ENERGY_DRIFT),
-                     CURVES[3]: ('~/invariants', ORIENTATION_ERROR)}[name]
-    stamps_ns, rows = _thin(track.columns[topic], begin_ns, end_ns)
-    values = rows[:, column]
-    return stamps_ns, values if name == CURVES[1] else np.log10(np.maximum(np.abs(values), LEAST))
+    if name == CURVES[1]:
+        stamps_ns, rows = _thin(track.rates, begin_ns, end_ns)
+        return stamps_ns, rows[:, PRECESSION]
+    stamps_ns, rows = _thin(track.columns['~/invariants'], begin_ns, end_ns)
+    values = rows[:, ENERGY_DRIFT if name == CURVES[2] else ORIENTATION_ERROR]
+    return stamps_ns, np.log10(np.maximum(np.abs(values), LEAST))
 
 
 def _thin(columns: Columns, begin_ns: int, end_ns: int) -> tuple[NDArray[np.int64], Rows]:

@@ -22,10 +22,12 @@ from spinning_top_sim.tools.analysis import SNAP, attitudes_of
 Rows = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
-# Columns of each topic: attitude x, y, z, w; angular velocity in the body; phi, psi, phi'; force.
-WIDTHS = {'pose': 4, 'joint_states': 10, 'ground_truth/odom': 7, 'ground_truth/imu': 10,
+# Columns of each topic: attitude x, y, z, w; angular velocity in the body; phi' or specific force.
+WIDTHS = {'pose': 4, 'joint_states': 8, 'ground_truth/odom': 8, 'ground_truth/imu': 10,
           '~/invariants': 8}
 ATTITUDES = ('pose', 'joint_states', 'ground_truth/odom', 'ground_truth/imu')     # best first
+RATES = ('joint_states', 'ground_truth/odom')
+PRECESSION = 7              # column of RATES
 ENERGY, L3, LZ, ENERGY_DRIFT, ORIENTATION_ERROR = 0, 1, 2, 3, 7     # columns of ~/invariants
 SAME = 1e-6                 # relative difference of constants of one motion
 MOST_MOTIONS = 99           # that are kept
@@ -128,6 +130,8 @@ class Track:
         found = attitudes_of(topic, self._imu, stamps, fields)
         assert found is not None
         rows = found.rows.T
+        if topic in RATES and found.phi_dot is not None:
+            rows = np.column_stack((rows[:, :7], found.phi_dot))
         if topic == 'ground_truth/imu':
             if len(rows) < len(stamps):         # an attitude of zeros
                 return
@@ -147,6 +151,12 @@ class Track:
                      if len(self.columns[topic].stamps_ns)), self.columns['pose'])
 
     @property
+    def rates(self) -> Columns:
+        """The topic that shows angular velocity and phi', with the attitude before them."""
+        return next((self.columns[topic] for topic in RATES
+                     if len(self.columns[topic].stamps_ns)), self.columns[RATES[0]])
+
+    @property
     def span(self) -> tuple[int, int] | None:
         """The first and the last stamp of the attitude [ns]; None without samples."""
         stamps_ns = self.attitudes.stamps_ns
@@ -158,8 +168,8 @@ class Track:
         return begun[-1] if begun else next(iter(self.motions), None)
 
     def follow(self) -> None:
-        """Begin a new motion where the newest joint state is of another than the last."""
-        newest = self.columns['joint_states'].at(LATEST_NS)
+        """Begin a new motion where the newest rates are of another than the last."""
+        newest = self.rates.at(LATEST_NS)
         if newest is None:
             return
         stamp_ns, row = newest
@@ -176,7 +186,7 @@ class Track:
 
 
 def state_of(top: Top, row: Rows) -> tuple[tuple[float, float, float], State]:
-    """Return energy, L3 and Lz of a row of joint_states, and its state but for phi and psi."""
+    """Return energy, L3 and Lz of a row of RATES, and its state but for phi and psi."""
     x, y, z, w, one, two, spin = row[:7].tolist()
     cos2, sin2 = w * w + z * z, x * x + y * y
     up_1, up_2, up_3 = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), cos2 - sin2
