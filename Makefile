@@ -44,7 +44,7 @@ help:
 	@echo '             SCENE=$(SCENE), the path of a parameter file or one of'
 	@echo '$(SCENES)' | fold -s -w 65 | sed 's/^/             /'
 	@echo '             ARGS=... adds arguments, such as ARGS="-p time_scale:=0.5"'
-	@echo 'make view    the same without a log, and show it in the browser; PORT=... of the page'
+	@echo 'make view    the same in the browser, without a log; PORT=... of the page'
 	@echo 'make test    run the tests; TESTS=... selects some, ARGS=... goes to pytest,'
 	@echo '             which has WORKERS=$(WORKERS) processes (0: its own, for ARGS=--pdb)'
 	@echo 'make stress  kill 200 recording nodes (KILLS=...), try random logs, parameters,'

@@ -14,7 +14,7 @@ import threading
 import time
 
 import viser
-from processes import SIM_NODE, Process, median, ros_arguments
+from processes import SIM_NODE, Process, median, ros_arguments, script
 from websockets.sync.client import connect
 
 NAMESPACE = '/view_cost'
@@ -59,22 +59,32 @@ def main() -> None:
             **{f'{stream}.rate': 200.0 for stream in ('pose', 'joint_states', 'imu')}}
         with Process(SIM_NODE, ros_arguments(NAMESPACE, parameters)) as sim:
             time.sleep(5.0)
-            alone, watched, page, rates = [], [], [], []
-            for _ in range(options.rounds):
-                alone.append(measure(sim, options.seconds)[0])
-                with Process(VIEW, ros_arguments(NAMESPACE, {}), talks=True) as view:
-                    found = re.search(r'http://[\w.:]+', view.line())
-                    assert found
-                    client = Client(found.group())
-                    client.start()
-                    time.sleep(5.0)
-                    node_share, page_share, rate = measure(sim, options.seconds, view, client)
-                    watched.append(node_share)
-                    page.append(page_share)
-                    rates.append(rate)
-            print(f'sim_node, recording at 200 Hz: {median(alone):.1%} of a core; with the page '
-                  f'{median(watched):.1%}: {median(watched) / median(alone):.2f} times')
-            print(f'page: {median(page):.1%} of a core, {median(rates):.1f} attitudes a second')
+            compare('sim_node, recording at 200 Hz', sim, options)
+            with Process(script('listener.py'), [NAMESPACE], talks=True) as listener:
+                listener.line()         # it is ready
+                compare('the same with another subscriber of pose, joint_states and imu', sim,
+                        options)
+                listener.tell('')
+
+
+def compare(title: str, sim: Process, options: argparse.Namespace) -> None:
+    """Print what the page costs the node, and itself."""
+    alone, watched, page, rates = [], [], [], []
+    for _ in range(options.rounds):
+        alone.append(measure(sim, options.seconds)[0])
+        with Process(VIEW, ros_arguments(NAMESPACE, {}), talks=True) as view:
+            found = re.search(r'http://[\w.:]+', view.line())
+            assert found
+            client = Client(found.group())
+            client.start()
+            time.sleep(5.0)
+            node_share, page_share, rate = measure(sim, options.seconds, view, client)
+            watched.append(node_share)
+            page.append(page_share)
+            rates.append(rate)
+    print(f'{title}: {median(alone):.1%} of a core; with the page {median(watched):.1%}, '
+          f'{median(watched) / median(alone):.2f} times')
+    print(f'page: {median(page):.1%} of a core, {median(rates):.1f} attitudes a second', flush=True)
 
 
 if __name__ == '__main__':

@@ -34,7 +34,7 @@ from spinning_top_sim.streams.journal import NODE_NAME
 from spinning_top_sim.tools.scene_file import read_scene
 from spinning_top_sim.view import model
 from spinning_top_sim.view.controls import Controls
-from spinning_top_sim.view.page import RATE, WINDOW_NS, Page
+from spinning_top_sim.view.page import CATCH_UP_S, RATE, WINDOW_NS, Page
 from spinning_top_sim.view.track import L3, LATEST_NS, LZ, Track
 
 # The newest of few: a page that is slow or hangs never makes the node wait.
@@ -126,7 +126,7 @@ class LiveView(Node):
     def _draw(self) -> None:
         due = time.monotonic()
         while not self._stopped:
-            due = max(due + 1.0 / RATE, time.monotonic())       # a late picture moves no other
+            due = max(due + 1.0 / RATE, time.monotonic() - CATCH_UP_S)
             try:
                 self._draw_once()
             except Exception:

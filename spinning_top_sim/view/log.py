@@ -22,7 +22,7 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import recorded_run
-from spinning_top_sim.view.page import RATE, Page, set_value
+from spinning_top_sim.view.page import CATCH_UP_S, RATE, Page, set_value
 from spinning_top_sim.view.track import WIDTHS, Motion, Track
 
 BLOCK = 16384               # messages decoded together
@@ -181,7 +181,7 @@ class Player:
         """Show pictures until KeyboardInterrupt."""
         due = time.monotonic()
         while True:
-            due = max(due + 1.0 / RATE, time.monotonic())
+            due = max(due + 1.0 / RATE, time.monotonic() - CATCH_UP_S)
             self.draw_next(float(self._speed.value) / RATE if self._plays else 0.0)
             time.sleep(max(due - time.monotonic(), 0.0))
 

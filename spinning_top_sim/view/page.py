@@ -18,6 +18,7 @@ from spinning_top_sim.view import model
 from spinning_top_sim.view.track import Rows, Track
 
 RATE = 30.0                     # pictures a second
+CATCH_UP_S = 0.2                # by so much late pictures follow each other at once
 PLOT_EVERY = 6                  # pictures
 WINDOW_NS = 10 * NANOSECONDS    # of the plots
 PORTS = 100                     # tried in turn
