@@ -26,7 +26,7 @@ def take(address, path):
         page = browser.new_page(viewport={'width': 1100, 'height': 800})
         page.goto(address)
         page.wait_for_function("window.__viserMutable?.nodePoseData['/top0/body']")
-        page.wait_for_timeout(3000)
+        page.wait_for_timeout(12_000)          # the scene fades in
         # What the browser says about a machine without graphics.
         page.evaluate("document.querySelectorAll('.mantine-Notifications-root')"
                       '.forEach(element => element.remove())')

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page as a browser shows it, live, from logs and as a file; needs Chromium."""
 
-import math
 import re
 import signal
 import subprocess
@@ -114,6 +113,10 @@ def test_live(browser, peer, tmp_path):
         assert node.alive
 
 
+def turned(attitude):
+    return attitude if attitude != [0, 0, 0, 1] else None
+
+
 def stamp_of(poses):
     seconds, nanoseconds = Time.from_msg(poses.last().header.stamp).seconds_nanoseconds()
     return str(seconds), f'{nanoseconds:09d}'
@@ -147,12 +150,11 @@ def test_file_without_a_network(browser, log, tmp_path):
     with Visit(browser, str(page), offline=True) as visit:
         visit.read('cusps')
         for _ in range(3):
-            shown = visit.attitude()
+            # Before the first picture, and where it begins again, viser turns nothing.
+            shown = wait_for('a picture', lambda: turned(visit.attitude()))
             assert min(apart(shown, pose) for pose in poses.values()) < 1e-6
-        turned = visit.attitude
         visit.page.wait_for_function(
             "then => String(window.__viserMutable.nodePoseData['/top0/body'].wxyz) != then",
             arg=','.join(map(str, [shown[3], *shown[:3]])))
-        assert math.isfinite(turned()[0])
         assert visit.errors == []
         assert visit.hosts <= {'', None}
