@@ -84,7 +84,8 @@ def compare(title: str, sim: Process, options: argparse.Namespace) -> None:
             rates.append(rate)
     print(f'{title}: {median(alone):.1%} of a core; with the page {median(watched):.1%}, '
           f'{median(watched) / median(alone):.2f} times')
-    print(f'page: {median(page):.1%} of a core, {median(rates):.1f} attitudes a second', flush=True)
+    print(f'page: {median(page):.1%} of a core, {median(rates):.1f} attitudes a second',
+          flush=True)
 
 
 if __name__ == '__main__':
