@@ -13,13 +13,14 @@ import tempfile
 import threading
 import time
 
+import msgspec
 import viser
+import zstandard
 from processes import SIM_NODE, Process, median, ros_arguments, script
 from websockets.sync.client import connect
 
 NAMESPACE = '/view_cost'
 VIEW = ('-P', '-u', '-m', 'spinning_top_sim.view.command', '--no-browser')
-ATTITUDE = re.compile(b'/top0/body.{0,20}wxyz', re.DOTALL)
 
 
 class Client(threading.Thread):
@@ -32,8 +33,13 @@ class Client(threading.Thread):
         self.count = 0
 
     def run(self) -> None:
+        unzip = zstandard.ZstdDecompressor()
         for message in self._socket:
-            self.count += len(ATTITUDE.findall(message))
+            size = int.from_bytes(message[8:16], 'little')
+            content = msgspec.msgpack.decode(unzip.decompress(message[16:16 + size]))
+            self.count += sum(
+                part['type'] == 'SetOrientationMessage' and part['name'] == '/top0/body'
+                for part in content['messages'])
 
 
 def measure(sim: Process, seconds: float, view: Process | None = None,
