@@ -14,7 +14,7 @@ MAKEFLAGS += --no-builtin-rules
 .SUFFIXES:
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help run test stress performance benchmark docs dependencies lint build clean check-scene \
+.PHONY: help run view test stress performance benchmark docs dependencies lint build clean check-scene \
     FORCE
 
 # DDS stays on this machine.  Its default is to discover nodes in the whole network.
@@ -44,6 +44,7 @@ help:
 	@echo '             SCENE=$(SCENE), the path of a parameter file or one of'
 	@echo '$(SCENES)' | fold -s -w 65 | sed 's/^/             /'
 	@echo '             ARGS=... adds arguments, such as ARGS="-p time_scale:=0.5"'
+	@echo 'make view    the same in the browser, without a log; PORT=... of the page'
 	@echo 'make test    run the tests; TESTS=... selects some, ARGS=... goes to pytest,'
 	@echo '             which has WORKERS=$(WORKERS) processes (0: its own, for ARGS=--pdb)'
 	@echo 'make stress  kill 200 recording nodes (KILLS=...), try random logs, parameters,'
@@ -76,6 +77,16 @@ run: check-scene
 	    'ROS_AUTOMATIC_DISCOVERY_RANGE=$(ROS_AUTOMATIC_DISCOVERY_RANGE)'
 	@exec '$(VENV)/bin/sim_node' --ros-args --params-file '$(SCENE_FILE)' \
 	    -p record.enabled:=true -p 'record.uri:=$(LOGS)/' $(ARGS)
+
+# Ctrl-C reaches all processes of a terminal, but a shell makes those behind `&` ignore it.
+view: export ROS_DOMAIN_ID := $(RUN_DOMAIN_ID)
+view: check-scene
+	@flock Makefile $(MAKE) --silent --no-print-directory '$(VENV)/.deps-view' '$(VENV)/.package'
+	@trap : INT TERM; \
+	'$(VENV)/bin/sim_node' --ros-args --params-file '$(SCENE_FILE)' -p status_period:=0.0 \
+	    $(ARGS) & node=$$!; \
+	'$(VENV)/bin/view' $(if $(PORT),--port '$(PORT)'); code=$$?; \
+	kill -TERM $$node 2>/dev/null; wait $$node; exit $$code
 
 # A preset of an IMU goes on top of a scene; alone it would run the default parameters.
 check-scene:

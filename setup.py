@@ -18,6 +18,7 @@ EXECUTABLES = {
     'inspect': 'spinning_top_sim.tools.cli:inspect',
     'ensemble': 'spinning_top_sim.tools.cli:ensemble',
     'examine': 'spinning_top_sim.tools.cli:examine',
+    'view': 'spinning_top_sim.view.command:main',
 }
 
 DATA_FILES = {
@@ -68,14 +69,17 @@ setup(
             'mcap-ros2-support>=0.5.5,<0.7',
             'pyarrow>=14,<30',
             'pytest>=7.4,<10',
+            'playwright>=1.45,<2',      # drives the Chromium of the system, and brings none
             'pytest-xdist>=3.5,<4',     # make test: several workers
             'rosbags>=0.10.11,<0.12',
+            'viser>=1.1.1,<1.2',
             'vqf>=2.1,<3',
             'xacro>=2.1,<3',
             'yourdfpy>=0.0.60,<0.1',
         ],
         'parquet': ['pyarrow>=14,<30'],
         'plot': ['matplotlib>=3.6,<4'],     # inspect --plot, docs/figures.py
+        'view': ['viser>=1.1.1,<1.2'],      # a narrow range: the page uses much of it
         # examples/attitude_filter.py
         'examples': ['ahrs>=0.4,<0.5', 'matplotlib>=3.6,<4', 'rosbags>=0.10.11,<0.12',
                      'vqf>=2.1,<3'],

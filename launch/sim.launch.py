@@ -57,6 +57,9 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(
             'rviz', default_value='false', choices=SWITCH, description='Run RViz'),
         DeclareLaunchArgument(
+            'view', default_value='false', choices=SWITCH,
+            description='Show the top in the browser'),
+        DeclareLaunchArgument(
             'markers', default_value=LaunchConfiguration('rviz'), choices=SWITCH,
             description='Publish markers; default: the value of rviz'),
         OpaqueFunction(function=_nodes)])
@@ -65,8 +68,9 @@ def generate_launch_description() -> LaunchDescription:
 def _nodes(context: LaunchContext) -> list:
     given = {name: context.launch_configurations[name] for name in (
         'scene', 'params_file', 'set', 'namespace', 'frame_prefix', 'record', 'use_sim_time',
-        'tf', 'rviz', 'markers')}
-    on = {name: given[name] == 'true' for name in ('use_sim_time', 'tf', 'rviz', 'markers')}
+        'tf', 'rviz', 'view', 'markers')}
+    on = {name: given[name] == 'true' for name in (
+        'use_sim_time', 'tf', 'rviz', 'view', 'markers')}
     namespace = given['namespace'].strip('/')
     files = [_scene_file(given['scene']), *filter(None, [given['params_file']])]
     scene, *second = map(read_scene, files)
@@ -100,6 +104,9 @@ def _nodes(context: LaunchContext) -> list:
         actions += launch_helpers.state_publisher(
             SHARE, values, namespace, resolve_topic('joint_states', namespace),
             on['use_sim_time'])
+    if on['view']:
+        actions.append(Node(package='spinning_top_sim', executable='view', namespace=namespace,
+                            output='screen'))
     if on['rviz']:
         actions += launch_helpers.rviz(SHARE, values['world_frame'], namespace,
                                        on['use_sim_time'])

@@ -19,6 +19,7 @@ MAY_IMPORT = {
     'tools': {'physics', 'solvers', 'streams', 'recording'},
     'exam': {'physics', 'solvers', 'streams', 'recording', 'tools'},
     'nodes': {'physics', 'solvers', 'streams', 'recording', 'tools'},
+    'view': {'physics', 'solvers', 'streams', 'recording', 'tools', 'nodes'},
 }
 ROS = {'rclpy', 'launch', 'launch_ros', 'rcl_interfaces', 'ament_index_python', 'std_msgs',
        'geometry_msgs', 'sensor_msgs', 'diagnostic_msgs', 'std_srvs'}
@@ -29,7 +30,8 @@ MAY_NOT_IMPORT = {
     'recording': {'rclpy', 'scipy'},
     'tools': {'rclpy'},
     'exam': set(),
-    'nodes': {'scipy'},
+    'nodes': {'scipy', 'viser'},
+    'view': {'scipy'},
 }
 MODULES = {'.'.join(path.relative_to(PACKAGE.parent).with_suffix('').parts): path
            for path in sorted(PACKAGE.rglob('*.py'))}
@@ -76,6 +78,17 @@ def test_one_module_of_the_exam_needs_ros():
     needs = {module for module, path in MODULES.items() if room(module) == 'exam'
              and any(name.split('.')[0] in ROS for name in imported(path))}
     assert needs == {f'{NAME}.exam.live'}
+
+
+def test_only_the_page_knows_viser_and_only_the_live_one_ros():
+    for module, path in MODULES.items():
+        top_level = {name.split('.')[0] for name in imported(path)}
+        assert 'viser' not in top_level or room(module) == 'view'
+        if room(module) == 'view':
+            # `view.command` only takes ROS arguments away.
+            assert not top_level & ROS - {'rclpy'} or module == f'{NAME}.view.live'
+            assert 'rclpy' not in top_level or module in {
+                f'{NAME}.view.live', f'{NAME}.view.command'}
 
 
 def test_every_folder_is_a_room():

@@ -219,6 +219,12 @@ def log(tmp_path):
     return path
 
 
+def test_the_page_is_started_beside_the_node_when_asked_for(installed):
+    assert 'spinning_top_sim/view' not in started('sim').nodes
+    view = started('sim', namespace='left', view='true').nodes['spinning_top_sim/view']
+    assert view.namespace == 'left'
+
+
 def test_without_rviz_a_warning_names_the_package_and_all_else_starts(installed, log):
     installed.discard('rviz2')
     for run in (started('sim', rviz='true'), started('replay', file=str(log), rviz='true')):

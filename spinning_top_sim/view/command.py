@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The executable `view`."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import signal
+import sys
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from spinning_top_sim.nodes.executable import RunnableNode, run
+from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.tools import cli
+
+if TYPE_CHECKING:
+    from spinning_top_sim.view.page import Page
+
+DESCRIPTION = """\
+Show a top in the browser: the one that a sim_node simulates, or those of logs.
+
+  view                                  with a running sim_node of this namespace
+  view run.mcap                         without ROS
+  view rk45.mcap exact.mcap             side by side, or one over the other
+  view run.mcap --html page.html        a file that opens without this program
+"""
+LOOPBACK = '127.0.0.1'
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    argv = sys.argv if argv is None else argv
+    words = argv[1:argv.index('--ros-args')] if '--ros-args' in argv else argv[1:]
+    if _parser().parse_args(words).log:
+        return cli.run('view', DESCRIPTION, words, _add_arguments, _show_logs,
+                       (LogError, OSError, ImportError))
+    return run('view', argv, _prepare)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser('view', description=DESCRIPTION,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    _add_arguments(parser)
+    return parser
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add('log', nargs='*', type=Path, help='one or two MCAP files; without: a running sim_node')
+    add('--port', type=int, help='of the page (default: the first free one from 8080 on)')
+    add('--host', default=LOOPBACK,
+        help=f'address to serve at (default: {LOOPBACK}, which only this machine reaches)')
+    add('--html', type=Path, metavar='FILE',
+        help='write the first minute of the logs as a page that needs no server, and end')
+    add('--no-browser', action='store_true', help='only print the address')
+    add('--version', action='store_true', help='print the version, then end')
+
+
+def _show_logs(arguments: argparse.Namespace) -> int:
+    if len(arguments.log) > 2:
+        raise ValueError(f'{len(arguments.log)} logs: must be one or two')
+    from spinning_top_sim.view.log import Player, read_logs  # noqa: PLC0415
+    logs = read_logs(arguments.log)
+    page = _open_page(arguments, ' and '.join(log.name for log in arguments.log))
+    try:
+        player = Player(page, logs)
+        if arguments.html is not None:
+            cli.print_line(f'{arguments.html}: {player.write_html(arguments.html)}')
+        else:
+            with contextlib.suppress(KeyboardInterrupt):
+                player.play()
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        page.close()
+    return cli.OK
+
+
+def _open_page(arguments: argparse.Namespace, title: str) -> Page:
+    """Return the page, shown by the browser if there is one, and say where it is."""
+    try:
+        from spinning_top_sim.view.page import Page  # noqa: PLC0415
+    except ImportError as error:
+        raise ImportError("the page needs viser: pip install 'spinning_top_sim[view]' "
+                          f'({error})') from error
+    if arguments.html is not None:
+        return Page(title, LOOPBACK, 0)
+    page = Page(title, arguments.host, arguments.port)
+    who = ('only this machine reaches it' if arguments.host == LOOPBACK else
+           'whoever reaches this address can watch and command')
+    cli.print_line(f'view: {page.address} ({who}), until Ctrl-C')
+    sys.stdout.flush()
+    if not arguments.no_browser and _has_desktop():
+        webbrowser.open(page.address)
+    return page
+
+
+def _has_desktop() -> bool:
+    return bool(os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')
+                or sys.platform == 'darwin')
+
+
+def _prepare(argv: list[str]) -> Callable[[], RunnableNode]:
+    from rclpy.utilities import remove_ros_args  # noqa: PLC0415
+    arguments = _parser().parse_args(remove_ros_args(argv)[1:])
+    if arguments.html is not None:
+        raise ValueError(f'--html {arguments.html}: must have a log')
+    from spinning_top_sim.view.live import LiveView  # noqa: PLC0415
+    return lambda: LiveView(_open_page(arguments, 'spinning_top'))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the live page can tell a sim_node: sliders and buttons, and its answers in words."""
+
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import viser
+
+from spinning_top_sim.physics.top import Top
+from spinning_top_sim.view.page import Page, set_value
+
+TIME_SCALES = ('0.1', '0.25', '0.5', '1', '2', '5', '10')
+STEPS = 1000                    # of a slider
+LEFT_ALONE_S = 1.0              # a slider that nobody has moved for so long follows the node
+NO_SCENE = '(as it was started)'
+
+
+class Commands(Protocol):
+    """What can be asked of a node; each returns what is said then, or raises with the reason."""
+
+    def call(self, name: str, *on: bool) -> str: ...
+    def set_parameters_together(self, values: Mapping[str, Any]) -> str: ...
+    def command(self, l3: float, lz: float) -> str: ...
+    def height(self) -> float | None: ...
+    def load_scene(self, name: str, paused: bool) -> str: ...
+
+
+class Controls:
+    """The controls.  Their callbacks run in threads of viser, one of them at a time acts."""
+
+    def __init__(self, page: Page, node: Commands, scenes: Sequence[str]) -> None:
+        self._page, self._node = page, node
+        self._lock = threading.Lock()
+        self._paused = False
+        self._spin: list[float] | None = None                   # L3 and Lz of the node
+        self._wanted: dict[int, float] = {}                     # of them, by sliders not sent yet
+        self._moved_at = 0.0                                    # on the monotonic clock
+        gui = page.gui
+        with page.controls:
+            self._status = gui.add_markdown('*waiting for sim_node*')
+            self._sliders = [gui.add_slider(label, -1.0, 1.0, 2.0 / STEPS, 0.0) for label in (
+                'L3 [kg m²/s]', 'Lz [kg m²/s]')]
+            rest = gui.add_button('Let go from rest', hint='Lz = L3 cos θ')
+            self._pause = gui.add_button('Pause')
+            step, reset = gui.add_button('Step'), gui.add_button('Reset')
+            self._record = gui.add_checkbox('record', False)
+            self._time_scale = gui.add_dropdown('time scale', TIME_SCALES, initial_value='1')
+            scene = gui.add_dropdown('scene', (NO_SCENE, *scenes))
+        for k, slider in enumerate(self._sliders):
+            slider.on_update(self._on_slider(k))
+        rest.on_click(lambda _: self._act(self._let_go))
+        self._pause.on_click(lambda _: self._act(self._switch_pause))
+        step.on_click(lambda _: self._act(lambda: node.call('step')))
+        reset.on_click(lambda _: self._act(lambda: node.call('reset')))
+        self._on_change(self._record, lambda: node.call('record', self._record.value))
+        self._on_change(self._time_scale, lambda: node.set_parameters_together(
+            {'time_scale': float(self._time_scale.value)}))
+        self._on_change(scene, lambda: node.load_scene(scene.value, self._paused)
+                        if scene.value != NO_SCENE else '')
+
+    def _act(self, action: Callable[[], str]) -> None:
+        """Do something, and say what was done, or why not."""
+        with self._lock:
+            try:
+                self._page.message.content = action()
+            except Exception as error:
+                self._page.message.content = f'**refused:** {error}'
+
+    def _on_change(self, handle: viser.GuiInputHandle[Any], action: Callable[[], str]) -> None:
+        """Act where somebody in a browser has changed an input."""
+        @handle.on_update
+        def _(event: viser.GuiEvent[Any]) -> None:
+            if event.client is not None:
+                self._act(action)
+
+    def _on_slider(self, number: int) -> Callable[[viser.GuiEvent[Any]], None]:
+        def _moved(event: viser.GuiEvent[Any]) -> None:
+            if event.client is not None:
+                self._moved_at = time.monotonic()
+                self._wanted[number] = float(self._sliders[number].value)
+                # While one waits for its answer, a slider moves on: then its newest place counts.
+                self._act_on_sliders()
+        return _moved
+
+    def _act_on_sliders(self) -> None:
+        with self._lock:
+            wanted, self._wanted = self._wanted, {}
+        if wanted and self._spin is not None:
+            l3, lz = (wanted.get(k, present) for k, present in enumerate(self._spin))
+            self._act(lambda: self._command(l3, lz))
+
+    def _command(self, l3: float, lz: float) -> str:
+        try:
+            said = self._node.command(l3, lz)
+        except Exception:
+            self._moved_at = 0.0            # the sliders go back
+            if self._spin is not None:
+                self.show_spin(*self._spin)
+            raise
+        self._spin = [l3, lz]
+        return said
+
+    def _let_go(self) -> str:
+        height = self._node.height()
+        if self._spin is None or height is None:
+            return 'there are no samples yet'
+        l3, _ = self._spin
+        return self._command(l3, l3 * height)
+
+    def _switch_pause(self) -> str:
+        said = self._node.call('set_pause', not self._paused)
+        self._show_paused(not self._paused)
+        return said
+
+    def _show_paused(self, paused: bool) -> None:
+        self._paused = paused
+        self._pause.label = 'Resume' if paused else 'Pause'
+
+    def set_range(self, top: Top, l3: float, lz: float) -> None:
+        """Let the sliders reach twice as far as what this top has, and what it may need."""
+        usual = 2.0 * math.sqrt(top.lambda1 * abs(top.gravity_torque))      # where a top wakes up
+        reach = 2.0 * (max(abs(l3), abs(lz), usual) or 1.0)
+        digits = 1 - math.floor(math.log10(reach))
+        reach = math.ceil(reach * 10.0 ** digits) / 10.0 ** digits
+        for slider in self._sliders:
+            slider.min, slider.max, slider.step = -reach, reach, 2.0 * reach / STEPS
+        self._moved_at = 0.0
+        self.show_spin(l3, lz)
+
+    def show_spin(self, l3: float, lz: float) -> None:
+        """Let the sliders show the spin of the node, unless somebody moves them."""
+        self._spin = [l3, lz]
+        if time.monotonic() - self._moved_at > LEFT_ALONE_S:
+            for slider, value in zip(self._sliders, self._spin, strict=True):
+                set_value(slider, min(max(value, slider.min), slider.max))
+
+    def show_values(self, values: Mapping[str, Any]) -> None:
+        """Show the parameters of the node."""
+        scale = f'{values["time_scale"]:g}'
+        if scale not in self._time_scale.options:
+            self._time_scale.options = (*TIME_SCALES, scale)
+        set_value(self._time_scale, scale)
+        self._spin = [values['spin.l3'], values['spin.lz']]
+
+    def tell_status(self, message: str, numbers: Mapping[str, str]) -> None:
+        """Show what /diagnostics says."""
+        recorder, path = numbers['recorder'], numbers.get('recorded file', '')
+        self._status.content = ' · '.join(filter(None, (
+            message, f't = {float(numbers["simulated time [s]"]):.1f} s',
+            f'real-time factor {numbers["real-time factor"]}',
+            f'recorder {recorder} {path}'.rstrip())))
+        if not self._lock.locked():
+            if message in ('paused', 'running'):        # else it says something worse
+                self._show_paused(message == 'paused')
+            set_value(self._record, recorder == 'recording')

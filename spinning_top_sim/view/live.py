@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page of a running sim_node: a node that listens to it, and asks as any ROS client does."""
+
+import contextlib
+import struct
+import sys
+import threading
+import time
+import traceback
+from collections import defaultdict, deque
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import ParameterEvent
+from rcl_interfaces.srv import GetParameters, SetParametersAtomically
+from rclpy.client import Client
+from rclpy.node import Node
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+from rclpy.task import Future
+from sensor_msgs.msg import Imu, JointState
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import SetBool, Trigger
+
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.journal import NODE_NAME
+from spinning_top_sim.tools.scene_file import read_scene
+from spinning_top_sim.view import model
+from spinning_top_sim.view.controls import Controls
+from spinning_top_sim.view.page import CATCH_UP_S, RATE, WINDOW_NS, Page
+from spinning_top_sim.view.track import L3, LATEST_NS, LZ, Track
+
+# The newest of few: a page that is slow or hangs never makes the node wait.
+QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+INBOX = 2000                    # messages that wait for the next picture
+ANSWER_S = 5.0                  # a service that takes longer does not answer
+KEPT_NS = 2 * max(WINDOW_NS, model.TRACE_NS)
+KIND_OF = {'pose': PoseStamped, 'joint_states': JointState, '~/invariants': Float64MultiArray,
+           'ground_truth/odom': Odometry, 'ground_truth/imu': Imu}
+SPIN = ('spin.l3', 'spin.lz')
+# What a scene decides: where it does not, the default holds.
+OF_A_SCENE = ('top.', 'initial.', 'solver.', 'imu.')
+
+
+class RefusedError(Exception):
+    """The sim_node refuses, or does not answer; the text is its reason."""
+
+
+class LiveView(Node):
+    """
+    The node `view`, with the names of the sim_node in the same namespace.
+
+    The executor's thread takes messages and answers, the page's thread draws, and those of the
+    page's controls wait for answers.
+    """
+
+    def __init__(self, page: Page) -> None:
+        super().__init__('view')
+        self.finished: Future = Future()
+        self._page = page
+        self._inbox: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
+        self._listeners: dict[str, Subscription] = {}
+        self._sim = self.resolve_topic_name(NODE_NAME)
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, QOS)
+        self.create_subscription(ParameterEvent, '/parameter_events', self._on_parameters, 10)
+        self.create_timer(0.2, self._listen_as_needed)
+        self._services_of_sim = {
+            name: self.create_client(kind, f'{NODE_NAME}/{name}') for name, kind in (
+                ('get_parameters', GetParameters),
+                ('set_parameters_atomically', SetParametersAtomically), ('set_pause', SetBool),
+                ('record', SetBool), ('step', Trigger), ('reset', Trigger))}
+        self._track: Track | None = None
+        self._stale = True                      # the parameters have to be read again
+        self._origin_ns: int | None = None      # stamp of the first sample
+        self._stopped = False
+        self._controls = Controls(page, self, sorted(_scenes()))
+        self._thread = threading.Thread(target=self._draw, name='page', daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stopped = True
+        self._thread.join(2.0 * ANSWER_S)
+        self._page.close()
+
+    def _listen(self, topic: str) -> None:
+        def _receive(data: Any) -> None:         # serialized: `raw`
+            self._inbox.append((topic, data))
+        self._listeners[topic] = self.create_subscription(
+            KIND_OF[topic], topic.replace('~', NODE_NAME), _receive, QOS, raw=True)
+
+    def _listen_as_needed(self) -> None:
+        """Listen to as little as is shown: each message costs the node some time."""
+        if self._track is None:
+            return
+        needed = {'~/invariants'}
+        if self._track.values['ground_truth_odom.enabled']:     # attitude and rates in one
+            needed |= {'ground_truth/odom'}
+        else:
+            needed |= {'pose', 'joint_states'}
+        if self._page.arrows[model.ARROWS.index('specific force')].value:
+            needed |= {'ground_truth/imu'}
+        for topic in needed - self._listeners.keys():
+            self._listen(topic)
+        for topic in self._listeners.keys() - needed:
+            self.destroy_subscription(self._listeners.pop(topic))
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name == self._sim.lstrip('/'):
+                self._controls.tell_status(
+                    status.message, {pair.key: pair.value for pair in status.values})
+
+    def _on_parameters(self, event: ParameterEvent) -> None:
+        if event.node == self._sim:
+            self._stale = True
+
+    def _draw(self) -> None:
+        due = time.monotonic()
+        while not self._stopped:
+            due = max(due + 1.0 / RATE, time.monotonic() - CATCH_UP_S)
+            try:
+                self._draw_once()
+            except Exception:
+                if not self.context.ok():       # a signal has ended it
+                    return
+                self.get_logger().error(traceback.format_exc(), throttle_duration_sec=5.0)
+            time.sleep(max(due - time.monotonic(), 0.0))
+
+    def _draw_once(self) -> None:
+        if self._stale and self._services_of_sim['get_parameters'].service_is_ready():
+            self._read_parameters()
+        track = self._track
+        if track is None:
+            return
+        arrived = defaultdict(list)
+        while self._inbox:
+            topic, data = self._inbox.popleft()
+            arrived[topic].append(data)
+        invariants = arrived.pop('~/invariants', [])
+        for topic, messages in arrived.items():
+            track.add(topic, [_stamp_ns(data) for data in messages], messages)
+        if track.span is None:
+            return
+        newest_ns = track.span[1]
+        if invariants:          # they have no stamp
+            track.add('~/invariants', [newest_ns], invariants[-1:])
+            row = track.columns['~/invariants'].rows[-1]
+            self._controls.show_spin(float(row[L3]), float(row[LZ]))
+        track.forget(newest_ns - KEPT_NS)
+        track.follow()
+        if self._origin_ns is None:
+            self._origin_ns = newest_ns
+        self._page.draw([newest_ns], self._origin_ns)
+
+    def _read_parameters(self) -> None:
+        """Read the parameters of the sim_node, and begin a new track if it is another top."""
+        self._stale = False
+        names = [name for name in parameters.BY_NAME if name not in SPIN]
+        try:
+            answer = self._ask('get_parameters', GetParameters.Request(names=[*names, *SPIN]))
+        except RefusedError:
+            self._stale = True
+            return
+        shown = list(map(parameter_value_to_python, answer.values))
+        # The present spin need not be one to start with.
+        values = {**parameters.checked(dict(zip(names, shown, strict=False))),
+                  **dict(zip(SPIN, shown[-len(SPIN):], strict=True))}
+        if self._track is None or _drawn(values) != _drawn(self._track.values):
+            self._track = Track('', values)
+            self._page.set_tracks([self._track])
+            self._controls.set_range(self._track.top, *(values[name] for name in SPIN))
+        self._track.values = values
+        self._controls.show_values(values)
+
+    # Called by the page's controls, in threads of their own.
+
+    def _ask(self, name: str, request: object) -> Any:
+        """Return the answer of a service.  Raises RefusedError where there is none."""
+        client: Client = self._services_of_sim[name]
+        if not client.service_is_ready():
+            raise RefusedError(f'there is no {self._sim}')
+        answered = threading.Event()
+        future = client.call_async(request)
+        future.add_done_callback(lambda _: answered.set())
+        end = time.monotonic() + ANSWER_S
+        while not answered.wait(0.1):
+            if time.monotonic() > end or self._stopped:
+                client.remove_pending_request(future)
+                raise RefusedError(f'{self._sim}/{name} has not answered')
+        return future.result()
+
+    def call(self, name: str, *on: bool) -> str:
+        """Call a service of the sim_node; return what it says.  Raises RefusedError."""
+        request = SetBool.Request(data=on[0]) if on else Trigger.Request()
+        answer = self._ask(name, request)
+        if not answer.success:
+            raise RefusedError(answer.message)
+        return f'{name.removeprefix("set_")}: {answer.message}'
+
+    def set_parameters_together(self, values: Mapping[str, Any]) -> str:
+        """Set parameters of the sim_node, all or none.  Raises RefusedError."""
+        result = self._ask('set_parameters_atomically', SetParametersAtomically.Request(
+            parameters=[Parameter(name, value=list(value) if isinstance(value, tuple) else value
+                                  ).to_parameter_msg() for name, value in values.items()])).result
+        if not result.successful:
+            raise RefusedError(result.reason)
+        return ', '.join(f'{name} = {value:.6g}' if isinstance(value, float) else
+                         f'{name} = {value}' for name, value in values.items())
+
+    def command(self, l3: float, lz: float) -> str:
+        """Let L3 and Lz jump [kg m^2/s].  Raises RefusedError."""
+        return self.set_parameters_together(dict(zip(SPIN, (l3, lz), strict=True)))
+
+    def height(self) -> float | None:
+        """Return cos(theta) of the newest attitude."""
+        sample = self._track and self._track.attitudes.at(LATEST_NS)
+        if not sample:
+            return None
+        x, y, z, w = sample[1][:4].tolist()
+        return float(w * w + z * z - (x * x + y * y))
+
+    def load_scene(self, name: str, paused: bool) -> str:
+        """Start again with a scene; return what it could not change.  Raises RefusedError."""
+        try:
+            given = read_scene(_scenes()[name])
+            scene = parameters.checked(given)
+            start = parameters.start_state(scene)
+        except (OSError, ValueError) as error:
+            raise RefusedError(str(error)) from error
+        chosen = {key: scene[key] for key, parameter in parameters.BY_NAME.items()
+                  if (key in given or key.startswith(OF_A_SCENE)) and key not in SPIN
+                  and parameter.effect in (parameters.Effect.NOW, parameters.Effect.RESET)}
+        fixed = [key for key in given if key not in chosen and key not in SPIN]
+        # At t = 0 of the new start, before time runs, it gets its spin.
+        self.call('set_pause', True)
+        try:
+            self.set_parameters_together(chosen)
+            self.call('reset')
+            self.command(start.l3, start.lz)
+        finally:
+            if not paused:
+                self.call('set_pause', False)
+        return f'scene {name}' + (f'; only at the start of the node: {", ".join(fixed)}'
+                                  if fixed else '')
+
+
+def _drawn(values: Mapping[str, Any]) -> list[Any]:
+    """Return what a track depends on."""
+    return [value for name, value in values.items()
+            if name.startswith('top.') or name in (
+                'world_frame', 'body_frame', 'imu.frame_id', 'imu.rpy', 'imu.lever_arm')]
+
+
+def _stamp_ns(data: bytes) -> int:
+    """Return the stamp of a serialized message that begins with a std_msgs/Header [ns]."""
+    seconds, nanoseconds = struct.unpack_from('<iI', data, 4)
+    return int(seconds) * NANOSECONDS + int(nanoseconds)
+
+
+def _scenes() -> dict[str, Path]:
+    """Return the installed scenes by name."""
+    folders = [Path(sys.prefix) / 'share/spinning_top_sim', Path(__file__).parents[2]]
+    with contextlib.suppress(PackageNotFoundError):
+        folders.insert(0, Path(get_package_share_directory('spinning_top_sim')))
+    found = (sorted((folder / 'config').glob('*.yaml')) for folder in folders)
+    return {path.stem: path for path in next(filter(None, found), ())}

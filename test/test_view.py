@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the page draws, as numbers; no browser, no ROS."""
+
+import math
+import socket
+import threading
+import urllib.request
+
+import numpy as np
+import pytest
+from helpers.reference import ROOT
+
+from spinning_top_sim import State, solve
+from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.tools import simulate
+from spinning_top_sim.view import model
+from spinning_top_sim.view.track import Columns, Motion, Track, state_of
+
+COMMAND_S = 3.0
+
+
+@pytest.fixture(scope='module')
+def log(tmp_path_factory):
+    path = tmp_path_factory.mktemp('view') / 'cusp.mcap'
+    assert simulate.main([
+        '--params', str(ROOT / 'config/cusp.yaml'), '--duration', '6', '-o', str(path),
+        '-p', 'imu.rpy:=[0.3, -0.2, 1.0]', '-p', 'imu.lever_arm:=[0.1, 0.0, 0.2]',
+        '--command', f'{COMMAND_S}:2.0:1.5']) == 0
+    return path
+
+
+@pytest.fixture(scope='module')
+def shown(log):
+    pytest.importorskip('viser')
+    from spinning_top_sim.view.log import read_logs
+    return read_logs([log])[0]
+
+
+def truth(shown, stamp_ns):
+    """Return the exact state at a stamp before the command."""
+    values = shown.track.values
+    return solve(shown.track.top, parameters.start_state(values),
+                 [(stamp_ns - shown.origin_ns) * 1e-9])
+
+
+def volume(vertices, faces):
+    a, b, c = (vertices[faces[:, k]].astype(float) for k in range(3))
+    return float(np.einsum('ij,ij->', a, np.cross(b, c))) / 6.0
+
+
+@pytest.mark.parametrize('angles', [(0.0, math.tau), (-0.3, 0.3), (0.3, math.tau - 0.3)])
+def test_a_sector_is_closed_and_faces_outwards(angles):
+    vertices, faces = model.sector(2.0, -0.5, 1.5, *angles)
+    assert volume(vertices, faces) == pytest.approx(0.5 * 4.0 * (angles[1] - angles[0]) * 2.0,
+                                                    rel=0.01)
+    if angles[1] - angles[0] < math.tau:        # each edge once in each direction
+        edges = [tuple(edge) for face in faces.tolist()
+                 for edge in zip(face, [*face[1:], face[0]], strict=True)]
+        assert len(set(edges)) == len(edges)
+        assert {(b, a) for a, b in edges} == set(edges)
+
+
+def test_columns_keep_what_is_later_and_forget_what_is_old():
+    columns = Columns(2)
+    for begin in range(0, 3000, 100):
+        stamps = np.arange(begin, begin + 150)      # half of them are there already
+        columns.append(stamps, np.column_stack((stamps, -stamps)))
+        columns.forget(begin - 500)
+    assert columns.stamps_ns.tolist() == list(range(2400, 3050))
+    assert (columns.rows[:, 0] == columns.stamps_ns).all()
+    assert columns.at(2399) is None
+    assert columns.at(2500)[0] == 2500
+    assert columns.at(99999)[0] == 3049
+    assert columns.part(2500, 2502)[0].tolist() == [2500, 2501, 2502]
+
+
+def test_a_log_shows_the_published_attitude_at_every_stamp(log, shown):
+    from spinning_top_sim.streams.topics import all_streams
+    template = next(stream.template for stream in all_streams(shown.track.values)
+                    if stream.topic == 'pose')
+    with LogReader(log) as reader:
+        for message in reader.messages(topics=['/pose']):
+            stamp_ns, row = shown.track.attitudes.at(message.log_time)
+            assert stamp_ns == message.log_time
+            assert row[:4] == pytest.approx(template.decode(message.data)[0][0], abs=1e-15)
+
+
+def test_motions_of_a_log_begin_with_its_commands(shown):
+    first, second = shown.track.motions
+    assert (first.words[0], second.words[0]) == ('cusps', 'loops')
+    assert (second.l3, second.lz) == (2.0, 1.5)
+    assert shown.commands_ns == [second.begin_ns]
+    assert second.begin_ns - shown.origin_ns == COMMAND_S * 1e9
+    assert shown.track.motion_at(second.begin_ns - 1) is first
+    assert shown.track.motion_at(second.begin_ns) is second
+    assert first.theta_range[0] == pytest.approx(math.radians(30.0))
+
+
+@pytest.mark.parametrize('name', model.ARROWS)
+def test_arrows_are_the_vectors_in_the_world(shown, name):
+    stamp_ns = shown.origin_ns + 1_230_000_000
+    exact, top = truth(shown, stamp_ns), shown.track.top
+    omega = exact.angular_velocity[0]
+    body = {'angular velocity': omega,
+            'angular momentum': omega * [top.lambda1, top.lambda1, top.lambda3],
+            'specific force': np.ravel(exact.specific_force(shown.track.values['imu.lever_arm'])),
+            }[name]
+    x, y, z, w = exact.quaternion[0]
+    rotation = np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])
+    drawn = model.arrow(shown.track, name, stamp_ns)
+    expected = rotation @ body
+    assert drawn / np.linalg.norm(drawn) == pytest.approx(expected / np.linalg.norm(expected),
+                                                          abs=1e-8)
+    if name == 'angular momentum':      # Lz is conserved, and L3 the usual length
+        assert drawn[2] / model.reach(shown.track) == pytest.approx(
+            exact.lz[0] / exact.l3[0], abs=1e-8)
+
+
+def test_the_trace_ends_at_the_tip_and_breaks_where_it_jumps(shown):
+    stamp_ns = shown.origin_ns + 2_000_000_000
+    lines = model.trace(shown.track, stamp_ns)
+    exact = truth(shown, stamp_ns)
+    assert lines[-1, 1] == pytest.approx(
+        model.reach(shown.track) * np.ravel(exact.rows_axis), abs=1e-6)
+    assert len(lines) == 200            # 2 s at 100 Hz
+    track = Track('', parameters.checked({}))
+    half = math.sqrt(0.5)
+    track.columns['pose'].append(np.array([0, 1, 2, 3]), np.array(
+        [(0, 0, 0, 1), (0, 0.01, 0, 1), (0, half, 0, half), (0, half, 0.01, half)], float))
+    assert len(model.trace(track, 3)) == 2
+
+
+def test_curves_are_the_published_numbers(shown):
+    end_ns = shown.origin_ns + 2_500_000_000
+    for name, expected, tolerance in zip(model.CURVES[:2], (
+            lambda exact: math.degrees(exact.theta[0]), lambda exact: exact.phi_dot[0]),
+            (1e-8, 1e-7), strict=True):
+        stamps_ns, values = model.curve(shown.track, name, shown.origin_ns, end_ns)
+        for at in (0, 100, -1):
+            assert values[at] == pytest.approx(expected(truth(shown, int(stamps_ns[at]))),
+                                               abs=tolerance)
+    for name in model.CURVES[2:]:
+        _, values = model.curve(shown.track, name, shown.origin_ns, end_ns)
+        assert len(values) == 26
+        assert (values < -9.0).all()
+
+
+@pytest.mark.parametrize(('start', 'words'), [
+    (State(theta=0.5, l3=1.6, lz=1.6 * math.cos(0.5)), 'cusps'),
+    (State(theta=0.5, l3=1.6, lz=1.3), 'loops'),
+    (State(theta=0.0, l3=2.0, lz=2.0), 'sleeping'),
+    (State(theta=1.0, theta_dot=0.5, l3=0.0, lz=0.0), 'planar pendulum, swinging')])
+def test_a_live_track_names_the_motion_from_its_samples(start, words):
+    values = parameters.checked({})
+    track = Track('', values)
+    moved = solve(track.top, start, np.arange(200) * 0.01)
+    rows = np.column_stack((moved.quaternion, moved.angular_velocity, moved.phi_dot))
+    for k, row in enumerate(rows):
+        track.columns['joint_states'].append(np.array([k]), row[np.newaxis])
+        track.follow()
+    (motion,) = track.motions           # one: rounding begins no other
+    assert motion.words[0] == words
+    (energy, l3, lz), _ = state_of(track.top, rows[50])
+    assert (energy, l3, lz) == pytest.approx((moved.energy[50], start.l3, start.lz), abs=1e-9)
+    assert isinstance(motion, Motion)
+
+
+def test_two_logs_of_one_time_lie_on_each_other(log, tmp_path):
+    pytest.importorskip('viser')
+    from spinning_top_sim.view.log import read_logs
+    torn = tmp_path / 'torn.mcap'
+    torn.write_bytes(log.read_bytes()[:-60_000])
+    whole, part = read_logs([log, torn])
+    assert (whole.track.name, part.track.name) == ('cusp', 'torn')
+    assert 'truncated' in part.note
+    assert not whole.note
+    assert whole.span[0] == part.span[0] < part.span[1] <= whole.span[1]
+    row = part.track.attitudes.at(part.span[1])[1]
+    assert model.angle_apart(row, whole.track.attitudes.at(part.span[1])[1]) == 0.0
+
+
+def test_a_log_without_attitudes_is_refused(tmp_path):
+    pytest.importorskip('viser')
+    from spinning_top_sim.view.log import read_logs
+    path = tmp_path / 'clock.mcap'
+    assert simulate.main(['--duration', '1', '-o', str(path), '-p',
+                          'record.streams:=[invariants]']) == 0
+    with pytest.raises(LogError, match='no attitude of a top'):
+        read_logs([path])
+
+
+def test_the_server_is_on_loopback_and_takes_the_next_free_port():
+    pytest.importorskip('viser')
+    from spinning_top_sim.view.page import Page
+    pages = [Page('one', '127.0.0.1', None), Page('two', '127.0.0.1', None)]
+    try:
+        one, two = (page.server.get_port() for page in pages)
+        assert one != two
+        for page in pages:
+            assert urllib.request.urlopen(page.address, timeout=30).status == 200
+        with pytest.raises(OSError, match=f'127.0.0.1 port {one}: '):
+            Page('three', '127.0.0.1', one)
+        assert pages[0].server.request_share_url() is None
+        host = socket.gethostbyname(socket.gethostname())
+        if not host.startswith('127.'):
+            with pytest.raises(OSError):        # nobody listens there
+                socket.create_connection((host, one), 5.0)
+    finally:
+        for page in pages:
+            page.close()
+    assert threading.active_count() < 50

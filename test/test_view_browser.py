@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page as a browser shows it, live, from logs and as a file; needs Chromium."""
+
+import re
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped
+from helpers import browser as browsers
+from helpers.browser import Visit
+from helpers.node_harness import SimNode, wait_for
+from helpers.reference import ROOT
+from rclpy.time import Time
+from std_msgs.msg import Float64MultiArray
+
+from spinning_top_sim.physics.attitude import angle_between
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.tools import simulate
+
+pytest.importorskip('viser')
+VIEW = ('-m', 'spinning_top_sim.view.command', '--no-browser', '--port', '0')
+STAMP = r'stamp (\d+)\.(\d{9})'
+
+
+@pytest.fixture(scope='module')
+def browser():
+    yield from browsers.launch()
+
+
+def address_of(node):
+    return wait_for('the address', lambda: re.search(r'http://[\w.:]+', node.out)).group()
+
+
+def poses_of(path):
+    from rclpy.serialization import deserialize_message
+    with LogReader(path) as reader:
+        return {message.log_time: deserialize_message(message.data, PoseStamped).pose.orientation
+                for message in reader.messages(topics=['/pose'])}
+
+
+def apart(shown, orientation):
+    """Return the angle between a drawn attitude and a published one [rad]."""
+    published = orientation.x, orientation.y, orientation.z, orientation.w
+    return float(angle_between(*(tuple(np.array([x]) for x in q) for q in (shown, published)))[0])
+
+
+@pytest.fixture(scope='module')
+def log(tmp_path_factory):
+    path = tmp_path_factory.mktemp('view') / 'cusp.mcap'
+    assert simulate.main(['--params', str(ROOT / 'config/cusp.yaml'), '--duration', '6', '-o',
+                          str(path), '--command', '2.5:2.0:1.5']) == 0
+    return path
+
+
+def test_live(browser, peer, tmp_path):
+    with SimNode(tmp_path, {'record.uri': f'{tmp_path}/', 'tick_rate': 50.0}) as node:
+        view = SimNode(tmp_path / 'view', namespace=node.namespace, program=VIEW)
+        poses = peer.listen(node.topic('pose'), PoseStamped)
+        invariants = peer.listen(node.topic('~/invariants'), Float64MultiArray)
+        with view, Visit(browser, address_of(view)) as visit:
+            visit.read('cusps')
+
+            # What is drawn was published, also while it runs.
+            shown = visit.attitude()
+            poses.wait_more(1)
+            assert min(apart(shown, message.pose.orientation)
+                       for message in poses.messages()) < 1e-6
+
+            # A command, as of any client.
+            visit.put('L3 [kg m²/s]', 2.0)
+            visit.read(r'spin\.l3 = 2')
+            invariants.wait_more(2)
+            assert invariants.last().data[1] == pytest.approx(2.0, abs=0.01)
+
+            # A refused one says why, and the motion goes on.
+            visit.put('Lz [kg m²/s]', 1.0)
+            visit.read('spin.lz = 1')
+            visit.choose('scene', 'sleeping')
+            visit.read('scene sleeping')
+            visit.read('sleeping')
+            visit.put('Lz [kg m²/s]', 0.5)
+            visit.read('refused: .* the axis is at a pole')
+            visit.choose('scene', 'looping')
+            visit.read('scene looping')
+            visit.read('loops')
+
+            # Paused: this very stamp, and the attitude of the pose with it.
+            visit.press('Pause')
+            visit.read('pause: paused at')
+            wait_for('the last pose to be shown', lambda: visit.read(STAMP) == stamp_of(poses))
+            assert apart(visit.attitude(), poses.last().pose.orientation) < 1e-6
+            before = stamp_of(poses)
+            visit.press('Step')
+            visit.read('step: at t =')
+            wait_for('a step', lambda: visit.read(STAMP) > before)
+            visit.press('Resume')
+            visit.read('pause: running')
+
+            visit.press('Let go from rest')
+            l3, lz = visit.read(r'spin\.l3 = ([-\d.e]+), spin\.lz = ([-\d.e]+)')
+            assert abs(float(lz)) < abs(float(l3))
+            visit.tick('record')
+            visit.read('record: ')
+            wait_for('a log', lambda: list(tmp_path.glob('*.mcap')))
+            visit.press('Reset')
+            visit.read('reset: at t = 0')
+            assert visit.errors == []
+            assert visit.hosts <= {'127.0.0.1', None}
+            assert view.end(signal.SIGINT) == 0, view.err
+        assert node.alive
+
+
+def turned(attitude):
+    return attitude if attitude != [0, 0, 0, 1] else None
+
+
+def stamp_of(poses):
+    seconds, nanoseconds = Time.from_msg(poses.last().header.stamp).seconds_nanoseconds()
+    return str(seconds), f'{nanoseconds:09d}'
+
+
+def test_log(browser, log, tmp_path):
+    poses = poses_of(log)
+    view = SimNode(tmp_path, program=(*VIEW, str(log)))
+    with view, Visit(browser, address_of(view)) as visit:
+        visit.page.get_by_role('button', name='Play').wait_for()        # it has ended
+        visit.put('time [s]', 1.25)
+        visit.read(r't = 1\.250')
+        visit.read('cusps')
+        seconds, nanoseconds = map(int, visit.read(STAMP))
+        assert apart(visit.attitude(), poses[seconds * 10 ** 9 + nanoseconds]) < 1e-6
+        visit.press('Next command')
+        visit.read(r't = 2\.500')
+        visit.read('loops')
+        visit.press('Play')
+        visit.read(r't = (2\.[6-9]|[3-6])')
+        assert visit.errors == []
+        assert visit.hosts <= {'127.0.0.1', None}
+
+
+def test_file_without_a_network(browser, log, tmp_path):
+    page = tmp_path / 'page.html'
+    subprocess.run([sys.executable, '-m', 'spinning_top_sim.view.command', log, '--html', page],
+                   check=True, timeout=120, cwd=ROOT)
+    assert page.stat().st_size < 2e6        # for 6 s
+    poses = poses_of(log)
+    with Visit(browser, str(page), offline=True) as visit:
+        visit.read('cusps')
+        for _ in range(3):
+            # Before the first picture, and where it begins again, viser turns nothing.
+            shown = wait_for('a picture', lambda: turned(visit.attitude()))
+            assert min(apart(shown, pose) for pose in poses.values()) < 1e-6
+        visit.page.wait_for_function(
+            "then => String(window.__viserMutable.nodePoseData['/top0/body'].wxyz) != then",
+            arg=','.join(map(str, [shown[3], *shown[:3]])))
+        assert visit.errors == []
+        assert visit.hosts <= {'', None}
