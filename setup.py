@@ -83,7 +83,7 @@ setup(
         # examples/attitude_filter.py
         'examples': ['ahrs>=0.4,<0.5', 'matplotlib>=3.6,<4', 'rosbags>=0.10.11,<0.12',
                      'vqf>=2.1,<3'],
-        # Ensembles, and the filters that `examine` knows by name; gtsam is another, and not needed.
+        # Ensembles, and the filters that `examine` knows by name but for gtsam.
         'exam': ['ahrs>=0.4,<0.5', 'distributed>=2024.5,<2028', 'imufusion>=1.3,<2',
                  'pyarrow>=14,<30', 'vqf>=2.1,<3'],
         # Narrow ranges: a new release reports new faults.

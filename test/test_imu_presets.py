@@ -23,6 +23,7 @@ MAG = {f'mag.{name}' for name in ('noise_density', 'random_walk', 'range', 'reso
 # what the flat of a bias instability of 0 would be.
 ALL_ERRORS = {name for name in parameters.BY_NAME if name.startswith(('imu.', 'mag.'))
               } - {'imu.enabled', 'imu.rate', 'imu.frame_id', 'imu.lever_arm', 'imu.rpy',
+                   'imu.sampling',
                    'imu.bias_instability_band', 'imu.gyroscope_bias_correlation_time',
                    'imu.accelerometer_bias_correlation_time', 'mag.enabled', 'mag.rate',
                    'mag.field'}

@@ -286,9 +286,9 @@ def test_ticks_leave_nothing_behind(ahead):
         gc.collect()
         return sys.getallocatedblocks()
 
-    run(1000)
-    in_use = [run(512) for _ in range(9)]
-    assert min(np.diff(in_use)) < 16
+    run(500)
+    in_use = [run(256) for _ in range(9)]
+    assert min(np.diff(in_use)) < 8
 
 
 def test_a_tick_allocates_little():

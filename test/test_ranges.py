@@ -195,9 +195,9 @@ def short_life(seed):
 
 
 def test_every_combination_that_the_ranges_allow_runs_or_is_refused():
-    found = Counter(short_life(seed) for seed in range(100))
+    found = Counter(short_life(seed) for seed in range(60))
     assert found.keys() <= {'ran', 'refused', 'stopped'}
-    assert found['ran'] > 40 and found['refused'] > 5
+    assert found['ran'] > 24 and found['refused'] > 3
 
 
 def test_numbers_of_any_size_are_among_them():

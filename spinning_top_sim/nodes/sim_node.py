@@ -35,7 +35,7 @@ def _prepare(argv: list[str]) -> Callable[[], RunnableNode] | None:
     if {'--help', '-h'}.intersection(argv[1:]):
         print(USAGE)
         for *_, text in parameters.STREAM_DEFAULTS:
-            print(f'  {text}')
+            print(textwrap.fill(text, 78, initial_indent='  ', subsequent_indent=6 * ' '))
         print('Parameters:')
         for parameter in parameters.TABLE:
             default = parameter.default
