@@ -120,12 +120,9 @@ class AttitudeSeries:
 
 
 def _rows_on_huge_pages(count: int, n: int) -> NDArray[np.float64]:
-    """
-    Return an uninitialized array (count, n) that begins on a huge page if it fills half of one.
-
-    numpy asks for huge pages for arrays of 4 MiB and more.  Clearing small pages, one by one,
-    takes a quarter of the time of an evaluation.
-    """
+    """Return an uninitialized array (count, n) that begins on a huge page if it fills half."""
+    # numpy asks for huge pages for arrays of 4 MiB and more.  Clearing small pages, one by one,
+    # takes a quarter of the time of an evaluation.
     size = count * n
     if size < HUGE_PAGE // 2:
         return np.empty((count, n))
