@@ -190,7 +190,7 @@ def test_any_division_of_a_run_gives_the_same_bytes(scene, method):
 def test_a_restless_node_sends_the_same_bytes(scene, method):
     """What is recorded is the same, and what is published is that."""
     whole = undivided(scene, method)
-    run = RestlessRun(scene, method, seed=2).go(random_splits(2, 80))
+    run = RestlessRun(scene, method, seed=2).go(random_splits(2, 60))
     assert_same_bytes(run, whole)
     recorded = {topic: {data for _, data in rows} for topic, rows in whole.rows.items()}
     assert len(run.published) > 50

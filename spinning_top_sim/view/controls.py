@@ -38,6 +38,7 @@ class Controls:
         self._spin: list[float] | None = None                   # L3 and Lz of the node
         self._wanted: dict[int, float] = {}                     # of them, by sliders not sent yet
         self._moved_at = 0.0                                    # on the monotonic clock
+        self._shown = [math.nan, math.nan]                      # on the sliders
         gui = page.gui
         with page.controls:
             self._status = gui.add_markdown('*waiting for sim_node*')
@@ -96,7 +97,7 @@ class Controls:
         try:
             said = self._node.command(l3, lz)
         except Exception:
-            self._moved_at = 0.0            # the sliders go back
+            self._leave_sliders()           # they go back
             if self._spin is not None:
                 self.show_spin(*self._spin)
             raise
@@ -127,15 +128,22 @@ class Controls:
         reach = math.ceil(reach * 10.0 ** digits) / 10.0 ** digits
         for slider in self._sliders:
             slider.min, slider.max, slider.step = -reach, reach, 2.0 * reach / STEPS
-        self._moved_at = 0.0
+        self._leave_sliders()
         self.show_spin(l3, lz)
+
+    def _leave_sliders(self) -> None:
+        """Let the next `show_spin` set the sliders in any case."""
+        self._moved_at, self._shown = 0.0, [math.nan, math.nan]
 
     def show_spin(self, l3: float, lz: float) -> None:
         """Let the sliders show the spin of the node, unless somebody moves them."""
         self._spin = [l3, lz]
         if time.monotonic() - self._moved_at > LEFT_ALONE_S:
-            for slider, value in zip(self._sliders, self._spin, strict=True):
-                set_value(slider, min(max(value, slider.min), slider.max))
+            for k, (slider, value) in enumerate(zip(self._sliders, self._spin, strict=True)):
+                # A place that is set again would undo a move whose callback is still to come.
+                if not abs(value - self._shown[k]) < 0.5 * slider.step:
+                    set_value(slider, min(max(value, slider.min), slider.max))
+                    self._shown[k] = value
 
     def show_values(self, values: Mapping[str, Any]) -> None:
         """Show the parameters of the node."""

@@ -269,7 +269,8 @@ def _stamp_ns(data: bytes) -> int:
 def _scenes() -> dict[str, Path]:
     """Return the installed scenes by name."""
     folders = [Path(sys.prefix) / 'share/spinning_top_sim', Path(__file__).parents[2]]
-    with contextlib.suppress(PackageNotFoundError):
+    # OSError: AMENT_PREFIX_PATH is not set, as in an environment of pip.
+    with contextlib.suppress(PackageNotFoundError, OSError):
         folders.insert(0, Path(get_package_share_directory('spinning_top_sim')))
     found = (sorted((folder / 'config').glob('*.yaml')) for folder in folders)
     return {path.stem: path for path in next(filter(None, found), ())}

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import viser
 
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
@@ -160,7 +159,7 @@ class Player:
         self._now, self._plays, self._seen = 0.0, True, time.monotonic()
         self._button.on_click(lambda _: self._switch())
         self._next.on_click(lambda _: self._go_to_next())
-        self._slider.on_update(self._on_slider)
+        self._drawn_at = self._slider.value
 
     def _switch(self) -> None:
         if not self._plays and self._now >= self.length:
@@ -168,8 +167,13 @@ class Player:
         self._plays = not self._plays
         self._button.label = 'Pause' if self._plays else 'Play'
 
-    def _on_slider(self, event: viser.GuiEvent[Any]) -> None:
-        if event.client is not None:        # not by `draw_next`
+    def _follow_slider(self) -> None:
+        """
+        Go where a user has moved the slider.
+
+        A callback may come so late that the next picture has put the slider back.
+        """
+        if self._slider.value != self._drawn_at:
             self._now = float(self._slider.value)
 
     def _go_to_next(self) -> None:
@@ -187,10 +191,13 @@ class Player:
 
     def draw_next(self, step: float) -> None:
         """Draw the picture of now, which is so many seconds after the one before."""
+        self._follow_slider()
         self._now = min(self._now + step, self.length)
         if self._plays and self._now >= self.length:
             self._switch()
-        set_value(self._slider, self._now)
+        if self._now != self._drawn_at:
+            set_value(self._slider, self._now)
+            self._drawn_at = self._slider.value
         self.draw(self._now)
 
     def draw(self, now: float) -> None:
