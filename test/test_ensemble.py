@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.pipeline import Simulation
-from spinning_top_sim.tools import ensemble_spec
+from spinning_top_sim.tools import ensemble_part, ensemble_spec
 from spinning_top_sim.tools.ensemble import main
 from spinning_top_sim.tools.ensemble_part import (
     EnsembleError,
@@ -99,6 +99,21 @@ def contents(folder):
 
 
 # ------------------------------------------------------------------------------------- a dataset
+
+
+def test_every_stream_has_columns_or_is_left_out():
+    """Those without a rate of their own too; each number has a name."""
+    names = [name for name in ensemble_spec.STREAMS if name not in ensemble_spec.WITHOUT_COLUMNS]
+    for some in (names, *([name] for name in names)):
+        specification = ensemble_spec.parse({'runs': 1, 'duration': 0.1, 'streams': some}, 'test')
+        table = ensemble_part.table(specification, 0)
+        assert table.num_rows > 1 and len(set(table.column_names)) == table.num_columns > 3
+    columns = set(ensemble_part.table(ensemble_spec.parse(
+        {'runs': 1, 'duration': 0.1, 'streams': names}, 'test'), 0).column_names)
+    assert columns >= {
+        'imu/dq.quaternion.w', 'imu/dv.vector.z', 'ground_truth/imu_odom.pose.pose.position.x',
+        'ground_truth/imu_timing.data.copies', '~/invariants.data.energy',
+        'joint_states.velocity.spin_joint', 'imu/mag.magnetic_field_covariance.8'}
 
 
 @pytest.fixture(scope='module')

@@ -25,9 +25,9 @@ from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.streams.stream import Stream
-from spinning_top_sim.streams.topics import INVARIANTS, JOINTS
+from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING
 from spinning_top_sim.tools.ensemble_spec import WITHOUT_COLUMNS, Specification
-from spinning_top_sim.tools.recorded_run import FIELDS, reason_of
+from spinning_top_sim.tools.recorded_run import field_names, reason_of
 from spinning_top_sim.tools.simulate import write_log
 
 if TYPE_CHECKING:
@@ -39,8 +39,8 @@ EPOCH_NS = NANOSECONDS          # as `simulate` has it
 DATA, PROGRESS = 'data', 'progress'
 # Runs of so many rows together make a row group: each costs time, and memory holds one.
 ROWS_IN_A_GROUP = 8_000
-# Names of the numbers of a field, where they are not x, y, z and w.
-LABELS = {'position': JOINTS, 'velocity': JOINTS, 'data': INVARIANTS}
+# Names of the numbers in the fields of a topic, where they are not x, y, z and w.
+LABELS = {'joint_states': JOINTS, '~/invariants': INVARIANTS, 'ground_truth/imu_timing': TIMING}
 
 # Times of samples (n,) [ns], and fields of their messages (n, count) by name.
 Samples = tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]
@@ -80,9 +80,9 @@ def samples(values: Mapping[str, Any]) -> dict[str, Samples]:
     for stream in streams:
         times, fields = zip(*blocks[stream.topic], strict=True)
         arrays = map(np.concatenate, zip(*fields, strict=True))
-        columns = dict(zip(FIELDS[stream.type_name], arrays, strict=True))
+        columns = dict(zip(field_names(stream) or (), arrays, strict=True))
         if not getattr(stream, 'has_orientation', True):        # REP-145: there is none in it
-            del columns['orientation']
+            columns.pop('orientation', None)
         found[stream.topic] = np.concatenate(times), columns
     return found
 
@@ -107,7 +107,9 @@ def table(specification: Specification, run: int) -> 'pyarrow.Table':
         missing = np.ones(len(rows_ns), bool)
         missing[rows] = False
         for field, numbers in fields.items():
-            for label, column in zip(LABELS.get(field, 'xyzw'), numbers.T, strict=False):
+            count = numbers.shape[1]
+            labels = LABELS.get(topic) or ('xyzw'[:count] if count <= 4 else range(count))
+            for label, column in zip(labels, numbers.T, strict=True):
                 spread = np.zeros(len(rows_ns))
                 spread[rows] = column
                 columns[f'{topic}.{field}.{label}'] = pa.array(

@@ -253,5 +253,7 @@ def _runs_per_part(specification: Specification, source: str) -> int:
     if not names:
         raise ValueError(f'{source}: no stream is enabled; streams: must name one of '
                          f'{", ".join(STREAMS)}')
-    rows = values['duration'] * max(values[f'{name}.rate'] for name in names)
+    # What has no rate of its own has that of the IMU.
+    rows = values['duration'] * max(
+        values.get(f'{name}.rate', values['imu.rate']) for name in names)
     return max(1, min(int(ROWS_IN_A_PART / max(rows, 1.0)), specification.runs // LEAST_PARTS))

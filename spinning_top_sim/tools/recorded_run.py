@@ -53,6 +53,11 @@ FIELDS = {
 }
 
 
+def field_names(stream: Stream) -> Sequence[str] | None:
+    """Return the names of the fields of a stream's template, None if they are not in FIELDS."""
+    return FIELDS.get(stream.topic) or FIELDS.get(stream.type_name)
+
+
 class ForeignLogError(Exception):
     """A log lacks what is needed to compute its run again; the text says what."""
 
@@ -366,7 +371,7 @@ def _difference(key: tuple[int, str], stream: Stream | None, logged: bytes,
     if number < 0:
         what, code, text = 'header.stamp', '<iI', '{}.{:09d}'
     else:
-        names = FIELDS.get(stream.topic) or FIELDS.get(stream.type_name)
+        names = field_names(stream)
         what = f'{names[number] if names else f"array {number}"}[{element}]'
         code, text = '<d', '{!r}'
     one, two = (text.format(*struct.unpack_from(code, data, start)) for data in (logged, computed))
