@@ -25,7 +25,8 @@ from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, MagneticField
 
-NANOSECONDS = 1_000_000_000
+from spinning_top_sim.streams.cdr import NANOSECONDS
+
 IMU_TOPIC, FIELD_TOPIC = 'imu/data_raw', 'imu/mag'
 PATIENCE_S = 20.0               # for a node to start, and for an answer
 FIRST_PATIENCE_S, UNANSWERED = 1.0, 5       # some nodes do not answer their first samples

@@ -9,6 +9,7 @@ misreadings of them, a wrong stamp, the covariance, and whether they diverge.
 import json
 import math
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -105,7 +106,7 @@ def examine_log(path: Path, topic: str, truth: str | None = None,
     found = diagnosis.explain(settled, heading, None)
     if found is not None:
         faults = [Fault(name, found.text) for name in found.faults]
-        corrected = _with(outcome, found.read(outcome.estimates))
+        corrected = replace(outcome, estimates=found.read(outcome.estimates))
     else:
         corrected = outcome
     offset, fault = diagnosis.stamp_fault(corrected.later(), heading)
@@ -204,7 +205,3 @@ def _beside(name: str, said: Attitudes, true: Attitudes) -> Outcome:
     return Outcome(Truth(name, t, np.diff(t, prepend=t[0] - (t[1] - t[0])), truth.as_quat(),
                          rates), said.quaternions[chosen], np.arange(len(t)),
                    covariances if known else None, None)
-
-
-def _with(outcome: Outcome, estimates: Reals) -> Outcome:
-    return Outcome(outcome.run, estimates, outcome.read, outcome.covariances, outcome.biases)

@@ -70,30 +70,22 @@ def magnetic_field(frame_id: str) -> Template:
     return Template(writer)
 
 
-def odometry(frame_id: str, child_frame_id: str) -> Template:
-    """nav_msgs/Odometry of a fixed point, exact; fields: orientation, body rates."""
+def odometry(frame_id: str, child_frame_id: str, *, moves: bool = False) -> Template:
+    """
+    nav_msgs/Odometry, exact.
+
+    Fields: orientation, body rates; if the point `moves`, its position comes before the
+    one, and its velocity in the child frame before the other.
+    """
     writer = CdrWriter()
     writer.header(frame_id)
     writer.string(child_frame_id)
     for count in (4, 3):
-        writer.append('d', 0.0, 0.0, 0.0)           # position, linear velocity: the pivot rests
+        if moves:
+            writer.field(3)
+        else:
+            writer.append('d', 0.0, 0.0, 0.0)       # position, linear velocity: the pivot rests
         writer.field(count)
-        writer.append('d', *diagonal(*(6 * (0.0,))))
-    return Template(writer)
-
-
-def moving_odometry(frame_id: str, child_frame_id: str) -> Template:
-    """
-    nav_msgs/Odometry, exact.
-
-    Fields: position, orientation, linear velocity, angular velocity, each in its frame.
-    """
-    writer = CdrWriter()
-    writer.header(frame_id)
-    writer.string(child_frame_id)
-    for counts in ((3, 4), (3, 3)):
-        for count in counts:
-            writer.field(count)
         writer.append('d', *diagonal(*(6 * (0.0,))))
     return Template(writer)
 

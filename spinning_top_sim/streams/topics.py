@@ -266,8 +266,8 @@ class GroundTruthImuOdometry(Stream):
 
     def __init__(self, values: Mapping[str, Any], imu: Imu) -> None:
         self._imu = imu
-        super().__init__(values, messages.moving_odometry(values['world_frame'],
-                                                          values['imu.frame_id']))
+        super().__init__(values, messages.odometry(
+            values['world_frame'], values['imu.frame_id'], moves=True))
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         position, velocity = self._imu.motion(states)
