@@ -9,8 +9,10 @@ import pytest
 from helpers.sensor_logs import recorded
 from helpers.simulations import EPOCH_NS, SECOND, record, simulate, stream
 
+from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.timing import Timing
+from spinning_top_sim.tools.survey import survey
 
 FAULTS = {'imu.stamp_offset': -0.02, 'imu.stamp_jitter': 3e-4, 'imu.clock_drift': 200.0,
           'imu.drop_rate': 0.1, 'imu.duplicate_rate': 0.05}
@@ -44,6 +46,16 @@ def test_each_message_of_a_log_is_labelled_with_its_true_time(tmp_path):
     assert np.abs(raw[2][:, 4:7] - exact[2][at, 4:7]).max() < 6e-3 * math.sqrt(200.0)
     # All other topics keep their stamps.
     assert np.array_equal(exact[0], exact[1]) and len(exact[0]) == 6001
+
+
+def test_a_repeated_message_does_not_hide_a_lost_one(tmp_path):
+    path, log = recorded(tmp_path, {**FAULTS, 'imu_timing.enabled': True}, 30)
+    _, _, copies = labels(log['ground_truth/imu_timing'][2])
+    with LogReader(path) as reader:
+        report = survey(reader).topics['/imu/data_raw']
+    assert report.missing == np.count_nonzero(copies == 0) > 0
+    assert report.count == copies.sum()
+
 
 
 def test_offset_drift_and_jitter_are_found_by_a_straight_line(tmp_path):

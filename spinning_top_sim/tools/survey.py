@@ -269,10 +269,11 @@ def _count(report: TopicReport, stamps_ns: Stamps, sections: list[Section], topi
         here, stamps_ns = stamps_ns[:end], stamps_ns[end:]
         first, last = ((at_ns - epoch_ns) // period_ns
                        for at_ns in (section.begin_ns, section.end_ns))
-        off_grid = int(np.count_nonzero((here - epoch_ns) % period_ns))
+        is_on_grid = (here - epoch_ns) % period_ns == 0
         report.grid_rate = NANOSECONDS / period_ns
-        report.off_grid += off_grid
-        report.missing = (report.missing or 0) + last - first - len(here) + off_grid
+        report.off_grid += int(np.count_nonzero(~is_on_grid))
+        # A sample that was sent twice does not make up for one that is missing.
+        report.missing = (report.missing or 0) + last - first - len(np.unique(here[is_on_grid]))
         edges_ns = np.array([first * period_ns + epoch_ns, *here,
                              (last + 1) * period_ns + epoch_ns])
         places = np.flatnonzero(np.diff(edges_ns) > period_ns)
