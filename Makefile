@@ -3,12 +3,19 @@
 # Everything is installed into $(VENV).  setup.py lists the dependencies and their versions.
 
 PYTHON ?= python3
-VENV ?= .venv
+ROS ?= jazzy
+VENV ?= .venv$(ROS_SUFFIX)
 SCENE ?= cusp
 LOGS ?= logs
 ARGS ?=
 TESTS ?= test
 WORKERS ?= 4
+
+# The extra of setup.py with the wheels of this ROS; an environment has one ROS only.
+ROS_SUFFIX := $(if $(filter-out jazzy,$(ROS)),-$(ROS))
+ifeq ($(filter jazzy kilted,$(ROS)),)
+$(error ROS=$(ROS) is neither jazzy nor kilted)
+endif
 
 MAKEFLAGS += --no-builtin-rules
 .SUFFIXES:
@@ -62,7 +69,8 @@ help:
 	@echo 'make build   build with colcon in a temporary workspace, test the installation'
 	@echo 'make clean   remove $(VENV) and caches, but no logs'
 	@echo
-	@echo 'PYTHON=$(PYTHON)  interpreter, 3.11 or newer;  VENV=$(VENV)  environment'
+	@echo 'PYTHON=$(PYTHON)  interpreter, 3.11 or newer;  ROS=$(ROS)  or kilted'
+	@echo 'VENV=$(VENV)  environment, .venv-kilted for ROS=kilted'
 
 # A name, or the path of a parameter file.
 SCENE_FILE = $(or $(wildcard $(filter %.yaml,$(SCENE))),config/$(SCENE).yaml)
@@ -167,6 +175,8 @@ clean:
 	find $(wildcard benchmark examples launch spinning_top_sim test) -name __pycache__ -prune \
 	    -exec rm -rf {} +
 
+OTHER_ROS = $(filter-out %/.deps-ros$(ROS_SUFFIX),$(wildcard $(VENV)/.deps-ros*))
+
 # Created again if its Python is not the requested one, if it was moved, if it is incomplete or if
 # it does not run.  An environment that make did not create is used as it is, and never removed.
 PROBE := import sys; print("Python %d.%d" % sys.version_info[:2]); sys.exit(sys.version_info < (3, 11))
@@ -174,6 +184,7 @@ ASKED := $(filter command environment,$(firstword $(origin PYTHON)))
 # make would delete it when it is interrupted, and leave an environment that nobody made.
 .PRECIOUS: $(VENV)/.made
 $(VENV)/.made: FORCE
+	$(if $(OTHER_ROS),$(error $(VENV) has another ROS than $(ROS): choose another VENV=...))
 	@there=$$('$(VENV)/bin/python' -c '$(PROBE)' 2>/dev/null) || there=; \
 	made=$$(cat '$@' 2>/dev/null) || made=; \
 	wanted=$$there; \
@@ -209,7 +220,7 @@ $(VENV)/.deps-%: setup.py $(VENV)/.made
 	@touch '$@'
 
 # The package alone: takes seconds and needs no network.
-$(VENV)/.package: $(VENV)/.deps-ros $(SOURCES)
+$(VENV)/.package: $(VENV)/.deps-ros$(ROS_SUFFIX) $(SOURCES)
 	@echo 'Installing spinning_top_sim into $(VENV)'
 	@rm -rf '$(VENV)/build' && mkdir '$(VENV)/build'
 	@$(PIP) --no-deps --no-build-isolation --force-reinstall .

@@ -59,6 +59,11 @@ setup(
             'ros-jazzy-rclpy[fastrtps]>=7.1.6,<8',
             'ros-jazzy-common-interfaces>=5.3.6,<6',
         ],
+        # Instead of `ros`, never beside it: the wheels of both have the same names.
+        'ros-kilted': [
+            'ros-kilted-rclpy[fastrtps]>=9.1.2,<10',
+            'ros-kilted-common-interfaces>=5.5.1,<6',
+        ],
         'test': [
             'ahrs>=0.4,<0.5',
             'catkin_pkg>=1.0,<2',
