@@ -150,6 +150,13 @@ benchmark: performance
 	.venv-benchmark/bin/python benchmark/ensemble.py
 	.venv-benchmark/bin/python benchmark/exam.py
 
+# In the environment of the tests: nothing but the package differs.
+REF ?=
+performance-check: export OMP_NUM_THREADS ?= 1
+performance-check: export OPENBLAS_NUM_THREADS ?= 1
+performance-check: dependencies
+	'$(VENV)/bin/python' benchmark/regression.py $(REF)
+
 $(VENV)/.peers: $(wildcard benchmark/requirements*.txt) $(VENV)/.deps-test
 	@echo 'Installing into $(VENV) the programs that the benchmarks compare with'
 	@$(PIP) -r benchmark/requirements.txt
