@@ -34,7 +34,7 @@ DATA_FILES = {
 
 setup(
     name=NAME,
-    version='0.1.0',
+    version='1.0.0',
     description='Real-time simulation of the heavy symmetric top for ROS 2, with exact truth',
     maintainer='spinning_top_sim maintainers',
     maintainer_email='maintainers@spinning-top-sim.example',
