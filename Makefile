@@ -71,7 +71,7 @@ help:
 	@echo 'make build   build with colcon in a temporary workspace, test the installation'
 	@echo 'make clean   remove $(VENV) and caches, but no logs'
 	@echo
-	@echo 'PYTHON=$(PYTHON)  interpreter, 3.11 or newer;  ROS=$(ROS)  or kilted'
+	@echo 'PYTHON=$(PYTHON)  interpreter, 3.11 or newer;  ROS=$(ROS)  jazzy or kilted'
 	@echo 'VENV=$(VENV)  environment, .venv-kilted for ROS=kilted'
 
 # A name, or the path of a parameter file.
