@@ -3,19 +3,26 @@
 # Everything is installed into $(VENV).  setup.py lists the dependencies and their versions.
 
 PYTHON ?= python3
-VENV ?= .venv
+ROS ?= jazzy
+VENV ?= .venv$(ROS_SUFFIX)
 SCENE ?= cusp
 LOGS ?= logs
 ARGS ?=
 TESTS ?= test
 WORKERS ?= 4
 
+# The extra of setup.py with the wheels of this ROS; an environment has one ROS only.
+ROS_SUFFIX := $(if $(filter-out jazzy,$(ROS)),-$(ROS))
+ifeq ($(filter jazzy kilted,$(ROS)),)
+$(error ROS=$(ROS) is neither jazzy nor kilted)
+endif
+
 MAKEFLAGS += --no-builtin-rules
 .SUFFIXES:
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help run view test stress performance benchmark docs dependencies lint build clean check-scene \
-    FORCE
+.PHONY: help run view test stress performance performance-check benchmark docs dependencies lint \
+    build clean check-scene FORCE
 
 # DDS stays on this machine.  Its default is to discover nodes in the whole network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
@@ -49,20 +56,23 @@ help:
 	@echo '             which has WORKERS=$(WORKERS) processes (0: its own, for ARGS=--pdb)'
 	@echo 'make stress  kill 200 recording nodes (KILLS=...), try random logs, parameters,'
 	@echo '             commands, service calls, disk faults and the statistics of the'
-	@echo '             sensors (each SECONDS=600), then 100 000 random tops (STRESS=...)'
-	@echo '             with both solvers; two hours'
+	@echo '             sensors (each SECONDS=300), then 40 000 random tops (STRESS=...)'
+	@echo '             with both solvers; some 70 minutes'
 	@echo 'make performance'
 	@echo '             measure node, start-up, a long run, solvers and simulate, and write'
-	@echo '             docs/performance.md; an hour and a half, in .venv-benchmark'
+	@echo '             docs/performance.md; some 40 minutes, in .venv-benchmark'
 	@echo 'make benchmark'
 	@echo '             the same, and compare accuracy, stability and cost with other'
-	@echo '             programs, attitude filters and the noise of the IMU; three hours'
+	@echo '             programs, attitude filters and the noise of the IMU; 80 minutes'
+	@echo 'make performance-check'
+	@echo '             compare the cost with that of the last tag (REF=...), six minutes'
 	@echo 'make docs    write the interface page, the plain URDF and the pictures'
 	@echo 'make lint    run ruff and mypy'
 	@echo 'make build   build with colcon in a temporary workspace, test the installation'
 	@echo 'make clean   remove $(VENV) and caches, but no logs'
 	@echo
-	@echo 'PYTHON=$(PYTHON)  interpreter, 3.11 or newer;  VENV=$(VENV)  environment'
+	@echo 'PYTHON=$(PYTHON)  interpreter, 3.11 or newer;  ROS=$(ROS)  jazzy or kilted'
+	@echo 'VENV=$(VENV)  environment, .venv-kilted for ROS=kilted'
 
 # A name, or the path of a parameter file.
 SCENE_FILE = $(or $(wildcard $(filter %.yaml,$(SCENE))),config/$(SCENE).yaml)
@@ -105,42 +115,35 @@ dependencies: $(VENV)/.deps-test $(VENV)/.package
 test: dependencies
 	'$(VENV)/bin/pytest' -n $(WORKERS) --max-worker-restart=0 $(TESTS) $(ARGS)
 
-STRESS ?= 100000
+STRESS ?= 40000
 KILLS ?= 200
-SECONDS ?= 600
+SECONDS ?= 300
 stress: dependencies
-	KILLS=$(KILLS) '$(VENV)/bin/pytest' -q test/test_kill.py
-	for part in logs values nodes services disk sensor; do \
-	    '$(VENV)/bin/python' test/stress $$part --seconds $(SECONDS) || failed=1; \
-	done; \
-	'$(VENV)/bin/python' test/stress tops --count $(STRESS) && test -z "$$failed"
+	@.ci/timed "KILLS=$(KILLS) '$(VENV)/bin/pytest' -q test/test_kill.py" \
+	    $(foreach part,logs values nodes services disk sensor, \
+	        "'$(VENV)/bin/python' test/stress $(part) --seconds $(SECONDS)") \
+	    "'$(VENV)/bin/python' test/stress tops --count $(STRESS)"
 
 # The programs to compare with need hundreds of megabytes, so they have their own environment.
+PERFORMANCE := node_cpu wake_up startup solvers offline offline_scaling log_compression soak
+COMPARISONS := heavy_top exact_cost gauge stability work_precision allan increments \
+    attitude_filter ensemble exam
+offline_options := --hour
+offline_scaling_options := --long
 benchmark performance: export OMP_NUM_THREADS ?= 1
 benchmark performance: export OPENBLAS_NUM_THREADS ?= 1
-performance:
+benchmark performance:
 	@$(MAKE) --no-print-directory VENV=.venv-benchmark .venv-benchmark/.package \
 	    .venv-benchmark/.peers
-	.venv-benchmark/bin/python benchmark/node_cpu.py
-	.venv-benchmark/bin/python benchmark/wake_up.py
-	.venv-benchmark/bin/python benchmark/startup.py
-	.venv-benchmark/bin/python benchmark/solvers.py
-	.venv-benchmark/bin/python benchmark/offline.py --hour
-	.venv-benchmark/bin/python benchmark/offline_scaling.py --long
-	.venv-benchmark/bin/python benchmark/log_compression.py
-	.venv-benchmark/bin/python benchmark/soak.py
+	@.ci/timed $(foreach part,$(PERFORMANCE) $(if $(filter benchmark,$@),$(COMPARISONS)), \
+	    ".venv-benchmark/bin/python benchmark/$(part).py $($(part)_options)")
 
-benchmark: performance
-	.venv-benchmark/bin/python benchmark/heavy_top.py
-	.venv-benchmark/bin/python benchmark/exact_cost.py
-	.venv-benchmark/bin/python benchmark/gauge.py
-	.venv-benchmark/bin/python benchmark/stability.py
-	.venv-benchmark/bin/python benchmark/work_precision.py
-	.venv-benchmark/bin/python benchmark/allan.py
-	.venv-benchmark/bin/python benchmark/increments.py
-	.venv-benchmark/bin/python benchmark/attitude_filter.py
-	.venv-benchmark/bin/python benchmark/ensemble.py
-	.venv-benchmark/bin/python benchmark/exam.py
+# In the environment of the tests: nothing but the package differs.
+REF ?=
+performance-check: export OMP_NUM_THREADS ?= 1
+performance-check: export OPENBLAS_NUM_THREADS ?= 1
+performance-check: dependencies
+	'$(VENV)/bin/python' benchmark/regression.py $(REF)
 
 $(VENV)/.peers: $(wildcard benchmark/requirements*.txt) $(VENV)/.deps-test
 	@echo 'Installing into $(VENV) the programs that the benchmarks compare with'
@@ -167,6 +170,8 @@ clean:
 	find $(wildcard benchmark examples launch spinning_top_sim test) -name __pycache__ -prune \
 	    -exec rm -rf {} +
 
+OTHER_ROS = $(filter-out %/.deps-ros$(ROS_SUFFIX),$(wildcard $(VENV)/.deps-ros*))
+
 # Created again if its Python is not the requested one, if it was moved, if it is incomplete or if
 # it does not run.  An environment that make did not create is used as it is, and never removed.
 PROBE := import sys; print("Python %d.%d" % sys.version_info[:2]); sys.exit(sys.version_info < (3, 11))
@@ -174,6 +179,7 @@ ASKED := $(filter command environment,$(firstword $(origin PYTHON)))
 # make would delete it when it is interrupted, and leave an environment that nobody made.
 .PRECIOUS: $(VENV)/.made
 $(VENV)/.made: FORCE
+	$(if $(OTHER_ROS),$(error $(VENV) has another ROS than $(ROS): choose another VENV=...))
 	@there=$$('$(VENV)/bin/python' -c '$(PROBE)' 2>/dev/null) || there=; \
 	made=$$(cat '$@' 2>/dev/null) || made=; \
 	wanted=$$there; \
@@ -209,7 +215,7 @@ $(VENV)/.deps-%: setup.py $(VENV)/.made
 	@touch '$@'
 
 # The package alone: takes seconds and needs no network.
-$(VENV)/.package: $(VENV)/.deps-ros $(SOURCES)
+$(VENV)/.package: $(VENV)/.deps-ros$(ROS_SUFFIX) $(SOURCES)
 	@echo 'Installing spinning_top_sim into $(VENV)'
 	@rm -rf '$(VENV)/build' && mkdir '$(VENV)/build'
 	@$(PIP) --no-deps --no-build-isolation --force-reinstall .

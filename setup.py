@@ -34,7 +34,7 @@ DATA_FILES = {
 
 setup(
     name=NAME,
-    version='0.1.0',
+    version='1.0.0',
     description='Real-time simulation of the heavy symmetric top for ROS 2, with exact truth',
     maintainer='spinning_top_sim maintainers',
     maintainer_email='maintainers@spinning-top-sim.example',
@@ -58,6 +58,11 @@ setup(
         'ros': [
             'ros-jazzy-rclpy[fastrtps]>=7.1.6,<8',
             'ros-jazzy-common-interfaces>=5.3.6,<6',
+        ],
+        # Instead of `ros`, never beside it: the wheels of both have the same names.
+        'ros-kilted': [
+            'ros-kilted-rclpy[fastrtps]>=9.1.2,<10',
+            'ros-kilted-common-interfaces>=5.5.1,<6',
         ],
         'test': [
             'ahrs>=0.4,<0.5',

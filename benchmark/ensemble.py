@@ -3,7 +3,7 @@
 """
 Measure what an ensemble costs, and write that section of docs/ensembles.md.
 
-    python benchmark/ensemble.py                    # 10 000 runs, by one worker and by two
+    python benchmark/ensemble.py                    # 4000 runs, by one worker and by two
     python benchmark/ensemble.py --runs 500 --no-report
 
 A run takes 10 s at 200 Hz, with the exact solution and a BMI088 beside its truth and bias: 26
@@ -179,7 +179,7 @@ def page(folder: Path, runs: int) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--runs', type=int, default=10_000)
+    parser.add_argument('--runs', type=int, default=4000)
     parser.add_argument('--no-report', action='store_true', help='print only')
     arguments = parser.parse_args()
     head = '#' + preamble('Cost', ('numpy', 'distributed', 'pyarrow'))

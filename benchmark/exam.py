@@ -57,8 +57,8 @@ def marks_of(name: str) -> tuple[str, ...] | None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--exams', type=int, default=100, help='of each fault')
-    parser.add_argument('--unharmed', type=int, default=200, help='of each filter without fault')
+    parser.add_argument('--exams', type=int, default=20, help='of each fault')
+    parser.add_argument('--unharmed', type=int, default=100, help='of each filter without fault')
     parser.add_argument('--workers', type=int, default=os.cpu_count())
     arguments = parser.parse_args()
     examine(Vqf, seeds=1)           # imports

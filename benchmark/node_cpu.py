@@ -3,15 +3,16 @@
 """
 Measure the processor time of `sim_node`, compared with other nodes.
 
-    python benchmark/node_cpu.py                                # everything, takes half an hour
+    python benchmark/node_cpu.py                                # everything, takes 20 minutes
     python benchmark/node_cpu.py --rates 1000 --subscribers 1 --rounds 5 --no-report
 
-Each node publishes three streams (pose, joint_states, imu/data_raw) at the same rate, for 0, 1
-and 3 other processes that subscribe to all of them.  `sim_node` runs with one tick per sample,
-and with its default of 200 ticks per second, where a tick publishes several samples at higher
-rates.  It is compared with `straightforward_node.py` (a timer, SciPy's RK45, message objects) and
-with `bare_node.py` ("floor": constant bytes, one tick per sample, with a timer and with a
-thread).  All take turns in every round.  The tables have medians of rounds, and of ratios within
+Each node publishes three streams (pose, joint_states, imu/data_raw) at the same rate, for 1 and 3
+other processes that subscribe to all of them.  `sim_node` runs with one tick per sample, and with
+its default of 200 ticks per second, where a tick publishes several samples at higher rates.  It
+is compared with `straightforward_node.py` (a timer, SciPy's RK45, message objects), which runs
+under the executor of `rclpy.spin` and under rclpy's EventsExecutor, the best that plain rclpy
+has, and with `bare_node.py` ("floor": constant bytes, one tick per sample, by a thread).  All
+take turns in every round.  The tables have medians of rounds, and of ratios within
 a round.  Processor time is that of the whole process with its DDS threads, relative to the
 elapsed time.  An arrival is the reception of a message by the middleware of a subscriber.  Jitter
 is the difference between the period and the time between two arrivals on a topic.
@@ -31,19 +32,19 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from processes import SIM_NODE, Process, load, median, quantile, ros_arguments, script
+from processes import ROOT, SIM_NODE, Process, load, median, quantile, ros_arguments, script
 from report import number, preamble, table, write_section
 
 STREAMS = ('pose', 'joint_states', 'imu')
 OTHERS = ('ground_truth_imu', 'ground_truth_odom', 'invariants')
-RATES = (200, 500, 1000, 2000)
-SUBSCRIBERS = (0, 1, 3)
+RATES = (200, 1000, 2000)
+SUBSCRIBERS = (1, 3)
 KINDS = {
     'sim_node, 200 ticks, recording': (False, True), 'sim_node, 200 ticks': (False, False),
     'sim_node, recording': (True, True), 'sim_node': (True, False),
-    'straightforward': None, 'floor, timer': None, 'floor, thread': None,
+    'straightforward': None, 'straightforward, EventsExecutor': None, 'floor, thread': None,
 }
-STRAIGHT, FLOOR = 'straightforward', 'floor, thread'
+STRAIGHT, EVENTS, FLOOR = 'straightforward', 'straightforward, EventsExecutor', 'floor, thread'
 
 
 @dataclass
@@ -68,11 +69,11 @@ def program(kind: str, rate: float, namespace: str, folder: Path) -> list[str]:
                       **{f'{name}.rate': float(rate) for name in STREAMS},
                       **{f'{name}.enabled': False for name in OTHERS}}
         return [*SIM_NODE, *ros_arguments(namespace, parameters)]
-    if kind == STRAIGHT:
-        return [*script('straightforward_node.py'),
-                *ros_arguments(namespace, {'rate': float(rate)})]
-    return [*script('bare_node.py'), *ros_arguments(
-        namespace, {'rate': float(rate), 'pacing': kind.rsplit(maxsplit=1)[-1]})]
+    if kind in (STRAIGHT, EVENTS):
+        return [*script('straightforward_node.py'), *ros_arguments(
+            namespace, {'rate': float(rate), 'executor': 'events' if kind == EVENTS else 'single'})]
+    return [*script('bare_node.py'),
+            *ros_arguments(namespace, {'rate': float(rate), 'pacing': 'thread'})]
 
 
 _namespaces = itertools.count(1)
@@ -167,12 +168,14 @@ def measured(arguments: argparse.Namespace) -> dict:
 
 
 def together(programs: Mapping[str, Callable[[str], list[str]]], rounds: int, seconds: float,
-             subscribers: int = 0) -> dict[str, list[float]]:
+             subscribers: int = 0, checkouts: Mapping[str, Path] | None = None
+             ) -> dict[str, list[float]]:
     """
     Return the processor time over elapsed time of nodes that run at once, of each in every round.
 
     So both nodes meet the same load of the machine.  They take turns in starting first.
-    programs: arguments of python for a node, by its namespace;  subscribers: of each node
+    programs: arguments of python for a node, by its namespace;  subscribers: of each node;
+    checkouts: whose package a node runs, if not that of this one
     """
     shares: dict[str, list[float]] = {name: [] for name in programs}
     for number_ in range(rounds):
@@ -183,7 +186,8 @@ def together(programs: Mapping[str, Callable[[str], list[str]]], rounds: int, se
                 for _ in range(subscribers):
                     running.enter_context(
                         Process((*script('listener.py'), namespace), talks=True)).line()
-                nodes[name] = running.enter_context(Process(programs[name](namespace)))
+                nodes[name] = running.enter_context(Process(
+                    programs[name](namespace), checkout=(checkouts or {}).get(name, ROOT)))
             time.sleep(4.0)
             begin = {name: (node.cpu_ns(), time.monotonic_ns()) for name, node in nodes.items()}
             time.sleep(seconds)
@@ -248,9 +252,8 @@ def share_table(found: dict) -> str:
     return table(('Hz', 'subscribers', *kinds), rows)
 
 
-COMPARED = (('sim_node, recording', STRAIGHT), ('sim_node', STRAIGHT),
-            ('sim_node, 200 ticks, recording', STRAIGHT), ('sim_node, 200 ticks', STRAIGHT),
-            ('floor, timer', STRAIGHT), ('sim_node, recording', FLOOR), ('sim_node', FLOOR))
+COMPARED = (*((kind, EVENTS) for kind, ours in KINDS.items() if ours), (STRAIGHT, EVENTS),
+            ('sim_node, recording', FLOOR), ('sim_node', FLOOR))
 
 
 def ratio_table(found: dict, per_sample: bool = False) -> str:
@@ -291,7 +294,7 @@ def figure(found: dict, path: Path) -> None:
     for panel, count in zip(axes, subscribers, strict=True):
         rates = [rate for rate, n in found if n == count]
         for kind in next(iter(found.values())):
-            style = {'floor': ':', 'straightforward': '--'}.get(kind.split(',')[0], '-')
+            style = {'floor': ':', STRAIGHT: '--'}.get(kind.split(',')[0], '-')
             panel.plot(rates, [100 * median([run.share for run in found[rate, count][kind] if run])
                                for rate in rates], style, marker='.', label=kind)
         panel.set(xscale='log', yscale='log', xlabel='rate of three streams [Hz]',
@@ -341,8 +344,7 @@ def main() -> None:
         '## Arrivals\n', arrival_table(found)))
     print(text)
     if not arguments.no_report:
-        docs = Path(__file__).resolve().parent.parent / 'docs'
-        figure(found, docs / 'node_cpu.png')
+        figure(found, ROOT / 'docs' / 'node_cpu.png')
         write_section('node_cpu', head, __doc__, '![Processor time over rate](node_cpu.png)\n',
                       text)
 

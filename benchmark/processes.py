@@ -28,7 +28,7 @@ os.environ.pop('PYTHONDONTWRITEBYTECODE', None)
 
 def ros_arguments(namespace: str, parameters: Mapping[str, Any]) -> list[str]:
     """Return the arguments behind the program's."""
-    return ['--ros-args', '-r', f'__ns:={namespace}',
+    return ['--ros-args', '--log-level', 'warn', '-r', f'__ns:={namespace}',
             *(item for name, value in parameters.items() for item in (
                 '-p', f'{name}:={value if isinstance(value, str) else json.dumps(value)}'))]
 
@@ -42,15 +42,21 @@ def script(name: str) -> tuple[str]:
     return (str(ROOT / 'benchmark' / name),)
 
 
+def environment(checkout: Path = ROOT) -> dict[str, str]:
+    """Return the environment of a process that runs the package of a checkout."""
+    return {**os.environ, 'PYTHONPATH': os.pathsep.join(
+        filter(None, [str(checkout), os.environ.get('PYTHONPATH')]))}
+
+
 class Process:
     """A python process in a group of its own; ends with the `with`."""
 
     def __init__(self, program: Sequence[str], arguments: Sequence[str] = (), *,
-                 talks: bool = False, stderr: IO[str] | None = None) -> None:
-        environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(
-            filter(None, [str(ROOT), os.environ.get('PYTHONPATH')]))}
+                 talks: bool = False, stderr: IO[str] | None = None,
+                 checkout: Path = ROOT) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, *program, *arguments], env=environment, start_new_session=True,
+            [sys.executable, *program, *arguments], env=environment(checkout),
+            start_new_session=True,
             stdin=subprocess.PIPE if talks else subprocess.DEVNULL,
             stdout=subprocess.PIPE if talks else subprocess.DEVNULL, stderr=stderr, text=True)
         self.pid = self._process.pid
@@ -124,7 +130,7 @@ sys.exit(code)
 """
 
 
-def simulate(arguments: Sequence[str]) -> tuple[float, int]:
+def simulate(arguments: Sequence[str], checkout: Path = ROOT) -> tuple[float, int]:
     """
     Run `simulate` in a process of its own.
 
@@ -133,7 +139,7 @@ def simulate(arguments: Sequence[str]) -> tuple[float, int]:
     begin = time.monotonic()
     run = subprocess.run(
         [sys.executable, '-P', '-c', _SIMULATE, *arguments, '--quiet'], stdout=subprocess.PIPE,
-        text=True, env={**os.environ, 'PYTHONPATH': str(ROOT)}, timeout=3600.0, check=False)
+        text=True, env=environment(checkout), timeout=3600.0, check=False)
     taken = time.monotonic() - begin
     if run.returncode:
         raise SystemExit(f'simulate ended with exit code {run.returncode}')

@@ -64,11 +64,12 @@ def program(kind: str, namespace: str, folder: Path, once: bool) -> list[str]:
             *ros_arguments(namespace, {'rate': 100.0, 'once': once, **like})]
 
 
-def one_sample(kind: str, namespace: str, folder: Path) -> tuple[float, float]:
+def one_sample(kind: str, namespace: str, folder: Path, checkout: Path = ROOT
+               ) -> tuple[float, float]:
     """Return wall and processor time [s] of a run that ends itself at its first sample."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     begin = time.monotonic()
-    with Process(program(kind, namespace, folder, once=True)) as node:
+    with Process(program(kind, namespace, folder, once=True), checkout=checkout) as node:
         code = node.wait(30.0)
         wall = time.monotonic() - begin
     if code:

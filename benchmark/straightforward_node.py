@@ -6,9 +6,10 @@ The top as an ordinary rclpy node, with which `node_cpu.py` compares `sim_node`.
 A timer has the rate of the streams.  SciPy's RK45 steps up to the present time, and its dense
 output gives the sample.  Every sample is a new message object.  The node has no parameters to
 change, no services and no recording; a late tick loses a sample.  The equations are (29)-(32) in
-Euler angles, at the default tolerance of `sim_node`.
+Euler angles, at the default tolerance of `sim_node`.  The executor is that of `rclpy.spin`, or
+rclpy's EventsExecutor, which takes a fraction of its processor time.
 
-    python benchmark/straightforward_node.py --ros-args -p rate:=1000.0
+    python benchmark/straightforward_node.py --ros-args -p rate:=1000.0 -p executor:=events
 """
 
 import math
@@ -17,6 +18,7 @@ import sys
 import rclpy
 from geometry_msgs.msg import PoseStamped
 from rclpy.executors import ExternalShutdownException
+from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from scipy.integrate import RK45
 from sensor_msgs.msg import Imu, JointState
@@ -33,6 +35,9 @@ class StraightforwardTop(Node):
     def __init__(self):
         super().__init__('spinning_top')
         rate = self.declare_parameter('rate', 100.0).value
+        self.executor_name = self.declare_parameter('executor', 'single').value
+        if self.executor_name not in EXECUTORS:
+            raise ValueError(f'executor = {self.executor_name!r}: one of {sorted(EXECUTORS)}')
         self.l3, self.lz = L3, L3 * math.cos(THETA)
         self.solver = RK45(self.derivative, 0.0, [THETA, 0.0, 0.0, 0.0], math.inf,
                            rtol=1e-11, atol=1e-11)
@@ -107,11 +112,21 @@ class StraightforwardTop(Node):
         self.imu.publish(message)
 
 
+def spin_events(node):
+    executor = EventsExecutor()
+    executor.add_node(node)
+    while rclpy.ok():
+        executor.spin_once(1.0)         # Jazzy's hangs without a timeout
+
+
+EXECUTORS = {'single': rclpy.spin, 'events': spin_events}
+
+
 def main():
     rclpy.init(args=sys.argv)
     node = StraightforwardTop()
     try:
-        rclpy.spin(node)
+        EXECUTORS[node.executor_name](node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:

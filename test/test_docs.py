@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The documents say what the code does."""
 
+import importlib
 import re
 import runpy
 
@@ -35,3 +36,23 @@ def test_the_readme_begins_with_the_two_commands_and_lists_every_scene():
     commands = re.findall(r'^\s*(make \w+)', text, re.MULTILINE)
     assert commands[:2] == ['make run', 'make test']
     assert all(f'`{scene}`' in text for scene in SCENES)
+
+
+def test_every_name_that_is_public_can_be_imported():
+    page = (ROOT / 'docs/versioning.md').read_text()
+    public = re.findall(r'`(spinning_top_sim(?:\.\w+)+)`', page)
+    assert len(public) > 5
+    for name in public:
+        module, _, attribute = name.rpartition('.')
+        assert hasattr(importlib.import_module(module), attribute), name
+
+
+def test_the_documents_of_the_repository_link_to_what_there_is():
+    for name in ('CONTRIBUTING.md', 'QUALITY_DECLARATION.md', 'SECURITY.md', 'docs/versioning.md'):
+        page = ROOT / name
+        for path, anchor in re.findall(r'\]\(((?!https?:)[^)#]+)#?([^)]*)\)', page.read_text()):
+            target = page.parent / path
+            assert target.exists(), (name, path)
+            heads = re.findall(r'^#+ (.*)$', target.read_text(), re.MULTILINE) if anchor else ()
+            anchors = {re.sub(r'[^\w -]', '', head.lower()).replace(' ', '-') for head in heads}
+            assert not anchor or anchor in anchors, (name, path, anchor)

@@ -105,7 +105,7 @@ def test_the_manifest_names_every_package_that_is_launched():
 
 def test_versions_agree(setup_py):
     package = parse_package(str(ROOT / 'package.xml'))
-    newest = next(iter(get_changelog_from_path(str(ROOT), NAME).foreach_version()))[0]
+    newest = next(get_changelog_from_path(str(ROOT), NAME).foreach_version(reverse=True))[0]
     assert package.version == newest == setup_py.get_version()
 
 
@@ -237,10 +237,44 @@ def test_manifest_and_setup_py_require_the_same(setup_py):
     assert declared == required == set(keys.values())
 
 
-def test_make_run_installs_what_the_tools_draw_with():
-    plan = subprocess.run(['make', '--dry-run', '--always-make', 'run'], cwd=ROOT, check=True,
-                          capture_output=True, text=True, timeout=60).stdout
-    assert "'.[build,plot]'" in plan and "'.[build,ros]'" in plan
+def own_environment():
+    """Return the environment without what the `make` that runs the tests was given."""
+    return {name: value for name, value in os.environ.items()
+            if name not in ('MAKEFLAGS', 'MFLAGS', 'MAKELEVEL', 'PYTHON', 'ROS', 'VENV')}
+
+
+@pytest.mark.parametrize(('ros', 'extra', 'folder'), [
+    ('jazzy', 'ros', '.venv'), ('kilted', 'ros-kilted', '.venv-kilted')])
+def test_make_run_installs_what_the_tools_draw_with(ros, extra, folder):
+    plan = subprocess.run(['make', '--dry-run', '--always-make', 'run', f'ROS={ros}'], cwd=ROOT,
+                          check=True, capture_output=True, text=True, timeout=60,
+                          env=own_environment()).stdout
+    assert f"'{folder}/bin/sim_node'" in plan
+    assert re.findall(r"'\.\[build,(ros.*?)\]'", plan) == [extra] and "'.[build,plot]'" in plan
+
+
+def test_make_refuses_a_ros_that_has_no_wheels_here_and_a_second_one_in_an_environment(tmp_path):
+    def refused(*arguments):
+        made = subprocess.run(['make', *arguments], cwd=ROOT, check=False, capture_output=True,
+                              text=True, timeout=60, env=own_environment())
+        assert made.returncode == 2
+        return made.stderr
+    assert 'ROS=humble is neither jazzy nor kilted' in refused('run', 'ROS=humble')
+    (tmp_path / '.deps-ros').touch()
+    assert 'has another ROS than kilted' in refused(
+        'dependencies', 'ROS=kilted', f'VENV={tmp_path}')
+
+
+def test_the_workflow_calls_what_there_is():
+    jobs = yaml.safe_load((ROOT / '.github/workflows/ci.yml').read_text())['jobs']
+    matrix = jobs['test']['strategy']['matrix']
+    assert matrix['ros'] == ['jazzy', 'kilted']
+    for name in matrix['libraries']:
+        assert name == 'newest' or (ROOT / f'.ci/constraints-{name}.txt').is_file()
+    (run,) = (step['run'] for step in jobs['test']['steps'] if 'run' in step)
+    assert run == '.ci/run test ' + ' '.join(
+        f'${{{{ matrix.{key} }}}}' for key in ('python', 'ros', 'libraries'))
+    assert jobs['lint']['strategy']['matrix']['step'] == ['lint', 'build']
 
 
 @pytest.mark.parametrize(('scene', 'file'), [
@@ -271,11 +305,8 @@ def test_make_run_takes_no_imu_for_a_scene(scene):
 
 
 def test_make_help_fits_into_80_columns_and_names_every_scene():
-    # Without what the `make` that runs the tests was given.
-    environment = {name: value for name, value in os.environ.items()
-                   if name not in ('MAKEFLAGS', 'MFLAGS', 'MAKELEVEL', 'PYTHON', 'VENV')}
     told = subprocess.run(['make', 'help'], cwd=ROOT, check=True, capture_output=True, text=True,
-                          timeout=60, env=environment).stdout
+                          timeout=60, env=own_environment()).stdout
     assert max(map(len, told.splitlines())) <= 80
     assert {path.stem for path in SCENES} <= set(told.split())
 
