@@ -2,8 +2,8 @@
 """
 The site: `make docs`, or `sphinx-build docs SITE` where the package can be imported.
 
-Building and reading it need no network.  rosdoc2, which copies this folder and brings Sphinx with a
-theme of its own, builds it too.
+Building and reading it need no network.  rosdoc2, which copies this folder and brings Sphinx with
+a theme of its own, builds it too.
 """
 
 import importlib.util
@@ -32,7 +32,8 @@ version = release
 extensions = ['myst_parser', 'sphinx.ext.autodoc', 'site_extension',
               'numpydoc' if installed('numpydoc') else 'sphinx.ext.napoleon']
 source_suffix = {'.md': 'markdown', '.rst': 'restructuredtext'}
-exclude_patterns = ['_*', 'exam_marks_*']
+# The latter two are what rosdoc2 adds.
+exclude_patterns = ['_*', 'modules.rst', 'spinning_top_sim*']
 nitpicky = True
 # Types of other packages: a link to them would need the network.
 nitpick_ignore_regex = [('py:.*', r'(numpy|np|pathlib|collections|argparse|NDArray|ArrayLike|'

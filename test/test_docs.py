@@ -23,6 +23,7 @@ NOT_RUN = {
     'takes minutes or hours': 0,
     'serves a page until Ctrl-C; test_view_browser.py opens one': 0,
     'a part of a configuration': 0,
+    'runs in a guide or tutorial, with all arguments': 0,
 }
 
 

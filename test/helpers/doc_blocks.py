@@ -26,8 +26,8 @@ from typing import NamedTuple
 from helpers.reference import ROOT
 
 LANGUAGES = {'python', 'bash', 'yaml', 'text', 'xml', 'ini'}
-FENCE = re.compile(r'^(?:<!-- (?P<mark>[^\n]*?) -->\n)?^```(?P<language>[^\n]*)\n(?P<text>.*?)^```$',
-                   re.MULTILINE | re.DOTALL)
+FENCE = re.compile(r'^(?:<!-- (?P<mark>[^\n]*?) -->\n)?'
+                   r'^```(?P<language>[^\n]*)\n(?P<text>.*?)^```$', re.MULTILINE | re.DOTALL)
 NUMBER = re.compile(r'(?<![\w.])[-+]?\d+\.?\d*(?:e[-+]?\d+)?(?![\w])')
 FILE = re.compile(r'# ([\w/]+\.(?:py|yaml))\n')
 TIMEOUT = 120
