@@ -66,7 +66,8 @@ help:
 	@echo '             programs, attitude filters and the noise of the IMU; 80 minutes'
 	@echo 'make performance-check'
 	@echo '             compare the cost with that of the last tag (REF=...), six minutes'
-	@echo 'make docs    write the interface page, the plain URDF and the pictures'
+	@echo 'make docs    write the interface page, the plain URDF and the pictures, and build the'
+	@echo '             site of all pages in site/'
 	@echo 'make lint    run ruff and mypy'
 	@echo 'make build   build with colcon in a temporary workspace, test the installation'
 	@echo 'make clean   remove $(VENV) and caches, but no logs'
@@ -152,10 +153,13 @@ $(VENV)/.peers: $(wildcard benchmark/requirements*.txt) $(VENV)/.deps-test
 	    echo 'numbalsoda is left out: its source needs CMake and a Fortran compiler'
 	@touch '$@'
 
-docs: $(VENV)/.deps-plot $(VENV)/.deps-test $(VENV)/.package
+docs: $(VENV)/.deps-plot $(VENV)/.deps-test $(VENV)/.deps-docs $(VENV)/.package
 	'$(VENV)/bin/python' docs/interface.py
 	'$(VENV)/bin/python' docs/urdf.py
 	'$(VENV)/bin/python' docs/figures.py
+	rm -rf site
+	'$(VENV)/bin/python' -m sphinx --fail-on-warning --keep-going --nitpicky --quiet docs site
+	@echo 'Open site/index.html'
 
 lint: $(VENV)/.deps-test $(VENV)/.deps-lint $(VENV)/.package
 	'$(VENV)/bin/ruff' check . scripts/*
@@ -166,7 +170,7 @@ build: $(VENV)/.deps-colcon $(VENV)/.deps-test $(VENV)/.package
 
 clean:
 	test ! -e '$(VENV)/.made' || rm -rf '$(VENV)'
-	rm -rf .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .mypy_cache .pytest_cache .ruff_cache site
 	find $(wildcard benchmark examples launch spinning_top_sim test) -name __pycache__ -prune \
 	    -exec rm -rf {} +
 

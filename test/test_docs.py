@@ -4,10 +4,66 @@
 import importlib
 import re
 import runpy
+from collections import Counter
 
+import pytest
+from helpers import doc_blocks
 from helpers.reference import ROOT, SCENES
 
 FOLDERS = 'config', 'docs', 'examples', 'launch', 'rviz', 'scripts', 'test', 'urdf', 'benchmark'
+
+# Pages that programs write or Sphinx copies have no blocks of their own.
+PAGES = {str(path.relative_to(ROOT)): path.read_text(encoding='utf-8')
+         for path in (ROOT / 'README.md', *sorted((ROOT / 'docs').rglob('*.md')))
+         if not path.name.startswith('top_')}
+# Why blocks are not run, and how many.
+NOT_RUN = {
+    'installs packages from the network': 0,
+    'needs the command line tools of a ROS installation': 0,
+    'runs until Ctrl-C, after it has installed packages': 0,
+    'takes minutes or hours': 0,
+    'serves a page until Ctrl-C; test_view_browser.py opens one': 0,
+    'a part of a configuration': 0,
+    'runs in a guide or tutorial, with all arguments': 0,
+}
+
+
+@pytest.mark.parametrize('name', [name for name, page in PAGES.items()
+                                  if any(block.language in ('python', 'bash')
+                                         for block in doc_blocks.blocks(page))])
+def test_the_code_of_a_page_runs_and_prints_what_it_says(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    runner, said, last = doc_blocks.Runner(name), None, None
+    try:
+        for block in doc_blocks.blocks(PAGES[name]):
+            if block.language == 'text' and block.follows and said is not None:
+                if not doc_blocks.agrees(block.text.splitlines(), said.splitlines()):
+                    pytest.fail(f'{name}:{last.line} prints\n{said}', pytrace=False)
+            else:
+                said = None if doc_blocks.left_out(block) else runner.run(block)
+                last = block
+    finally:
+        runner.end()
+
+
+def test_what_is_not_run_is_counted():
+    reasons = Counter(doc_blocks.left_out(block) for page in PAGES.values()
+                      for block in doc_blocks.blocks(page) if doc_blocks.left_out(block))
+    assert reasons == NOT_RUN
+
+
+def test_code_is_in_fenced_blocks_of_a_known_language():
+    for name, page in PAGES.items():
+        assert not re.search(r'^\n    \S', doc_blocks.outside(page), re.MULTILINE), name
+        assert {block.language for block in doc_blocks.blocks(page)} <= doc_blocks.LANGUAGES, name
+        assert page.count('```') % 2 == 0, name
+
+
+def test_output_that_differs_is_found():
+    assert doc_blocks.agrees(['a 1.00 b', '...', 'end'], ['a  1.01 b', 'x', 'y', 'end'])
+    assert not doc_blocks.agrees(['a 1.00 b'], ['a 1.10 b'])
+    assert not doc_blocks.agrees(['a 1.00 b'], ['a 1.00 c'])
+    assert not doc_blocks.agrees(['a'], ['a', 'b'])
 
 
 def test_the_interface_page_is_written_from_the_present_code():

@@ -35,7 +35,16 @@ CONSISTENT = 0.9999             # probability of the band of the NEES
 
 
 class Fault(NamedTuple):
-    """What is wrong with a filter, a name of FAULTS, and from what that follows."""
+    """
+    What is wrong with a filter.
+
+    Parameters
+    ----------
+    name : str
+        One of FAULTS.
+    evidence : str
+        From what it follows.
+    """
 
     name: str
     evidence: str

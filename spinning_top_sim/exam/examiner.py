@@ -39,17 +39,29 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
 
     Parameters
     ----------
-    make_filter : returns a new filter, see `trial.Filter`; it is called for every run
-    level : 'quick', or 'full' with more seeds and motions
-    imu : parameters of the IMU by name, or the path of a file of them, as in config/imu; default:
-        the noise of a calibrated device, `scenarios.CALIBRATED`
-    seeds : of noise and start of the noisy runs, or how many; default: SEEDS of the level
-    subject : name in the report; default: that of the filter's class
+    make_filter : callable
+        Returns a new filter, see `trial.Filter`; it is called for every run.
+    level : {'quick', 'full'}
+        'full' has more seeds and motions.
+    imu : mapping or path, optional
+        Parameters of the IMU by name, or the path of a file of them, as in config/imu; default:
+        the noise of a calibrated device, `scenarios.CALIBRATED`.
+    seeds : int or iterable of int, optional
+        Of noise and start of the noisy runs, or how many; default: SEEDS of the level.
+    subject : str, optional
+        Name in the report; default: that of the filter's class.
+
+    Returns
+    -------
+    Report
+        Faults with their evidence, and measures.
 
     Raises
     ------
-    ValueError : for a level, parameter or seed that is not allowed
-    OSError : if the file cannot be read
+    ValueError
+        For a level, parameter or seed that is not allowed.
+    OSError
+        If the file cannot be read.
 
     Notes
     -----

@@ -68,13 +68,28 @@ def examine_log(path: Path, topic: str, truth: str | None = None,
     """
     Examine the attitudes of a topic.
 
-    path : an MCAP file
-    topic : of the attitudes q(world <- sensor), of a type of LAYOUTS
-    truth : topic of the truth; default: the first of TRUTHS
-    north : from which the heading counts, one of NORTHS; None: the heading needs only be steady
+    Parameters
+    ----------
+    path : Path
+        An MCAP file.
+    topic : str
+        Of the attitudes q(world <- sensor), of a type of LAYOUTS.
+    truth : str, optional
+        Topic of the truth; default: the first of TRUTHS.
+    north : {'true', 'magnetic'}, optional
+        From which the heading counts; by default it needs only be steady.
 
-    Raises LogError for what is no log, and ValueError for one without these topics or with too
-    few attitudes.
+    Returns
+    -------
+    Report
+        The faults that show in a log, and measures.
+
+    Raises
+    ------
+    LogError
+        For what is no log.
+    ValueError
+        For a log without these topics, or with too few attitudes.
     """
     heading = north is not None
     with LogReader(path) as reader:

@@ -15,7 +15,16 @@ LEAST_DEG = 1e-4                # that is drawn
 
 
 def draw_page(report: Report, path: Path) -> None:
-    """Draw a page about a report, in the format of the path's ending."""
+    """
+    Draw a page about a report; needs matplotlib.
+
+    Parameters
+    ----------
+    report : Report
+        What `examine` has returned.
+    path : Path
+        File to write, in the format of its ending.
+    """
     with rc_context({'axes.spines.right': False, 'axes.spines.top': False, 'font.size': 9}):
         figure = Figure(figsize=(11.0, 7.0), layout='constrained')
         grid = figure.add_gridspec(2, 2, width_ratios=(3.0, 2.0))

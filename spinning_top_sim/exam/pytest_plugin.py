@@ -11,7 +11,14 @@ from spinning_top_sim.exam.report import Report
 
 @pytest.fixture
 def pass_exam() -> Callable[..., Report]:
-    """Return `examine` that fails the test if there are faults, except some that are known."""
+    """
+    Return `examine` that fails the test if there are faults, except some that are known.
+
+    Returns
+    -------
+    callable
+        Takes the arguments of `examine`, and `known`, names of faults; returns the report.
+    """
     def pass_exam(*arguments: object, known: Iterable[str] = (), **options: object) -> Report:
         __tracebackhide__ = True
         report = examine(*arguments, **options)     # type: ignore[arg-type]

@@ -14,12 +14,18 @@ from spinning_top_sim.exam.trial import Outcome
 @dataclass(frozen=True)
 class Report:
     """
-    What an exam has found.
+    What an exam has found; `str(report)` is readable.
 
-    subject : what was examined
-    found : the faults with their evidence
-    measures : by name; docs/exam.md defines them.  NaN: could not be measured
-    outcomes : of the runs, for pictures
+    Parameters
+    ----------
+    subject : str
+        What was examined.
+    found : sequence of Fault
+        The faults with their evidence.
+    measures : mapping of str to float
+        By name; docs/exam.md defines them.  NaN: could not be measured.
+    outcomes : sequence of Outcome
+        What the filter said in the runs, for pictures.
     """
 
     subject: str
@@ -45,7 +51,15 @@ class Report:
         return '\n'.join(lines)
 
     def as_json(self) -> str:
-        """Return everything as JSON; what is not finite is null."""
+        """
+        Return everything as JSON.
+
+        Returns
+        -------
+        str
+            An object with subject, passed, faults, evidence and measures; what is not finite is
+            null.
+        """
         return json.dumps({
             'subject': self.subject, 'passed': self.passed, 'faults': self.faults,
             'evidence': {fault.name: fault.evidence for fault in self.found},
@@ -53,7 +67,14 @@ class Report:
                          for name, value in self.measures.items()}}, indent=2)
 
     def as_junit(self) -> str:
-        """Return a test suite of JUnit XML with a test case for each fault of FAULTS."""
+        """
+        Return the verdict as JUnit XML.
+
+        Returns
+        -------
+        str
+            A test suite with a test case for each fault of FAULTS.
+        """
         suite = ElementTree.Element('testsuite', name=f'examine {self.subject}',
                                     tests=str(len(FAULTS)), failures=str(len(self.found)),
                                     errors='0', skipped='0')

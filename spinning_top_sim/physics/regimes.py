@@ -24,11 +24,24 @@ COINCIDE = 1e-12
 @dataclass(frozen=True)
 class Description:
     """
-    A motion in numbers: angles [rad], rates [rad/s], means over a nutation.
+    A motion in numbers.
 
-    nutation_period : [s], None where theta rests
-    separatrix_distance : 1 - m of the elliptic functions; 0 is the motion that rises for ever
-    gyroscopic_ratio : L3^2/(4 lambda1 |P|); an upright top sleeps above 1; inf without gravity
+    Parameters
+    ----------
+    name : str
+        The classical name, such as 'cusps'.
+    nutation_period : float or None
+        Period of theta [s], None where it rests.
+    theta_min, theta_max : float
+        Between which the axis swings [rad].
+    mean_precession_rate, mean_spin_rate : float
+        Means over a nutation [rad/s].
+    precession_min, precession_max : float
+        Least and greatest precession rate [rad/s].
+    separatrix_distance : float
+        1 - m of the elliptic functions; 0 is the motion that rises for ever.
+    gyroscopic_ratio : float
+        L3^2 over 4 lambda1 abs(P); an upright top sleeps above 1; inf without gravity.
     """
 
     name: str

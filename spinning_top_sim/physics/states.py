@@ -23,16 +23,27 @@ class States:
 
     Attributes
     ----------
-    t : (n,) times since the start of the motion [s]
-    theta, phi, psi : (n,) ZYZ Euler angles [rad], unwrapped and continued through the poles
-    theta_dot, phi_dot, psi_dot : (n,) nutation, precession and spin rate [rad/s]
-    theta_folded : (n,) tilt from the upward vertical, in [0, pi] [rad]
-    quaternion : (n, 4) attitude q(world <- body) as x, y, z, w, its sign continuous in time
-    angular_velocity, angular_acceleration : (n, 3) in the body frame [rad/s], [rad/s^2]
-    energy : (n,) kinetic energy + P cos(theta) [J]
-    l3, lz : (n,) angular momentum along the axis and along the vertical [kg m^2/s]
-    norm_error : (n,) |q| - 1
-    rows_... : the same as tuples of (n,) components, which cost no copy
+    t : (n,) array
+        Times since the start of the motion [s].
+    theta, phi, psi : (n,) array
+        ZYZ Euler angles [rad], unwrapped and continued through the poles.
+    theta_dot, phi_dot, psi_dot : (n,) array
+        Nutation, precession and spin rate [rad/s].
+    theta_folded : (n,) array
+        Tilt from the upward vertical [rad], in [0, pi].
+    quaternion : (n, 4) array
+        Attitude q(world <- body) as x, y, z, w, its sign continuous in time.
+    angular_velocity, angular_acceleration : (n, 3) array
+        In the body frame [rad/s], [rad/s^2].
+    energy : (n,) array
+        Kinetic energy + P cos(theta) [J].
+    l3, lz : (n,) array
+        Angular momentum along the axis and along the vertical [kg m^2/s].
+    norm_error : (n,) array
+        ``|q| - 1``.
+    rows_quaternion, rows_axis, rows_vertical, rows_angular_velocity : tuple of (n,) array
+        Components of the attitude, of the axis in the world, of the upward vertical in the body
+        and of the angular velocity, which cost no copy.
     """
 
     def __init__(self, top: Top, start: State, n: int) -> None:
@@ -144,16 +155,38 @@ class States:
         return np.stack(np.broadcast_arrays(*self.rows_angular_acceleration), axis=-1)
 
     def velocity(self, point: Point) -> Vector:
-        """Return omega x r, that of a point r of the body [m], in the body frame [m/s]."""
+        """
+        Return the velocity omega x r of a point of the body.
+
+        Parameters
+        ----------
+        point : tuple of three float
+            Position r in the body frame, from the pivot [m].
+
+        Returns
+        -------
+        tuple of three (n,) array
+            Components in the body frame [m/s].
+        """
         (w1, w2, w3), (r1, r2, r3) = self.rows_angular_velocity, point
         return w2 * r3 - w3 * r2, w3 * r1 - w1 * r3, w1 * r2 - w2 * r1
 
     def specific_force(self, point: Point) -> Vector:
         """
-        Return what an ideal accelerometer at a point r of the body [m] measures [m/s^2].
+        Return what an ideal accelerometer at a point of the body measures.
 
-        f = omega' x r + omega x (omega x r) + g z in the body frame, with the upward vertical z:
-        at rest +g upwards, as REP-145 has it.
+        It is f = omega' x r + omega x (omega x r) + g z with the upward vertical z: at rest +g
+        upwards, as REP-145 has it.
+
+        Parameters
+        ----------
+        point : tuple of three float
+            Position r in the body frame, from the pivot [m].
+
+        Returns
+        -------
+        tuple of three (n,) array
+            Components in the body frame [m/s^2].
         """
         gravity, (z1, z2, z3) = self.top.gravity, self.rows_vertical
         if not any(point):          # the pivot is at rest: no rate is needed

@@ -23,11 +23,23 @@ class Top:
     """
     The constants of a top.
 
-    lambda1 : principal moment of inertia across the axis, *about the pivot* [kg m^2], > 0
-    lambda3 : principal moment of inertia along the axis [kg m^2], > 0
-    mass : [kg], >= 0
-    com_distance : signed distance from pivot to centre of mass along +e3 [m]
-    gravity : [m/s^2], downwards positive
+    Parameters
+    ----------
+    lambda1 : float
+        Principal moment of inertia across the axis, *about the pivot* [kg m^2], > 0.
+    lambda3 : float
+        Principal moment of inertia along the axis [kg m^2], > 0.
+    mass : float
+        Mass [kg], >= 0.
+    com_distance : float
+        Signed distance from pivot to centre of mass along +e3 [m].
+    gravity : float
+        Acceleration of gravity [m/s^2], downwards positive.
+
+    Raises
+    ------
+    ValueError
+        For a constant that is not allowed, naming it, its value and what is allowed.
     """
 
     lambda1: float
@@ -68,9 +80,24 @@ class State:
     """
     Where the top is and how it moves at one instant.
 
-    theta, theta_dot : tilt of the axis from the upward vertical, in [0, pi] [rad], [rad/s]
-    phi, psi : precession and spin angle [rad]; their rates follow from l3 and lz
-    l3, lz : angular momentum along the body axis and along the vertical [kg m^2/s]
+    The rates of phi and psi follow from l3 and lz.
+
+    Parameters
+    ----------
+    theta : float
+        Tilt of the axis from the upward vertical [rad], in [0, pi].
+    theta_dot : float
+        Nutation rate [rad/s].
+    phi, psi : float
+        Precession and spin angle [rad].
+    l3, lz : float
+        Angular momentum along the body axis and along the vertical [kg m^2/s].  Where the axis
+        is vertical, lz must be l3 at the top and -l3 at the bottom.
+
+    Raises
+    ------
+    ValueError
+        For a value that is not allowed, naming it and what is allowed.
     """
 
     theta: float

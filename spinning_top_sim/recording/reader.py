@@ -38,24 +38,56 @@ _RUN_BYTES = 1 << 20  # of messages outside of chunks that are read at a time
 
 @dataclass(frozen=True)
 class LogTopic:
-    """A channel of a log."""
+    """
+    A channel of a log.
+
+    Parameters
+    ----------
+    name, type_name : str
+        Of the topic and its type, such as 'sensor_msgs/msg/Imu', empty without schema.
+    schema, schema_encoding : str
+        The definition with its dependencies, and its format, such as 'ros2msg'.
+    encoding : str
+        Of the messages, such as 'cdr'.
+    qos : tuple of mapping
+        Offered profiles, each with the keys of `rosbag2.DEFAULT_QOS`.
+    metadata : mapping of str to str
+        Of the channel.
+    channel_id : int
+        Its number in the file.
+    """
 
     name: str
-    type_name: str              # such as 'sensor_msgs/msg/Imu'; '' without schema
-    schema: str                 # the definition with its dependencies
-    schema_encoding: str        # its format, such as 'ros2msg'
-    encoding: str               # of the messages, such as 'cdr'
-    qos: tuple[Qos, ...]        # offered profiles, each as the `qos` of RecordedTopic
+    type_name: str
+    schema: str
+    schema_encoding: str
+    encoding: str
+    qos: tuple[Qos, ...]
     metadata: Mapping[str, str]
     channel_id: int
 
 
 class LogMessage(NamedTuple):
-    """A message of a log."""
+    """
+    A message of a log.
+
+    Parameters
+    ----------
+    topic : str
+        Name of the topic.
+    log_time, publish_time : int
+        Times of the record [ns].
+    sequence : int
+        Number in its channel.
+    data : bytes
+        The serialized message.
+    channel_id : int
+        Number of its channel.
+    """
 
     topic: str
-    log_time: int           # [ns]
-    publish_time: int       # [ns]
+    log_time: int
+    publish_time: int
     sequence: int
     data: bytes
     channel_id: int
@@ -76,13 +108,22 @@ _Index = tuple[list[_Span], dict[str, dict[str, str]]]
 
 class LogReader(contextlib.AbstractContextManager['LogReader']):
     """
-    An MCAP file, open for reading.
-
-    max_bytes : largest record, and largest uncompressed chunk, that is read into memory
+    An MCAP file, open for reading; a context manager.
 
     A file with a usable summary opens at once.  Any other is scanned before its topics, metadata
-    or messages are returned, and so is every file for its `damage`.  Damage raises nothing; what
-    is no MCAP file, or cannot be read, raises LogError.
+    or messages are returned, and so is every file for its `damage`.  Damage raises nothing.
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+    max_bytes : int
+        Largest record, and largest uncompressed chunk, that is read into memory.
+
+    Raises
+    ------
+    LogError
+        For what is no MCAP file, or cannot be read.
     """
 
     def __init__(self, path: str | os.PathLike[str], max_bytes: int = records.MAX_BYTES) -> None:
@@ -99,6 +140,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         self.profile, self.library = header.profile, header.library
 
     def close(self) -> None:
+        """Close the file."""
         self.source.close()
 
     def __exit__(self, *exception: object) -> None:
@@ -151,8 +193,17 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         """
         Yield the whole messages in the order of their log times, equal ones in file order.
 
-        topics : names, default: all
-        start, end : log times [ns]; `end` is exclusive
+        Parameters
+        ----------
+        topics : iterable of str, optional
+            Names; default: all.
+        start, end : int, optional
+            Log times [ns]; `end` is exclusive.
+
+        Yields
+        ------
+        LogMessage
+            A message that is read completely.
         """
         spans, _ = self._index      # also makes the channels known
         names = None if topics is None else frozenset(topics)

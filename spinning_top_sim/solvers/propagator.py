@@ -123,21 +123,31 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
 
     Parameters
     ----------
-    t : (n,) times [s]: in any order and of any sign for 'exact', from 0 on and never decreasing
-        for 'rk45'
-    method : 'exact', the closed form, or 'rk45', Dormand-Prince steps
-    rtol, atol : tolerated error of a step; atol is rtol/10 by default
-    equations : of the steps: 'transport', regular everywhere, or 'euler', to the letter of the
-        paper, for study
+    top : Top
+        What moves.
+    start : State
+        The state at t = 0.
+    t : (n,) array_like
+        Times [s]: in any order and of any sign for 'exact', from 0 on and never decreasing for
+        'rk45'.
+    method : {'exact', 'rk45'}
+        The closed form, or Dormand-Prince steps.
+    rtol, atol : float
+        Tolerated error of a step; atol is rtol/10 by default.
+    equations : {'transport', 'euler'}
+        Of the steps: regular everywhere, or to the letter of the paper, for study.
 
     Returns
     -------
-    States, whose columns are computed when they are first asked for
+    States
+        Its columns are computed when they are first asked for.
 
     Raises
     ------
-    ValueError : naming the argument, its value and what is allowed
-    IntegrationError : where the 'euler' equations cannot go on, or after 1e7 steps
+    ValueError
+        Naming the argument, its value and what is allowed.
+    IntegrationError
+        Where the 'euler' equations cannot go on, or after 1e7 steps.
     """
     try:
         given = np.asarray(t)

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The code blocks of a page of the documentation, and what runs them.
+
+A page runs from its first block to its last in one empty folder, and in one Python namespace.
+
+- `python` blocks are executed, unless their first line is a comment with the name of a file, as
+  `# my_filter.py`: then they are that file.  So are `yaml` blocks.
+- `bash` blocks are run by bash.  `<!-- background -->` in the line before keeps one running until
+  the page ends; `<!-- not run: REASON -->` leaves one out, and fails where REASON is not known.
+- A `text` block right behind a block that ran is its output.  Numbers agree within 2 %, and a line
+  `...` stands for any lines.
+"""
+
+import contextlib
+import io
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+from helpers.reference import ROOT
+
+LANGUAGES = {'python', 'bash', 'yaml', 'text', 'xml', 'ini'}
+FENCE = re.compile(r'^(?:<!-- (?P<mark>[^\n]*?) -->\n)?'
+                   r'^```(?P<language>[^\n]*)\n(?P<text>.*?)^```$', re.MULTILINE | re.DOTALL)
+NUMBER = re.compile(r'(?<![\w.])[-+]?\d+\.?\d*(?:e[-+]?\d+)?(?![\w])')
+FILE = re.compile(r'# ([\w/]+\.(?:py|yaml))\n')
+TIMEOUT = 120
+
+
+class Block(NamedTuple):
+    """A fenced block: its language, text, first line in the page, mark, and what is before it."""
+
+    language: str
+    text: str
+    line: int
+    mark: str
+    follows: bool       # directly behind the block before
+
+
+def blocks(page):
+    """Return the blocks of a page, those of Sphinx (`{...}`) left out."""
+    found, end = [], 0
+    for match in FENCE.finditer(page):
+        language = match['language'] or 'text'
+        if not language.startswith('{'):
+            found.append(Block(language, match['text'], page[:match.start()].count('\n') + 1,
+                               match['mark'] or '', not page[end:match.start()].strip()))
+        end = match.end()
+    return found
+
+
+def outside(page):
+    """Return the page without its blocks."""
+    return FENCE.sub('', page)
+
+
+def left_out(block):
+    """Return why a block is not run, or None."""
+    return block.mark.removeprefix('not run: ') if block.mark.startswith('not run: ') else None
+
+
+def same(expected, actual):
+    """Return whether two lines are the same but for the last digits of numbers."""
+    if NUMBER.sub('#', ' '.join(expected.split())) != NUMBER.sub('#', ' '.join(actual.split())):
+        return False
+    return all(math.isclose(float(one), float(other), rel_tol=0.02) for one, other in
+               zip(NUMBER.findall(expected), NUMBER.findall(actual), strict=True))
+
+
+def agrees(expected, actual):
+    """Return whether lines of output are those of a page, where `...` stands for any lines."""
+    if not expected or not actual:
+        return all(line.strip() == '...' for line in expected) and not actual
+    if expected[0].strip() == '...':
+        return any(agrees(expected[1:], actual[skipped:]) for skipped in range(len(actual) + 1))
+    return same(expected[0], actual[0]) and agrees(expected[1:], actual[1:])
+
+
+class Runner:
+    """Runs the blocks of a page in a folder, which is the working directory."""
+
+    def __init__(self, name):
+        self._name, self._namespace, self._background = name, {'__name__': '__main__'}, []
+        for folder in ('config', 'examples', 'urdf'):
+            Path(folder).symlink_to(ROOT / folder)
+        # Executables, and the package where it is not installed.
+        paths = (str(Path(sys.executable).parent), str(ROOT / 'scripts'), os.environ['PATH'])
+        self._environment = {**os.environ, 'PATH': os.pathsep.join(paths), 'COLUMNS': '118',
+                             'PYTHONPATH': os.pathsep.join(filter(None, (
+                                 os.environ.get('PYTHONPATH'), str(ROOT))))}
+
+    def run(self, block):
+        """Run a block; return what it printed, None if it is no code."""
+        named = FILE.match(block.text)
+        if block.language in ('python', 'yaml') and named:
+            path = Path(named[1])
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(block.text, encoding='utf-8')
+            return None
+        if block.language == 'python':
+            said = io.StringIO()
+            with contextlib.redirect_stdout(said):
+                exec(compile('\n' * block.line + block.text, self._name, 'exec'),
+                     self._namespace)
+            return said.getvalue()
+        if block.language == 'bash':
+            return self._shell(block)
+        return None
+
+    def _shell(self, block):
+        process = subprocess.Popen(
+            ['bash', '-euo', 'pipefail', '-c', block.text], stdin=subprocess.DEVNULL, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
+            env=self._environment)
+        if block.mark == 'background':
+            self._background.append(process)
+            return None
+        try:
+            said, _ = process.communicate(timeout=TIMEOUT)
+        except BaseException:
+            os.killpg(process.pid, signal.SIGKILL)
+            raise
+        assert process.returncode == 0, f'{self._name}:{block.line}: {said}'
+        return said
+
+    def end(self):
+        """End what runs in the background, as Ctrl-C does."""
+        for process in self._background:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGINT)
+            try:
+                process.communicate(timeout=30)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                raise
