@@ -14,6 +14,8 @@ from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.streams.cdr import NANOSECONDS
 
+# Message packages have no types.
+Message = Any
 TAGS = ('spinning_top', 'heavy_symmetric_top', 'imu')
 # How far the pivot may be from the origin [m], how fast it may move [m/s], and by how much the
 # length of a quaternion may differ from 1: what a client's rounding makes.
@@ -32,7 +34,7 @@ class PoseError(ValueError):
     """The top cannot have this pose."""
 
 
-def fill_state(message: Any, states: States, stamp_ns: int, frame: str) -> None:
+def fill_state(message: Message, states: States, stamp_ns: int, frame: str) -> None:
     """Put the state (n = 1) into an EntityState, in the world frame; the pivot is at rest."""
     seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
     message.header.stamp.sec, message.header.stamp.nanosec = seconds, nanoseconds
@@ -48,7 +50,7 @@ def fill_state(message: Any, states: States, stamp_ns: int, frame: str) -> None:
             setattr(target, name, float(column[0]))
 
 
-def changed_state(request: Any, top: Top, frame: str) -> Callable[[States], State]:
+def changed_state(request: Message, top: Top, frame: str) -> Callable[[States], State]:
     """
     Return what makes the state that a SetEntityState request asks for from the present one.
 
@@ -92,7 +94,7 @@ def _check_pose(position: Reals, rotation: Reals) -> None:
                         f'(within {LENGTH_ERROR:g})')
 
 
-def is_chosen(filters: Any, name: str, category: int, top: Top,
+def is_chosen(filters: Message, name: str, category: int, top: Top,
               present: Callable[[], States]) -> bool:
     """
     Return whether EntityFilters choose the top.
@@ -130,7 +132,7 @@ def _matches(expression: str, name: str) -> bool:
     return pattern.search(name) is not None
 
 
-def _overlaps(bounds: Any, top: Top, present: Callable[[], States]) -> bool:
+def _overlaps(bounds: Message, top: Top, present: Callable[[], States]) -> bool:
     """Return whether Bounds, in the world frame, and the box of the top have common points."""
     points = np.array([_numbers(point, 'xyz') for point in bounds.points])
     if bounds.type not in (bounds.TYPE_SPHERE, bounds.TYPE_BOX):
@@ -148,7 +150,7 @@ def _overlaps(bounds: Any, top: Top, present: Callable[[], States]) -> bool:
     return box.overlaps_sphere(rotation, points[0], radius)
 
 
-def fill_bounds(bounds: Any, top: Top) -> None:
+def fill_bounds(bounds: Message, top: Top) -> None:
     """Put the box of the top into Bounds, in the body frame: upper corner, lower corner."""
     box = Box.of(top)
     bounds.type = bounds.TYPE_BOX
@@ -163,5 +165,5 @@ def describe(top: Top) -> str:
             f'{top.lambda3:g} kg m^2')
 
 
-def _numbers(message: Any, names: Sequence[str]) -> Reals:
+def _numbers(message: Message, names: Sequence[str]) -> Reals:
     return np.array([getattr(message, name) for name in names], float)

@@ -147,7 +147,9 @@ class SimulationHandlers:
             return states.STATE_STOPPED
         if loop.state is State.RUNNING:
             return states.STATE_PLAYING
-        is_at_start = self._simulation.now_ns < 0 and loop.interruptions != self._pause_at_start
+        # A motion that has failed is paused, too.
+        is_at_start = (loop.state is State.PAUSED and self._simulation.now_ns < 0
+                       and loop.interruptions != self._pause_at_start)
         return states.STATE_STOPPED if is_at_start else states.STATE_PAUSED
 
     def _get_state(self, _: Any, response: Any) -> str:
