@@ -21,6 +21,7 @@ parameter, in files or not, the last one on the command line holds.
   ~/commands (std_msgs/Float64MultiArray: [L3, Lz] in kg m^2/s)
 Services:
   ~/set_pause, ~/record (std_srvs/SetBool); ~/step, ~/reset (std_srvs/Trigger)
+  those of simulation_interfaces, where that package is installed
 Publishes, where enabled:
   /diagnostics (diagnostic_msgs/DiagnosticArray), always"""
 

@@ -3,11 +3,12 @@
 
 import functools
 import importlib
+import importlib.util
 import itertools
 import sys
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -111,7 +112,7 @@ class Simulator(Node):
             tell=lambda text, bad: self._log.error(text) if bad else self._log.warning(text),
             update_subscribers=lambda: self._outputs.update_subscribers(simulation.streams),
             source=self._date_ns if self._follows else time.monotonic_ns)
-        self._pacer = DeadlineThread(self._tick, self._idle, lambda: self._loop.grid, self._fail)
+        self._pacer = DeadlineThread(self._tick, self._idle, lambda: self._loop.grid, self.fail)
         self._report = reports.MotionReport(simulation, self._loop, self._session)
         self._outputs.open(simulation.streams, values)
         self._diagnostics = self._outputs.create(DiagnosticArray, '/diagnostics')
@@ -120,6 +121,10 @@ class Simulator(Node):
                                 ('step', Trigger, self._step), ('reset', Trigger, self._reset),
                                 ('record', SetBool, self._record)):
             self.create_service(kind, f'~/{name}', functools.partial(self._serve, act))
+        if values['simulation_interfaces'] and importlib.util.find_spec('simulation_interfaces'):
+            from spinning_top_sim.nodes import simulation_services  # noqa: PLC0415
+            self._steps_action = simulation_services.offer(
+                self, self, self._loop, simulation, self._lock, values['world_frame'])
         self._diagnostics_count = itertools.count()
         self._steady_timer(1.0, self._publish_diagnostics)
         self._status_timer: Timer | None = None
@@ -142,7 +147,7 @@ class Simulator(Node):
             try:
                 callback()
             except Exception as error:
-                self._fail(error)
+                self.fail(error)
         return self.create_timer(period, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _set_status_period(self, period: float) -> None:
@@ -215,7 +220,7 @@ class Simulator(Node):
         with self._lock:
             self._loop.idle()
 
-    def _fail(self, error: Exception) -> None:
+    def fail(self, error: Exception) -> None:
         """Stop the motion after an unexpected error, and close the log while it is whole."""
         if not self.context.ok():       # publishing fails once the context is down
             return
@@ -232,7 +237,7 @@ class Simulator(Node):
         except (ValueError, RuntimeError, RecordingError) as error:
             return False, str(error)
         except Exception as error:
-            self._fail(error)
+            self.fail(error)
             return False, f'{type(error).__name__}: {error}'
 
     def _on_command(self, message: Float64MultiArray) -> None:
@@ -274,9 +279,7 @@ class Simulator(Node):
                 changed = {name: values[name] for name in rest}
                 self._session.write_event('parameters', **changed)
                 self._simulation.apply(changed)
-                self._outputs.open(self._simulation.streams, values)
-                if 'status_period' in rest:
-                    self._set_status_period(values['status_period'])
+                self._open_outputs(values)
                 self._loop.set_pace(values)
         for effect in (parameters.Effect.RESET, parameters.Effect.RECORDING):
             names = [name for name in rest if parameters.BY_NAME[name].effect is effect
@@ -285,11 +288,18 @@ class Simulator(Node):
                 self._log.info(f'{", ".join(names)}: {effect.value}')
         self._values = values
 
+    def _open_outputs(self, values: Mapping[str, Any]) -> None:
+        """Have the publishers and the status line that these parameters ask for."""
+        self._outputs.open(self._simulation.streams, values)
+        if values['status_period'] != self._values['status_period']:
+            self._set_status_period(values['status_period'])
+
     def _serve(self, act: Callable[[Any], str], request: object, response: Any) -> object:
         response.success, response.message = self._outcome(act, request)
         return response
 
-    def _check_started(self) -> None:
+    def check_started(self) -> None:
+        """Raise RuntimeError before the motion begins."""
         if not self._pacer.is_alive():
             raise RuntimeError(self._loop.failure or 'waiting for /clock (use_sim_time is set)')
 
@@ -303,25 +313,69 @@ class Simulator(Node):
 
     def _step(self, _: Trigger.Request) -> str:
         with self._lock:
-            self._check_started()
+            self.check_started()
             self._loop.step(self._values['step.count'], self._values['step.dt'])
             return self._loop.time_text
 
     def _reset(self, _: Trigger.Request) -> str:
-        with self._lock:
-            self._check_started()
-            self._loop.reset({**self._values, **self._start_spin}, self._date_ns())
-        self._values |= {'spin.l3': self._simulation.l3, 'spin.lz': self._simulation.lz}
-        # The motion has this spin already: the parameters only show it.
-        self.remove_on_set_parameters_callback(self._on_set_parameters)
-        self.set_parameters([Parameter(name, value=self._values[name]) for name in SPIN])
-        self.add_on_set_parameters_callback(self._on_set_parameters)
+        self.start_again()
         return f'at t = 0, stamps go on from {self._simulation.epoch_ns} ns'
+
+    @property
+    def values(self) -> Mapping[str, Any]:
+        """The parameters, with the spin as last commanded."""
+        return self._values
+
+    @property
+    def start_values(self) -> dict[str, Any]:
+        """The parameters that a reset starts with."""
+        return {**self._values, **self._start_spin}
+
+    def start_again(self, values: Mapping[str, Any] | None = None,
+                    paused: bool | None = None) -> None:
+        """
+        Reset the motion, with all these parameters instead of the present ones if they are given.
+
+        paused : whether it is paused then; None: as before
+
+        Raises RuntimeError before the motion begins, and ValueError where none does; then nothing
+        changes.
+        """
+        with self._lock:
+            self.check_started()
+            self._loop.reset(self.start_values if values is None else values, self._date_ns(),
+                             paused)
+            if values is not None:
+                self._open_outputs(values)
+                self._start_spin = {name: values[name] for name in SPIN}
+        if values is not None:
+            changed = [name for name in values if values[name] != self._values[name]]
+            self._values = dict(values)
+            self._show(name for name in changed if name not in SPIN)
+        self.show_spin()
+
+    def show_spin(self) -> None:
+        """Let the parameters spin.l3 and spin.lz show the present ones."""
+        self._values |= {'spin.l3': self._simulation.l3, 'spin.lz': self._simulation.lz}
+        self._show(SPIN)
+
+    def _show(self, names: Iterable[str]) -> None:
+        """Let parameters show values that are in effect already."""
+        self.remove_on_set_parameters_callback(self._on_set_parameters)
+        self.set_parameters([Parameter(name, value=list(value) if isinstance(value, tuple)
+                                       else value)
+                             for name, value in ((name, self._values[name]) for name in names)])
+        self.add_on_set_parameters_callback(self._on_set_parameters)
+
+    def finish(self) -> None:
+        """End the process, once the response that is under way has been sent."""
+        self._finish_timer = self._steady_timer(
+            0.2, lambda: self.finished.done() or self.finished.set_result(None))
 
     def _record(self, request: SetBool.Request) -> str:
         if not request.data:
             return self._session.stop() or 'not recording'
-        self._check_started()
+        self.check_started()
         return self._session.start(self._values)()
 
     def _publish_diagnostics(self) -> None:

@@ -3,11 +3,14 @@
 
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from enum import Enum
 from typing import Any
 
 from spinning_top_sim.nodes.pacing import SimulatedClock
 from spinning_top_sim.nodes.recording_session import RecordingSession
+from spinning_top_sim.physics import top
+from spinning_top_sim.physics.states import States
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import Simulation
@@ -245,18 +248,34 @@ class TickLoop:
         self._recording.write_command(l3, lz)
         self.commands += 1
 
-    def reset(self, values: Mapping[str, Any], date_ns: int) -> None:
+    def set_state(self, change: Callable[[States], top.State]) -> None:
         """
-        Go back to the start state of these parameters, and out of a failure; a pause remains.
+        Send what is due, then let the top be in another state, or raise ValueError.
 
-        t = 0 has this date or, as stamps never go back, a later one.  Raises ValueError if no
-        motion begins there; the present one goes on then.
+        change : takes the present state (n = 1), and returns the new one
+        """
+        self._advance()
+        if self.failure:
+            raise ValueError(f'the motion stands still: {self.failure}')
+        state = change(self._simulation.state())
+        self._simulation.set_state(state)
+        self._recording.write_event('state', **asdict(state))
+        self.commands += 1
+
+    def reset(self, values: Mapping[str, Any], date_ns: int, paused: bool | None = None) -> None:
+        """
+        Go back to the start state of these parameters, and out of a failure.
+
+        A pause remains, or is as `paused` says.  t = 0 has this date or, as stamps never go back,
+        a later one.  Raises ValueError if no motion begins there; the present one goes on then.
         """
         simulation, sent_ns = self._simulation, self._simulation.now_ns
         epoch_ns = next_epoch(max(simulation.epoch_ns + sent_ns + 1, date_ns))
         simulation.restart(values)
         simulation.epoch_ns = epoch_ns
         self.failure = None
+        if paused is not None:
+            self.paused = paused
         self.interruptions += 1
         self.set_pace(values)           # a change that failed midway may not have set it
         self._enter(State.PAUSED if self.paused else State.RUNNING)

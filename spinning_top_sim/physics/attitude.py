@@ -75,6 +75,12 @@ def in_body(q: Quaternion, v: Vector) -> tuple[Column, Column, Column]:
             + (w * w - x * x - y * y + z * z) * vz)
 
 
+def in_world(q: Quaternion, v: Vector) -> tuple[Column, Column, Column]:
+    """Return the components in the world frame of a vector given in the body frame."""
+    x, y, z, w = q
+    return in_body((-x, -y, -z, w), v)
+
+
 def rotation_vector(q: Quaternion) -> tuple[Column, Column, Column]:
     """Return axis times angle [rad] of a unit quaternion; the angle is in [0, 2 pi]."""
     x, y, z, w = q

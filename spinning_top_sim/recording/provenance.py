@@ -10,7 +10,7 @@ from typing import Any
 
 
 def provenance(values_at_start: Mapping[str, Any], epoch_ns: int, begun_ns: int,
-               history: Iterable[tuple[int, float, float]],
+               history: Iterable[tuple[int, *tuple[float, ...]]],
                values_at_recording: Mapping[str, Any]) -> dict[str, str]:
     """
     Return the `spinning_top_sim` metadata record.
@@ -18,7 +18,7 @@ def provenance(values_at_start: Mapping[str, Any], epoch_ns: int, begun_ns: int,
     values_at_start : parameters at the start of the motion (the last reset)
     epoch_ns : stamp of t = 0
     begun_ns : simulated time at which the recording begins
-    history : commands applied before, as (t_ns, l3, lz)
+    history : commands and states applied before, as `Simulation.history`
     values_at_recording : parameters when the recording begins, with later changes
     """
     return {

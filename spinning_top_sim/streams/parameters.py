@@ -204,6 +204,8 @@ TABLE: tuple[Parameter, ...] = (
     _at_once('time_scale', 1.0, 'Simulated over real time', '', 1e-6, 1e6),
     _at_start('start_paused', False, 'Wait for ~/set_pause or ~/step'),
     _at_start('publish_clock', False, 'Publish /clock (the same as clock.enabled)'),
+    _at_start('simulation_interfaces', True, 'Offer the services of simulation_interfaces if that '
+              'package is installed'),
     _at_start('world_frame', 'world', 'Frame of the pivot, z up'),
     _at_start('body_frame', 'base_link', 'Frame of the body, z along its axis'),
     _at_reset('seed', 0, 'Seed of the noise', '', 0, 2 ** 63 - 1),

@@ -17,6 +17,7 @@ A tick moves `now_ns` to the time that is due; `prepare` moves the other two ahe
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import astuple
 from functools import cache
 from typing import Any
 
@@ -56,7 +57,8 @@ class Simulation:
     streams : every stream; the caller sets `publish` of each, and records them with `log_to`
     now_ns : every sample up to here is sent (-1: not even that of t = 0)
     l3, lz : as last commanded [kg m^2/s]
-    history : applied commands since the start as (t_ns, l3, lz)
+    history : what was applied since the start: commands as (t_ns, l3, lz), and states that were
+        set as t_ns and the fields of `State`
     segment : the motion since the last command
 
     Raises ValueError where there is no motion from the start state.
@@ -86,7 +88,7 @@ class Simulation:
         segment = _segment(top, start, 0, values)
         streams = all_streams(values)
         self.values, self.top = dict(values), top
-        self.history: list[tuple[int, float, float]] = []
+        self.history: list[tuple[int, *tuple[float, ...]]] = []
         self.now_ns = -1
         for new, old in zip(streams, self.streams, strict=False):
             new.publish, new.log_index = old.publish, old.log_index
@@ -293,10 +295,23 @@ class Simulation:
                 f'{theta!r} rad), where lz must equal {pole!r}; command both together')
         start = ContinuedState(theta=theta, theta_dot=float(now.theta_dot[0]),
                                phi=float(now.phi[0]), psi=float(now.psi[0]), l3=l3, lz=lz)
+        self._go_on_from(start)
+        self.history.append((self.now_ns, l3, lz))
+
+    def set_state(self, state: State) -> None:
+        """
+        Let the top be in another state from now on; the simulated time goes on.
+
+        Raises ValueError if no motion begins there; then the present one goes on unchanged.
+        """
+        self.advance(max(self.now_ns, 0))
+        self._go_on_from(state)
+        self.history.append((self.now_ns, *astuple(state)))
+
+    def _go_on_from(self, start: State) -> None:
         segment = _segment(self.top, start, self.now_ns, self.values)
         self._steps_before, self._evaluations_before = self.steps, self.evaluations
         self._begin(segment)
-        self.history.append((self.now_ns, l3, lz))
 
 
 def _segment(top: Top, start: State, start_ns: int, values: Mapping[str, Any]) -> Segment:

@@ -178,7 +178,8 @@ def _as_text(found: Survey, verdict: Verdict | None) -> Iterator[str]:
     counts = Counter(event.name for event in run.events)
     yield ('no journal: commands and resets are unknown' if run.events_topic is None else
            f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
-           f'{counts["parameters"]} changes of parameters')
+           f'{counts["parameters"]} changes of parameters'
+           + (f', {counts["state"]} states set' if counts['state'] else ''))
     for stamp_ns, reason in run.broken:
         yield f'journal, entry at {seconds(stamp_ns)}: {reason}'
     yield from found.notes

@@ -9,12 +9,13 @@ import re
 import struct
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.physics.top import State
 from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.writer import METADATA_NAME
@@ -34,6 +35,9 @@ MOST_TEXT = 300             # of a reason
 LEAST_STEPS, STEPS_A_BYTE = 200_000, 20
 LEAST_SAMPLES, SAMPLES_A_BYTE = 100_000, 1
 MOST_BLOCKS = 20_000        # of samples between two events
+# Numbers of the events that begin another motion at the present time, in the order of
+# `Simulation.history`.
+FIELDS_OF = {'command': ('l3', 'lz'), 'state': tuple(field.name for field in fields(State))}
 # Names in the message definition of the arrays of numbers in a template, in their order, by topic
 # or by type.
 FIELDS = {
@@ -70,7 +74,7 @@ class DepartureError(Exception):
 class Event:
     """An entry of the journal."""
 
-    name: str                             # start, command, parameters or reset
+    name: str                             # start, command, state, parameters or reset
     stamp_ns: int                         # log time [ns]
     t_ns: int                             # simulated time [ns]
     sent_ns: int                          # time up to which all samples had been sent [ns]
@@ -86,7 +90,7 @@ class RunDescription:
     values_at_recording: Mapping[str, Any]
     epoch_ns: int                         # stamp of t = 0 [ns]
     begun_ns: int                         # simulated time at which the recording began [ns]
-    history: Sequence[Event]              # commands before that
+    history: Sequence[Event]              # commands and states before that
     surroundings: Mapping[str, str]       # version, platform and libraries
     topics: Mapping[str, str]             # topic in the log by that of the stream, imu/data_raw
     commands_topic: str | None            # None where the log has none
@@ -106,8 +110,7 @@ def read_run_description(reader: LogReader) -> RunDescription:
         at_start, at_recording = (parameters.checked(json.loads(metadata[key]))
                                   for key in ('parameters', 'parameters_now'))
         epoch_ns, begun_ns = int(metadata['epoch_ns']), int(metadata['begun_ns'])
-        history = [Event('command', epoch_ns + t_ns, t_ns, t_ns, {'l3': l3, 'lz': lz})
-                   for t_ns, l3, lz in json.loads(metadata['history'])]
+        history = [_applied_before(epoch_ns, *entry) for entry in json.loads(metadata['history'])]
         times_ns = [0, *(operator.index(event.t_ns) for event in history), max(begun_ns, 0)]
         if times_ns != sorted(times_ns) or epoch_ns < 0 or (
                 epoch_ns + times_ns[-1] > min(LATEST_NS, reader.span[1] or LATEST_NS)):
@@ -135,6 +138,13 @@ def read_run_description(reader: LogReader) -> RunDescription:
             broken.append((message.log_time, reason_of(error)))
     return RunDescription(at_start, at_recording, epoch_ns, begun_ns, history, surroundings,
                           topics, commands_topic, events_topic, events, broken, reader.size)
+
+
+def _applied_before(epoch_ns: int, t_ns: int, *numbers: float) -> Event:
+    """Return an entry of `Simulation.history` as an event.  Raises ValueError for other counts."""
+    name = 'command' if len(numbers) == len(FIELDS_OF['command']) else 'state'
+    return Event(name, epoch_ns + t_ns, t_ns, t_ns,
+                 dict(zip(FIELDS_OF[name], numbers, strict=True)))
 
 
 def reason_of(error: Exception) -> str:
@@ -170,8 +180,8 @@ def _event(stamp_ns: int, data: bytes) -> Event:
     if journal.event(name, t_ns, sent_ns, **details) != data:
         raise ValueError('the bytes of the entry are not as it was written')
     operator.index(t_ns), operator.index(sent_ns)
-    if name == 'command':
-        details = {key: float(details[key]) for key in ('l3', 'lz')}
+    if name in FIELDS_OF:
+        details = {key: float(details[key]) for key in FIELDS_OF[name]}
     elif name == 'parameters':
         details = {key: parameters.BY_NAME[key].check(value) for key, value in details.items()}
     elif name == 'reset':
@@ -231,7 +241,7 @@ def _rerun(run: RunDescription, end_ns: int,
 
     # 3. The journal: samples up to each event that acts on them, and up to the end.
     at_once = {name for stream in simulation.streams for name in stream.at_once}
-    acting = [event for event in run.events if event.name in ('command', 'reset')
+    acting = [event for event in run.events if event.name in ('reset', *FIELDS_OF)
               or not at_once.isdisjoint(event.details)]
     for item in (*acting, None):
         now_ns = max(simulation.now_ns, 0)
@@ -243,7 +253,7 @@ def _rerun(run: RunDescription, end_ns: int,
         block_ns = max(offline_block_ns(recorded), (stop_ns - now_ns) // MOST_BLOCKS)
         for target_ns, arrived in offline_targets(now_ns, [(stop_ns, item)], block_ns):
             # Without samples states are only needed where a command finds them.
-            if send is not None or (arrived is not None and arrived.name == 'command'):
+            if send is not None or (arrived is not None and arrived.name in FIELDS_OF):
                 reach(target_ns)
             simulation.skip_to(target_ns)
             if arrived is not None:
@@ -255,8 +265,11 @@ def _apply(simulation: Simulation, event: Event) -> None:
     """Apply an event.  Raises DepartureError where that cannot be."""
     details = event.details
     try:
-        if event.name == 'command':
-            simulation.command(details['l3'], details['lz'])
+        if event.name in FIELDS_OF:
+            if event.name == 'command':
+                simulation.command(**details)
+            else:
+                simulation.set_state(State(**details))
             applied_ns = simulation.history[-1][0]
             if applied_ns != event.t_ns:
                 raise ValueError(f'applied at {applied_ns} ns')

@@ -43,20 +43,28 @@ def read_scene(path: str | Path) -> dict[str, object]:
 
     Raises OSError, or ValueError which names the file and what is wrong with it.
     """
-    content = parse_yaml(Path(path).read_bytes(), str(path))
+    return known(parse_scene(Path(path).read_bytes(), str(path)), str(path))
+
+
+def parse_scene(text: str | bytes, source: str) -> dict[str, object]:
+    """
+    Return what the text of a parameter file sets for the node spinning_top, by any name.
+
+    Raises ValueError, which names the source and what is wrong with it.
+    """
+    content = parse_yaml(text, source)
     sections = [node['ros__parameters'] for name, node in content.items()
                 if name in NODES and isinstance(node, Mapping) and isinstance(
                     node.get('ros__parameters'), Mapping)] if isinstance(content, Mapping) else []
     if not sections:
-        raise ValueError(f'{path} has no parameters for the node spinning_top: it must have '
+        raise ValueError(f'{source} has no parameters for the node spinning_top: it must have '
                          "'/**:' or 'spinning_top:', and 'ros__parameters:' in it")
-    return {name: value for section in sections
-            for name, value in parse_section(section, str(path)).items()}
+    return {name: value for section in sections for name, value in _flatten(section)}
 
 
 def parse_section(section: Mapping[object, object], source: str) -> dict[str, object]:
     """Return parameters by name, not checked yet.  Raises ValueError, which names the source."""
-    return _known(dict(_flatten(section)), source)
+    return known(dict(_flatten(section)), source)
 
 
 def parse_assignment(text: str) -> tuple[str, object]:
@@ -65,7 +73,7 @@ def parse_assignment(text: str) -> tuple[str, object]:
     if not separator:
         raise ValueError(f'{text!r}: must be NAME:=VALUE')
     value = parse_yaml(yaml_text, text)
-    _known({name: value}, text)
+    known({name: value}, text)
     return name, value
 
 
@@ -91,10 +99,10 @@ def is_of_ros(name: str) -> bool:
     return name.partition('.')[0] in ROS_PARAMETERS
 
 
-def _known(values: Mapping[str, object], source: str) -> dict[str, object]:
+def known(values: Mapping[str, object], source: str) -> dict[str, object]:
     """Return the values but for those of ROS.  Raises ValueError for others than ours."""
-    known = {name: value for name, value in values.items() if not is_of_ros(name)}
-    for name, value in known.items():
+    ours = {name: value for name, value in values.items() if not is_of_ros(name)}
+    for name, value in ours.items():
         if name not in parameters.BY_NAME:
             near = difflib.get_close_matches(name, parameters.BY_NAME, 1)
             hint = f'; did you mean {near[0]}?' if near else ''
@@ -104,4 +112,4 @@ def _known(values: Mapping[str, object], source: str) -> dict[str, object]:
         if isinstance(value, list) and len(set(map(type, value))) > 1:
             raise ValueError(f'{source}: {name} = {value!r}: the items of a list must have one '
                              'type, such as [0.0, 1.5]')
-    return known
+    return ours

@@ -190,7 +190,7 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
                 writer.write_blocks()
             if momenta is not None:
                 _command(simulation, *momenta)
-                t_ns, l3, lz = simulation.history[-1]
+                t_ns, (l3, lz) = simulation.history[-1][0], momenta
                 writer.write(events_topic, epoch_ns + t_ns, journal.event(
                     'command', t_ns, simulation.now_ns, l3=l3, lz=lz))
                 writer.write(commands_topic, epoch_ns + t_ns, journal.command(l3, lz))

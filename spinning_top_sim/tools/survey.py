@@ -101,7 +101,7 @@ class Section:
 class Motion:
     """One motion of the top, from the start, a command or a reset to the next."""
 
-    cause: str                            # start, command or reset
+    cause: str                            # start, command, state or reset
     origin_ns: int                        # log time of the t = 0 of `segment` [ns]
     segment: Segment                      # its constants and its exact solution
     exact: Description | None             # None where the closed form cannot hold it

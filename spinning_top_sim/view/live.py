@@ -1,18 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of a running sim_node: a node that listens to it, and asks as any ROS client does."""
 
-import contextlib
 import struct
-import sys
 import threading
 import time
 import traceback
 from collections import defaultdict, deque
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
-from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
@@ -28,6 +24,7 @@ from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
+from spinning_top_sim.nodes.worlds import scene_files
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.journal import NODE_NAME
@@ -80,7 +77,7 @@ class LiveView(Node):
         self._stale = True                      # the parameters have to be read again
         self._origin_ns: int | None = None      # stamp of the first sample
         self._stopped = False
-        self._controls = Controls(page, self, sorted(_scenes()))
+        self._controls = Controls(page, self, sorted(scene_files()))
         self._thread = threading.Thread(target=self._draw, name='page', daemon=True)
 
     def start(self) -> None:
@@ -231,7 +228,7 @@ class LiveView(Node):
     def load_scene(self, name: str, paused: bool) -> str:
         """Start again with a scene; return what it could not change.  Raises RefusedError."""
         try:
-            given = read_scene(_scenes()[name])
+            given = read_scene(scene_files()[name])
             scene = parameters.checked(given)
             start = parameters.start_state(scene)
         except (OSError, ValueError) as error:
@@ -264,13 +261,3 @@ def _stamp_ns(data: bytes) -> int:
     """Return the stamp of a serialized message that begins with a std_msgs/Header [ns]."""
     seconds, nanoseconds = struct.unpack_from('<iI', data, 4)
     return int(seconds) * NANOSECONDS + int(nanoseconds)
-
-
-def _scenes() -> dict[str, Path]:
-    """Return the installed scenes by name."""
-    folders = [Path(sys.prefix) / 'share/spinning_top_sim', Path(__file__).parents[2]]
-    # OSError: AMENT_PREFIX_PATH is not set, as in an environment of pip.
-    with contextlib.suppress(PackageNotFoundError, OSError):
-        folders.insert(0, Path(get_package_share_directory('spinning_top_sim')))
-    found = (sorted((folder / 'config').glob('*.yaml')) for folder in folders)
-    return {path.stem: path for path in next(filter(None, found), ())}

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A top that is put somewhere: its state from pose and twist, and the space that it takes."""
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.top import Shape, State, Top
+
+Reals = NDArray[np.float64]
+# An axis nearer to a vertical than this [rad] counts as vertical.  The rounding of Lz changes the
+# angular velocity of a tilted axis by some 1e-16 L3/(lambda1 theta): here as much as the tilt.
+POLE = 1.5e-8
+
+
+def state_of(top: Top, quaternion: Reals, angular_velocity: Reals) -> State:
+    """
+    Return the state of a top with this attitude and angular velocity.
+
+    A vertical axis has no precession angle of its own: there the angle is that of the line about
+    which the axis turns, so that all of this motion is nutation.
+
+    Parameters
+    ----------
+    quaternion : (4,) q(world <- body) as x, y, z, w, of any length but 0
+    angular_velocity : (3,) in the world frame [rad/s]
+
+    Returns
+    -------
+    State
+        phi and psi are in [-2 pi, 2 pi], and belong to the sign of the quaternion.
+    """
+    x, y, z, w = (quaternion / np.linalg.norm(quaternion)).tolist()
+    wx, wy, wz = angular_velocity.tolist()
+    theta = 2.0 * math.atan2(math.hypot(x, y), math.hypot(z, w))
+    half_sum, half_difference = math.atan2(z, w), math.atan2(-x, y)
+    if math.sin(theta) < POLE:
+        phi = math.atan2(-wx, wy) if wx or wy else 0.0
+        if theta < 1.0:
+            theta, psi, sign = 0.0, 2.0 * half_sum - phi, 1.0
+        else:
+            theta, psi, sign = math.pi, phi - 2.0 * half_difference, -1.0
+        lz = top.lambda3 * wz
+        return State(theta=theta, theta_dot=math.hypot(wx, wy), phi=phi, psi=psi, l3=sign * lz,
+                     lz=lz)
+    columns = _columns(np.array([x, y, z, w]))
+    w1, w2, w3 = (float(part[0]) for part in attitude.in_body(columns, (wx, wy, wz)))
+    z1, z2, z3 = (float(part[0]) for part in attitude.vertical_in_body(columns))
+    phi, l3 = half_sum + half_difference, top.lambda3 * w3
+    return State(theta=theta, theta_dot=wy * math.cos(phi) - wx * math.sin(phi), phi=phi,
+                 psi=half_sum - half_difference, l3=l3,
+                 lz=top.lambda1 * (w1 * z1 + w2 * z2) + l3 * z3)
+
+
+@dataclass(frozen=True)
+class Box:
+    """
+    A box along the axes of its frame.
+
+    lower, upper : (3,) its corners [m]
+    """
+
+    lower: Reals
+    upper: Reals
+
+    @classmethod
+    def of(cls, top: Top) -> Self:
+        """Return the box in the body frame around the body that is drawn, the pivot, the tip."""
+        shape = Shape(top)
+        heights = (0.0, shape.tip, shape.centre - 0.5 * shape.height,
+                   shape.centre + 0.5 * shape.height)
+        return cls(np.array([-shape.radius, -shape.radius, min(heights)]),
+                   np.array([shape.radius, shape.radius, max(heights)]))
+
+    @property
+    def centre(self) -> Reals:
+        """(3,) [m]."""
+        return 0.5 * (self.lower + self.upper)
+
+    def overlaps_sphere(self, rotation: Reals, centre: Reals, radius: float) -> bool:
+        """
+        Return whether the box and a sphere have a point in common.
+
+        rotation : (3, 3) from the frame of the box to that of the sphere, with the same origin
+        """
+        inside = rotation.T @ centre
+        nearest = np.clip(inside, self.lower, self.upper)
+        return bool(np.linalg.norm(inside - nearest) <= radius)
+
+    def overlaps_box(self, rotation: Reals, other: 'Box') -> bool:
+        """
+        Return whether two boxes have a point in common, by the separating axis theorem.
+
+        rotation : (3, 3) from the frame of this box to that of the other, with the same origin
+        """
+        ours, theirs = 0.5 * (self.upper - self.lower), 0.5 * (other.upper - other.lower)
+        apart = other.centre - rotation @ self.centre
+        axes = [*np.eye(3), *rotation.T,
+                *(np.cross(one, two) for one in np.eye(3) for two in rotation.T)]
+        return all(abs(apart @ axis) <= np.abs(rotation.T @ axis) @ ours + np.abs(axis) @ theirs
+                   for axis in axes)
+
+
+def rotation_matrix(quaternion: Reals) -> Reals:
+    """Return the matrix (3, 3) from the body to the world of a unit quaternion x, y, z, w."""
+    columns = _columns(quaternion)
+    return np.stack([np.concatenate(attitude.in_world(columns, unit)) for unit in (
+        (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))], axis=-1)
+
+
+def _columns(quaternion: Reals) -> attitude.Quaternion:
+    x, y, z, w = quaternion.reshape(4, 1)
+    return x, y, z, w

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The messages of simulation_interfaces 2.1 for machines without that package: stand-ins.
+
+They have its fields and constants and check types as rclpy's messages do, but have no type
+support: they cannot be sent.  Where the package is installed, a test compares the two.
+"""
+
+from types import MappingProxyType, ModuleType, SimpleNamespace
+
+from geometry_msgs.msg import Accel, Pose, Twist, Vector3
+from std_msgs.msg import Header
+
+
+class Message:
+    """fields: by name a type, or a list with the type of the items."""
+
+    fields = MappingProxyType({})
+
+    def __init__(self, **given):
+        for name, kind in self.fields.items():
+            setattr(self, name, given.pop(name) if name in given
+                    else [] if isinstance(kind, list) else kind())
+        assert not given, given
+
+    def __setattr__(self, name, value):
+        kind = self.fields[name]
+        if isinstance(kind, list):
+            assert all(isinstance(item, kind[0]) for item in value), (name, value)
+        else:
+            assert isinstance(value, kind), (name, value)
+            assert kind is not int or (value >= 0 and not isinstance(value, bool)), (name, value)
+        super().__setattr__(name, value)
+
+
+def message(name, fields=None, **constants):
+    return type(name, (Message,), {'fields': fields or {}, **constants})
+
+
+def service(request=None, response=None, *, constants=None, codes=None, result=True):
+    answer = {**({'result': Result} if result else {}), **(response or {})}
+    return SimpleNamespace(Request=message('Request', request, **(constants or {})),
+                           Response=message('Response', answer, **(codes or {})))
+
+
+def numbered(names, start=0):
+    return {name: number for number, name in enumerate(names.split(), start)}
+
+
+Result = message('Result', {'result': int, 'error_message': str}, **numbered(
+    'RESULT_FEATURE_UNSUPPORTED RESULT_OK RESULT_NOT_FOUND RESULT_INCORRECT_STATE '
+    'RESULT_OPERATION_FAILED'))
+SimulationState = message('SimulationState', {'state': int}, **numbered(
+    'STATE_STOPPED STATE_PLAYING STATE_PAUSED STATE_QUITTING STATE_NO_WORLD STATE_LOADING_WORLD'))
+SimulatorFeatures = message(
+    'SimulatorFeatures', {'features': [int], 'spawn_formats': [str], 'custom_info': str},
+    **numbered('SPAWNING DELETING NAMED_POSES POSE_BOUNDS ENTITY_TAGS ENTITY_BOUNDS '
+               'ENTITY_BOUNDS_BOX ENTITY_BOUNDS_CONVEX ENTITY_CATEGORIES '
+               'SPAWNING_RESOURCE_STRING ENTITY_STATE_GETTING ENTITY_STATE_SETTING '
+               'ENTITY_INFO_GETTING ENTITY_INFO_SETTING SPAWNABLES'),
+    **numbered('SIMULATION_RESET SIMULATION_RESET_TIME SIMULATION_RESET_STATE '
+               'SIMULATION_RESET_SPAWNED SIMULATION_STATE_GETTING SIMULATION_STATE_SETTING '
+               'SIMULATION_STATE_PAUSE', 20),
+    **numbered('STEP_SIMULATION_SINGLE STEP_SIMULATION_MULTIPLE STEP_SIMULATION_ACTION', 31),
+    **numbered('WORLD_LOADING WORLD_RESOURCE_STRING WORLD_TAGS WORLD_UNLOADING '
+               'WORLD_INFO_GETTING AVAILABLE_WORLDS', 40), SPAWNING_ENTITIES=50)
+EntityCategory = message('EntityCategory', {'category': int}, CATEGORY_DYNAMIC_OBJECT=4,
+                         CATEGORY_STATIC_OBJECT=5,
+                         **numbered('CATEGORY_OBJECT CATEGORY_ROBOT CATEGORY_HUMAN'))
+Bounds = message('Bounds', {'type': int, 'points': [Vector3]}, **numbered(
+    'TYPE_EMPTY TYPE_BOX TYPE_CONVEX_HULL TYPE_SPHERE'))
+TagsFilter = message('TagsFilter', {'tags': [str], 'filter_mode': int}, **numbered(
+    'FILTER_MODE_ANY FILTER_MODE_ALL'))
+EntityFilters = message('EntityFilters', {
+    'filter': str, 'categories': [EntityCategory], 'tags': TagsFilter, 'bounds': Bounds})
+EntityInfo = message('EntityInfo', {
+    'category': EntityCategory, 'description': str, 'tags': [str]})
+EntityState = message('EntityState', {
+    'header': Header, 'pose': Pose, 'twist': Twist, 'acceleration': Accel})
+Resource = message('Resource', {'uri': str, 'resource_string': str})
+WorldResource = message('WorldResource', {
+    'name': str, 'world_resource': Resource, 'description': str, 'tags': [str]})
+
+MESSAGES = (Result, SimulationState, SimulatorFeatures, EntityCategory, Bounds, TagsFilter,
+            EntityFilters, EntityInfo, EntityState, Resource, WorldResource)
+FILTERED, NAMED = {'filters': EntityFilters}, {'entity': str}
+SERVICES = {
+    'GetSimulatorFeatures': service(response={'features': SimulatorFeatures}, result=False),
+    'GetSimulationState': service(response={'state': SimulationState}),
+    'SetSimulationState': service({'state': SimulationState}, codes=numbered(
+        'ALREADY_IN_TARGET_STATE STATE_TRANSITION_ERROR INCORRECT_TRANSITION', 101)),
+    'StepSimulation': service({'steps': int}),
+    'ResetSimulation': service({'scope': int}, constants={
+        'SCOPE_DEFAULT': 0, 'SCOPE_TIME': 1, 'SCOPE_STATE': 2, 'SCOPE_SPAWNED': 4,
+        'SCOPE_ALL': 255}),
+    'GetEntities': service(FILTERED, {'entities': [str]}),
+    'GetEntitiesStates': service(FILTERED, {'entities': [str], 'states': [EntityState]}),
+    'GetEntityState': service(NAMED, {'state': EntityState}),
+    'SetEntityState': service({**NAMED, 'state': EntityState, 'set_pose': bool, 'set_twist': bool,
+                               'set_acceleration': bool}, codes={'INVALID_POSE': 101}),
+    'GetEntityInfo': service(NAMED, {'info': EntityInfo}),
+    'GetEntityBounds': service(NAMED, {'bounds': Bounds}),
+    'GetAvailableWorlds': service(
+        {'additional_sources': [str], 'filter': TagsFilter, 'offline_only': bool,
+         'continue_on_error': bool}, {'worlds': [WorldResource]},
+        codes={'DEFAULT_SOURCES_FAILED': 101}),
+    'LoadWorld': service(
+        {'world_resource': Resource, 'fail_on_unsupported_element': bool,
+         'ignore_missing_or_unsupported_assets': bool}, {'world': WorldResource},
+        codes=numbered('UNSUPPORTED_FORMAT NO_RESOURCE RESOURCE_PARSE_ERROR MISSING_ASSETS '
+                       'UNSUPPORTED_ASSETS UNSUPPORTED_ELEMENTS', 101)),
+    'GetCurrentWorld': service(response={'world': WorldResource}, codes={'NO_WORLD_LOADED': 101}),
+}
+ACTIONS = {'SimulateSteps': SimpleNamespace(
+    Goal=message('Goal', {'steps': int}), Result=message('Result', {'result': Result}),
+    Feedback=message('Feedback', {'completed_steps': int, 'remaining_steps': int}))}
+
+
+def modules():
+    """Return simulation_interfaces.msg, .srv and .action."""
+    found = [ModuleType(f'simulation_interfaces.{kind}') for kind in ('msg', 'srv', 'action')]
+    for module, content in zip(found, (
+            {one.__name__: one for one in MESSAGES}, SERVICES, ACTIONS), strict=True):
+        vars(module).update(content)
+    return found

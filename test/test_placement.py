@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""States of a top from pose and twist, and the box around it."""
+
+import math
+
+import numpy as np
+import pytest
+
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.placement import POLE, Box, rotation_matrix, state_of
+from spinning_top_sim.physics.top import Shape, State, Top
+from spinning_top_sim.solvers.propagator import propagate
+
+TOP = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
+
+
+def pose_and_twist(state):
+    """Return quaternion and angular velocity in the world of a state, by the exact solver."""
+    states = propagate(TOP, state, method='exact').states(range(1))
+    q = states.rows_quaternion
+    return np.concatenate(q), np.concatenate(attitude.in_world(q, states.rows_angular_velocity))
+
+
+@pytest.mark.parametrize('seed', range(30))
+def test_a_state_comes_back_from_its_pose_and_twist(seed):
+    rng = np.random.default_rng(seed)
+    state = State(theta=rng.uniform(0.02, 3.12), theta_dot=rng.normal(), phi=rng.uniform(-3, 3),
+                  psi=rng.uniform(-3, 3), l3=rng.normal(), lz=rng.normal())
+    q, rates = pose_and_twist(state)
+    found = state_of(TOP, q * rng.choice([0.5, 1.0, 2.0]), rates)
+    for name, value in vars(state).items():
+        # The length of a quaternion does not matter; angles come back up to turns.
+        difference = getattr(found, name) - value
+        if name in ('phi', 'psi'):
+            difference = math.remainder(difference, math.tau)
+        assert abs(difference) < 1e-12, name
+    again, rates_again = pose_and_twist(found)
+    assert np.allclose(again, q, rtol=0.0, atol=1e-14), 'the sign of the quaternion stays'
+    assert np.allclose(rates_again, rates, rtol=0.0, atol=1e-11)
+
+
+@pytest.mark.parametrize('tilt', [0.0, 0.4 * POLE])
+@pytest.mark.parametrize('inverted', [False, True])
+@pytest.mark.parametrize('rates', [(0.0, 0.0, 3.0), (0.3, -0.4, 2.0), (0.0, -0.5, 0.0)])
+def test_at_a_pole_what_is_not_spin_is_nutation(tilt, inverted, rates):
+    theta = math.pi - tilt if inverted else tilt
+    columns = [np.array([value]) for value in (0.7, theta, -1.9)]
+    q = np.concatenate(attitude.quaternion_of_angles(*columns))
+    state = state_of(TOP, q, np.array(rates))
+    assert state.theta == (math.pi if inverted else 0.0)
+    assert state.lz == (-state.l3 if inverted else state.l3) == TOP.lambda3 * rates[2]
+    assert state.theta_dot == math.hypot(*rates[:2])
+    again, rates_again = pose_and_twist(state)
+    assert np.allclose(np.abs(again @ q), 1.0, rtol=0.0, atol=1e-15)
+    assert np.allclose(again, q, rtol=0.0, atol=POLE)
+    assert np.allclose(rates_again, rates, rtol=0.0, atol=1e-14)
+
+
+def test_just_beside_a_pole_the_motion_is_still_what_was_asked_for():
+    """POLE is where rounding disturbs the angular velocity as much as the tilt matters."""
+    columns = [np.array([value]) for value in (0.7, 2.0 * POLE, -1.9)]
+    q = np.concatenate(attitude.quaternion_of_angles(*columns))
+    rates = np.array([0.3, -0.4, 2.0])
+    _, found = pose_and_twist(state_of(TOP, q, rates))
+    assert np.allclose(found, rates, rtol=0.0, atol=1e-7)
+
+
+def test_the_matrix_turns_as_the_quaternion():
+    q = np.array([0.1, -0.5, 0.3, 0.8])
+    q /= np.linalg.norm(q)
+    matrix, vector = rotation_matrix(q), np.array([0.2, -1.0, 3.0])
+    assert np.allclose(matrix.T @ matrix, np.eye(3), atol=1e-15)
+    columns = tuple(np.array([part]) for part in q)
+    assert np.allclose(matrix @ vector,
+                       np.concatenate(attitude.in_world(columns, tuple(vector))), atol=1e-15)
+
+
+@pytest.mark.parametrize('distance', [0.15, 0.0, -0.4])
+def test_the_box_holds_the_body_the_pivot_and_the_tip(distance):
+    top = Top(lambda1=0.5, lambda3=0.15, mass=2.0, com_distance=distance, gravity=9.8)
+    box, shape = Box.of(top), Shape(top)
+    assert box.upper[:2].tolist() == (-box.lower[:2]).tolist() == 2 * [shape.radius]
+    for height in (0.0, shape.tip, shape.centre - shape.height / 2,
+                   shape.centre + shape.height / 2):
+        assert box.lower[2] <= height <= box.upper[2]
+    assert {*box.lower, *box.upper} <= {
+        -shape.radius, shape.radius, 0.0, shape.tip, shape.centre - shape.height / 2,
+        shape.centre + shape.height / 2}
+
+
+def nearest_points(box, rotation, inside):
+    """Return the smallest distance of samples of the box from what `inside` measures."""
+    grid = np.stack(np.meshgrid(*(np.linspace(low, high, 21) for low, high in zip(
+        box.lower, box.upper, strict=True)), indexing='ij'), axis=-1).reshape(-1, 3)
+    return inside(grid @ rotation.T).min()
+
+
+@pytest.mark.parametrize('seed', range(40))
+def test_overlaps_are_those_of_sampled_points(seed):
+    """What samples of the box are inside of overlaps; what is well away from all does not."""
+    rng = np.random.default_rng(seed)
+    box = Box(-rng.uniform(0.1, 1.0, 3), rng.uniform(0.1, 1.0, 3))
+    q = rng.normal(size=4)
+    rotation = rotation_matrix(q / np.linalg.norm(q))
+    centre, radius = rng.uniform(-2.0, 2.0, 3), rng.uniform(0.1, 1.0)
+    half = rng.uniform(0.05, 0.8, 3)
+    other = Box(centre - half, centre + half)
+    to_sphere = nearest_points(box, rotation,
+                               lambda at: np.linalg.norm(at - centre, axis=1) - radius)
+    to_box = nearest_points(box, rotation, lambda at: np.linalg.norm(
+        np.maximum(np.abs(at - centre) - half, 0.0), axis=1))
+    spacing = 0.1 * math.sqrt(3.0)          # a point of the box is this near to a sample
+    for found, distance in ((box.overlaps_sphere(rotation, centre, radius), to_sphere),
+                            (box.overlaps_box(rotation, other), to_box)):
+        if distance <= 0.0:
+            assert found
+        elif distance > spacing:
+            assert not found

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The services and the action of simulation_interfaces, called by clients in another process.
+
+Only where the package is installed; test_simulation_interfaces.py does the same with stand-ins.
+"""
+
+import threading
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip('rclpy')
+pytest.importorskip('simulation_interfaces')
+
+import simulation_interfaces.action
+import simulation_interfaces.msg
+import simulation_interfaces.srv
+from geometry_msgs.msg import PoseStamped
+from helpers.node_harness import PATIENCE_S, SimNode, wait_for
+from helpers.node_logs import QUIET, assert_clean_end, settled, stamp_of, stamps_of, xyzw
+from nav_msgs.msg import Odometry
+from rclpy.action import ActionClient
+
+from spinning_top_sim.nodes.simulation_handlers import SERVICES
+from spinning_top_sim.nodes.simulation_services import service_name
+
+UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
+STOPPED, PLAYING, PAUSED, QUITTING = range(4)
+SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
+
+
+@pytest.fixture(scope='module')
+def served(peer, tmp_path_factory):
+    folder = tmp_path_factory.mktemp('standard')
+    with SimNode(folder, {**QUIET, 'start_paused': True}, namespace='/standard') as node:
+        yield SimpleNamespace(node=node, odom=peer.listen(
+            node.topic('ground_truth/odom'), Odometry))
+        assert_clean_end(node, node.end())
+
+
+@pytest.fixture(scope='module')
+def steps(peer, served):
+    client = ActionClient(peer.node, simulation_interfaces.action.SimulateSteps,
+                          served.node.topic('simulate_steps'))
+    assert client.wait_for_server(PATIENCE_S)
+    return client
+
+
+def call(peer, served, name, **request):
+    kind = getattr(simulation_interfaces.srv, name)
+    return peer.call(kind, served.node.topic(service_name(name)), kind.Request(**request))
+
+
+def set_state(peer, served, state):
+    return call(peer, served, 'SetSimulationState',
+                state=simulation_interfaces.msg.SimulationState(state=state)).result.result
+
+
+def resolved(future):
+    """Wait for a future of the peer, whose thread spins; return its result."""
+    done = threading.Event()
+    future.add_done_callback(lambda _: done.set())
+    assert done.wait(PATIENCE_S)
+    return future.result()
+
+
+def test_all_services_are_there_in_the_namespace(peer, served):
+    names = {f'/standard/{service_name(name)}': [f'simulation_interfaces/srv/{name}']
+             for name in SERVICES}
+    wait_for('the services', lambda: names.items() <= dict(
+        peer.node.get_service_names_and_types()).items())
+    features = call(peer, served, 'GetSimulatorFeatures').features
+    known = simulation_interfaces.msg.SimulatorFeatures
+    assert {known.STEP_SIMULATION_ACTION, known.WORLD_LOADING, known.ENTITY_STATE_SETTING} <= set(
+        features.features)
+
+
+def test_steps_publish_and_the_state_is_that_of_the_last_sample(peer, served):
+    assert call(peer, served, 'GetSimulationState').state.state == STOPPED
+    assert set_state(peer, served, PAUSED) == OK
+    wait_for('a subscriber', lambda: peer.node.count_subscribers(
+        served.node.topic('ground_truth/odom')))
+    count = settled(served.odom)
+    response = call(peer, served, 'StepSimulation', steps=25)
+    assert response.result.result == OK, response.result.error_message
+    served.odom.wait(count + 25)
+    count = settled(served.odom)
+    state = call(peer, served, 'GetEntityState', entity='spinning_top').state
+    last = served.odom.last()
+    assert state.header.stamp == last.header.stamp
+    assert xyzw(state.pose.orientation) == xyzw(last.pose.pose.orientation)
+    state.twist.angular.z = 12.5
+    assert call(peer, served, 'SetEntityState', entity='spinning_top', state=state,
+                set_twist=True).result.result == OK
+    now = call(peer, served, 'GetEntityState', entity='spinning_top').state
+    assert now.twist.angular.z == pytest.approx(12.5, abs=1e-12)
+    assert call(peer, served, 'GetEntities').entities == ['spinning_top']
+
+
+def test_simulate_steps_with_feedback(peer, served, steps):
+    count, feedback = settled(served.odom), []
+    handle = resolved(steps.send_goal_async(
+        simulation_interfaces.action.SimulateSteps.Goal(steps=50),
+        feedback_callback=lambda message: feedback.append(
+            (message.feedback.completed_steps, message.feedback.remaining_steps))))
+    assert handle.accepted
+    result = resolved(handle.get_result_async())
+    assert (result.status, result.result.result.result) == (SUCCEEDED, OK)
+    served.odom.wait(count + 50)
+    assert settled(served.odom) == count + 50
+    assert set(stamps_of(served.odom)[count:][1:] - stamps_of(served.odom)[count:][:-1]) == {
+        10_000_000}
+    # A client drops feedback that comes late or fast; what it takes is in order.
+    assert feedback == sorted(feedback)
+    assert {one + other for one, other in feedback} <= {50}
+
+
+def test_simulate_steps_can_be_canceled_and_the_node_answers_meanwhile(peer, served, steps):
+    feedback = []
+    handle = resolved(steps.send_goal_async(
+        simulation_interfaces.action.SimulateSteps.Goal(steps=10 ** 12),
+        feedback_callback=feedback.append))
+    wait_for('feedback', lambda: feedback)
+    assert call(peer, served, 'GetSimulationState').state.state == PAUSED
+    assert call(peer, served, 'StepSimulation', steps=1).result.result == FAILED
+    other = resolved(steps.send_goal_async(
+        simulation_interfaces.action.SimulateSteps.Goal(steps=1)))
+    assert resolved(other.get_result_async()).status == ABORTED
+    assert resolved(handle.cancel_goal_async()).goals_canceling
+    result = resolved(handle.get_result_async())
+    assert (result.status, result.result.result.result) == (CANCELED, FAILED)
+    assert 'canceled after' in result.result.result.error_message
+    assert call(peer, served, 'StepSimulation', steps=1).result.result == OK
+
+
+def test_play_and_load_a_world(peer, served):
+    assert set_state(peer, served, PLAYING) == OK
+    served.odom.wait_more(20)
+    response = call(peer, served, 'LoadWorld', world_resource=simulation_interfaces.msg.Resource(
+        uri='looping'))
+    assert response.result.result == OK, response.result.error_message
+    assert call(peer, served, 'GetSimulationState').state.state == STOPPED
+    assert call(peer, served, 'GetCurrentWorld').world.name == 'looping'
+    assert peer.get(served.node, 'spin.lz') == [1.3]
+    count = settled(served.odom)
+    assert set_state(peer, served, PLAYING) == OK
+    served.odom.wait(count + 20)
+    assert stamp_of(served.odom.raw[count]) > stamp_of(served.odom.raw[count - 1])
+    assert call(peer, served, 'ResetSimulation', scope=4).result.result == UNSUPPORTED
+
+
+def test_quitting_answers_and_ends_with_a_whole_log(peer, tmp_path):
+    with SimNode(tmp_path, {**QUIET, 'record.enabled': True, 'record.min_free_bytes': 0},
+                 namespace='/quits') as node:
+        peer.listen(node.topic('pose'), PoseStamped).wait(10)
+        assert set_state(peer, SimpleNamespace(node=node), QUITTING) == OK
+        assert_clean_end(node, node.wait())
+        assert 'messages' in node.err + node.out
+
+
+def test_the_parameter_switches_it_off(peer, tmp_path):
+    with SimNode(tmp_path, {**QUIET, 'simulation_interfaces': False}, namespace='/off') as node:
+        peer.listen(node.topic('pose'), PoseStamped).wait(3)
+
+        def names():
+            return {name for name, _ in peer.node.get_service_names_and_types()
+                    if name.startswith('/off/')}
+        # Services are discovered in the order of their creation; this one is the last.
+        wait_for('a service', lambda: '/off/spinning_top/record' in names())
+        assert not {name for name in names() if name.count('/') == 2}
+        assert_clean_end(node, node.end())

@@ -1,0 +1,296 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The top as the entity of simulation_interfaces: what it says, what can be set, filters."""
+
+import math
+import subprocess
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy')
+
+from geometry_msgs.msg import Vector3
+from helpers.node_logs import log_of, turned, xyz, xyzw
+from helpers.standard_node import KINDS, StandardNode
+from nav_msgs.msg import Odometry
+from rclpy.serialization import deserialize_message
+
+from spinning_top_sim.physics.placement import Box
+from spinning_top_sim.physics.top import Top
+from spinning_top_sim.tools import inspect
+
+UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
+PAUSED, INVALID_POSE = 2, 101
+NAME = 'spinning_top'
+
+
+@pytest.fixture(params=KINDS)
+def top(request, monkeypatch, tmp_path):
+    with StandardNode(request.param, monkeypatch, tmp_path) as node:
+        yield node.pause()
+
+
+def numbers(state):
+    """Return attitude, angular velocity and acceleration of an EntityState, as one array."""
+    assert xyz(state.pose.position) == xyz(state.twist.linear) == (0.0, 0.0, 0.0)
+    assert xyz(state.acceleration.linear) == (0.0, 0.0, 0.0)
+    return np.array([*xyzw(state.pose.orientation), *xyz(state.twist.angular),
+                     *xyz(state.acceleration.angular)])
+
+
+def state_of(top):
+    return top.done('GetEntityState', entity=NAME).state
+
+
+def test_the_state_is_what_is_published_at_its_stamp(top, tmp_path):
+    """Bit by bit against the log: attitude and rates of ground_truth/odom."""
+    top.node._session.start(top.node.values)()
+    found = {}
+    for _ in range(12):
+        top.done('StepSimulation', steps=3)
+        state = state_of(top)
+        assert state.header.frame_id == 'world'
+        found[state.header.stamp.sec, state.header.stamp.nanosec] = state
+        (other,) = top.done('GetEntitiesStates').states
+        assert (numbers(other) == numbers(state)).all()
+    top.node._session.stop()
+    logged = [deserialize_message(data, Odometry)
+              for _, data in log_of(tmp_path / 'run.mcap')[0]['/ground_truth/odom']]
+    published = {(one.header.stamp.sec, one.header.stamp.nanosec): one for one in logged}
+    assert len(found) == 12
+    for stamp, state in found.items():
+        odom = published[stamp]
+        assert xyzw(state.pose.orientation) == xyzw(odom.pose.pose.orientation)
+        # The twist of an odometry is in the frame of the body.
+        turned_rates = turned(np.array(xyzw(odom.pose.pose.orientation)),
+                              np.array(xyz(odom.twist.twist.angular)))
+        assert np.allclose(numbers(state)[4:7], turned_rates, rtol=1e-14, atol=1e-14)
+
+
+def test_the_acceleration_is_the_change_of_the_twist(monkeypatch, tmp_path):
+    with StandardNode('stand-in', monkeypatch, tmp_path, step__dt=1e-5) as top:
+        top.pause().done('StepSimulation', steps=20_000)
+        states = []
+        for _ in range(3):
+            states.append(numbers(state_of(top)))
+            top.done('StepSimulation', steps=1)
+    change = (states[2][4:7] - states[0][4:7]) / 2e-5
+    assert np.allclose(change, states[1][7:], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize('which', ['pose', 'twist', 'both'])
+def test_a_state_that_is_set_is_the_state(top, which):
+    top.done('StepSimulation', steps=20)
+    before = numbers(state_of(top))
+    wanted = top.messages.EntityState()
+    q = np.array([0.2, -0.5, 0.4, 0.7])
+    q /= np.linalg.norm(q)
+    for name, value in zip('xyzw', q.tolist(), strict=True):
+        setattr(wanted.pose.orientation, name, value)
+    for name, value in zip('xyz', (1.0, -2.0, 9.0), strict=True):
+        setattr(wanted.twist.angular, name, value)
+    response = top.done('SetEntityState', entity=NAME, state=wanted,
+                        set_pose=which != 'twist', set_twist=which != 'pose')
+    assert not response.result.error_message
+    after = numbers(state_of(top))
+    expected = np.concatenate([before[:4] if which == 'twist' else q,
+                               before[4:7] if which == 'pose' else (1.0, -2.0, 9.0)])
+    assert np.allclose(after[:7], expected, rtol=0.0, atol=1e-12)
+    assert top.state == PAUSED
+    assert top.simulation.now_ns == 200_000_000
+    # The parameters show the spin, and the motion goes on from there.
+    assert (top.parameter('spin.l3'), top.parameter('spin.lz')) == (
+        top.simulation.l3, top.simulation.lz)
+    top.done('StepSimulation', steps=1)
+    moved = numbers(state_of(top))
+    assert np.allclose(moved[4:7], after[4:7] + 0.01 * after[7:], rtol=0.0, atol=0.05)
+    # A reset is back at the start.
+    top.done('ResetSimulation', scope=0)
+    assert top.parameter('spin.l3') == 1.6
+
+
+def test_a_state_goes_through_a_client_unchanged(top):
+    """What GetEntityState has said can be set."""
+    top.done('StepSimulation', steps=30)
+    state = state_of(top)
+    response = top.done('SetEntityState', entity=NAME, state=state, set_pose=True,
+                        set_twist=True, set_acceleration=True)
+    assert 'acceleration follows' in response.result.error_message
+    again = numbers(state_of(top))
+    assert np.allclose(again, numbers(state), rtol=1e-12, atol=1e-12)
+
+
+def upright(top, **changes):
+    """Return a state with these numbers, by paths such as twist__linear__x."""
+    state = top.messages.EntityState()
+    state.pose.orientation.w = 1.0
+    for path, value in changes.items():
+        *way, name = path.split('__')
+        target = state
+        for part in way:
+            target = getattr(target, part)
+        setattr(target, name, value)
+    return state
+
+
+BAD_STATES = [
+    ({'pose__position__x': 0.1}, INVALID_POSE, 'pose.position = [0.1, 0.0, 0.0] m: must be'),
+    ({'pose__position__z': math.nan}, INVALID_POSE, 'pose.position = [0.0, 0.0, nan] m: must be'),
+    ({'pose__orientation__w': 0.9}, INVALID_POSE, 'has length 0.9: must be 1'),
+    ({'pose__orientation__w': 0.0}, INVALID_POSE, 'has length 0.0: must be 1'),
+    ({'pose__orientation__x': math.inf}, INVALID_POSE, 'has length inf: must be 1'),
+    ({'pose__orientation__x': math.nan}, INVALID_POSE, 'has length nan: must be 1'),
+    ({'twist__linear__y': 0.5}, FAILED, 'twist.linear = [0.0, 0.5, 0.0] m/s: must be 0'),
+    ({'twist__linear__y': math.nan}, FAILED, 'twist.linear = [0.0, nan, 0.0] m/s: must be 0'),
+    ({'twist__angular__z': math.inf}, FAILED, 'twist.angular = [0.0, 0.0, inf] rad/s: must be'),
+    ({'twist__angular__z': 1e200}, FAILED, 'no motion from'),
+    ({'header__frame_id': 'map'}, UNSUPPORTED, "header.frame_id = 'map': must be 'world'"),
+]
+
+
+@pytest.mark.parametrize(('changes', 'code', 'text'), BAD_STATES)
+def test_a_bad_state_changes_nothing(top, changes, code, text):
+    top.done('StepSimulation', steps=5)
+    segment = top.simulation.segment
+    found, reason = top.refused('SetEntityState', entity=NAME, state=upright(top, **changes),
+                                set_pose=True, set_twist=True)
+    assert (found, text in reason) == (code, True), (found, reason)
+    assert top.simulation.segment is segment
+
+
+def test_what_is_not_set_is_not_looked_at(top):
+    state = upright(top, twist__linear__y=0.5)
+    top.done('SetEntityState', entity=NAME, state=state, set_pose=True)
+    state = upright(top, pose__position__y=0.5, header__frame_id='world')
+    top.done('SetEntityState', entity=NAME, state=state, set_twist=True)
+    code, text = top.refused('SetEntityState', entity=NAME, state=upright(top))
+    assert (code, 'one of them must be true' in text) == (FAILED, True)
+
+
+@pytest.mark.parametrize('service', ['GetEntityState', 'SetEntityState', 'GetEntityInfo',
+                                     'GetEntityBounds'])
+@pytest.mark.parametrize('name', ['', 'Spinning_top', '/spinning_top'])
+def test_there_is_one_entity(top, service, name):
+    code, text = top.refused(service, entity=name)
+    assert (code, text) == (NOT_FOUND, f"entity = {name!r}: there is 'spinning_top' only")
+
+
+def test_what_the_entity_is(top):
+    info = top.done('GetEntityInfo', entity=NAME).info
+    assert info.category.category == top.messages.EntityCategory.CATEGORY_ROBOT
+    assert 'mass 2 kg' in info.description
+    assert list(info.tags) == ['spinning_top', 'heavy_symmetric_top', 'imu']
+    bounds = top.done('GetEntityBounds', entity=NAME).bounds
+    box = Box.of(top.simulation.top)
+    assert bounds.type == top.messages.Bounds.TYPE_BOX
+    assert [xyz(point) for point in bounds.points] == [tuple(box.upper), tuple(box.lower)]
+
+
+# ----------------------------------------------------------------------------------- filters
+
+def chosen(top, **filters):
+    request = {'filters': top.messages.EntityFilters(**filters)}
+    names = list(top.done('GetEntities', **request).entities)
+    both = top.done('GetEntitiesStates', **request)
+    assert list(both.entities) == names
+    assert len(both.states) == len(names)
+    assert names in ([], [NAME])
+    return bool(names)
+
+
+@pytest.mark.parametrize(('expression', 'found'), [
+    ('', True), ('spin', True), ('^spinning_top$', True), ('^top', False),
+    ('t[[:alpha:]]p$', True), ('[[:digit:]]', False), ('^[[:lower:]_]+$', True), ('(spin|roll)ning', True), ('x*', True),
+    ('s.{3}ning', True), ('[^[:alnum:]]', True), ('SPIN', False)])
+def test_names_by_regular_expressions(top, expression, found):
+    assert chosen(top, filter=expression) is found
+    # POSIX's own implementation agrees.
+    grep = subprocess.run(['grep', '-E', '-q', '--', expression], input=NAME, text=True,
+                          timeout=60, check=False)
+    assert (grep.returncode == 0) is found
+
+
+@pytest.mark.parametrize('expression', ['(', '[', '*a(', '[[:letter:]]'])
+def test_bad_expressions_are_refused(top, expression):
+    filters = top.messages.EntityFilters(filter=expression)
+    for service in ('GetEntities', 'GetEntitiesStates'):
+        code, text = top.refused(service, filters=filters)
+        assert code == FAILED
+        assert f'filter = {expression!r}' in text
+
+
+def test_categories_and_tags(top):
+    kinds = [top.messages.EntityCategory(category=number) for number in (0, 1, 2, 4, 5)]
+    assert [chosen(top, categories=[kind]) for kind in kinds] == [False, True, False, False, False]
+    assert chosen(top, categories=kinds)
+
+    def tags(*names, mode=0):
+        return top.messages.TagsFilter(tags=list(names), filter_mode=mode)
+    assert chosen(top, tags=tags('imu', 'robot'))
+    assert not chosen(top, tags=tags('imu', 'robot', mode=1))
+    assert chosen(top, tags=tags('imu', 'spinning_top', mode=1))
+    assert not chosen(top, tags=tags('robot'))
+    assert not chosen(top, tags=tags('imu'), filter='cube')
+    code, text = top.refused('GetEntities', filters=top.messages.EntityFilters(
+        tags=tags('imu', mode=7)))
+    assert (code, text) == (FAILED, 'tags.filter_mode = 7: must be 0 or 1')
+
+
+def bounds(top, kind, *points):
+    return top.messages.Bounds(type=getattr(top.messages.Bounds, f'TYPE_{kind}'), points=[
+        Vector3(x=x, y=y, z=z) for x, y, z in points])
+
+
+def test_bounds_move_with_the_top(top):
+    """A small sphere at the tip, which lies by 30 degrees from the vertical at the start."""
+    height = Box.of(Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15,
+                        gravity=9.80665)).upper[2]
+    tip = (height * math.sin(math.pi / 6), 0.0, height * math.cos(math.pi / 6))
+    far = tuple(1.2 * part for part in tip)
+    low = tuple(-1.0 * part for part in tip)
+    for at, found in ((tip, True), (far, False), (low, False)):
+        assert chosen(top, bounds=bounds(top, 'SPHERE', at, (0.01, 0.0, 0.0))) is found
+        corners = [tuple(part + half for part in at) for half in (0.01, -0.01)]
+        assert chosen(top, bounds=bounds(top, 'BOX', *corners)) is found
+        assert chosen(top, bounds=bounds(top, 'BOX', *corners[::-1])) is found
+    assert chosen(top, bounds=bounds(top, 'SPHERE', far, (1.0, 9.0, 9.0)))
+    assert chosen(top, bounds=bounds(top, 'EMPTY'))
+    hanging = top.messages.EntityState()
+    hanging.pose.orientation.x, hanging.pose.orientation.w = 1.0, 0.0
+    top.done('SetEntityState', entity=NAME, state=hanging, set_pose=True)
+    below = bounds(top, 'SPHERE', (0.0, 0.0, -height), (0.001, 0.0, 0.0))
+    assert chosen(top, bounds=below)
+
+
+def test_bad_bounds_are_refused(top):
+    for given, code, text in (
+            (bounds(top, 'CONVEX_HULL', *4 * [(0.0, 0.0, 0.0)]), UNSUPPORTED, 'bounds.type = 2'),
+            (bounds(top, 'SPHERE', (0.0, 0.0, 0.0)), FAILED, 'must be two finite points'),
+            (bounds(top, 'BOX', *3 * [(0.0, 0.0, 0.0)]), FAILED, 'must be two finite points'),
+            (bounds(top, 'BOX', (math.nan, 0.0, 0.0), (1.0, 0.0, 0.0)), FAILED, 'finite'),
+            (bounds(top, 'SPHERE', (0.0, 0.0, 0.0), (-1.0, 0.0, 0.0)), FAILED, 'radius')):
+        found, reason = top.refused('GetEntities', filters=top.messages.EntityFilters(
+            bounds=given))
+        assert (found, text in reason) == (code, True), (found, reason)
+
+
+# ----------------------------------------------------------------------------------- journal
+
+def test_a_log_with_a_damaged_state_does_not_verify(monkeypatch, tmp_path, capsys):
+    with StandardNode('stand-in', monkeypatch, tmp_path) as top:
+        top.pause()
+        top.node._session.start(top.node.values)()
+        top.done('StepSimulation', steps=3)
+        top.done('SetEntityState', entity=NAME, state=upright(top, twist__angular__z=20.0),
+                 set_twist=True)
+        top.simulation.history[-1] = (*top.simulation.history[-1][:-1], 5.0)
+        top.done('StepSimulation', steps=3)
+        top.node._session.stop()
+        assert inspect.main([f'{tmp_path}/run.mcap', '--verify']) == 0
+        # A recording that begins later has the states before it in its metadata.
+        top.node._values = {**top.node.values, 'record.uri': f'{tmp_path}/later.mcap'}
+        top.node._session.start(top.node.values)()
+        top.done('StepSimulation', steps=3)
+        top.node._session.stop()
+        assert inspect.main([f'{tmp_path}/later.mcap', '--verify']) == 1
+    capsys.readouterr()
