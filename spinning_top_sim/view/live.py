@@ -49,6 +49,7 @@ from spinning_top_sim.view.track import (
 QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 INBOX = 2000                    # messages that wait for the next picture
 ANSWER_S = 5.0                  # a service that takes longer does not answer
+SILENT_S = 5.0                  # /diagnostics come every second
 KEPT_NS = 2 * max(WINDOW_NS, model.TRACE_NS)
 KIND_OF = {'pose': PoseStamped, 'joint_states': JointState, 'ground_truth/odom': Odometry,
            'ground_truth/imu': Imu}
@@ -88,6 +89,8 @@ class LiveView(Node):
         self._stale = True                      # the parameters have to be read again
         self._origin_ns: int | None = None      # stamp of t = 0; unknown in the first second
         self._errors: tuple[float, float] | None = None         # not drawn yet
+        self._heard_at = math.inf       # when /diagnostics came last, on the monotonic clock
+        self._gone = False                      # whether the page says that the node has ended
         self._stopped = False
         self._controls = Controls(page, self, sorted(_scenes()))
         self._thread = threading.Thread(target=self._draw, name='page', daemon=True)
@@ -98,6 +101,8 @@ class LiveView(Node):
     def stop(self) -> None:
         self._stopped = True
         self._thread.join(2.0 * ANSWER_S)
+        if not self._gone:
+            self._controls.tell_end('`view` has ended: no more samples come')
         self._page.close()
 
     def _listen(self, topic: str) -> None:
@@ -127,11 +132,17 @@ class LiveView(Node):
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name == self._sim.lstrip('/'):
+                self._heard_at = time.monotonic()
                 numbers = {pair.key: pair.value for pair in status.values}
                 self._controls.tell_status(status.message, numbers)
                 self._origin_ns = int(numbers['stamp of t = 0 [ns]'])
                 self._errors = float(numbers['energy drift']), float(
                     numbers['orientation error [rad]'])
+
+    def _is_heard(self) -> bool:
+        """Whether there is still a sim_node, as far as that is known."""
+        return (self._services_of_sim['get_parameters'].service_is_ready()
+                and time.monotonic() < self._heard_at + SILENT_S)
 
     def _on_parameters(self, event: ParameterEvent) -> None:
         if event.node == self._sim:
@@ -155,6 +166,9 @@ class LiveView(Node):
         track = self._track
         if track is None:
             return
+        self._gone = not self._is_heard()
+        if self._gone:
+            self._controls.tell_end(f'{self._sim} has ended, or does not answer')
         arrived = defaultdict(list)
         while self._inbox:
             topic, data = self._inbox.popleft()

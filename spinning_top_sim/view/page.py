@@ -2,6 +2,7 @@
 """The page: the scene, what it says, and its plots, made with viser; the same for all sources."""
 
 import math
+import time
 from collections.abc import Sequence
 from typing import TypeVar
 
@@ -16,6 +17,7 @@ from spinning_top_sim.view.track import Rows, Track
 
 RATE = 30.0                     # pictures a second
 CATCH_UP_S = 0.2                # by so much late pictures follow each other at once
+LAST_WORDS_S = 0.2              # until they are sent
 PLOT_EVERY = 6                  # pictures
 WINDOW_NS = 10 * NANOSECONDS    # of the plots
 BODY, MARK, ROD = (51, 102, 178), (242, 191, 51), (90, 90, 90)
@@ -136,6 +138,9 @@ class Page:
         self._number = 0            # of the picture
 
     def close(self) -> None:
+        """End; the browsers keep what was said last."""
+        self.server.flush()
+        time.sleep(LAST_WORDS_S)
         self.server.stop()
 
     def set_tracks(self, tracks: Sequence[Track]) -> None:
