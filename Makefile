@@ -89,15 +89,19 @@ run: check-scene
 	@exec '$(VENV)/bin/sim_node' --ros-args --params-file '$(SCENE_FILE)' \
 	    -p record.enabled:=true -p 'record.uri:=$(LOGS)/' $(ARGS)
 
-# Ctrl-C reaches all processes of a terminal, but a shell makes those behind `&` ignore it.
+# Ends with the exit code of the node or, if the page ends first, of the page, which has a second
+# to see that the node has gone.  Ctrl-C reaches all processes of a terminal, but a shell makes
+# those behind `&` ignore it.
 view: export ROS_DOMAIN_ID := $(RUN_DOMAIN_ID)
 view: check-scene
 	@flock Makefile $(MAKE) --silent --no-print-directory '$(VENV)/.deps-view' '$(VENV)/.package'
-	@trap : INT TERM; \
+	@trap 'kill -TERM $$node 2>/dev/null' INT TERM; \
 	'$(VENV)/bin/sim_node' --ros-args --params-file '$(SCENE_FILE)' -p status_period:=0.0 \
 	    $(ARGS) & node=$$!; \
-	'$(VENV)/bin/view' $(if $(PORT),--port '$(PORT)'); code=$$?; \
-	kill -TERM $$node 2>/dev/null; wait $$node; exit $$code
+	'$(VENV)/bin/view' $(if $(PORT),--port '$(PORT)') & page=$$!; \
+	(trap '' INT; while kill -0 $$page; do sleep 0.5; done; kill -TERM $$node) 2>/dev/null & \
+	while wait $$node; code=$$?; kill -0 $$node 2>/dev/null; do :; done; \
+	sleep 1; if kill -TERM $$page 2>/dev/null; then wait $$page; exit $$code; else wait $$page; fi
 
 # A preset of an IMU goes on top of a scene; alone it would run the default parameters.
 check-scene:

@@ -3,15 +3,20 @@
 """
 What the page costs: `python benchmark/view.py` (extras `ros` and `view`).
 
-A sim_node records at 200 Hz; the page has one client, which counts the attitudes that arrive.
-Rounds with and without the page alternate.
+Two sim_nodes record at 200 Hz, each in a domain of its own.  In turn one has the page, which has
+one client that counts the attitudes that arrive, and the other has not.  Both are measured at the
+same time, and each in both parts: what else this machine does cancels in the ratio.
 """
 
 import argparse
+import contextlib
+import math
+import os
 import re
 import tempfile
 import threading
 import time
+from collections.abc import Sequence
 
 import msgspec
 import viser
@@ -21,6 +26,8 @@ from websockets.sync.client import connect
 
 NAMESPACE = '/view_cost'
 VIEW = ('-P', '-u', '-m', 'spinning_top_sim.view.command', '--no-browser')
+DOMAINS = os.environ['ROS_DOMAIN_ID'], str((int(os.environ['ROS_DOMAIN_ID']) + 100) % 200)
+WARM_UP_S = 5.0
 
 
 class Client(threading.Thread):
@@ -29,7 +36,7 @@ class Client(threading.Thread):
     def __init__(self, address: str) -> None:
         super().__init__(daemon=True)
         self._socket = connect(address.replace('http', 'ws'), max_size=None,
-                               subprotocols=[f'viser-v{viser.__version__}'])
+                               subprotocols=[f'viser-v{viser.__version__}'], origin=address)
         self.count = 0
 
     def run(self) -> None:
@@ -42,56 +49,65 @@ class Client(threading.Thread):
                 for part in content['messages'])
 
 
-def measure(sim: Process, seconds: float, view: Process | None = None,
-            client: Client | None = None) -> tuple[float, float, float]:
-    """Return the shares of a core of sim_node and page, and the attitudes a second."""
-    begin = sim.cpu_ns(), view.cpu_ns() if view else 0, client.count if client else 0
-    begun = time.monotonic()
+def started(number: int, program: Sequence[str], arguments: Sequence[str], *,
+            talks: bool = False) -> Process:
+    """Return a process in one of the two domains."""
+    os.environ['ROS_DOMAIN_ID'] = DOMAINS[number]
+    return Process(program, arguments, talks=talks)
+
+
+def measure(processes: Sequence[Process], client: Client, seconds: float) -> list[float]:
+    """Return the share of a core of each process, and the attitudes a second."""
+    begin, count, begun = [one.cpu_ns() for one in processes], client.count, time.monotonic()
     time.sleep(seconds)
     taken = time.monotonic() - begun
-    return ((sim.cpu_ns() - begin[0]) * 1e-9 / taken,
-            (view.cpu_ns() - begin[1]) * 1e-9 / taken if view else 0.0,
-            (client.count - begin[2]) / taken if client else 0.0)
+    return [*((one.cpu_ns() - before) * 1e-9 / taken
+              for one, before in zip(processes, begin, strict=True)),
+            (client.count - count) / taken]
+
+
+def compare(title: str, sims: Sequence[Process], options: argparse.Namespace) -> None:
+    """Print what the page costs the node, and itself."""
+    ratios, parts = [], []
+    for _ in range(options.rounds):
+        part = []
+        for number, sim in enumerate(sims):
+            with started(number, VIEW, ros_arguments(NAMESPACE, {}), talks=True) as view:
+                found = re.search(r'http://[\w.:]+', view.line())
+                assert found
+                client = Client(found.group())
+                client.start()
+                time.sleep(WARM_UP_S)
+                part.append(measure((sim, sims[1 - number], view), client, options.seconds))
+        ratios.append(math.sqrt(math.prod(watched / alone for watched, alone, *_ in part)))
+        parts += part
+    watched, alone, page, rate = (median(column) for column in zip(*parts, strict=True))
+    print(f'{title}: {alone:.1%} of a core; with the page {watched:.1%}, {median(ratios):.2f} '
+          f'times ({min(ratios):.2f} to {max(ratios):.2f})')
+    print(f'page: {page:.1%} of a core, {rate:.1f} attitudes a second', flush=True)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--seconds', type=float, default=10.0)
-    parser.add_argument('--rounds', type=int, default=3)
+    parser.add_argument('--seconds', type=float, default=5.0)
+    parser.add_argument('--rounds', type=int, default=5)
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         parameters = {
-            'record.enabled': True, 'record.uri': f'{folder}/run.mcap', 'status_period': 0.0,
+            'record.enabled': True, 'status_period': 0.0,
             **{f'{stream}.rate': 200.0 for stream in ('pose', 'joint_states', 'imu')}}
-        with Process(SIM_NODE, ros_arguments(NAMESPACE, parameters)) as sim:
-            time.sleep(5.0)
-            compare('sim_node, recording at 200 Hz', sim, options)
-            with Process(script('listener.py'), [NAMESPACE], talks=True) as listener:
-                listener.line()         # it is ready
-                compare('the same with another subscriber of pose, joint_states and imu', sim,
-                        options)
-                listener.tell('')
-
-
-def compare(title: str, sim: Process, options: argparse.Namespace) -> None:
-    """Print what the page costs the node, and itself."""
-    alone, watched, page, rates = [], [], [], []
-    for _ in range(options.rounds):
-        alone.append(measure(sim, options.seconds)[0])
-        with Process(VIEW, ros_arguments(NAMESPACE, {}), talks=True) as view:
-            found = re.search(r'http://[\w.:]+', view.line())
-            assert found
-            client = Client(found.group())
-            client.start()
-            time.sleep(5.0)
-            node_share, page_share, rate = measure(sim, options.seconds, view, client)
-            watched.append(node_share)
-            page.append(page_share)
-            rates.append(rate)
-    print(f'{title}: {median(alone):.1%} of a core; with the page {median(watched):.1%}, '
-          f'{median(watched) / median(alone):.2f} times')
-    print(f'page: {median(page):.1%} of a core, {median(rates):.1f} attitudes a second',
-          flush=True)
+        sims = [stack.enter_context(started(number, SIM_NODE, ros_arguments(
+            NAMESPACE, {**parameters, 'record.uri': f'{folder}/run{number}.mcap'})))
+            for number in range(2)]
+        time.sleep(WARM_UP_S)
+        compare('sim_node, recording at 200 Hz', sims, options)
+        listeners = [stack.enter_context(started(number, script('listener.py'), [NAMESPACE],
+                                                 talks=True)) for number in range(2)]
+        for listener in listeners:
+            listener.line()         # it is ready
+        compare('the same with another subscriber of pose, joint_states and imu', sims, options)
+        for listener in listeners:
+            listener.tell('')
 
 
 if __name__ == '__main__':

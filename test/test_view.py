@@ -213,3 +213,46 @@ def test_the_server_is_on_loopback_and_takes_the_next_free_port():
         for page in pages:
             page.close()
     assert threading.active_count() < 50
+
+
+def test_a_page_of_another_site_is_refused():
+    """Raw handshakes, as a browser sends them for a page that it has from elsewhere."""
+    viser = pytest.importorskip('viser')
+    from spinning_top_sim.view.page import Page
+    page = Page('one', '127.0.0.1', None)
+    port = page.server.get_port()
+
+    def shake_hands(host, origin=None):
+        lines = ['GET / HTTP/1.1', f'Host: {host}', 'Upgrade: websocket', 'Connection: Upgrade',
+                 'Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==', 'Sec-WebSocket-Version: 13',
+                 f'Sec-WebSocket-Protocol: viser-v{viser.__version__}',
+                 *([f'Origin: {origin}'] if origin else []), '', '']
+        with socket.create_connection(('127.0.0.1', port), 30.0) as connection:
+            connection.sendall('\r\n'.join(lines).encode())
+            return int(connection.recv(4096).split()[1])
+
+    own = f'127.0.0.1:{port}'
+    try:
+        assert shake_hands(own, f'http://{own}') == 101
+        assert shake_hands(f'localhost:{port}', f'http://localhost:{port}') == 101
+        assert shake_hands(own) == 101                          # no browser
+        assert shake_hands(own, 'http://evil.example') == 403
+        assert shake_hands(own, f'http://127.0.0.1:{port + 1}') == 403
+        assert shake_hands(own, 'null') == 403                  # a file, or a sandboxed frame
+        # A name of another site that stands for this address.
+        assert shake_hands(f'evil.example:{port}', f'http://evil.example:{port}') == 403
+        assert shake_hands(f'evil.example:{port}') == 403
+    finally:
+        page.close()
+
+
+@pytest.mark.parametrize(('asked', 'origin', 'allowed'), [
+    ('[::1]:8080', 'http://[::1]:8080', True), ('192.0.2.7:8080', 'http://192.0.2.7:8080', True),
+    ('robot:8080', 'http://robot:8080', True), ('ROBOT:8080', 'http://robot:8080', True),
+    ('robot:8080', 'http://other:8080', False), ('other:8080', 'http://other:8080', False),
+    ('robot:8080', 'http://robot', False), ('192.0.2.7:8080', 'http://192.0.2.8:8080', False),
+    ('[::1', None, False)])
+def test_names_and_addresses_of_the_page(asked, origin, allowed):
+    pytest.importorskip('viser')
+    from spinning_top_sim.view.server import refusal
+    assert (refusal(asked, origin, {'robot'}) == '') is allowed

@@ -49,12 +49,14 @@ class MotionReport:
         now_ns = loop.now_ns
         numbers = {
             'simulated time [s]': f'{now_ns / NANOSECONDS:.6f}',
+            'stamp of t = 0 [ns]': simulation.epoch_ns,
             'real-time factor': f'{self._measure_speed(now_ns):.3f}',
             'late ticks': loop.late_ticks,
             'skipped ticks': loop.skipped_ticks,
             'published messages': self._total('sent'),
             'skipped samples': self._total('skipped'),
             'clock slip [s]': f'{loop.slipped_ns / NANOSECONDS:.3f}',
+            'energy drift': f'{simulation.energy_drift:.3g}',
             'orientation error [rad]': f'{error:.3g}',
             'commands': loop.commands,
             'rejected commands': loop.rejected_commands,

@@ -29,6 +29,7 @@ from spinning_top_sim.nodes.executable import wait_for_all_acked
 from spinning_top_sim.nodes.pacing import DeadlineThread, FairLock
 from spinning_top_sim.nodes.recording_session import RecordingSession, Topic
 from spinning_top_sim.nodes.ros_parameters import SPIN
+from spinning_top_sim.nodes.throttle import TOPICS, Throttle
 from spinning_top_sim.nodes.tick_loop import State, TickLoop, next_epoch
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
@@ -38,11 +39,12 @@ from spinning_top_sim.streams.stream import Stream
 
 
 class StreamPublishers:
-    """Has a publisher for each enabled stream."""
+    """Has a publisher for each enabled stream, and for some one that throttles."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self.by_topic: dict[str, Publisher] = {}
+        self._throttles: dict[str, Throttle] = {}       # by the topic that each throttles
 
     def create(self, message_class: type, topic: str) -> Publisher:
         return self._node.create_publisher(
@@ -58,16 +60,28 @@ class StreamPublishers:
                 package, _, name = stream.type_name.split('/')
                 message_class = getattr(importlib.import_module(f'{package}.msg'), name)
                 self.by_topic[stream.topic] = self.create(message_class, stream.topic)
+                if stream.topic in TOPICS:
+                    self._throttles[stream.topic] = Throttle(
+                        self.create(message_class, TOPICS[stream.topic]))
             elif there and not enabled:
                 stream.publish = None
                 self._node.destroy_publisher(self.by_topic.pop(stream.topic))
+                if stream.topic in TOPICS:
+                    self._node.destroy_publisher(self._throttles.pop(stream.topic).publisher)
 
     def update_subscribers(self, streams: Sequence[Stream]) -> None:
         """Let a stream publish if anybody subscribes to it; without that, it computes nothing."""
         for stream in streams:
             publisher = self.by_topic.get(stream.topic)
             if publisher is not None:
-                stream.publish = publisher.publish if publisher.get_subscription_count() else None
+                sink = publisher.publish if publisher.get_subscription_count() else None
+                throttle = self._throttles.get(stream.topic)
+                stream.publish = throttle.sink(stream, sink) if throttle else sink
+
+    def flush(self) -> None:
+        """Publish what is withheld for its rate: the motion stands still."""
+        for throttle in self._throttles.values():
+            throttle.flush()
 
     def topics_to_record(self, streams: Sequence[Stream]) -> list[Topic]:
         """Return the topics of these streams, and behind them those of the journal."""
@@ -211,6 +225,8 @@ class Simulator(Node):
     def _tick(self) -> bool:
         with self._lock:
             wants_idle = self._loop.tick()
+            if self._loop.state is not State.RUNNING:
+                self._outputs.flush()
         if self._loop.state is State.ENDED and not self.finished.done():
             wait_for_all_acked(self._outputs.by_topic.values(), 1.0)
             self.finished.set_result(None)

@@ -164,3 +164,9 @@ class Controls:
             if message in ('paused', 'running'):        # else it says something worse
                 self._show_paused(message == 'paused')
             set_value(self._record, recorder == 'recording')
+
+    def tell_end(self, reason: str) -> None:
+        """Say why no samples come; a later `tell_status` takes its place."""
+        text = f'**{reason}**'
+        if self._status.content != text:
+            self._status.content = text

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of a running sim_node: a node that listens to it, and asks as any ROS client does."""
 
+import math
 import struct
 import threading
 import time
@@ -9,6 +10,7 @@ from collections import defaultdict, deque
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
@@ -21,9 +23,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.task import Future
 from sensor_msgs.msg import Imu, JointState
-from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
+from spinning_top_sim.nodes import throttle
 from spinning_top_sim.nodes.worlds import scene_files
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -32,15 +34,22 @@ from spinning_top_sim.tools.scene_file import read_scene
 from spinning_top_sim.view import model
 from spinning_top_sim.view.controls import Controls
 from spinning_top_sim.view.page import CATCH_UP_S, RATE, WINDOW_NS, Page
-from spinning_top_sim.view.track import L3, LATEST_NS, LZ, Track
+from spinning_top_sim.view.track import (
+    ENERGY_DRIFT,
+    LATEST_NS,
+    ORIENTATION_ERROR,
+    WIDTHS,
+    Track,
+)
 
 # The newest of few: a page that is slow or hangs never makes the node wait.
 QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 INBOX = 2000                    # messages that wait for the next picture
 ANSWER_S = 5.0                  # a service that takes longer does not answer
+SILENT_S = 5.0                  # /diagnostics come every second
 KEPT_NS = 2 * max(WINDOW_NS, model.TRACE_NS)
-KIND_OF = {'pose': PoseStamped, 'joint_states': JointState, '~/invariants': Float64MultiArray,
-           'ground_truth/odom': Odometry, 'ground_truth/imu': Imu}
+KIND_OF = {'pose': PoseStamped, 'joint_states': JointState, 'ground_truth/odom': Odometry,
+           'ground_truth/imu': Imu}
 SPIN = ('spin.l3', 'spin.lz')
 # What a scene decides: where it does not, the default holds.
 OF_A_SCENE = ('top.', 'initial.', 'solver.', 'imu.')
@@ -75,7 +84,10 @@ class LiveView(Node):
                 ('record', SetBool), ('step', Trigger), ('reset', Trigger))}
         self._track: Track | None = None
         self._stale = True                      # the parameters have to be read again
-        self._origin_ns: int | None = None      # stamp of the first sample
+        self._origin_ns: int | None = None      # stamp of t = 0; unknown in the first second
+        self._errors: tuple[float, float] | None = None         # not drawn yet
+        self._heard_at = math.inf       # when /diagnostics came last, on the monotonic clock
+        self._gone = False                      # whether the page says that the node has ended
         self._stopped = False
         self._controls = Controls(page, self, sorted(scene_files()))
         self._thread = threading.Thread(target=self._draw, name='page', daemon=True)
@@ -86,23 +98,27 @@ class LiveView(Node):
     def stop(self) -> None:
         self._stopped = True
         self._thread.join(2.0 * ANSWER_S)
+        if not self._gone:
+            self._controls.tell_end('`view` has ended: no more samples come')
         self._page.close()
 
     def _listen(self, topic: str) -> None:
         def _receive(data: Any) -> None:         # serialized: `raw`
             self._inbox.append((topic, data))
         self._listeners[topic] = self.create_subscription(
-            KIND_OF[topic], topic.replace('~', NODE_NAME), _receive, QOS, raw=True)
+            KIND_OF[topic], throttle.TOPICS.get(topic, topic), _receive, QOS, raw=True)
 
     def _listen_as_needed(self) -> None:
-        """Listen to as little as is shown: each message costs the node some time."""
+        """
+        Listen to as little as is shown: each message costs the node some time.
+
+        Where it throttles a topic, these are few.
+        """
         if self._track is None:
             return
-        needed = {'~/invariants'}
+        needed = {'pose', 'joint_states'}
         if self._track.values['ground_truth_odom.enabled']:     # attitude and rates in one
-            needed |= {'ground_truth/odom'}
-        else:
-            needed |= {'pose', 'joint_states'}
+            needed = {'ground_truth/odom'}
         if self._page.arrows[model.ARROWS.index('specific force')].value:
             needed |= {'ground_truth/imu'}
         for topic in needed - self._listeners.keys():
@@ -113,8 +129,17 @@ class LiveView(Node):
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name == self._sim.lstrip('/'):
-                self._controls.tell_status(
-                    status.message, {pair.key: pair.value for pair in status.values})
+                self._heard_at = time.monotonic()
+                numbers = {pair.key: pair.value for pair in status.values}
+                self._controls.tell_status(status.message, numbers)
+                self._origin_ns = int(numbers['stamp of t = 0 [ns]'])
+                self._errors = float(numbers['energy drift']), float(
+                    numbers['orientation error [rad]'])
+
+    def _is_heard(self) -> bool:
+        """Whether there is still a sim_node, as far as that is known."""
+        return (self._services_of_sim['get_parameters'].service_is_ready()
+                and time.monotonic() < self._heard_at + SILENT_S)
 
     def _on_parameters(self, event: ParameterEvent) -> None:
         if event.node == self._sim:
@@ -138,25 +163,28 @@ class LiveView(Node):
         track = self._track
         if track is None:
             return
+        self._gone = not self._is_heard()
+        if self._gone:
+            self._controls.tell_end(f'{self._sim} has ended, or does not answer')
         arrived = defaultdict(list)
         while self._inbox:
             topic, data = self._inbox.popleft()
             arrived[topic].append(data)
-        invariants = arrived.pop('~/invariants', [])
         for topic, messages in arrived.items():
             track.add(topic, [_stamp_ns(data) for data in messages], messages)
         if track.span is None:
             return
         newest_ns = track.span[1]
-        if invariants:          # they have no stamp
-            track.add('~/invariants', [newest_ns], invariants[-1:])
-            row = track.columns['~/invariants'].rows[-1]
-            self._controls.show_spin(float(row[L3]), float(row[LZ]))
+        errors, self._errors = self._errors, None
+        if errors is not None:
+            row = np.full((1, WIDTHS['~/invariants']), math.nan)
+            row[0, [ENERGY_DRIFT, ORIENTATION_ERROR]] = errors
+            track.columns['~/invariants'].append(np.array([newest_ns]), row)
         track.forget(newest_ns - KEPT_NS)
         track.follow()
-        if self._origin_ns is None:
-            self._origin_ns = newest_ns
-        self._page.draw([newest_ns], self._origin_ns)
+        if track.motions:
+            self._controls.show_spin(track.motions[-1].l3, track.motions[-1].lz)
+        self._page.draw([newest_ns], self._origin_ns or newest_ns)
 
     def _read_parameters(self) -> None:
         """Read the parameters of the sim_node, and begin a new track if it is another top."""

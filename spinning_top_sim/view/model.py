@@ -21,6 +21,7 @@ TRACE_NS = 10 * NANOSECONDS     # so far back goes the trace of the tip
 TRACE_POINTS = 1500             # of it at most
 REACH = 1.6                     # radius of the sphere of the trace, by the tip's distance
 LONGEST_CHORD = 0.5             # of the trace, by its radius: what is longer is a jump
+TRACE_STEP_NS, MOST_STEPS = 10_000_000, 4       # of the trace between two samples
 CURVE_POINTS = 400              # of a curve at most
 STEPS = 48                      # of a full circle
 ARROWS = ('angular momentum', 'angular velocity', 'specific force')
@@ -85,13 +86,39 @@ def meridians(radius: float) -> Floats:
 
 def trace(track: Track, stamp_ns: int) -> Floats:
     """Return the lines (n, 2, 3) along which the tip has come, up to a stamp."""
-    _, rows = track.attitudes.part(stamp_ns - TRACE_NS, stamp_ns)
+    _, axis, joined = path(track, stamp_ns - TRACE_NS, stamp_ns)
+    return segments(reach(track) * axis)[joined]
+
+
+def path(track: Track, begin_ns: int, end_ns: int
+         ) -> tuple[NDArray[np.int64], Rows, NDArray[np.bool_]]:
+    """
+    Return stamps (n,) [ns] and the axis (n, 3) between two stamps, and where it has no jump.
+
+    Samples that are far apart are joined by the cubic of their velocities (Hermite's), with its
+    error of the fourth order.  The third array, (n - 1,), belongs to the steps between points.
+    """
+    stamps_ns, rows = track.attitudes.part(begin_ns, end_ns)
     stride = _stride(len(rows), TRACE_POINTS)
-    rows = rows[(len(rows) - 1) % stride::stride] if len(rows) else rows     # with the last one
+    last = (len(rows) - 1) % stride if len(rows) else 0         # with the last sample
+    stamps_ns, rows = stamps_ns[last::stride], rows[last::stride]
     axis = np.column_stack(attitude.axis_in_world(_columns(rows)))
-    lines = segments(reach(track) * axis)
-    near = np.linalg.norm(np.diff(axis, axis=0), axis=1) < LONGEST_CHORD
-    return lines[near]
+    steps = np.diff(axis, axis=0)
+    longest_ns = int(np.max(np.diff(stamps_ns), initial=0))
+    count = min(-(-longest_ns // TRACE_STEP_NS), MOST_STEPS)
+    if count < 2 or rows.shape[1] < 7:          # near each other, or without a velocity
+        return stamps_ns, axis, np.linalg.norm(steps, axis=1) < LONGEST_CHORD
+    velocity = np.cross(in_world(rows[:, :4].T, rows[:, 4:7].T), axis, axisa=0)
+    span = 1e-9 * np.diff(stamps_ns)[:, np.newaxis]
+    before, after = span * velocity[:-1], span * velocity[1:]
+    joined = np.linalg.norm(steps - 0.5 * (before + after), axis=1) < LONGEST_CHORD
+    s = np.arange(count)[:, np.newaxis, np.newaxis] / count
+    between = (axis[:-1] + s * s * (3.0 - 2.0 * s) * steps
+               + s * (1.0 - s) * ((1.0 - s) * before - s * after))
+    fine_ns = stamps_ns[:-1] + (np.arange(count)[:, np.newaxis] * np.diff(stamps_ns)) // count
+    return (np.append(fine_ns.T.ravel(), stamps_ns[-1]),
+            np.vstack((between.transpose(1, 0, 2).reshape(-1, 3), axis[-1:])),
+            np.repeat(joined, count))
 
 
 def _stride(count: int, most: int) -> int:
@@ -136,10 +163,10 @@ def arrow(track: Track, name: str, stamp_ns: int) -> Rows | None:
 def curve(track: Track, name: str, begin_ns: int, end_ns: int) -> tuple[NDArray[np.int64], Rows]:
     """Return stamps (n,) [ns] and values (n,) of one of CURVES between two stamps."""
     if name == CURVES[0]:
-        stamps_ns, rows = _thin(track.attitudes, begin_ns, end_ns)
-        x, y, z, w = _columns(rows)
-        return stamps_ns, np.degrees(2.0 * np.arctan2(np.sqrt(x * x + y * y),
-                                                      np.sqrt(z * z + w * w)))
+        stamps_ns, axis, _ = path(track, begin_ns, end_ns)
+        x, y, z = axis.T
+        thin = slice(None, None, _stride(len(axis), CURVE_POINTS))
+        return stamps_ns[thin], np.degrees(np.arctan2(np.hypot(x, y), z))[thin]
     if name == CURVES[1]:
         stamps_ns, rows = _thin(track.rates, begin_ns, end_ns)
         return stamps_ns, rows[:, PRECESSION]

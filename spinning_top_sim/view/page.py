@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page: the scene, what it says, and its plots, made with viser; the same for all sources."""
 
-import contextlib
-import errno
-import io
 import math
-import socket
+import time
 from collections.abc import Sequence
 from typing import TypeVar
 
@@ -15,13 +12,14 @@ from viser import uplot
 
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.view import model
+from spinning_top_sim.view.server import Server
 from spinning_top_sim.view.track import Rows, Track
 
 RATE = 30.0                     # pictures a second
 CATCH_UP_S = 0.2                # by so much late pictures follow each other at once
+LAST_WORDS_S = 0.2              # until they are sent
 PLOT_EVERY = 6                  # pictures
 WINDOW_NS = 10 * NANOSECONDS    # of the plots
-PORTS = 100                     # tried in turn
 BODY, MARK, ROD = (51, 102, 178), (242, 191, 51), (90, 90, 90)
 TRACES = ((229, 77, 51), (40, 140, 70))
 BOUNDS, SPHERE = (120, 90, 170), (205, 205, 210)
@@ -29,25 +27,6 @@ ARROW_COLOURS = ((20, 120, 60), (190, 60, 160), (230, 130, 20))
 CAMERAS = ('side', 'above', 'with the body')
 Value = TypeVar('Value')
 NO_SAMPLES = 'no samples yet'
-
-
-def _free_port(host: str, port: int | None, first: int = 8080) -> int:
-    """Return the port, by default the first free one.  Raises OSError if it cannot be used."""
-    for number in (range(first, first + PORTS) if port is None else (port,)):
-        try:
-            with socket.create_server((host, number)) as server:
-                return int(server.getsockname()[1])
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE or number == port:
-                raise OSError(error.errno, f'{host} port {number}: {error.strerror}') from error
-    raise OSError(errno.EADDRINUSE, f'{host} ports {first} to {first + PORTS - 1}: in use')
-
-
-class _Server(viser.ViserServer):
-    """Serves to who has the address, and to nobody else."""
-
-    def request_share_url(self, verbose: bool = True) -> None:
-        """Refuse: viser would ask a server in the internet to pass the page on."""
 
 
 def set_value(handle: viser.GuiInputHandle[Value], value: Value) -> None:
@@ -138,8 +117,7 @@ class Page:
     """
 
     def __init__(self, title: str, host: str, port: int | None) -> None:
-        with contextlib.redirect_stdout(io.StringIO()):         # viser's own greeting
-            self.server = _Server(host=host, port=_free_port(host, port), verbose=False)
+        self.server = Server(host, port)
         shown_host = f'[{host}]' if ':' in host else host
         self.address = f'http://{shown_host}:{self.server.get_port()}'
         gui = self.gui = self.server.gui
@@ -160,8 +138,10 @@ class Page:
         self._number = 0            # of the picture
 
     def close(self) -> None:
-        with contextlib.redirect_stdout(io.StringIO()):
-            self.server.stop()
+        """End; the browsers keep what was said last."""
+        self.server.flush()
+        time.sleep(LAST_WORDS_S)
+        self.server.stop()
 
     def set_tracks(self, tracks: Sequence[Track]) -> None:
         """Show these tops instead of those before."""
