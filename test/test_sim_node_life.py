@@ -168,7 +168,7 @@ def test_the_default_scene_imports_just_what_it_uses(finished):
     messages = {name.split('.')[0] for name in modules if name.endswith('_msgs')}
     assert messages <= {
         'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'sensor_msgs', 'std_msgs',      # ours
-        'rosgraph_msgs', 'service_msgs'}                                              # rclpy's
+        'rosgraph_msgs', 'service_msgs', 'unique_identifier_msgs'}                    # rclpy's
 
 
 # ------------------------------------------------------------------------------------ the end

@@ -249,8 +249,14 @@ class Peer:
         """Let what comes from now on go by; rclpy cannot destroy what its executor waits for."""
         topic.muted = True
 
-    def call(self, kind, name, request, timeout=PATIENCE_S):
-        """Call a service and return its answer."""
+    def call(self, kind, name, request, timeout=PATIENCE_S, again=False):
+        """
+        Call a service and return its answer.
+
+        again: ask once more if there is no answer; for what does the same twice as once.  A node
+        that has ended may be in the graph for seconds, above all of Kilted; until the one that
+        takes its place is found, requests are lost.
+        """
         new = name not in self._clients
         if new:
             self._clients[name] = self.node.create_client(kind, name)
@@ -258,7 +264,7 @@ class Peer:
         assert client.wait_for_service(timeout), f'no service {name}'
         # A server that has not heard of a new client yet gives up its answer after 0.1 s, with
         # "client will not receive response" (rmw_fastrtps); such a client asks once more.
-        for patience in (timeout / 10, timeout) if new else (timeout,):
+        for patience in (timeout / 10, timeout) if new or again else (timeout,):
             done = threading.Event()
             future = client.call_async(request)
             future.add_done_callback(lambda _, done=done: done.set())
@@ -272,7 +278,8 @@ class Peer:
         return self.call(Trigger, node.topic(f'~/{name}'), Trigger.Request())
 
     def switch(self, node, name, on):
-        return self.call(SetBool, node.topic(f'~/{name}'), SetBool.Request(data=on))
+        return self.call(SetBool, node.topic(f'~/{name}'), SetBool.Request(data=on),
+                         again=name == 'set_pause')
 
     def set_together(self, node, **values):
         """Set parameters all or none (`__` for the dot); return the one result."""
@@ -287,7 +294,7 @@ class Peer:
 
     def get(self, node, *names):
         answer = self.call(GetParameters, node.topic('~/get_parameters'),
-                           GetParameters.Request(names=list(names)))
+                           GetParameters.Request(names=list(names)), again=True)
         return [parameter_value_to_python(value) for value in answer.values]
 
     def dump(self, node):
