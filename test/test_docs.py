@@ -17,7 +17,7 @@ PAGES = {str(path.relative_to(ROOT)): path.read_text(encoding='utf-8')
          if not path.name.startswith('top_')}
 # Why blocks are not run, and how many.
 NOT_RUN = {
-    'installs packages from the network': 2,
+    'installs packages from the network': 3,
     'needs the command line tools of a ROS installation': 6,
     'runs until Ctrl-C, after it has installed packages': 5,
     'takes minutes or hours': 3,
