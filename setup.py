@@ -91,8 +91,8 @@ setup(
         # Ensembles, and the filters that `examine` knows by name but for gtsam.
         'exam': ['ahrs>=0.4,<0.5', 'distributed>=2024.5,<2028', 'imufusion>=1.3,<2',
                  'pyarrow>=14,<30', 'vqf>=2.1,<3'],
-        'docs': ['docutils>=0.22,<1', 'furo>=2024.8,<2027', 'myst-parser>=4,<7',
-                 'numpydoc>=1.8,<2', 'sphinx>=8.1,<10'],
+        'docs': ['furo>=2024.8,<2027', 'myst-parser>=4,<7', 'numpydoc>=1.8,<2', 'sphinx>=8.1,<10',
+                 'sphinx-mathjax-offline>=0.0.2,<0.1'],
         # Narrow ranges: a new release reports new faults.
         'lint': [
             'mypy>=2.4.1,<2.5',

@@ -7,14 +7,17 @@ a theme of its own, builds it too.
 """
 
 import importlib.util
+import os
 import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
 HERE = Path(__file__).resolve().parent
-# rosdoc2 has copied this folder: the working directory is the package, or the package installed.
-ROOT = next((folder for folder in (HERE.parent, *HERE.parents, Path.cwd())
-             if (folder / 'spinning_top_sim/__init__.py').is_file()), HERE.parent)
+# rosdoc2 has copied this folder, changed the working directory, and keeps the path of the package
+# in its arguments only.
+ROOT = next(folder for folder in (HERE.parent, *(
+    Path(os.environ.get('PWD', '.'), word.rpartition('=')[2]).resolve() for word in sys.argv[1:]))
+    if (folder / 'spinning_top_sim/__init__.py').is_file())
 sys.path[:0] = [str(HERE), str(ROOT)]
 site_root = ROOT
 
@@ -31,10 +34,11 @@ version = release
 
 extensions = ['myst_parser', 'sphinx.ext.autodoc', 'site_extension',
               'numpydoc' if installed('numpydoc') else 'sphinx.ext.napoleon']
+if installed('sphinx-mathjax-offline'):
+    extensions.append('sphinx-mathjax-offline')     # formulas without the network
 source_suffix = {'.md': 'markdown', '.rst': 'restructuredtext'}
 # The latter two are what rosdoc2 adds.
 exclude_patterns = ['_*', 'modules.rst', 'spinning_top_sim*']
-nitpicky = True
 # Types of other packages: a link to them would need the network.
 nitpick_ignore_regex = [('py:.*', r'(numpy|np|pathlib|collections|argparse|NDArray|ArrayLike|'
                                   r'npt|scipy|os|contextlib)(\..*)?')]
@@ -42,7 +46,6 @@ suppress_warnings = ['config.cache']
 
 myst_enable_extensions = ['dollarmath', 'amsmath', 'deflist', 'attrs_block']
 myst_heading_anchors = 3
-html_math_renderer = 'mathml'
 
 autodoc_member_order = 'bysource'
 autodoc_typehints = 'none'

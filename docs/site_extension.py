@@ -2,7 +2,6 @@
 """
 What the site needs of Sphinx beyond its own extensions.
 
-- Formulas become MathML, which browsers draw themselves, by docutils' converter.
 - `{help-of} NAME` is what the command says with `--help`.
 - Files at the top of the repository, as the changelog, get a page in docs/project/.
 """
@@ -14,7 +13,6 @@ import sys
 from pathlib import Path
 
 from docutils import nodes
-from docutils.utils.math import latex2mathml
 from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
 
@@ -23,21 +21,6 @@ logger = logging.getLogger(__name__)
 WIDTH = 88
 # Pages made from files at the top of the repository, where these exist.
 PAGES = 'CONTRIBUTING.md', 'SECURITY.md', 'QUALITY_DECLARATION.md', 'CHANGELOG.rst'
-
-
-def visit_math(translator, node):
-    """Write a formula in a line."""
-    translator.body.append(latex2mathml.tex2mathml(node.astext()))
-    raise nodes.SkipNode
-
-
-def visit_math_block(translator, node):
-    """Write a displayed formula, with its number if it has one."""
-    translator.body.append(translator.starttag(node, 'div', CLASS='math'))
-    if node['number']:
-        translator.body.append(f'<span class="eqno">({node["number"]})</span>')
-    translator.body.append(latex2mathml.tex2mathml(node.astext(), as_block=True) + '</div>\n')
-    raise nodes.SkipNode
 
 
 class HelpOf(SphinxDirective):
@@ -81,7 +64,6 @@ def write_pages(app):
 def setup(app):
     """Register all this."""
     app.add_config_value('site_root', Path(app.confdir).parent, 'env')
-    app.add_html_math_renderer('mathml', (visit_math, None), (visit_math_block, None))
     app.add_directive('help-of', HelpOf)
     app.connect('builder-inited', write_pages)
     return {'parallel_read_safe': True, 'parallel_write_safe': True}

@@ -18,13 +18,13 @@ PAGES = {str(path.relative_to(ROOT)): path.read_text(encoding='utf-8')
          if not path.name.startswith('top_')}
 # Why blocks are not run, and how many.
 NOT_RUN = {
-    'installs packages from the network': 0,
-    'needs the command line tools of a ROS installation': 0,
-    'runs until Ctrl-C, after it has installed packages': 0,
-    'takes minutes or hours': 0,
-    'serves a page until Ctrl-C; test_view_browser.py opens one': 0,
-    'a part of a configuration': 0,
-    'runs in a guide or tutorial, with all arguments': 0,
+    'installs packages from the network': 3,
+    'needs the command line tools of a ROS installation': 6,
+    'runs until Ctrl-C, after it has installed packages': 5,
+    'takes minutes or hours': 3,
+    'serves a page until Ctrl-C; test_view_browser.py opens one': 1,
+    'a part of a configuration': 1,
+    'runs in a guide or tutorial, with all arguments': 5,
 }
 
 

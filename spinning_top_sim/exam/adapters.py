@@ -26,15 +26,15 @@ class Vqf:
     """VQF (Laidig and Seel 2023), package vqf.  Its period is fixed: lost samples are repeated."""
 
     def __init__(self, magnetic: bool = True) -> None:
-        self._magnetic, self._period = magnetic, 0.0
+        from vqf import VQF  # noqa: PLC0415
+
+        self._make, self._magnetic, self._period = VQF, magnetic, 0.0
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
         """See `trial.Filter`."""
         if not self._period:
-            from vqf import VQF  # noqa: PLC0415
-
-            self._filter, self._period = VQF(dt), dt
+            self._filter, self._period = self._make(dt), dt
         uses_field = self._magnetic and magnetometer is not None
         for _ in range(max(1, round(dt / self._period))):
             self._filter.update(gyroscope, accelerometer, *([magnetometer] * uses_field))

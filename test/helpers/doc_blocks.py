@@ -30,7 +30,7 @@ FENCE = re.compile(r'^(?:<!-- (?P<mark>[^\n]*?) -->\n)?'
                    r'^```(?P<language>[^\n]*)\n(?P<text>.*?)^```$', re.MULTILINE | re.DOTALL)
 NUMBER = re.compile(r'(?<![\w.])[-+]?\d+\.?\d*(?:e[-+]?\d+)?(?![\w])')
 FILE = re.compile(r'# ([\w/]+\.(?:py|yaml))\n')
-TIMEOUT = 120
+TIMEOUT = 600        # of a block [s], also under load
 
 
 class Block(NamedTuple):
@@ -135,7 +135,7 @@ class Runner:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGINT)
             try:
-                process.communicate(timeout=30)
+                process.communicate(timeout=TIMEOUT)
             except subprocess.TimeoutExpired:
                 os.killpg(process.pid, signal.SIGKILL)
                 raise
