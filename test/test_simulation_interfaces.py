@@ -22,8 +22,7 @@ from helpers.standard_node import INSTALLED, KINDS, StandardNode, finished, type
 from rclpy.parameter import Parameter
 
 from spinning_top_sim.nodes import worlds
-from spinning_top_sim.nodes.simulation_handlers import FEATURES, SERVICES
-from spinning_top_sim.nodes.simulation_services import service_name
+from spinning_top_sim.nodes.simulation_standard import FEATURES, SERVICES, service_name
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import inspect
@@ -124,6 +123,8 @@ def test_quitting_ends_the_node(top):
     assert top.set_state('QUITTING') == ALREADY
     for name in ('STOPPED', 'PLAYING', 'PAUSED'):
         assert top.set_state(name) == INCORRECT_TRANSITION
+    assert top.refused('ResetSimulation', scope=0) == (
+        INCORRECT_STATE, 'the simulator is quitting')
     assert not top.node.finished.done(), 'the response goes out first'
     import rclpy
     wait_for('the end', lambda: rclpy.spin_once(top.node, timeout_sec=0.1)
@@ -161,9 +162,13 @@ def test_before_the_clock_nothing_can_be_set(monkeypatch, tmp_path):
         assert top.state == STOPPED
         for name in ('PLAYING', 'PAUSED'):
             assert top.set_state(name) == TRANSITION_ERROR
-        for name, request in (('StepSimulation', {'steps': 1}), ('ResetSimulation', {'scope': 0})):
+        for expected, name, request in (
+                (FAILED, 'StepSimulation', {'steps': 1}),
+                (INCORRECT_STATE, 'ResetSimulation', {'scope': 0}),
+                (INCORRECT_STATE, 'LoadWorld', load(top, 'looping')),
+                (INCORRECT_STATE, 'SetEntityState', {'entity': 'spinning_top'})):
             code, text = top.refused(name, **request)
-            assert (code, text) == (FAILED, 'waiting for /clock (use_sim_time is set)')
+            assert (code, text) == (expected, 'waiting for /clock (use_sim_time is set)')
 
 
 # ------------------------------------------------------------------------------------- steps
@@ -229,7 +234,7 @@ def test_simulate_steps_ends_as_it_is_told_to(top):
     top.done('StepSimulation', steps=1)         # the next ones may begin
 
 
-@pytest.mark.parametrize('how', ['reset', 'play', 'stop'])
+@pytest.mark.parametrize('how', ['reset', 'play', 'stop', 'quit'])
 def test_a_reset_or_another_state_ends_the_steps(top, how):
     top.pause()
     goal, coroutine = top.steps(10 ** 18)
@@ -237,7 +242,8 @@ def test_a_reset_or_another_state_ends_the_steps(top, how):
     if how == 'reset':
         top.done('ResetSimulation', scope=0)
     else:
-        assert top.set_state('PLAYING' if how == 'play' else 'STOPPED') == OK
+        name = {'play': 'PLAYING', 'stop': 'STOPPED', 'quit': 'QUITTING'}[how]
+        assert top.set_state(name) == OK
     result = finished(coroutine).result
     assert (goal.end, goal.feedback) == ('aborted', [(1, 10 ** 18 - 1)])
     assert 'interrupted after 1 of' in result.error_message
@@ -461,7 +467,7 @@ rclpy.init(args=['sim_node', '--ros-args', '-p', 'simulation_interfaces:={offere
 node = Simulator()
 print(sorted(name for name in sys.modules if name in (
     'rclpy.action.server', 'simulation_interfaces') or name.startswith(
-    ('spinning_top_sim.nodes.simulation_', 'spinning_top_sim.tools.', 'yaml'))))
+    ('spinning_top_sim.nodes.simulation_', 'spinning_top_sim.tools.'))))
 node.stop()
 node.destroy_node()
 rclpy.try_shutdown()
