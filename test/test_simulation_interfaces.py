@@ -196,6 +196,13 @@ def test_steps_are_whole_nanoseconds_however_they_are_divided(monkeypatch, tmp_p
         assert top.state == PAUSED
 
 
+def test_many_steps_are_exact_beyond_the_whole_numbers_of_doubles(monkeypatch, tmp_path):
+    with StandardNode('stand-in', monkeypatch, tmp_path, step__dt=1.0 / 3.0,
+                      solver__method='exact') as top:
+        top.pause().done('StepSimulation', steps=30_000_001)
+        assert top.simulation.now_ns == 30_000_001 * 333_333_333 > 2 ** 53
+
+
 def test_steps_beyond_the_duration_say_so(monkeypatch, tmp_path):
     with StandardNode('stand-in', monkeypatch, tmp_path, duration=0.05) as top:
         code, text = top.pause().refused('StepSimulation', steps=6)

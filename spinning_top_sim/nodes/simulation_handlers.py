@@ -161,7 +161,7 @@ class SimulationHandlers:
         step_ns = round(self._node.values['step.dt'] * NANOSECONDS)
         with self._lock:
             target_ns = loop.now_ns + count * step_ns
-            loop.step(count, step_ns / NANOSECONDS)
+            loop.step_by(count * step_ns)
             if loop.now_ns < target_ns:
                 raise RuntimeError(f'{loop.time_text}: `duration` ends before the steps do')
 
