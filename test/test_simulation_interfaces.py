@@ -432,25 +432,31 @@ def test_unsupported_elements_are_named(top):
 
 # --------------------------------------------------------------------------------- recording
 
-def test_a_log_of_all_this_verifies(top, tmp_path, capsys):
+@pytest.mark.parametrize('method', ['rk45', 'exact'])
+def test_a_log_of_all_this_verifies(monkeypatch, tmp_path, capsys, method):
     """States, resets and worlds are in the journal: the run can be computed again."""
-    state = top.messages.EntityState()
-    state.twist.angular.x, state.pose.orientation.w = 0.5, 1.0
-    state.twist.angular.z = 11.0
-    top.pause().done('StepSimulation', steps=3)
-    top.done('SetEntityState', entity='spinning_top', state=state, set_twist=True)
-    top.done('StepSimulation', steps=3)
-    top.node._session.start(top.node.values)()
-    top.done('StepSimulation', steps=7)
-    top.done('SetEntityState', entity='spinning_top', state=state, set_pose=True, set_twist=True)
-    top.done('StepSimulation', steps=11)
-    top.done('ResetSimulation', scope=2)
-    top.done('StepSimulation', steps=5)
-    top.done('LoadWorld', **load(top, 'waking_sleeper'))
-    top.pause().done('StepSimulation', steps=20)
-    top.done('SetEntityState', entity='spinning_top', state=state, set_pose=True)
-    top.done('StepSimulation', steps=13)
-    top.node._session.stop()
+    with StandardNode(
+            'stand-in', monkeypatch, tmp_path, solver__method=method, increments__enabled=True,
+            markers__enabled=True, mag__enabled=True, imu__lever_arm=[0.1, 0.0, 0.02],
+            imu__gyroscope_noise_density=1e-3, imu__gyroscope_bias_stddev=0.1) as top:
+        state = top.messages.EntityState()
+        state.twist.angular.x, state.pose.orientation.w = 0.5, 1.0
+        state.twist.angular.z = 11.0
+        top.pause().done('StepSimulation', steps=3)
+        top.done('SetEntityState', entity='spinning_top', state=state, set_twist=True)
+        top.done('StepSimulation', steps=3)
+        top.node._session.start(top.node.values)()
+        top.done('StepSimulation', steps=7)
+        top.done('SetEntityState', entity='spinning_top', state=state, set_pose=True,
+                 set_twist=True)
+        top.done('StepSimulation', steps=11)
+        top.done('ResetSimulation', scope=2)
+        top.done('StepSimulation', steps=5)
+        top.done('LoadWorld', **load(top, 'waking_sleeper'))
+        top.pause().done('StepSimulation', steps=20)
+        top.done('SetEntityState', entity='spinning_top', state=state, set_pose=True)
+        top.done('StepSimulation', steps=13)
+        top.node._session.stop()
     code = inspect.main([f'{tmp_path}/run.mcap', '--verify', '--json'])
     content = json.loads(capsys.readouterr().out)
     assert (code, content['verify']['identical']) == (0, True), content['verify']
