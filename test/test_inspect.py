@@ -660,9 +660,10 @@ def test_odd_logs_end_in_words(tmp_path, capsys, seed):
         ('parameters', 'parameters_now', 'history', 'epoch_ns', 'begun_ns'),
         ('', '[]', '[' * 100_000, '"\\ud800"', '9' * 5000, str(2 ** 63), 'NaN')),
     ('history', '[[0, 1, NaN]]'), ('history', '[[5, 1.0, 1.0], [4, 1.0, 1.0]]'),
-    ('history', '[[1e300, 1.0, 1.0]]'), ('epoch_ns', '-1'), ('begun_ns', str(10 ** 18)),
-    ('parameters', '{"spin.l3": {}}'), ('parameters', '{"world_frame": "\\ud800"}'),
-    ('parameters', '{"top.lambda1": 1e-320}')])
+    ('history', '[[1e300, 1.0, 1.0]]'), ('history', '[[0, 1.0, 1.0, 1.0]]'),
+    ('history', '[[0, 4.0, 0.0, 0.0, 0.0, 1.0, 1.0]]'), ('epoch_ns', '-1'),
+    ('begun_ns', str(10 ** 18)), ('parameters', '{"spin.l3": {}}'),
+    ('parameters', '{"world_frame": "\\ud800"}'), ('parameters', '{"top.lambda1": 1e-320}')])
 def test_odd_metadata_end_in_words(stepped, tmp_path, capsys, key, text):
     path = rewritten(stepped, tmp_path / 'odd.mcap', metadata={key: text})
     code, out, _ = told(capsys, path, '--verify')
@@ -675,6 +676,11 @@ def test_odd_metadata_end_in_words(stepped, tmp_path, capsys, key, text):
     {'event': 'command', 'sent_ns': 2 ** 63, 'l3': 1.0, 'lz': 1.0},
     {'event': 'command', 'sent_ns': 0.5, 'l3': 1.0, 'lz': 1.0}, {'event': 'parameters', 'x': 1},
     {'event': 'parameters', 'pose.rate': '\ud800'}, {'event': 'reset'}, {'event': []},
+    {'event': 'state', 'l3': 1.0, 'lz': 1.0},
+    {'event': 'state', 'theta': -1.0, 'theta_dot': 0.0, 'phi': 0.0, 'psi': 0.0, 'l3': 1.0,
+     'lz': 1.0},
+    {'event': 'state', 'theta': math.nan, 'theta_dot': 0.0, 'phi': 0.0, 'psi': 0.0, 'l3': 1.0,
+     'lz': 1.0},
     {'event': 'reset', 'parameters': {}, 'epoch_ns': 10 ** 18},
     {'event': 'reset', 'parameters': [], 'epoch_ns': 3_500_000_000}])
 def test_an_odd_entry_of_the_journal_is_told(stepped, tmp_path, capsys, event):

@@ -22,8 +22,7 @@ from helpers.standard_node import INSTALLED, KINDS, StandardNode, finished, type
 from rclpy.parameter import Parameter
 
 from spinning_top_sim.nodes import worlds
-from spinning_top_sim.nodes.simulation_handlers import FEATURES, SERVICES
-from spinning_top_sim.nodes.simulation_services import service_name
+from spinning_top_sim.nodes.simulation_standard import FEATURES, SERVICES, service_name
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import inspect
@@ -124,6 +123,8 @@ def test_quitting_ends_the_node(top):
     assert top.set_state('QUITTING') == ALREADY
     for name in ('STOPPED', 'PLAYING', 'PAUSED'):
         assert top.set_state(name) == INCORRECT_TRANSITION
+    assert top.refused('ResetSimulation', scope=0) == (
+        INCORRECT_STATE, 'the simulator is quitting')
     assert not top.node.finished.done(), 'the response goes out first'
     import rclpy
     wait_for('the end', lambda: rclpy.spin_once(top.node, timeout_sec=0.1)
@@ -161,9 +162,13 @@ def test_before_the_clock_nothing_can_be_set(monkeypatch, tmp_path):
         assert top.state == STOPPED
         for name in ('PLAYING', 'PAUSED'):
             assert top.set_state(name) == TRANSITION_ERROR
-        for name, request in (('StepSimulation', {'steps': 1}), ('ResetSimulation', {'scope': 0})):
+        for expected, name, request in (
+                (FAILED, 'StepSimulation', {'steps': 1}),
+                (INCORRECT_STATE, 'ResetSimulation', {'scope': 0}),
+                (INCORRECT_STATE, 'LoadWorld', load(top, 'looping')),
+                (INCORRECT_STATE, 'SetEntityState', {'entity': 'spinning_top'})):
             code, text = top.refused(name, **request)
-            assert (code, text) == (FAILED, 'waiting for /clock (use_sim_time is set)')
+            assert (code, text) == (expected, 'waiting for /clock (use_sim_time is set)')
 
 
 # ------------------------------------------------------------------------------------- steps
@@ -189,6 +194,13 @@ def test_steps_are_whole_nanoseconds_however_they_are_divided(monkeypatch, tmp_p
         assert top.simulation.now_ns == 9 * 333_333_333
         assert (goal.end, goal.feedback) == ('succeeded', [(1, 2), (2, 1), (3, 0)])
         assert top.state == PAUSED
+
+
+def test_many_steps_are_exact_beyond_the_whole_numbers_of_doubles(monkeypatch, tmp_path):
+    with StandardNode('stand-in', monkeypatch, tmp_path, step__dt=1.0 / 3.0,
+                      solver__method='exact') as top:
+        top.pause().done('StepSimulation', steps=30_000_001)
+        assert top.simulation.now_ns == 30_000_001 * 333_333_333 > 2 ** 53
 
 
 def test_steps_beyond_the_duration_say_so(monkeypatch, tmp_path):
@@ -229,7 +241,7 @@ def test_simulate_steps_ends_as_it_is_told_to(top):
     top.done('StepSimulation', steps=1)         # the next ones may begin
 
 
-@pytest.mark.parametrize('how', ['reset', 'play', 'stop'])
+@pytest.mark.parametrize('how', ['reset', 'play', 'stop', 'quit'])
 def test_a_reset_or_another_state_ends_the_steps(top, how):
     top.pause()
     goal, coroutine = top.steps(10 ** 18)
@@ -237,7 +249,8 @@ def test_a_reset_or_another_state_ends_the_steps(top, how):
     if how == 'reset':
         top.done('ResetSimulation', scope=0)
     else:
-        assert top.set_state('PLAYING' if how == 'play' else 'STOPPED') == OK
+        name = {'play': 'PLAYING', 'stop': 'STOPPED', 'quit': 'QUITTING'}[how]
+        assert top.set_state(name) == OK
     result = finished(coroutine).result
     assert (goal.end, goal.feedback) == ('aborted', [(1, 10 ** 18 - 1)])
     assert 'interrupted after 1 of' in result.error_message
@@ -419,25 +432,31 @@ def test_unsupported_elements_are_named(top):
 
 # --------------------------------------------------------------------------------- recording
 
-def test_a_log_of_all_this_verifies(top, tmp_path, capsys):
+@pytest.mark.parametrize('method', ['rk45', 'exact'])
+def test_a_log_of_all_this_verifies(monkeypatch, tmp_path, capsys, method):
     """States, resets and worlds are in the journal: the run can be computed again."""
-    state = top.messages.EntityState()
-    state.twist.angular.x, state.pose.orientation.w = 0.5, 1.0
-    state.twist.angular.z = 11.0
-    top.pause().done('StepSimulation', steps=3)
-    top.done('SetEntityState', entity='spinning_top', state=state, set_twist=True)
-    top.done('StepSimulation', steps=3)
-    top.node._session.start(top.node.values)()
-    top.done('StepSimulation', steps=7)
-    top.done('SetEntityState', entity='spinning_top', state=state, set_pose=True, set_twist=True)
-    top.done('StepSimulation', steps=11)
-    top.done('ResetSimulation', scope=2)
-    top.done('StepSimulation', steps=5)
-    top.done('LoadWorld', **load(top, 'waking_sleeper'))
-    top.pause().done('StepSimulation', steps=20)
-    top.done('SetEntityState', entity='spinning_top', state=state, set_pose=True)
-    top.done('StepSimulation', steps=13)
-    top.node._session.stop()
+    with StandardNode(
+            'stand-in', monkeypatch, tmp_path, solver__method=method, increments__enabled=True,
+            markers__enabled=True, mag__enabled=True, imu__lever_arm=[0.1, 0.0, 0.02],
+            imu__gyroscope_noise_density=1e-3, imu__gyroscope_bias_stddev=0.1) as top:
+        state = top.messages.EntityState()
+        state.twist.angular.x, state.pose.orientation.w = 0.5, 1.0
+        state.twist.angular.z = 11.0
+        top.pause().done('StepSimulation', steps=3)
+        top.done('SetEntityState', entity='spinning_top', state=state, set_twist=True)
+        top.done('StepSimulation', steps=3)
+        top.node._session.start(top.node.values)()
+        top.done('StepSimulation', steps=7)
+        top.done('SetEntityState', entity='spinning_top', state=state, set_pose=True,
+                 set_twist=True)
+        top.done('StepSimulation', steps=11)
+        top.done('ResetSimulation', scope=2)
+        top.done('StepSimulation', steps=5)
+        top.done('LoadWorld', **load(top, 'waking_sleeper'))
+        top.pause().done('StepSimulation', steps=20)
+        top.done('SetEntityState', entity='spinning_top', state=state, set_pose=True)
+        top.done('StepSimulation', steps=13)
+        top.node._session.stop()
     code = inspect.main([f'{tmp_path}/run.mcap', '--verify', '--json'])
     content = json.loads(capsys.readouterr().out)
     assert (code, content['verify']['identical']) == (0, True), content['verify']
@@ -461,7 +480,7 @@ rclpy.init(args=['sim_node', '--ros-args', '-p', 'simulation_interfaces:={offere
 node = Simulator()
 print(sorted(name for name in sys.modules if name in (
     'rclpy.action.server', 'simulation_interfaces') or name.startswith(
-    ('spinning_top_sim.nodes.simulation_', 'spinning_top_sim.tools.', 'yaml'))))
+    ('spinning_top_sim.nodes.simulation_', 'spinning_top_sim.tools.'))))
 node.stop()
 node.destroy_node()
 rclpy.try_shutdown()

@@ -18,12 +18,20 @@ import simulation_interfaces.msg
 import simulation_interfaces.srv
 from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import PATIENCE_S, SimNode, wait_for
-from helpers.node_logs import QUIET, assert_clean_end, settled, stamp_of, stamps_of, xyzw
+from helpers.node_logs import (
+    QUIET,
+    assert_clean_end,
+    settled,
+    stamp_of,
+    stamps_of,
+    the_log,
+    xyzw,
+)
 from nav_msgs.msg import Odometry
 from rclpy.action import ActionClient
 
-from spinning_top_sim.nodes.simulation_handlers import SERVICES
-from spinning_top_sim.nodes.simulation_services import service_name
+from spinning_top_sim.nodes.simulation_standard import SERVICES, service_name
+from spinning_top_sim.tools import inspect
 
 UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
 STOPPED, PLAYING, PAUSED, QUITTING = range(4)
@@ -157,6 +165,21 @@ def test_quitting_answers_and_ends_with_a_whole_log(peer, tmp_path):
         assert set_state(peer, SimpleNamespace(node=node), QUITTING) == OK
         assert_clean_end(node, node.wait())
         assert 'messages' in node.err + node.out
+
+
+def test_a_signal_ends_the_steps_and_the_node(peer, tmp_path):
+    with SimNode(tmp_path, {**QUIET, 'start_paused': True, 'record.enabled': True,
+                            'record.min_free_bytes': 0}, namespace='/signal') as node:
+        served, feedback = SimpleNamespace(node=node), []
+        client = ActionClient(peer.node, simulation_interfaces.action.SimulateSteps,
+                              node.topic('simulate_steps'))
+        assert client.wait_for_server(PATIENCE_S)
+        assert set_state(peer, served, PAUSED) == OK
+        client.send_goal_async(simulation_interfaces.action.SimulateSteps.Goal(steps=10 ** 12),
+                               feedback_callback=feedback.append)
+        wait_for('feedback', lambda: feedback)
+        assert_clean_end(node, node.end())
+        assert inspect.main([str(the_log(node.folder)), '--verify']) == 0
 
 
 def test_the_parameter_switches_it_off(peer, tmp_path):

@@ -2,77 +2,27 @@
 """
 What the services and the action of simulation_interfaces do; no executor and no DDS.
 
-A handler takes a request and fills its response, and raises RefusedError or, for what only
-simulation_interfaces' general code fits, ValueError or RuntimeError.
+The handler of GetEntities is `_get_entities`: it takes a request and fills its response, or raises
+RefusedError with a code, or ValueError or RuntimeError, which mean RESULT_OPERATION_FAILED.
 """
 
 import types
-from collections.abc import Callable, Coroutine, Generator, Mapping
-from typing import Any, Protocol
+from collections.abc import Callable, Coroutine, Generator
+from typing import Any
 
 from spinning_top_sim.nodes import entity, worlds
 from spinning_top_sim.nodes.pacing import FairLock
+from spinning_top_sim.nodes.simulation_standard import (
+    FEATURES,
+    Node,
+    RefusedError,
+    service_name,
+)
 from spinning_top_sim.nodes.tick_loop import State, TickLoop
 from spinning_top_sim.nodes.worlds import World
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import Simulation
-
-# Services, and the values of SimulatorFeatures that say that they are there.
-FEATURES: Mapping[str, tuple[str, ...]] = {
-    'GetSimulatorFeatures': (),
-    'GetSimulationState': ('SIMULATION_STATE_GETTING',),
-    'SetSimulationState': ('SIMULATION_STATE_SETTING', 'SIMULATION_STATE_PAUSE'),
-    'StepSimulation': ('STEP_SIMULATION_SINGLE', 'STEP_SIMULATION_MULTIPLE'),
-    'SimulateSteps': ('STEP_SIMULATION_ACTION',),
-    'ResetSimulation': ('SIMULATION_RESET', 'SIMULATION_RESET_STATE'),
-    'GetEntities': ('ENTITY_TAGS', 'ENTITY_CATEGORIES', 'ENTITY_BOUNDS_BOX'),
-    'GetEntitiesStates': ('ENTITY_STATE_GETTING',),
-    'GetEntityState': ('ENTITY_STATE_GETTING',),
-    'SetEntityState': ('ENTITY_STATE_SETTING',),
-    'GetEntityInfo': ('ENTITY_INFO_GETTING',),
-    'GetEntityBounds': ('ENTITY_BOUNDS',),
-    'GetAvailableWorlds': ('AVAILABLE_WORLDS',),
-    'LoadWorld': ('WORLD_LOADING', 'WORLD_RESOURCE_STRING'),
-    'GetCurrentWorld': ('WORLD_INFO_GETTING',),
-}
-SERVICES = tuple(name for name in FEATURES if name != 'SimulateSteps')
-
-
-class RefusedError(Exception):
-    """A request is refused with a result code."""
-
-    def __init__(self, code: int, reason: object) -> None:
-        super().__init__(str(reason))
-        self.code = code
-
-
-class Node(Protocol):
-    """What the handlers ask of the node."""
-
-    @property
-    def values(self) -> Mapping[str, Any]:
-        """The parameters, with the spin as last commanded."""
-
-    @property
-    def start_values(self) -> dict[str, Any]:
-        """The parameters that a reset starts with."""
-
-    def check_started(self) -> None:
-        """Raise RuntimeError before the motion begins."""
-
-    def start_again(self, values: Mapping[str, Any] | None = None,
-                    paused: bool | None = None) -> None:
-        """Reset, as `TickLoop.reset`; with other parameters if these are given."""
-
-    def show_spin(self) -> None:
-        """Let the parameters spin.l3 and spin.lz show the present ones."""
-
-    def fail(self, error: Exception) -> None:
-        """Stop the motion after an unexpected error."""
-
-    def finish(self) -> None:
-        """End the process soon."""
 
 
 class SimulationHandlers:
@@ -98,21 +48,11 @@ class SimulationHandlers:
     def serve(self, name: str, request: object, response: object) -> object:
         """Fill a response, its result too; unexpected errors stop the motion."""
         result: Any = getattr(response, 'result', None)
-        code, text = self._outcome(lambda: self._act(name)(request, response))
+        act = getattr(self, f'_{service_name(name)}')
+        code, text = self._outcome(lambda: act(request, response))
         if result is not None:
             result.result, result.error_message = code, text
         return response
-
-    def _act(self, name: str) -> Callable[[Any, Any], str | None]:
-        return {
-            'GetSimulatorFeatures': self._get_features, 'GetSimulationState': self._get_state,
-            'SetSimulationState': self._set_state, 'StepSimulation': self._step_simulation,
-            'ResetSimulation': self._reset, 'GetEntities': self._get_entities,
-            'GetEntitiesStates': self._get_entities_states,
-            'GetEntityState': self._get_entity_state, 'SetEntityState': self._set_entity_state,
-            'GetEntityInfo': self._get_entity_info, 'GetEntityBounds': self._get_entity_bounds,
-            'GetAvailableWorlds': self._get_available_worlds, 'LoadWorld': self._load_world,
-            'GetCurrentWorld': self._get_current_world}[name]
 
     def _outcome(self, act: Callable[[], str | None]) -> tuple[int, str]:
         """Return the code of what `act` does, and what is to say about it."""
@@ -128,7 +68,7 @@ class SimulationHandlers:
             self._node.fail(error)
             return self._results.RESULT_OPERATION_FAILED, f'{type(error).__name__}: {error}'
 
-    def _get_features(self, _: Any, response: Any) -> None:
+    def _get_simulator_features(self, _: Any, response: Any) -> None:
         names = dict.fromkeys(name for row in FEATURES.values() for name in row)
         known = self._messages.SimulatorFeatures
         response.features.features = sorted(
@@ -152,12 +92,12 @@ class SimulationHandlers:
                        and loop.interruptions != self._pause_at_start)
         return states.STATE_STOPPED if is_at_start else states.STATE_PAUSED
 
-    def _get_state(self, _: Any, response: Any) -> str:
+    def _get_simulation_state(self, _: Any, response: Any) -> str:
         with self._lock:
             response.state.state = self._state()
             return self._loop.failure or ''
 
-    def _set_state(self, request: Any, response: Any) -> None:
+    def _set_simulation_state(self, request: Any, response: Any) -> None:
         states, loop, target = self._states, self._loop, request.state.state
         allowed = {states.STATE_STOPPED: 'STOPPED', states.STATE_PLAYING: 'PLAYING',
                    states.STATE_PAUSED: 'PAUSED', states.STATE_QUITTING: 'QUITTING'}
@@ -221,9 +161,20 @@ class SimulationHandlers:
         step_ns = round(self._node.values['step.dt'] * NANOSECONDS)
         with self._lock:
             target_ns = loop.now_ns + count * step_ns
-            loop.step(count, step_ns / NANOSECONDS)
+            loop.step_by(count * step_ns)
             if loop.now_ns < target_ns:
                 raise RuntimeError(f'{loop.time_text}: `duration` ends before the steps do')
+
+    def _check_runs(self) -> None:
+        """Raise RefusedError before the motion begins, and when the process ends."""
+        with self._lock:
+            quits = self._state() == self._states.STATE_QUITTING
+        try:
+            self._node.check_started()
+            if quits:
+                raise RuntimeError('the simulator is quitting')
+        except RuntimeError as error:
+            raise RefusedError(self._results.RESULT_INCORRECT_STATE, error) from error
 
     @property
     def steps_action(self) -> Callable[[object], Coroutine[None, None, object]]:
@@ -231,7 +182,22 @@ class SimulationHandlers:
         return self._simulate_steps
 
     async def _simulate_steps(self, goal: Any) -> Any:
-        """Step one by one; between two steps the executor has its turn."""
+        try:
+            return await self._step_one_by_one(goal)
+        except Exception:
+            if self._node.can_send():
+                raise
+        # A signal has ended the context.  To tell the goal so would crash the executor, which is
+        # about to end and does not come back here.
+        while True:
+            await _turn()
+
+    def _check_context(self) -> None:
+        if not self._node.can_send():
+            raise RuntimeError('the context has ended')
+
+    async def _step_one_by_one(self, goal: Any) -> Any:
+        """Step up to the goal; between two steps the executor has its turn."""
         action = self._actions.SimulateSteps
         steps, done = goal.request.steps, 0
         result, feedback = action.Result(), action.Feedback()
@@ -248,13 +214,14 @@ class SimulationHandlers:
         interruptions = self._loop.interruptions
 
         def step() -> None:
-            if self._loop.interruptions != interruptions:
+            if self._quits or self._loop.interruptions != interruptions:
                 raise RuntimeError(f'interrupted after {done} of {steps} steps: the simulation '
                                    'was reset, or its state set')
             self._step(1)
 
         try:
             while code == self._results.RESULT_OK and done < steps:
+                self._check_context()
                 if goal.is_cancel_requested:
                     goal.canceled()
                     result.result.result = self._results.RESULT_OPERATION_FAILED
@@ -269,6 +236,7 @@ class SimulationHandlers:
         finally:
             if mine:
                 self._steps = False
+        self._check_context()
         result.result.result, result.result.error_message = code, text
         if code == self._results.RESULT_OK:
             goal.succeed()
@@ -276,9 +244,9 @@ class SimulationHandlers:
             goal.abort()
         return result
 
-    def _reset(self, request: Any, _: Any) -> None:
+    def _reset_simulation(self, request: Any, _: Any) -> None:
         time_and_state = request.SCOPE_TIME | request.SCOPE_STATE
-        self._node.check_started()
+        self._check_runs()
         if request.scope in (request.SCOPE_DEFAULT, request.SCOPE_ALL, time_and_state):
             self._node.start_again()
         elif request.scope == request.SCOPE_STATE:
@@ -331,7 +299,7 @@ class SimulationHandlers:
 
     def _set_entity_state(self, request: Any, response: Any) -> str:
         self._check_entity(request.entity)
-        self._node.check_started()
+        self._check_runs()
         try:
             change = entity.changed_state(request, self._simulation.top, self._frame)
         except entity.PoseError as error:
@@ -405,7 +373,7 @@ class SimulationHandlers:
                    f'{", ".join(world.ignored)}' if world.ignored else '')
         if ignored and request.fail_on_unsupported_element:
             raise RefusedError(response.UNSUPPORTED_ELEMENTS, ignored)
-        self._node.check_started()
+        self._check_runs()
         self._node.start_again(values, paused=True)
         self._world = world
         self._fill_world(response.world, world)

@@ -3,22 +3,21 @@
 
 import functools
 import importlib
-import re
 
 import rclpy.node
 from rclpy.action import ActionServer, CancelResponse
 
-from spinning_top_sim.nodes import simulation_handlers
+from spinning_top_sim.nodes import simulation_standard
 from spinning_top_sim.nodes.pacing import FairLock
-from spinning_top_sim.nodes.simulation_handlers import SERVICES, SimulationHandlers
+from spinning_top_sim.nodes.simulation_handlers import SimulationHandlers
+from spinning_top_sim.nodes.simulation_standard import ACTION, SERVICES, service_name
 from spinning_top_sim.nodes.tick_loop import TickLoop
 from spinning_top_sim.streams.pipeline import Simulation
 
 PACKAGE = 'simulation_interfaces'
-ACTION = 'SimulateSteps'
 
 
-def offer(node: rclpy.node.Node, control: simulation_handlers.Node, loop: TickLoop,
+def offer(node: rclpy.node.Node, control: simulation_standard.Node, loop: TickLoop,
           simulation: Simulation, lock: FairLock, frame: str) -> ActionServer:
     """
     Create the services, in the namespace of the node, and return the action server.
@@ -35,8 +34,3 @@ def offer(node: rclpy.node.Node, control: simulation_handlers.Node, loop: TickLo
                                 functools.partial(handlers.serve, name))
     return ActionServer(node, getattr(actions, ACTION), service_name(ACTION),
                         handlers.steps_action, cancel_callback=lambda _: CancelResponse.ACCEPT)
-
-
-def service_name(type_name: str) -> str:
-    """Return the name of a service by that of its type: get_entities for GetEntities."""
-    return re.sub(r'(?<!^)(?=[A-Z])', '_', type_name).lower()

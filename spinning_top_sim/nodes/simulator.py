@@ -383,6 +383,10 @@ class Simulator(Node):
                              for name, value in ((name, self._values[name]) for name in names)])
         self.add_on_set_parameters_callback(self._on_set_parameters)
 
+    def can_send(self) -> bool:
+        """Return False when a signal has ended the context."""
+        return bool(self.context.ok())
+
     def finish(self) -> None:
         """End the process, once the response that is under way has been sent."""
         self._finish_timer = self._steady_timer(

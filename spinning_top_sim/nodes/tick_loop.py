@@ -212,12 +212,16 @@ class TickLoop:
 
         It goes no further than `duration`.
         """
+        self.step_by(round(count * dt * NANOSECONDS))
+
+    def step_by(self, length_ns: int) -> None:
+        """Move a paused motion on by this time [ns], as `step` does."""
         if not self.paused:
             raise RuntimeError('running: ~/step works while paused (~/set_pause true)')
         if self.failure:
             raise RuntimeError(f'the motion stands still: {self.failure}')
         self._update_subscribers()
-        target_ns = min(self.now_ns + round(count * dt * NANOSECONDS), self._duration_ns)
+        target_ns = min(self.now_ns + length_ns, self._duration_ns)
         last_ns = LAST_LIVE_STAMP_NS - self._simulation.epoch_ns
         stop_at_ns = self._steady() + STEP_BUDGET_NS
 

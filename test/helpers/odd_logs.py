@@ -99,7 +99,8 @@ def _odd_entry(rng, data):
     if kind < 0.2:
         return messages.string(rng.choice(TEXTS))
     if kind < 0.45:
-        entry['event'] = rng.choice(('start', 'command', 'parameters', 'reset', 'end', *VALUES))
+        entry['event'] = rng.choice(('start', 'command', 'state', 'parameters', 'reset', 'end',
+                                     *VALUES))
     for name in ('t_ns', 'sent_ns'):
         if rng.random() < 0.3:
             entry[name] = _odd_number(rng, entry[name])
