@@ -42,7 +42,7 @@ export PYTHONUNBUFFERED := 1
 PIP := '$(VENV)/bin/python' -m pip --disable-pip-version-check install --quiet --quiet
 SCENES := $(sort $(basename $(notdir $(wildcard config/*.yaml))))
 # Folders too: their modification time changes when a file is removed.
-SOURCES := $(shell find setup.py setup.cfg package.xml config launch resource rviz \
+SOURCES := $(shell find setup.py setup.cfg package.xml config foxglove launch resource rviz \
     scripts spinning_top_sim urdf -name __pycache__ -prune -o \( -type f -o -type d \) \
     ! -name '.*' ! -name '*~' -print 2>/dev/null)
 

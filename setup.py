@@ -29,6 +29,7 @@ DATA_FILES = {
     f'share/{NAME}/launch': glob('launch/*.launch.*'),
     f'share/{NAME}/urdf': glob('urdf/*'),
     f'share/{NAME}/rviz': glob('rviz/*.rviz'),
+    f'share/{NAME}/foxglove': glob('foxglove/*.json'),
     f'lib/{NAME}': [f'scripts/{name}' for name in EXECUTABLES],
 }
 
@@ -70,8 +71,10 @@ setup(
             'distributed>=2024.5,<2028',
             'docutils>=0.20,<1',
             'imufusion>=1.3,<2',
+            'ipykernel>=6.20,<8',       # with nbclient: runs examples/tour.ipynb
             'matplotlib>=3.6,<4',
             'mcap-ros2-support>=0.5.5,<0.7',
+            'nbclient>=0.8,<0.12',
             'pyarrow>=14,<30',
             'pytest>=7.4,<10',
             'playwright>=1.45,<2',      # drives the Chromium of the system, and brings none

@@ -4,6 +4,7 @@
 
 from pathlib import Path
 
+from spinning_top_sim.nodes import throttle
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING, all_streams
 
@@ -22,7 +23,8 @@ Publishers are RELIABLE and KEEP_LAST with depth 10. The parameters
 |---|---|---|---|---|
 """
 
-AFTER_TOPICS = """| `/diagnostics` | diagnostic_msgs/msg/DiagnosticArray | 1 | yes | |
+AFTER_TOPICS = """| `{throttled}` | nav_msgs/msg/Odometry | at most {rate:g} | yes | `ground_truth_odom.enabled` |
+| `/diagnostics` | diagnostic_msgs/msg/DiagnosticArray | 1 | yes | |
 
 - `pose`: attitude q(world ← body) in `world_frame`; the position is the pivot, (0, 0, 0).
 - `joint_states`: {joints}: φ, θ, ψ [rad], unwrapped, and their rates [rad/s].
@@ -37,6 +39,8 @@ AFTER_TOPICS = """| `/diagnostics` | diagnostic_msgs/msg/DiagnosticArray | 1 | y
 - `ground_truth/imu_timing`: one labelled dimension, {timing}. It has
   the stamp and the true time of each sample of `imu/data_raw`, and how often it was sent.
 - `ground_truth/imu`, `ground_truth/odom`: noise-free. The twist of the odometry is in the body frame.
+- `{throttled}`: messages of `ground_truth/odom` for those who only watch, at most
+  {rate:g} a second of real time, and the last one before a pause. They are not recorded.
 - What is exact has the variance 1e-18 in SI units: in sensor_msgs a covariance of zeros means unknown.
 - `~/invariants`: one labelled dimension, {invariants}. Drifts are relative to the value at the start of
   the motion; the orientation error [rad] is the angle to the exact solution.
@@ -83,7 +87,8 @@ def page() -> str:
         lines.append(f'| `{stream.topic}` | {stream.type_name} | {rate:g} | '
                      f'{"yes" if on else "no"} | `{stream.parameter}.enabled`, '
                      f'`{stream.rate_parameter.removeprefix(stream.parameter)}` |\n')
-    lines.append(AFTER_TOPICS.format(joints=', '.join(f'`{name}`' for name in JOINTS),
+    lines.append(AFTER_TOPICS.format(throttled=throttle.TOPICS['ground_truth/odom'],
+                                     rate=throttle.RATE, joints=', '.join(f'`{name}`' for name in JOINTS),
                                      invariants=', '.join(f'`{name}`' for name in INVARIANTS),
                                      timing=', '.join(f'`{name}`' for name in TIMING)))
     for parameter in parameters.TABLE:

@@ -212,7 +212,8 @@ def test_the_share_folder_is_complete(prefix):
     share = prefix / 'share' / NAME
     assert (share / 'package.xml').read_bytes() == (ROOT / 'package.xml').read_bytes()
     for folder, pattern in (('config', '*.yaml'), ('config/imu', '*.yaml'),
-                            ('launch', '*.launch.*'), ('urdf', '*'), ('rviz', '*.rviz')):
+                            ('launch', '*.launch.*'), ('urdf', '*'), ('rviz', '*.rviz'),
+                            ('foxglove', '*.json')):
         there = {path.name for path in (share / folder).glob('*') if path.is_file()}
         assert there, folder
         assert there == {path.name for path in (ROOT / folder).glob(pattern)}, folder

@@ -89,9 +89,11 @@ def test_live(browser, peer, tmp_path):
 
             # Paused: this very stamp, and the attitude of the pose with it.
             visit.press('Pause')
-            visit.read('pause: paused at')
+            (paused_at,) = visit.read(r'pause: paused at t = ([\d.]+) s')
             wait_for('the last pose to be shown', lambda: visit.read(STAMP) == stamp_of(poses))
             assert apart(visit.attitude(), poses.last().pose.orientation) < 1e-6
+            (shown_at,) = visit.read(r't = ([\d.]+) s, stamp')     # simulated time, of a sample
+            assert -1e-3 < float(paused_at) - float(shown_at) < 0.011
             before = stamp_of(poses)
             visit.press('Step')
             visit.read('step: at t =')
@@ -109,8 +111,11 @@ def test_live(browser, peer, tmp_path):
             visit.read('reset: at t = 0')
             assert visit.errors == []
             assert visit.hosts <= {'127.0.0.1', None}
+
+            # The page says when the node ends, and when it ends itself.
+            assert node.end() == 0
+            visit.read('spinning_top has ended')
             assert view.end(signal.SIGINT) == 0, view.err
-        assert node.alive
 
 
 def turned(attitude):

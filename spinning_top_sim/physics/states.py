@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """States of a top at many times, as columns that are computed when they are first asked for."""
 
+from __future__ import annotations
+
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +13,12 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.top import State, Top
 
+if TYPE_CHECKING:
+    from matplotlib.animation import FuncAnimation
+    from matplotlib.figure import Figure
+
 Point = tuple[float, float, float]
+NO_PICTURES = "pictures need matplotlib: pip install 'spinning_top_sim[plot]' ({})"
 
 
 class States:
@@ -23,6 +31,8 @@ class States:
 
     Attributes
     ----------
+    top, start : Top, State
+        What moves, and its state at t = 0.
     t : (n,) array
         Times since the start of the motion [s].
     theta, phi, psi : (n,) array
@@ -47,7 +57,8 @@ class States:
     """
 
     def __init__(self, top: Top, start: State, n: int) -> None:
-        self.top, self._l3, self._lz, self._n = top, start.l3, start.lz, n
+        self.top, self.start, self._n = top, start, n
+        self._l3, self._lz = start.l3, start.lz
 
     def __len__(self) -> int:
         return self._n
@@ -206,3 +217,57 @@ class States:
         return (0.5 * self.top.lambda1 * (omega1 * omega1 + omega2 * omega2)
                 + 0.5 * self._l3 * self._l3 / self.top.lambda3
                 + self.top.gravity_torque * self.rows_vertical[2])
+
+    def plot(self) -> Figure:
+        """
+        Draw the motion: the path of its axis, tilt, precession rate and energy drift.
+
+        The path is drawn on the sphere and from above, with the bounds of theta, which are dotted
+        lines beside the tilt.  The drift is relative to the first sample.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            A notebook with `%matplotlib inline` shows it; `savefig` writes it to a file.
+
+        Raises
+        ------
+        ImportError
+            Without matplotlib, the extra `plot`.
+        ValueError
+            If there are less than two times, or if they do not ascend.
+        """
+        try:
+            from spinning_top_sim.physics.pictures import plot  # noqa: PLC0415
+        except ImportError as error:
+            raise ImportError(NO_PICTURES.format(error)) from error
+        return plot(self)
+
+    def animate(self, fps: float = 20.0, speed: float = 1.0) -> FuncAnimation:
+        """
+        Animate the motion: the body, its axis and the path of the tip.
+
+        Parameters
+        ----------
+        fps : float, default 20
+            Frames per second, > 0.  Each frame shows the newest sample: no others are computed.
+        speed : float, default 1
+            Simulated over real time, > 0.
+
+        Returns
+        -------
+        matplotlib.animation.FuncAnimation
+            `to_jshtml` makes it a part of a notebook, `save` a file.
+
+        Raises
+        ------
+        ImportError
+            Without matplotlib, the extra `plot`.
+        ValueError
+            For an argument out of range, or as `plot`.
+        """
+        try:
+            from spinning_top_sim.physics.pictures import animate  # noqa: PLC0415
+        except ImportError as error:
+            raise ImportError(NO_PICTURES.format(error)) from error
+        return animate(self, fps, speed)

@@ -2,7 +2,6 @@
 """Pictures of a top: the tip's path on the sphere, a page about a log, an animation."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from cycler import cycler
@@ -13,65 +12,28 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
+from spinning_top_sim.physics import pictures
+from spinning_top_sim.physics.pictures import (
+    COLOURS,
+    DISC,
+    DISC_HEIGHT,
+    FAINT,
+    INK,
+    draw_sphere,
+    draw_tip,
+    on_sphere,
+    project,
+)
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools.analysis import Attitudes, Complexes, Reals, interpolate
 from spinning_top_sim.tools.survey import Motion, Survey
 
-# From the world to the viewer: towards, right, up.
-VIEW = Rotation.from_euler('zy', (60.0, 45.0), degrees=True)
-INK, FAINT, PATH = '#1b1b1b', '#c9c9c9', '#0b6fa4'
-# Okabe and Ito's colours: distinct also for the colour-blind, and as greys.
-COLOURS = ('#0072b2', '#d55e00', '#009e73')
-STYLE: dict[Any, Any] = {
-    'axes.labelsize': 9, 'axes.prop_cycle': cycler(color=COLOURS), 'axes.spines.right': False,
-    'axes.spines.top': False, 'axes.titlesize': 11, 'axes.xmargin': 0.0, 'legend.fontsize': 8,
-    'legend.frameon': False, 'lines.linewidth': 1.2, 'text.color': INK, 'xtick.labelsize': 8,
-    'ytick.labelsize': 8}
+STYLE = {**pictures.STYLE, 'axes.prop_cycle': cycler(color=COLOURS), 'legend.fontsize': 8,
+         'legend.frameon': False}
 FINER = 10                  # points drawn for each sample
 PAGE_NUTATIONS, PAGE_S = 8, 5.0      # on the page; seconds where theta rests
 MOST_MARKS = 30             # motions whose begin is marked
 FRAMES_PER_S, LONGEST_S = 20, 10.0
-DISC, DISC_HEIGHT = 0.42, 0.45      # radius of the body's disc and its place on the axis
-
-
-def project(points: Reals) -> tuple[Reals, Reals, Reals]:
-    """Return picture coordinates across and up of points (n, 3), and how near they are (n,)."""
-    near, across, up = VIEW.apply(points).T
-    return across, up, near
-
-
-def draw(axes: Axes, points: Reals, color: str, width: float) -> None:
-    """Draw a curve (n, 3) on the sphere: the part behind it faintly."""
-    across, up, near = project(points)
-    for visible, alpha in ((near >= 0.0, 1.0), (near < 0.0, 0.25)):
-        axes.plot(np.where(visible, across, np.nan), np.where(visible, up, np.nan),
-                  alpha=alpha, color=color, linewidth=width)
-
-
-def on_sphere(tip: Complexes, height: Reals | float) -> Reals:
-    """Return points (n, 3) from x + iy and z."""
-    return np.stack(np.broadcast_arrays(tip.real, tip.imag, height), axis=1)
-
-
-def draw_sphere(axes: Axes, tilts: tuple[float, ...], lowest: float = -0.9) -> None:
-    """Draw the unit sphere with circles of these tilts; below `lowest` it is open."""
-    circle = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 400))
-    axes.plot(np.where(circle.imag > lowest + 0.2, circle.real, np.nan), circle.imag,
-              color=FAINT, linewidth=1.0)
-    for theta in tilts:
-        draw(axes, on_sphere(np.sin(theta) * circle, np.cos(theta)), FAINT, 0.8)
-    axes.set_aspect('equal')
-    axes.set(xlim=(-1.1, 1.1), ylim=(lowest, 1.25))
-    axes.axis('off')
-
-
-def draw_tip(axes: Axes, tip: Complexes, height: Reals) -> None:
-    """Draw the tip's path, x + iy and z, and the axis at its end."""
-    path = on_sphere(tip, height)
-    draw(axes, path, PATH, 1.8)
-    across, up, _ = project(path[-1:])
-    axes.plot([0.0, *across], [0.0, *up], color=INK, linewidth=2.2, solid_capstyle='round')
-    axes.plot(across, up, 'o', color=INK, markersize=5)
 
 
 def smooth_tip(data: Attitudes) -> tuple[Reals, Complexes, Reals]:

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of a motion by matplotlib: the tip's path on the sphere, its curves, an animation."""
+
+from typing import Any, Protocol
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.animation import FuncAnimation
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from spinning_top_sim.physics.regimes import swing
+from spinning_top_sim.physics.top import State, Top
+
+Reals = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+# From the world to the viewer: towards, right, up.  60 deg about z, then 45 deg about y.
+_TURN, _TILT = np.radians(60.0), np.radians(45.0)
+VIEW = np.array([[np.cos(_TILT), 0.0, np.sin(_TILT)], [0.0, 1.0, 0.0],
+                 [-np.sin(_TILT), 0.0, np.cos(_TILT)]]) @ np.array(
+    [[np.cos(_TURN), -np.sin(_TURN), 0.0], [np.sin(_TURN), np.cos(_TURN), 0.0], [0.0, 0.0, 1.0]])
+INK, FAINT, PATH = '#1b1b1b', '#c9c9c9', '#0b6fa4'
+# Okabe and Ito's colours: distinct also for the colour-blind, and as greys.
+COLOURS = ('#0072b2', '#d55e00', '#009e73')
+STYLE: dict[Any, Any] = {
+    'axes.labelsize': 9, 'axes.spines.right': False, 'axes.spines.top': False,
+    'axes.titlesize': 11, 'axes.xmargin': 0.0, 'lines.linewidth': 1.2, 'text.color': INK,
+    'xtick.labelsize': 8, 'ytick.labelsize': 8}
+DISC, DISC_HEIGHT = 0.42, 0.45      # radius of the body's disc and its place on the axis
+
+
+class Motion(Protocol):
+    """The columns of `States` that are drawn."""
+
+    top: Top
+    start: State
+
+    @property
+    def t(self) -> Reals: ...
+    @property
+    def theta_folded(self) -> Reals: ...
+    @property
+    def phi_dot(self) -> Reals: ...
+    @property
+    def energy(self) -> Reals: ...
+    @property
+    def quaternion(self) -> Reals: ...
+    @property
+    def rows_axis(self) -> tuple[Reals, Reals, Reals]: ...
+
+
+def project(points: Reals) -> tuple[Reals, Reals, Reals]:
+    """Return picture coordinates across and up of points (n, 3), and how near they are (n,)."""
+    near, across, up = VIEW @ points.T
+    return across, up, near
+
+
+def draw(axes: Axes, points: Reals, color: str, width: float) -> None:
+    """Draw a curve (n, 3) on the sphere: the part behind it faintly."""
+    across, up, near = project(points)
+    for visible, alpha in ((near >= 0.0, 1.0), (near < 0.0, 0.25)):
+        axes.plot(np.where(visible, across, np.nan), np.where(visible, up, np.nan),
+                  alpha=alpha, color=color, linewidth=width)
+
+
+def on_sphere(tip: Complexes, height: Reals | float) -> Reals:
+    """Return points (n, 3) from x + iy and z."""
+    return np.stack(np.broadcast_arrays(tip.real, tip.imag, height), axis=1)
+
+
+def draw_sphere(axes: Axes, tilts: tuple[float, ...], lowest: float = -0.9) -> None:
+    """Draw the unit sphere with circles of these tilts; below `lowest` it is open."""
+    circle = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 400))
+    axes.plot(np.where(circle.imag > lowest + 0.2, circle.real, np.nan), circle.imag,
+              color=FAINT, linewidth=1.0)
+    for theta in tilts:
+        draw(axes, on_sphere(np.sin(theta) * circle, np.cos(theta)), FAINT, 0.8)
+    axes.set_aspect('equal')
+    axes.set(xlim=(-1.1, 1.1), ylim=(lowest, 1.25))
+    axes.axis('off')
+
+
+def draw_tip(axes: Axes, tip: Complexes, height: Reals) -> None:
+    """Draw the tip's path, x + iy and z, and the axis at its end."""
+    path = on_sphere(tip, height)
+    draw(axes, path, PATH, 1.8)
+    across, up, _ = project(path[-1:])
+    axes.plot([0.0, *across], [0.0, *up], color=INK, linewidth=2.2, solid_capstyle='round')
+    axes.plot(across, up, 'o', color=INK, markersize=5)
+
+
+def _lowest(height: Reals) -> float:
+    return -0.9 if np.min(height) > -0.2 else -1.25
+
+
+def _check(motion: Motion) -> None:
+    if len(motion.t) < 2 or not (np.diff(motion.t) > 0.0).all():
+        raise ValueError(f't has {len(motion.t)} times: a picture must have 2 at least, ascending')
+
+
+def plot(motion: Motion) -> Figure:
+    """Return a figure of a motion; see `States.plot`."""
+    _check(motion)
+    x, y, z = motion.rows_axis
+    bounds = sorted(float(np.arccos(u)) for u in swing(motion.top, motion.start))
+    energy = motion.energy
+    with rc_context(STYLE):
+        figure = Figure(figsize=(10.0, 7.0), layout='constrained')
+        panels = figure.subplot_mosaic(
+            [['sphere', 'above'], ['theta', 'rate'], ['drift', 'drift']],
+            height_ratios=(2.2, 1.0, 0.8))
+        draw_sphere(panels['sphere'], (*bounds, np.pi / 2), _lowest(z))
+        draw_tip(panels['sphere'], x + 1j * y, z)
+        panels['sphere'].set_title('path of the axis')
+        above = panels['above']
+        circle = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 200))
+        for theta in bounds:
+            above.plot(np.sin(theta) * circle.real, np.sin(theta) * circle.imag, color=FAINT,
+                       linewidth=0.8)
+        above.plot(x, y, color=PATH)
+        above.set(title='from above', aspect='equal')
+        above.axis('off')
+        panels['theta'].plot(motion.t, np.degrees(motion.theta_folded), color=COLOURS[0])
+        for theta in bounds:
+            panels['theta'].axhline(float(np.degrees(theta)), color=INK, linewidth=0.8,
+                                    linestyle=':')
+        panels['theta'].set(ylabel='tilt θ [deg]', xlabel='t [s]')
+        panels['rate'].plot(motion.t, motion.phi_dot, color=COLOURS[1])
+        panels['rate'].axhline(0.0, color=FAINT, linewidth=0.8, zorder=0)
+        panels['rate'].set(ylabel="precession φ' [rad/s]", xlabel='t [s]')
+        panels['drift'].plot(motion.t, (energy - energy[0]) / (abs(energy[0]) or 1.0),
+                             color=COLOURS[2])
+        panels['drift'].set(ylabel='energy drift', xlabel='t [s]')
+    return figure
+
+
+def animate(motion: Motion, fps: float, speed: float) -> FuncAnimation:
+    """Return an animation of a motion; see `States.animate`."""
+    _check(motion)
+    for name, value in (('fps', fps), ('speed', speed)):
+        if not 0.0 < value < np.inf:
+            raise ValueError(f'{name} = {value!r}: must be a number > 0')
+    times = motion.t
+    count = int((times[-1] - times[0]) * fps / speed) + 1
+    # Each frame shows a sample: the newest one, but for rounding.
+    shown = np.searchsorted(times, times[0] + (np.arange(count) + 1e-6) * speed / fps, 'right') - 1
+    x, y, z = motion.rows_axis
+    tip, lowest = x + 1j * y, _lowest(z)
+    bounds = tuple(float(np.arccos(u)) for u in swing(motion.top, motion.start))
+    rim, mark = (on_sphere(DISC * np.exp(1j * np.linspace(begin, end, points)), DISC_HEIGHT)
+                 for begin, end, points in ((0.0, 2.0 * np.pi, 60), (-0.25, 0.25, 9)))
+    mark = np.vstack(((0.0, 0.0, DISC_HEIGHT), mark))
+    figure = Figure(figsize=(4.0, 4.0), dpi=80)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+
+    def frame(number: int) -> list[Artist]:
+        axes.clear()
+        draw_sphere(axes, bounds, lowest)
+        now = shown[number]
+        for points, style in ((rim, {'facecolor': '#f2e3c9', 'edgecolor': INK, 'alpha': 0.9}),
+                              (mark, {'color': COLOURS[1]})):
+            axes.fill(*project(_turned(motion.quaternion[now], points))[:2], **style)
+        draw_tip(axes, tip[:now + 1], z[:now + 1])
+        axes.text(-1.05, 1.15, f't = {times[now]:.2f} s', color=INK, fontsize=9)
+        return []
+
+    return FuncAnimation(figure, frame, frames=count, interval=1000.0 / fps, blit=False)
+
+
+def _turned(quaternion: Reals, points: Reals) -> Reals:
+    """Return points (n, 3) of the body in the world."""
+    axis, w = quaternion[:3], quaternion[3]
+    across: Reals = np.cross(axis, points)
+    turned: Reals = points + 2.0 * (w * across + np.cross(axis, across))
+    return turned

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The layout of Foxglove: its topics and message paths are those of the node."""
+
+import importlib
+import json
+import re
+
+import pytest
+from helpers.reference import ROOT
+
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.journal import NODE_NAME, resolve_topic
+from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, all_streams
+
+LAYOUT = json.loads((ROOT / 'foxglove/spinning_top_sim.json').read_text())
+PANELS = LAYOUT['configById']
+TYPES = {resolve_topic(stream.topic, ''): stream.type_name
+         for stream in all_streams(parameters.checked({}))}
+TYPES['/diagnostics'] = 'diagnostic_msgs/msg/DiagnosticArray'
+# Of robot_state_publisher, which the launch files start.
+TYPES['/robot_description'] = 'std_msgs/msg/String'
+PATHS = [path for panel in PANELS.values() for path in panel.get('paths', ())]
+PART = re.compile(r'(\w+)(?:\[(\d+|:)\])?(?:\{(\w+)=="([^"]*)"\})?')
+
+
+def message_class(type_name):
+    package, *_, name = type_name.split('/')
+    return getattr(importlib.import_module(f'{package}.msg'), name)
+
+
+def end_of(path):
+    """Return topic and the parts of a message path; fail where its type has no such field."""
+    topic, *parts = re.split(r'\.(?![^{]*\})', path)
+    type_name = TYPES[topic]
+    for part in parts:
+        name, index, key, _ = PART.fullmatch(part).groups()
+        field = message_class(type_name).get_fields_and_field_types()[name]
+        sequence = re.fullmatch(r'sequence<(.+)>', field)
+        assert bool(sequence) is (index is not None), part
+        type_name = sequence[1] if sequence else field
+        if key:
+            assert key in message_class(type_name).get_fields_and_field_types()
+    assert type_name in ('double', 'string'), path
+    return topic, [PART.fullmatch(part).groups() for part in parts]
+
+
+@pytest.mark.parametrize('path', PATHS, ids=lambda path: path['value'])
+def test_a_path_is_a_field_of_a_topic(path):
+    topic, parts = end_of(path['value'])
+    if path['timestampMethod'] == 'headerStamp':
+        assert 'header' in message_class(TYPES[topic]).get_fields_and_field_types()
+    index = parts[-1][1]
+    if topic == f'/{NODE_NAME}/invariants':
+        assert INVARIANTS[int(index)].replace('_', ' ') == path['label']
+    if topic == '/joint_states':
+        assert JOINTS[int(index)] == {'θ': 'nutation_joint', "φ'": 'precession_joint'}[
+            path['label']]
+
+
+def test_filters_select_what_the_node_says(tmp_path, diagnostics):
+    from helpers.node_harness import SimNode
+    with SimNode(tmp_path) as node:
+        status = diagnostics.wait_for(node, 'numbers', lambda status: status.values)
+        keys = [pair.key for pair in status.values]
+    for path in PATHS:
+        for _, _, key, value in end_of(path['value'])[1]:
+            if key == 'name':
+                assert value == NODE_NAME
+            if key == 'key':
+                assert value in keys
+    panel = PANELS['DiagnosticStatusPanel!node']
+    assert (panel['selectedHardwareId'], panel['selectedName']) == (status.hardware_id, NODE_NAME)
+
+
+def test_panels_and_topics_are_there():
+    def panels(part):
+        return [part] if isinstance(part, str) else panels(part['first']) + panels(part['second'])
+    assert sorted(panels(LAYOUT['layout'])) == sorted(PANELS)
+    assert {'userNodes', 'globalVariables', 'playbackConfig'} < set(LAYOUT)
+    scene = PANELS['3D!scene']
+    assert set(scene['topics']) <= set(TYPES)
+    assert scene['layers']['urdf']['topic'] in TYPES
+    assert scene['followTf'] == parameters.BY_NAME['world_frame'].default

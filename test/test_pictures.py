@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of a motion for notebooks."""
+
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from helpers.reference import ROOT
+
+from spinning_top_sim import State, Top, solve
+
+TOP = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
+CUSP = State(theta=0.5, l3=1.6, lz=float(1.6 * np.cos(0.5)))
+
+
+@pytest.mark.parametrize('method', ['exact', 'rk45'])
+def test_plot_draws_the_columns(method):
+    pytest.importorskip('matplotlib')
+    motion = solve(TOP, CUSP, np.linspace(0.0, 4.0, 401), method=method)
+    figure = motion.plot()
+    panels = {axes.get_ylabel() or axes.get_title(): axes for axes in figure.axes}
+    for label, expected in (
+            ('tilt θ [deg]', np.degrees(motion.theta_folded)),
+            ("precession φ' [rad/s]", motion.phi_dot),
+            ('energy drift', (motion.energy - motion.energy[0]) / abs(motion.energy[0]))):
+        line = panels[label].lines[0]
+        assert (line.get_xdata() == motion.t).all()
+        assert (line.get_ydata() == expected).all()
+    low, high = sorted(float(line.get_ydata()[0]) for line in panels['tilt θ [deg]'].lines[1:])
+    assert low == pytest.approx(np.degrees(0.5))
+    assert high == pytest.approx(np.degrees(motion.theta.max()), abs=0.05)
+    path = panels['from above'].lines[-1]
+    assert (np.hypot(path.get_xdata(), path.get_ydata())
+            == pytest.approx(np.sin(motion.theta), abs=1e-12))
+    figure.savefig('/dev/null', format='png')
+
+
+def test_animate_shows_samples_in_time():
+    pytest.importorskip('matplotlib')
+    motion = solve(TOP, CUSP, np.linspace(0.0, 1.0, 101))
+    animation = motion.animate(fps=5.0, speed=0.5)
+    html = animation.to_jshtml()
+    assert len(re.findall(r'frames\[\d+\] = ', html)) == 11
+    axes = animation._fig.axes[0]
+    assert axes.texts[0].get_text() == 't = 1.00 s'         # the last one that was drawn
+    # The mark of the disc is where the body is.
+    from spinning_top_sim.physics.pictures import DISC, DISC_HEIGHT, project
+    x, y, z, w = motion.quaternion[-1]
+    rotation = np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])
+    middle = rotation @ [DISC, 0.0, DISC_HEIGHT]
+    drawn = axes.patches[1].get_xy()
+    assert np.min(np.linalg.norm(drawn - np.column_stack(project(middle[np.newaxis])[:2]),
+                                 axis=1)) < 1e-9
+
+
+@pytest.mark.parametrize('times', [[], [0.0], [1.0, 0.5], [0.0, 0.0]])
+def test_times_that_make_no_picture_are_refused(times):
+    pytest.importorskip('matplotlib')
+    with pytest.raises(ValueError, match=f't has {len(times)} times'):
+        solve(TOP, CUSP, np.array(times)).plot()
+
+
+@pytest.mark.parametrize('argument', [{'fps': 0.0}, {'speed': -1.0}, {'fps': np.inf}])
+def test_numbers_that_make_no_animation_are_refused(argument):
+    pytest.importorskip('matplotlib')
+    (name, value), = argument.items()
+    with pytest.raises(ValueError, match=re.escape(f'{name} = {value!r}')):
+        solve(TOP, CUSP, [0.0, 1.0]).animate(**argument)
+
+
+def test_without_matplotlib_the_error_names_the_extra():
+    program = ('import sys; sys.modules["matplotlib"] = None\n'
+               'from spinning_top_sim import State, Top, solve\n'
+               f'motion = solve({TOP!r}, {CUSP!r}, [0.0, 1.0])\n'
+               'for draw in (motion.plot, motion.animate):\n'
+               '    try:\n        draw()\n'
+               '    except ImportError as error:\n        print(error)\n')
+    said = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True,
+                          timeout=60, check=True, cwd=ROOT).stdout
+    assert said.count("pip install 'spinning_top_sim[plot]'") == 2

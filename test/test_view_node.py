@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the page does to the node: few messages, and nothing when it dies, hangs or is slow."""
+
+import os
+import signal
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped
+from helpers.node_harness import SimNode, wait_for
+from helpers.node_logs import stamp_of
+from nav_msgs.msg import Odometry
+
+from spinning_top_sim.nodes import throttle
+from spinning_top_sim.recording.reader import LogReader
+
+VIEW = ('-m', 'spinning_top_sim.view.command', '--no-browser', '--port', '0')
+PERIODS = {'/pose': 5_000_000, '/ground_truth/odom': 10_000_000}
+
+
+@pytest.mark.parametrize(('period', 'count'), [(0.001, 300), (0.01, 300), (0.1, 101)])
+def test_a_throttle_lets_few_messages_through_and_the_last_one(monkeypatch, period, count):
+    now, sent, stream = 0.0, [], SimpleNamespace(sent=0)
+    monkeypatch.setattr(throttle.time, 'monotonic', lambda: now)
+    publisher = SimpleNamespace(publish=sent.append, get_subscription_count=lambda: 1)
+    one = throttle.Throttle(publisher)
+    number = 0
+    while now < 10.0:
+        number += 1
+        one.sink(stream, None)(number)
+        stream.sent += 1                    # as the pipeline counts
+        now = number * period
+    assert len(sent) == pytest.approx(count, abs=1)
+    assert stream.sent == len(sent)
+    one.flush()
+    one.flush()
+    assert sent[-1] == number
+    assert len(set(sent)) == len(sent)
+
+
+def test_a_throttle_is_not_in_the_way_of_others():
+    sent, every, stream = [], [], SimpleNamespace(sent=0)
+    publisher = SimpleNamespace(publish=sent.append, get_subscription_count=lambda: watchers)
+    one, watchers = throttle.Throttle(publisher), 0
+    assert one.sink(stream, None) is None
+    assert one.sink(stream, every.append) == every.append
+    watchers = 1
+    for number in range(100):
+        one.sink(stream, every.append)(number)
+    assert every == list(range(100))
+    assert set(sent) < set(every)
+    assert stream.sent == 0                 # nothing is taken off what the pipeline counts
+    watchers = 0
+    one.sink(stream, every.append)
+    sent.clear()
+    one.flush()
+    assert sent == []                       # nobody waits for it
+
+
+def test_the_throttled_topic_has_messages_of_its_stream(peer, tmp_path):
+    with SimNode(tmp_path) as node:
+        few = peer.listen(node.topic('ground_truth/odom_throttle'), Odometry)
+        few.wait(20)
+        every = peer.listen(node.topic('ground_truth/odom'), Odometry)
+        every.wait(1)
+        few.wait_more(20)
+        assert peer.switch(node, 'set_pause', True).success
+        wait_for('the last message on both topics', lambda: few.raw[-1] == every.raw[-1])
+        known = {stamp_of(data): data for data in every.raw}
+        shared = [data for data in few.raw if stamp_of(data) in known]
+        assert len(shared) >= 20
+        assert all(data == known[stamp_of(data)] for data in shared)
+        # A step, too, is shown at once, whatever came shortly before.
+        assert peer.trigger(node, 'step').success
+        wait_for('the step', lambda: few.raw[-1] == every.raw[-1]
+                 and stamp_of(few.raw[-1]) > max(known))
+
+
+def kill(view):
+    os.killpg(view.process.pid, signal.SIGKILL)
+
+
+def hang(view):
+    os.killpg(view.process.pid, signal.SIGSTOP)
+
+
+def crawl(view):
+    """Let the page have a tenth of its time."""
+    for _ in range(15):
+        os.killpg(view.process.pid, signal.SIGSTOP)
+        time.sleep(0.18)
+        os.killpg(view.process.pid, signal.SIGCONT)
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize('trouble', [kill, hang, crawl])
+def test_a_page_in_trouble_does_not_slow_the_node(peer, diagnostics, tmp_path, trouble):
+    pytest.importorskip('viser')
+    path = tmp_path / 'run.mcap'
+    with SimNode(tmp_path, {'record.enabled': True, 'record.uri': str(path),
+                            'pose.rate': 200.0}) as node:
+        poses = peer.listen(node.topic('pose'), PoseStamped)
+        view = SimNode(tmp_path / 'view', namespace=node.namespace, program=VIEW)
+        with view:
+            wait_for('the page to listen', lambda: peer.node.count_subscribers(
+                node.topic('ground_truth/odom_throttle')))
+            poses.wait_more(100)
+            before = diagnostics.next(node)
+            trouble(view)
+            # Three seconds of simulated time, and of real time: a hung page stays that long.
+            poses.wait_more(600)
+            after = diagnostics.next(node)
+            if trouble is not kill:
+                os.killpg(view.process.pid, signal.SIGCONT)
+                assert view.alive
+        assert after['clock slip [s]'] == before['clock slip [s]'] == '0.000'
+        assert after['recorder'] == 'recording'
+        assert node.end() == 0
+    with LogReader(path) as reader:
+        stamps = {topic: np.array([message.log_time for message in reader.messages(
+            topics=[f'{node.namespace}{topic}'])]) for topic in PERIODS}
+    for topic, period in PERIODS.items():
+        assert len(stamps[topic]) > 3.0e9 / period
+        assert (np.diff(stamps[topic]) == period).all(), topic
+
