@@ -14,7 +14,7 @@ MAKEFLAGS += --no-builtin-rules
 .SUFFIXES:
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help run view test stress performance benchmark docs dependencies lint build clean check-scene \
+.PHONY: help run view test coverage mutation stress performance benchmark docs dependencies lint build clean check-scene \
     FORCE
 
 # DDS stays on this machine.  Its default is to discover nodes in the whole network.
@@ -47,6 +47,8 @@ help:
 	@echo 'make view    the same in the browser, without a log; PORT=... of the page'
 	@echo 'make test    run the tests; TESTS=... selects some, ARGS=... goes to pytest,'
 	@echo '             which has WORKERS=$(WORKERS) processes (0: its own, for ARGS=--pdb)'
+	@echo 'make coverage'
+	@echo '             the same, and tell what no test runs, in all processes and by folder'
 	@echo 'make stress  kill 200 recording nodes (KILLS=...), try random logs, parameters,'
 	@echo '             commands, service calls, disk faults and the statistics of the'
 	@echo '             sensors (each SECONDS=600), then 100 000 random tops (STRESS=...)'
@@ -104,6 +106,18 @@ dependencies: $(VENV)/.deps-test $(VENV)/.package
 # test that failed; pytest-xdist may wait for ever for the one that takes its place.
 test: dependencies
 	'$(VENV)/bin/pytest' -n $(WORKERS) --max-worker-restart=0 $(TESTS) $(ARGS)
+
+# Of the installed package, in every process that the tests start.
+COVERAGE = '$(VENV)/bin/coverage'
+coverage: export COVERAGE_FILE := $(abspath $(VENV))/coverage/data
+coverage: dependencies
+	@rm -rf '$(VENV)/coverage' && mkdir '$(VENV)/coverage'
+	$(COVERAGE) run '$(VENV)/bin/pytest' -n $(WORKERS) --max-worker-restart=0 $(TESTS) $(ARGS)
+	@$(COVERAGE) combine --quiet
+	@for room in spinning_top_sim/*/; do \
+	    printf '%-30s %s %%\n' "$$room" "$$($(COVERAGE) report --format=total --include="$$room*")"; \
+	done
+	$(COVERAGE) report --fail-under=95
 
 STRESS ?= 100000
 KILLS ?= 200
