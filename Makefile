@@ -49,7 +49,8 @@ help:
 	@echo '             which has WORKERS=$(WORKERS) processes (0: its own, for ARGS=--pdb)'
 	@echo 'make coverage'
 	@echo '             the same, and tell what no test runs, in all processes and by folder'
-	@echo 'make stress  kill 200 recording nodes (KILLS=...), try random logs, parameters,'
+	@echo 'make stress  kill 200 recording nodes (KILLS=...), try 100 times the random inputs'
+	@echo '             of the tests (EXAMPLES=...), then random logs, parameters,'
 	@echo '             commands, service calls, disk faults and the statistics of the'
 	@echo '             sensors (each SECONDS=600), then 100 000 random tops (STRESS=...)'
 	@echo '             with both solvers; two hours'
@@ -121,10 +122,15 @@ coverage: dependencies
 
 STRESS ?= 100000
 KILLS ?= 200
+EXAMPLES ?= 100
 SECONDS ?= 600
 stress: dependencies
 	KILLS=$(KILLS) '$(VENV)/bin/pytest' -q test/test_kill.py
-	for part in logs values nodes services disk sensor; do \
+	seed=$$(od -An -N4 -tu4 /dev/urandom | tr -d ' '); set -x; \
+	EXAMPLES=$(EXAMPLES) '$(VENV)/bin/pytest' -q -n $(WORKERS) --hypothesis-seed=$$seed \
+	    test/test_properties.py test/test_properties_logs.py test/test_ranges.py \
+	    test/test_extremes.py
+	for part in logs nodes services disk sensor; do \
 	    '$(VENV)/bin/python' test/stress $$part --seconds $(SECONDS) || failed=1; \
 	done; \
 	'$(VENV)/bin/python' test/stress tops --count $(STRESS) && test -z "$$failed"

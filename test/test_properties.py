@@ -25,8 +25,8 @@ NUMBERS = st.one_of(st.integers(), st.floats(), st.sampled_from((10 ** 400, -2 *
 LONG = st.integers(15_000, 20_000).map(lambda bits: 1 << bits)
 # Names may be anything; but of more lines than one, a message that quotes them is too.
 KEYS = st.text(st.characters(exclude_categories=('Cc', 'Cs', 'Zl', 'Zp')), max_size=5)
-PLAIN = st.one_of(st.none(), st.booleans(), NUMBERS, LONG, st.text(max_size=8), st.binary(max_size=4),
-                  st.dates(), st.complex_numbers())
+PLAIN = st.one_of(st.none(), st.booleans(), NUMBERS, LONG, st.text(max_size=8),
+                  st.binary(max_size=4), st.dates(), st.complex_numbers())
 OF_YAML = st.recursive(
     PLAIN, lambda inner: st.one_of(
         st.lists(inner, max_size=4), st.lists(inner, max_size=3).map(tuple),

@@ -103,6 +103,6 @@ def _known(values: Mapping[str, object], source: str) -> dict[str, object]:
         if value is None:
             raise ValueError(f'{source}: {name} has no value')
         if isinstance(value, list) and len(set(map(type, value))) > 1:
-            raise ValueError(f'{source}: {name} = {shown(value)}: the items of a list must have one '
-                             'type, such as [0.0, 1.5]')
+            raise ValueError(f'{source}: {name} = {shown(value)}: the items of a list must have '
+                             'one type, such as [0.0, 1.5]')
     return known

@@ -2,8 +2,8 @@
 """
 Extreme values that look legal: sets of parameters, commands, and what else is done to a node.
 
-All depend on the random numbers that they are given alone, and need no ROS.  Whatever they return, a node must live on with
-it, or refuse it in one clear line.
+All depend on the random numbers that they are given alone, and need no ROS.  Whatever they return,
+a node must live on with it, or refuse it in one clear line.
 """
 
 from __future__ import annotations
