@@ -21,8 +21,8 @@ MAKEFLAGS += --no-builtin-rules
 .SUFFIXES:
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help run view test stress performance performance-check benchmark docs dependencies lint \
-    build clean check-scene FORCE
+.PHONY: help run view test coverage mutation stress performance performance-check benchmark docs \
+    dependencies lint build clean check-scene FORCE
 
 # DDS stays on this machine.  Its default is to discover nodes in the whole network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
@@ -54,7 +54,10 @@ help:
 	@echo 'make view    the same in the browser, without a log; PORT=... of the page'
 	@echo 'make test    run the tests; TESTS=... selects some, ARGS=... goes to pytest,'
 	@echo '             which has WORKERS=$(WORKERS) processes (0: its own, for ARGS=--pdb)'
-	@echo 'make stress  kill 200 recording nodes (KILLS=...), try random logs, parameters,'
+	@echo 'make coverage'
+	@echo '             the same, and tell what no test runs, in all processes and by folder'
+	@echo 'make stress  kill 200 recording nodes (KILLS=...), try 30 times the random inputs'
+	@echo '             of the tests (EXAMPLES=...), then random logs, parameters,'
 	@echo '             commands, service calls, disk faults and the statistics of the'
 	@echo '             sensors (each SECONDS=300), then 40 000 random tops (STRESS=...)'
 	@echo '             with both solvers; some 70 minutes'
@@ -120,12 +123,28 @@ dependencies: $(VENV)/.deps-test $(VENV)/.package
 test: dependencies
 	'$(VENV)/bin/pytest' -n $(WORKERS) --max-worker-restart=0 $(TESTS) $(ARGS)
 
+# Of the installed package, in every process that the tests start.
+COVERAGE = '$(VENV)/bin/coverage'
+coverage: export COVERAGE_FILE := $(abspath $(VENV))/coverage/data
+coverage: dependencies
+	@rm -rf '$(VENV)/coverage' && mkdir '$(VENV)/coverage'
+	$(COVERAGE) run '$(VENV)/bin/pytest' -n $(WORKERS) --max-worker-restart=0 $(TESTS) $(ARGS)
+	@$(COVERAGE) combine --quiet
+	@for room in spinning_top_sim/*/; do \
+	    printf '%-30s %s %%\n' "$$room" "$$($(COVERAGE) report --format=total --include="$$room*")"; \
+	done
+	$(COVERAGE) report --fail-under=95
+
 STRESS ?= 40000
 KILLS ?= 200
+EXAMPLES ?= 30
 SECONDS ?= 300
 stress: dependencies
-	@.ci/timed "KILLS=$(KILLS) '$(VENV)/bin/pytest' -q test/test_kill.py" \
-	    $(foreach part,logs values nodes services disk sensor, \
+	@seed=$$(od -An -N4 -tu4 /dev/urandom | tr -d ' '); \
+	.ci/timed "KILLS=$(KILLS) '$(VENV)/bin/pytest' -q test/test_kill.py" \
+	    "EXAMPLES=$(EXAMPLES) '$(VENV)/bin/pytest' -q -n $(WORKERS) --hypothesis-seed=$$seed \
+	        $(addprefix test/test_,properties.py properties_logs.py ranges.py extremes.py)" \
+	    $(foreach part,logs nodes services disk sensor, \
 	        "'$(VENV)/bin/python' test/stress $(part) --seconds $(SECONDS)") \
 	    "'$(VENV)/bin/python' test/stress tops --count $(STRESS)"
 

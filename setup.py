@@ -68,8 +68,10 @@ setup(
         'test': [
             'ahrs>=0.4,<0.5',
             'catkin_pkg>=1.0,<2',
+            'coverage>=7.10,<8',        # make coverage
             'distributed>=2024.5,<2028',
             'docutils>=0.20,<1',
+            'hypothesis>=6.100,<7',
             'imufusion>=1.3,<2',
             'ipykernel>=6.20,<8',       # with nbclient: runs examples/tour.ipynb
             'matplotlib>=3.6,<4',

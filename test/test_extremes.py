@@ -1,90 +1,114 @@
 # SPDX-License-Identifier: Apache-2.0
 """Extreme parameters and commands: a node lives on, or refuses them in one clear line."""
 
+import math
+import random
 import time
-from types import SimpleNamespace
 
 import pytest
-from helpers.extremes import actions, commands, parameter_sets
+from helpers.examples import examples
+from helpers.extremes import actions, commands, parameter_set
+from helpers.simulations import doubles
+from hypothesis import given
+from hypothesis import strategies as st
+from test_tick_loop import POSE_NS, TICK_NS, Run
 
-from spinning_top_sim.nodes.tick_loop import TickLoop
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams import parameters
 
-TICK_NS = 5_000_000
-REFUSED = ValueError, IntegrationError
-
-
-class Run:
-    """A loop on a clock of its own, which records what is enabled and goes on as the node does."""
-
-    def __init__(self, values):
-        self.values, self.now_ns, self.sent = values, 77, 0
-        self.simulation = Simulation(values)
-        recording = SimpleNamespace(
-            has_room=lambda: True, wait_for_room=lambda: None, write_command=lambda *_: None,
-            write_event=lambda event, *_, **details: journal.event(event, 0, 0, **details))
-        self.loop = TickLoop(
-            self.simulation, values, recording, update_subscribers=lambda: None,
-            tell=lambda *_: None, source=lambda: self.now_ns,
-            steady=lambda: self.now_ns + time.monotonic_ns())
-        self.simulation.log_to(self.count, [
-            stream for stream in self.simulation.streams
-            if journal.is_enabled(stream.parameter, values)])
-        self.loop.start()
-
-    def count(self, *_):
-        self.sent += 1
-
-    def try_(self, act, *arguments):
-        """Do something; what is refused changes nothing, and any other error stops the motion."""
-        try:
-            act(*arguments)
-        except REFUSED as error:
-            assert str(error).strip()
-        except Exception as error:
-            self.loop.fail(str(error))
-
-    def tick(self):
-        self.now_ns += TICK_NS
-        if self.loop.tick():
-            self.loop.idle()
-
-    def ticks(self, count=8):
-        for _ in range(count):
-            self.try_(self.tick)
+CLOCK_STEP_NS = 5_000_000   # by which time goes on whenever it is read, so that budgets end
+REFUSED = ValueError, RuntimeError, IntegrationError
 
 
-def run_of(values):
-    """Return a run, or None where one is refused."""
+class Recorded:
+    """Takes what is recorded: stamps ascend, and attitudes are unit quaternions."""
+
+    def __init__(self, simulation):
+        self._last = {}
+        self._topics = [stream.topic for stream in simulation.streams]
+        simulation.log_to(self._write, simulation.streams)
+
+    def _write(self, numbers, stamp_ns, messages, size):
+        assert size == sum(map(len, messages))
+        for number, message in zip(numbers, messages, strict=True):
+            assert stamp_ns > self._last.get(number, -1), (self._topics[number], stamp_ns)
+            self._last[number] = stamp_ns
+            if self._topics[number] == 'pose':
+                quaternion = doubles(message, 4)
+                assert all(map(math.isfinite, quaternion)), quaternion
+                assert abs(math.hypot(*quaternion) - 1.0) < 1e-15, quaternion
+
+
+def run_of(given_values):
+    """Return a run that records, or None where one is refused."""
     try:
-        return Run(parameters.checked(values))
-    except (*REFUSED, ArithmeticError) as error:
-        assert str(error).strip() and '\n' not in str(error)
+        run = Run(**given_values)
+    except REFUSED as error:
+        check_reason(error)
         return None
+    run.clock.step_ns = CLOCK_STEP_NS
+    Recorded(run.simulation)
+    run.loop.start()
+    return run
 
 
-@pytest.mark.parametrize('first', range(0, 30, 10))
-def test_whatever_is_set_and_commanded_a_reset_to_the_default_revives(first):
-    for seed in range(first, first + 10):
-        given = {name: value for name, value in parameter_sets(seed).items()
-                 if name not in ('duration', 'start_paused')}
-        run = run_of(given) or run_of({})
-        run.ticks()
-        for data in commands(seed):
-            if len(data) == 2:
-                run.try_(run.loop.command, *data)
-            run.ticks()
-        values = parameters.checked({})
-        run.loop.reset(values, 0)
-        assert run.loop.failure is None, seed
-        sent = run.sent
-        run.simulation.log_to(run.count, run.simulation.streams[:1])
-        for _ in range(4):
-            run.tick()
-        assert run.loop.now_ns == 4 * TICK_NS, seed
-        assert run.sent == sent + 3, seed
+def check_reason(error):
+    """Whether a refusal is one line that people can read."""
+    assert str(error).strip() and '\n' not in str(error), error
+
+
+def angles(simulation):
+    state = simulation.state()
+    return [getattr(state, name)[0] for name in ('theta', 'theta_dot', 'phi', 'psi')]
+
+
+def act(run, kind, value):
+    """Do as the node does."""
+    simulation, loop = run.simulation, run.loop
+    if kind == 'set':
+        changed = parameters.checked({**run.values, **without_end(value)})
+        simulation.apply(changed)
+        loop.set_pace(changed)
+        run.values = changed
+    elif kind == 'command' and len(value) == 2:
+        loop.command(*value)
+    elif kind == 'pause':
+        (loop.pause if value else loop.resume)()
+    elif kind == 'step':
+        loop.step(run.values['step.count'], run.values['step.dt'])
+    elif kind == 'reset':
+        loop.reset(run.values, 0)
+
+
+def without_end(values):
+    return {name: value for name, value in values.items()
+            if name not in ('duration', 'start_paused')}
+
+
+@examples(12)
+@given(st.randoms(), st.booleans())
+def test_whatever_is_set_and_commanded_a_reset_to_the_default_revives(rng, allowed):
+    run = run_of(without_end(parameter_set(rng, allowed))) or run_of({})
+    for kind, value in [*actions(rng), *(('command', data) for data in commands(rng))]:
+        before, now_ns = angles(run.simulation), run.loop.now_ns
+        try:
+            act(run, kind, value)
+        except REFUSED as error:
+            check_reason(error)
+            if kind == 'set' and run.loop.now_ns == now_ns:
+                assert angles(run.simulation) == before, 'a refusal changes nothing'
+        run.tick(rng.choice((1_000_000, TICK_NS, 300_000_000)))
+        run.ticks(5)
+    run.clock.step_ns = 0
+    values = parameters.checked({})
+    run.simulation.apply(values)
+    run.loop.set_pace(values)
+    run.loop.reset(values, run.simulation.epoch_ns)
+    run.loop.resume()
+    assert run.loop.failure is None
+    run.stamps.clear()
+    run.record().ticks(4)
+    assert [stamp - run.simulation.epoch_ns for stamp in run.stamps] == [0, POSE_NS, 2 * POSE_NS]
 
 
 # ------------------------------------------------------------------------------------- real nodes
@@ -96,28 +120,6 @@ def peer():
 
     with Peer() as peer:
         yield peer
-
-
-def without_end(values):
-    return {name: value for name, value in values.items() if name != 'duration'}
-
-
-@pytest.mark.parametrize('seed', range(8))
-def test_a_node_starts_with_extreme_parameters_or_refuses_them_in_one_line(peer, tmp_path, seed):
-    from helpers.node_harness import SimNode, wait_for
-
-    given = {name: str(value).lower() if isinstance(value, bool) else value
-             for name, value in without_end(parameter_sets(seed)).items()}
-    with SimNode(tmp_path, {'status_period': 1.0} | given) as node:
-        wait_for('a service or the end', lambda: not node.alive or node.topic('~/record') in {
-            name for name, _ in peer.node.get_service_names_and_types()})
-        if node.alive:
-            assert peer.switch(node, 'set_pause', True) is not None
-            assert node.end() == 0, node.err
-        else:
-            assert node.wait() == 2, node.err
-            assert node.err.count('sim_node: cannot start: ') == 1
-    assert 'Traceback' not in node.out + node.err
 
 
 def test_a_node_survives_extreme_parameters_commands_and_resets(peer, tmp_path):
@@ -132,7 +134,7 @@ def test_a_node_survives_extreme_parameters_commands_and_resets(peer, tmp_path):
     with SimNode(tmp_path, {'status_period': 0.5}) as node:
         peer.introduce(node, Diagnostics(peer))
         for seed in range(20):
-            for kind, data in actions(seed):
+            for kind, data in actions(random.Random(seed)):
                 if kind == 'set':
                     for name, value in without_end(data).items():
                         peer.set_each(node, **{name: Parameter(name, value=value)

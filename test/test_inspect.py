@@ -16,7 +16,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.odd_logs import odd_log
 from helpers.reference import ROOT, SCENES, scene_parameters
 from mcap.reader import make_reader
 from mcap.writer import Writer
@@ -643,16 +642,6 @@ def test_says_what_it_cannot_tell(tmp_path, capsys, streams):
     assert code == 0
     assert 'drifts of E, L3, Lz: no topic with rates' in out
     assert ('no topic with an attitude' in out) == (streams != ['pose'])
-
-
-@pytest.mark.parametrize('seed', range(50))
-def test_odd_logs_end_in_words(tmp_path, capsys, seed):
-    path = odd_log(tmp_path / 'odd.mcap', seed)
-    code, out, err = told(capsys, path, '--verify')
-    assert code in (0, 1) and out.startswith(f'{path}: ')
-    assert (out + err).replace('\n', '').isprintable()
-    code, content = as_json(capsys, path)
-    assert code in (0, 1) and content['file'] == str(path)
 
 
 @pytest.mark.parametrize(('key', 'text'), [

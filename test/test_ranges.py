@@ -3,12 +3,14 @@
 
 import math
 import random
-from collections import Counter
 
 import numpy as np
 import pytest
-from helpers.extremes import number, parameter_sets
+from helpers.examples import examples
+from helpers.extremes import number, parameter_set
 from helpers.simulations import MILLISECOND, SECOND, record, simulate, stream
+from hypothesis import event, given
+from hypothesis import strategies as st
 
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
@@ -149,7 +151,7 @@ def test_a_run_offline_whose_stamps_would_end_is_refused_before(tmp_path, capsys
 COMPARABLE = {'~/invariants': 7}
 
 
-def short_life(seed):
+def short_life(rng):
     """
     Simulate for a few steps of any length, with commands, changes of rates and resets in between.
 
@@ -157,20 +159,19 @@ def short_life(seed):
     ValueError, where something is refused, and IntegrationError, where a motion ends; and numbers
     that are not finite.
     """
-    random_ = random.Random(-seed)
     spin, rate = parameters.BY_NAME['spin.l3'], parameters.BY_NAME['imu.rate']
     try:
-        checked = parameters.checked(parameter_sets(seed, allowed=True))
-        simulation = Simulation(checked, random_.choice((0, 1_700_000_000_000_000_000)))
+        checked = parameters.checked(parameter_set(rng, allowed=True))
+        simulation = Simulation(checked, rng.choice((0, 1_700_000_000_000_000_000)))
     except ValueError:
         return 'refused'
     simulation.log_to(lambda *call: None, simulation.streams)
     for _ in range(3):
         asked = iter(range(30))
-        target_ns = max(simulation.now_ns, 0) + random_.choice(
+        target_ns = max(simulation.now_ns, 0) + rng.choice(
             (0, 1, *(10 ** n for n in range(3, 18))))
         try:
-            if random_.random() < 0.5:
+            if rng.random() < 0.5:
                 simulation.prepare(target_ns, 5_000_000)
             simulation.advance(target_ns, give_way=lambda asked=asked: next(asked, None) is None)
         except IntegrationError:
@@ -180,29 +181,33 @@ def short_life(seed):
             data = one.encode(simulation.segment.states(now), simulation.epoch_ns, now)
             for field in one.template.decode(data.tobytes()):
                 shown = field[:, :COMPARABLE.get(one.topic)]
-                assert np.isfinite(shown).all(), (seed, one.topic, shown)
+                assert np.isfinite(shown).all(), (one.topic, shown)
         assert math.isfinite(simulation.energy_drift) and str(simulation.describe())
-        act = random_.choice((
-            lambda: simulation.command(number(random_, spin), number(random_, spin)),
-            lambda: simulation.apply({'imu.rate': number(random_, rate)}),
-            lambda: simulation.restart(parameters.checked(
-                parameter_sets(seed + 1, allowed=True)))))
+        act = rng.choice((
+            lambda: simulation.command(number(rng, spin), number(rng, spin)),
+            lambda: simulation.apply({'imu.rate': number(rng, rate)}),
+            lambda: simulation.restart(parameters.checked(parameter_set(rng, allowed=True)))))
         try:
             act()
         except ValueError as error:
-            assert str(error), seed
+            assert str(error)
     return 'ran'
 
 
-def test_every_combination_that_the_ranges_allow_runs_or_is_refused():
-    found = Counter(short_life(seed) for seed in range(60))
-    assert found.keys() <= {'ran', 'refused', 'stopped'}
-    assert found['ran'] > 24 and found['refused'] > 3
+@examples(25)
+@given(st.randoms())
+def test_every_combination_that_the_ranges_allow_runs_or_is_refused(rng):
+    event(short_life(rng))
+
+
+def test_most_combinations_run():
+    found = [short_life(random.Random(seed)) for seed in range(10)]
+    assert found.count('ran') >= 5 and 'refused' in found
 
 
 def test_numbers_of_any_size_are_among_them():
     sizes = [abs(value) for seed in range(600)
-             for name, value in parameter_sets(seed, allowed=True).items()
+             for name, value in parameter_set(random.Random(seed), allowed=True).items()
              if name == 'spin.l3' and value]
     assert min(sizes) < 1e-100 and max(sizes) > 1e100
     assert all(map(math.isfinite, sizes))

@@ -156,6 +156,14 @@ def _drawable(length: float) -> float:
     return min(max(length, SMALLEST), LARGEST)
 
 
+def shown(value: object) -> str:
+    """Return `repr(value)`, which Python refuses for integers of more than 4300 digits."""
+    try:
+        return repr(value)
+    except ValueError:
+        return f'<{type(value).__name__} with too many digits>'
+
+
 def _freeze_as_floats(record: Top | State) -> None:
     """Store every field as a finite float, or say which one is not."""
     for field in fields(record):
@@ -165,5 +173,5 @@ def _freeze_as_floats(record: Top | State) -> None:
         except (TypeError, ValueError, OverflowError):
             number = math.nan
         if not math.isfinite(number):
-            raise ValueError(f'{field.name} = {value!r}: must be a finite number')
+            raise ValueError(f'{field.name} = {shown(value)}: must be a finite number')
         object.__setattr__(record, field.name, number)

@@ -169,6 +169,8 @@ class Scanner:
             _, entries, extra = records.parse_message_index(raw)
             self._check_extra(extra, end)
             if entries:
+                if not self._finder.is_record(end):
+                    raise DamagedError('its length is not that of its content')
                 self._defects.append(f'the message index at byte {offset} is wrong')
             return ScannedRecord(opcode, offset, end, raw=raw)
         record, extra = records.parse(raw)
@@ -247,6 +249,8 @@ class Scanner:
             # The entries may be in any order, and a channel without messages may have an index.
             wanted = entries.get(channel_id, array('Q'))
             if found and found != wanted and sorted(found) != sorted(wanted):
+                if not self._finder.is_record(end):
+                    break       # bytes are missing in it, or too many
                 self._defects.append(f'the message index at byte {begin} is wrong')
             expected.pop(channel_id, None)
             offset = end
@@ -261,7 +265,11 @@ class Scanner:
         if end > self._limit and kind == _INDEX_KIND and not self._summary.closed:
             end = self._limit
         elif not self._finder.is_record(end):
-            return offset
+            # Bytes are missing in it if another record begins before.
+            following = self._finder.find(offset)
+            if following > end:
+                return offset
+            end = following
         self._defects.append(f'the message index at byte {offset} is wrong')
         return end
 

@@ -9,12 +9,12 @@ The defaults are the cusp scene: a bicycle wheel on a pivot, spun about its axis
 import contextlib
 import enum
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.solvers.propagator import EQUATIONS, METHODS
 
 Value = Any
@@ -90,12 +90,12 @@ class Parameter:
                 if isinstance(self.default, tuple):
                     return tuple(type(self.default[0])(item) for item in value)
                 return float(value) if self.is_double else value
-        raise ValueError(f'{self.name} = {value!r}: {self.allowed}')
+        raise ValueError(f'{self.name} = {shown(value)}: {self.allowed}')
 
     def _is_allowed(self, value: Value) -> bool:
         default = self.default
         if isinstance(default, tuple):
-            if isinstance(value, str | bytes):
+            if isinstance(value, str | bytes | Mapping | Set):       # no lists, though iterable
                 return False
             if isinstance(default[0], str):
                 return all(isinstance(item, str) for item in value)
@@ -277,7 +277,7 @@ def checked(values: Mapping[str, Value]) -> dict[str, Value]:
     result = {parameter.name: parameter.default for parameter in TABLE}
     for name, value in values.items():
         if name not in BY_NAME:
-            raise ValueError(f'{name} = {value!r}: there is no such parameter')
+            raise ValueError(f'{name} = {shown(value)}: there is no such parameter')
         result[name] = BY_NAME[name].check(value)
     names = [row[0] for row in STREAM_DEFAULTS]
     for name in result['record.streams']:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from spinning_top_sim.physics.top import shown
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.scene_file import parse_section, parse_yaml, read_scene
 
@@ -155,7 +156,7 @@ def parse(content: object, source: str, folder: Path = Path()) -> Specification:
     for name, least in whole.items():
         value = given.setdefault(name, least)
         if type(value) is not int or not least <= value < 2 ** 63:
-            raise ValueError(f'{source}: {name} = {value!r}: must be an integer >= {least}')
+            raise ValueError(f'{source}: {name} = {shown(value)}: must be an integer >= {least}')
     duration = given['duration'] = _check(source, 'duration', given['duration'])
     if not duration > 0.0:
         raise ValueError(f'{source}: duration = {duration!r}: must be a number > 0')
@@ -167,7 +168,7 @@ def parse(content: object, source: str, folder: Path = Path()) -> Specification:
     given['streams'] = _streams(given.get('streams') or [], given['format'], source)
     sample = given.get('sample') or {}
     if not isinstance(sample, Mapping):
-        raise ValueError(f'{source}: sample = {sample!r}: must be a mapping of parameters')
+        raise ValueError(f'{source}: sample = {shown(sample)}: must be a mapping of parameters')
     given['sample'] = {name: _rule(name, rule, f'{source}: sample', folder)
                        for name, rule in sample.items()}
     specification = Specification(**given)
@@ -184,7 +185,7 @@ def _check(source: str, name: str, value: object) -> Any:
 
 def _list(value: object, what: str) -> Sequence[Any]:
     if not isinstance(value, list | tuple):
-        raise ValueError(f'{what} = {value!r}: must be a list')
+        raise ValueError(f'{what} = {shown(value)}: must be a list')
     return value
 
 
@@ -196,8 +197,8 @@ def _set_of(given: object, source: str, folder: Path) -> dict[str, Any]:
     elif isinstance(given, Mapping):
         found = parse_section(given, source)
     else:
-        raise ValueError(f'{source}: {given!r}: must be a parameter file, or parameters and their '
-                         'values')
+        raise ValueError(f'{source}: {shown(given)}: must be a parameter file, or parameters and '
+                         'their values')
     return {name: _check(source, name, value) for name, value in found.items()}
 
 
@@ -217,7 +218,7 @@ def _rule(name: object, rule: object, source: str, folder: Path) -> dict[str, li
         raise ValueError(f'{source}: {name} is of ROS and has no effect')
     what = f'{source}: {name}'
     if not isinstance(rule, Mapping) or len(rule) != 1:
-        raise ValueError(f'{what} = {rule!r}: must be one of '
+        raise ValueError(f'{what} = {shown(rule)}: must be one of '
                          f'{", ".join((*DISTRIBUTIONS, VALUES))} with a list')
     (kind, given), = rule.items()
     if kind not in (*DISTRIBUTIONS, VALUES):
@@ -235,7 +236,7 @@ def _rule(name: object, rule: object, source: str, folder: Path) -> dict[str, li
     if len(items) != 2 or not all(
             isinstance(item, int | float) and not isinstance(item, bool) and math.isfinite(item)
             for item in items) or not is_allowed(*items):
-        raise ValueError(f'{what}: {kind} = {given!r}: must be {allowed}')
+        raise ValueError(f'{what}: {kind} = {shown(given)}: must be {allowed}')
     for bound in items[:1] if kind == 'normal' else items:
         _check(source, str(name), bound)
     return {kind: [float(item) for item in items]}

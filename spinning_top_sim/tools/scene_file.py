@@ -8,6 +8,7 @@ from pathlib import Path
 
 import yaml
 
+from spinning_top_sim.physics.top import shown
 from spinning_top_sim.streams import parameters
 
 # Names of nodes in a file that stand for the node spinning_top.
@@ -110,6 +111,6 @@ def known(values: Mapping[str, object], source: str) -> dict[str, object]:
         if value is None:
             raise ValueError(f'{source}: {name} has no value')
         if isinstance(value, list) and len(set(map(type, value))) > 1:
-            raise ValueError(f'{source}: {name} = {value!r}: the items of a list must have one '
-                             'type, such as [0.0, 1.5]')
+            raise ValueError(f'{source}: {name} = {shown(value)}: the items of a list must have '
+                             'one type, such as [0.0, 1.5]')
     return ours

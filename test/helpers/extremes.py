@@ -2,8 +2,8 @@
 """
 Extreme values that look legal: sets of parameters, commands, and what else is done to a node.
 
-All are plain functions of a seed, and need no ROS.  Whatever they return, a node must live on with
-it, or refuse it in one clear line.
+All depend on the random numbers that they are given alone, and need no ROS.  Whatever they return,
+a node must live on with it, or refuse it in one clear line.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ INTEGERS = (0, 1, -1, 2, 14, 1000, 2 ** 31 - 1, 2 ** 31, 2 ** 53 + 1, 2 ** 63 - 
 STRINGS = ('', 'x', 'world', '/', '~', 'a/b', 'a b', '\u00e9', '\x1b[31m', 'all', 'x' * 300, '..')
 
 
-def parameter_sets(seed: int, allowed: bool = False) -> dict[str, object]:
+def parameter_set(random_: random.Random, allowed: bool = False) -> dict[str, object]:
     """
     Return some parameters at extreme values, by name.
 
@@ -33,7 +33,6 @@ def parameter_sets(seed: int, allowed: bool = False) -> dict[str, object]:
 
     allowed : only values that the table allows, and now and then all parameters
     """
-    random_ = random.Random(seed)
     settable = [row for row in parameters.TABLE if not row.name.startswith('record.')]
     counts = (1, 2, 3, 5, 10, len(settable)) if allowed else (1, 1, 1, 2, 3, 5, 8)
     chosen = random_.sample(settable, random_.choice(counts))
@@ -59,30 +58,27 @@ def _default(row: Parameter) -> float:
     return row.default if isinstance(row.default, int | float) else 1.0
 
 
-def commands(seed: int) -> list[list[float]]:
+def commands(random_: random.Random) -> list[list[float]]:
     """Return one to six messages for ~/commands: [L3, Lz] as a rule, some of another length."""
-    random_ = random.Random(seed)
     return [[_double(random_) for _ in range(random_.choice((2, 2, 2, 2, 2, 2, 2, 0, 1, 3)))]
             for _ in range(random_.randint(1, 6))]
 
 
-def actions(seed: int) -> list[tuple[str, object]]:
+def actions(random_: random.Random) -> list[tuple[str, object]]:
     """
     Return four to twelve things to do to a running node, one after the other.
 
     ('set', parameters), ('command', [L3, Lz]), ('pause', bool), ('step', None), ('reset', None),
     and ('wait', seconds)
     """
-    random_ = random.Random(seed)
     found: list[tuple[str, object]] = []
     for _ in range(random_.randint(4, 12)):
         kind = random_.choice(('set', 'set', 'command', 'pause', 'step', 'reset', 'wait'))
-        inner = random_.getrandbits(32)
         found.append((kind, {
-            'set': lambda seed=inner: parameter_sets(seed),
-            'command': lambda seed=inner: commands(seed)[0],
-            'pause': lambda seed=inner: bool(seed % 2),
-            'wait': lambda seed=inner: (seed % 100) / 1000.0,
+            'set': lambda: parameter_set(random_),
+            'command': lambda: commands(random_)[0],
+            'pause': lambda: random_.random() < 0.5,
+            'wait': lambda: random_.randrange(100) / 1000.0,
         }.get(kind, lambda: None)()))
     return found
 

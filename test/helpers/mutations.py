@@ -22,9 +22,8 @@ NUMBERS = (0, 1, 2, 15, 0x7f, 0x80, 0xff, 0xffff, 1 << 31, (1 << 32) - 1, 1 << 4
            (1 << 63) - 1, 1 << 63, (1 << 64) - 1)
 
 
-def mutate(data: bytes, seed: int) -> bytes:
-    """Return a mutation of a log; the same for the same seed."""
-    rng = random.Random(seed)
+def mutate(data: bytes, rng: random.Random) -> bytes:
+    """Return a mutation of a log that depends on these random numbers alone."""
     changed = bytearray(data)
     if rng.random() < 0.4:
         _mutate_in_chunk(changed, rng)

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Logs of this package with odd metadata, journal entries, stamps and samples, from a seed.
+Logs of this package with odd metadata, journal entries, stamps and samples, at random.
 
-`odd_log(path, seed)` writes one.  The files are whole MCAP: only what is in them is odd.
+`odd_log(path, rng)` writes one.  The files are whole MCAP: only what is in them is odd.
 """
 
 import functools
 import json
 import math
-import random
 import tempfile
 from pathlib import Path
 
@@ -139,9 +138,8 @@ def _odd(rng, kinds, topic, stamp_ns, data):
     return (topic, stamp_ns, data), copies
 
 
-def odd_log(path, seed):
-    """Write a log that is odd in a way that depends on the seed alone; return the path."""
-    rng = random.Random(seed)
+def odd_log(path, rng):
+    """Write a log that is odd as these random numbers have it; return the path."""
     metadata, schemas, channels, logged = _recorded(rng.choice(('rk45', 'exact')))
     kinds = rng.sample(('metadata', 'journal', 'stamps', 'samples', 'names'), rng.randint(1, 2))
     numbers = [number for number, (topic, _, _) in enumerate(logged)

@@ -4,8 +4,7 @@ Stress tests: random inputs and faults, for so long or so many.
 
     python test/stress tops --count 100000      both solvers on random tops
     python test/stress logs --seconds 600       odd and damaged logs, and what reads them
-    python test/stress values --seconds 600     extreme parameters and commands, without ROS
-    python test/stress nodes --seconds 600      the same at a real node
+    python test/stress nodes --seconds 600      extreme parameters and commands at a real node
     python test/stress services --seconds 600   several clients at a real node at once
     python test/stress disk --seconds 600       recordings on a disk that fails
 

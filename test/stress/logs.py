@@ -11,6 +11,7 @@ import contextlib
 import functools
 import io
 import json
+import random
 import re
 import tempfile
 import time
@@ -33,11 +34,12 @@ TERMINAL_CODES = re.compile(r'[\x00-\x08\x0b-\x1f\x7f-\x9f]')
 
 def check(seed, folder):
     path = folder / 'run.mcap'
+    rng = random.Random(seed)
     if seed % 2:
-        odd_log(path, seed)
+        odd_log(path, rng)
     else:
         originals = original_logs()
-        path.write_bytes(mutate(originals[seed // 2 % len(originals)], seed))
+        path.write_bytes(mutate(originals[seed // 2 % len(originals)], rng))
     content = path.read_bytes()
     came_of_it = [read(path), *inspected(path), recovered(path, folder), replayed(path)]
     assert path.read_bytes() == content, 'the log was changed'

@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Inputs of any kind: parameters, commands, YAML and CDR are read, or refused by name."""
+
+import csv
+import dataclasses
+import math
+import string
+
+import numpy as np
+import yaml
+from helpers.examples import examples
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+
+from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.streams import messages, parameters
+from spinning_top_sim.tools import ensemble_spec, scene_file
+from spinning_top_sim.tools.simulate import UNITS, _write_csv
+
+JAZZY = get_typestore(Stores.ROS2_JAZZY)
+NUMBERS = st.one_of(st.integers(), st.floats(), st.sampled_from((10 ** 400, -2 ** 63, 5e-324)))
+# Python shows no integer of more than 4300 digits; YAML has them, in hexadecimal.
+LONG = st.integers(15_000, 20_000).map(lambda bits: 1 << bits)
+# Names may be anything; but of more lines than one, a message that quotes them is too.
+KEYS = st.text(st.characters(exclude_categories=('Cc', 'Cs', 'Zl', 'Zp')), max_size=5)
+PLAIN = st.one_of(st.none(), st.booleans(), NUMBERS, LONG, st.text(max_size=8),
+                  st.binary(max_size=4), st.dates(), st.complex_numbers())
+OF_YAML = st.recursive(
+    PLAIN, lambda inner: st.one_of(
+        st.lists(inner, max_size=4), st.lists(inner, max_size=3).map(tuple),
+        st.dictionaries(st.one_of(KEYS, st.sampled_from(('all', 'pose'))), inner, max_size=3),
+        st.lists(st.floats(), min_size=3, max_size=9),
+        st.sets(st.floats(0.0, 1.0), min_size=3, max_size=3),
+        st.dictionaries(st.floats(0.0, 1.0), inner, min_size=3, max_size=3)),
+    max_leaves=6)
+ANYTHING = OF_YAML | st.lists(st.floats(), min_size=3, max_size=3).map(np.array)
+NAMES = st.sampled_from(sorted(parameters.BY_NAME))
+LISTS = st.sampled_from(sorted(name for name, parameter in parameters.BY_NAME.items()
+                               if isinstance(parameter.default, tuple)))
+
+
+def is_a_line(text):
+    return '\n' not in text and text.strip() != ''
+
+
+# ------------------------------------------------------------------------------------ parameters
+
+@examples(400)
+@given(NAMES | LISTS, ANYTHING)
+def test_any_value_of_a_parameter_is_taken_or_refused_by_its_name(name, value):
+    try:
+        values = parameters.checked({name: value})
+    except ValueError as refusal:
+        assert str(refusal).startswith(f'{name} = '), refusal
+        assert 'must be ' in str(refusal) and is_a_line(str(refusal))
+        return
+    assert parameters.checked(values) == values
+    assert not isinstance(value, dict | set), 'without order there is no list'
+    default = parameters.BY_NAME[name].default
+    assert default is None or type(values[name]) is type(default)
+
+
+@examples(150)
+@given(st.fixed_dictionaries({name: st.one_of(st.floats(), PLAIN) for name in (
+    'lambda1', 'lambda3', 'mass', 'com_distance', 'gravity')}),
+    st.fixed_dictionaries({name: st.one_of(st.floats(), PLAIN) for name in (
+        'theta', 'theta_dot', 'phi', 'psi', 'l3', 'lz')}))
+def test_a_top_and_a_state_of_any_numbers_are_made_or_refused(top, start):
+    for kind, values in ((Top, top), (State, start)):
+        try:
+            made = kind(**values)
+        except ValueError as refusal:
+            assert any(name in str(refusal) for name in values) and is_a_line(str(refusal))
+        else:
+            assert all(math.isfinite(number) for number in dataclasses.astuple(made))
+
+
+# ------------------------------------------------------------------------------------------ YAML
+
+YAML_TEXT = st.text(st.sampled_from(string.ascii_letters + string.digits + ' \n\t:-[]{},&*!|>#\'"'
+                                    '%@`~.\x00\x85\u2028\ud800\U0001f300'), max_size=60)
+YAML = st.one_of(
+    YAML_TEXT, st.recursive(
+        st.one_of(st.none(), st.booleans(), NUMBERS, st.text(max_size=5), st.dates()),
+        lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(
+            st.one_of(NAMES, NUMBERS, KEYS), inner, max_size=3)),
+        max_leaves=8).map(lambda content: yaml.safe_dump(
+            {'/**': {'ros__parameters': content}}, allow_unicode=True)),
+    st.tuples(NAMES, LONG).map(lambda pair: f'/**: {{ros__parameters: {{{pair[0]}: [1.0, '
+                               f'{pair[1]:#x}]}}}}'))
+
+
+@examples(200)
+@given(YAML)
+def test_any_parameter_file_is_read_or_refused_by_its_path(tmp_path, text):
+    path = tmp_path / 'scene.yaml'
+    path.write_bytes(text.encode(errors='surrogatepass'))
+    try:
+        values = scene_file.read_scene(path)
+    except ValueError as refusal:
+        assert str(path) in str(refusal) and is_a_line(str(refusal))
+    else:
+        assert values.keys() <= parameters.BY_NAME.keys()
+
+
+@examples(150)
+@given(st.one_of(NAMES, st.text(max_size=5)), YAML_TEXT)
+def test_any_assignment_is_read_or_refused(name, text):
+    try:
+        found, _ = scene_file.parse_assignment(f'{name}:={text}')
+    except ValueError as refusal:
+        assert name in str(refusal)
+    else:
+        assert found in parameters.BY_NAME or scene_file.is_of_ros(found)
+
+
+# ------------------------------------------------------------------------------------- ensembles
+
+FLOATS = st.floats(-1e3, 1e3)
+RULES = st.one_of(
+    st.tuples(FLOATS, FLOATS).map(lambda pair: {'uniform': sorted(pair)}),
+    st.tuples(FLOATS, st.floats(0.0, 1e3)).map(lambda pair: {'normal': list(pair)}),
+    st.tuples(st.floats(1e-9, 1e3), st.floats(1.0, 1e3)).map(
+        lambda pair: {'log_uniform': [pair[0], pair[0] * pair[1]]}),
+    st.lists(FLOATS, min_size=1, max_size=4).map(lambda items: {'values': items}),
+    st.dictionaries(st.sampled_from(('uniform', 'normal', 'values', 'gauss')), OF_YAML,
+                    max_size=2), OF_YAML)
+SPECIFICATIONS = st.one_of(st.fixed_dictionaries(
+    {'runs': st.one_of(st.integers(1, 50), OF_YAML), 'duration': st.floats(1e-3, 10.0)},
+    optional={
+        'seed': st.one_of(st.integers(0, 2 ** 63 - 1), OF_YAML),
+        'format': st.one_of(st.sampled_from(ensemble_spec.FORMATS), OF_YAML),
+        'streams': st.one_of(st.lists(st.sampled_from(ensemble_spec.STREAMS), max_size=3),
+                             OF_YAML),
+        'runs_per_part': st.one_of(st.integers(0, 9), OF_YAML),
+        'params': st.one_of(st.lists(st.one_of(OF_YAML, st.dictionaries(NAMES, FLOATS)),
+                                     max_size=2), OF_YAML),
+        'sample': st.one_of(st.dictionaries(
+            st.one_of(NAMES, st.just('params'), KEYS), RULES, max_size=3),
+            OF_YAML)}), OF_YAML)
+
+
+@examples(300)
+@given(SPECIFICATIONS)
+def test_any_specification_gives_its_runs_or_is_refused_by_its_source(content):
+    try:
+        specification = ensemble_spec.parse(content, 'spec.yaml')
+    except ValueError as refusal:
+        assert str(refusal).startswith('spec.yaml: ') and is_a_line(str(refusal))
+        return
+    except OSError:         # a set of parameters names a file
+        return
+    assert ensemble_spec.parse(dataclasses.asdict(specification), 'again') == specification
+    parts = [run for number in range(specification.parts) for run in specification.part(number)]
+    assert parts == list(range(specification.runs)) or specification.runs > 50
+    try:
+        values = specification.values(specification.runs - 1)
+    except ValueError as refusal:
+        assert is_a_line(str(refusal))
+    else:
+        assert specification.values(specification.runs - 1) == values
+
+
+@examples(200)
+@given(st.sampled_from(('uniform', 'log_uniform')), st.integers(0, 2 ** 63 - 1),
+       st.floats(0.0, 1e30, exclude_min=True), st.floats(0.0, 1e30, exclude_min=True))
+def test_what_is_drawn_is_between_its_bounds(kind, seed, one, other):
+    low, high = sorted((one, other))
+    specification = ensemble_spec.parse(
+        {'runs': 3, 'duration': 1.0, 'seed': seed, 'sample': {'top.lambda1': {kind: [low, high]}}},
+        'spec.yaml')
+    for run in range(3):
+        assert low <= specification.drawn(run)['top.lambda1'] <= high
+
+
+# --------------------------------------------------------------------------------- CDR and CSV
+
+STAMPS = st.integers(-2 ** 31 * 10 ** 9, 2 ** 31 * 10 ** 9 - 1)
+
+
+@examples(100)
+@given(st.text(max_size=9).filter(lambda text: '\0' not in text), STAMPS,
+       st.lists(st.floats(), min_size=10, max_size=10))
+def test_messages_of_any_frame_stamp_and_numbers_are_read_by_rosbags(frame, stamp_ns, numbers):
+    """To the last bit of each number, NaN among them."""
+    template = messages.imu(frame, *3 * (messages.EXACT,))
+    data = template.encode_one(stamp_ns, numbers[:4], numbers[4:7], numbers[7:])
+    message = JAZZY.deserialize_cdr(data, 'sensor_msgs/msg/Imu')
+    assert message.header.frame_id == frame
+    assert message.header.stamp.sec * 10 ** 9 + message.header.stamp.nanosec == stamp_ns
+    found = [getattr(vector, axis) for vector, axes in (
+        (message.orientation, 'xyzw'), (message.angular_velocity, 'xyz'),
+        (message.linear_acceleration, 'xyz')) for axis in axes]
+    assert np.array(found).tobytes() == np.array(numbers).tobytes()
+    assert np.concatenate(template.decode(data), axis=1).tobytes() == np.array(numbers).tobytes()
+    assert template.stamps_ns(data).tolist() == [stamp_ns]
+
+
+@examples(50)
+@given(st.lists(st.lists(st.floats(), min_size=len(UNITS), max_size=len(UNITS)), max_size=4))
+def test_numbers_in_a_table_are_read_back_to_the_last_bit(tmp_path, rows):
+    path = tmp_path / 'table.csv'
+    path.unlink(missing_ok=True)
+    _write_csv(path, [np.array(rows).reshape(-1, len(UNITS)).T])
+    head, *lines = csv.reader(path.read_text().splitlines())
+    assert len(head) == len(UNITS) and len(lines) == len(rows)
+    for line, row in zip(lines, rows, strict=True):
+        assert str(list(map(float, line))) == str(row)
+        assert all(math.isnan(b) or a == b for a, b in zip(map(float, line), row, strict=True))
+
+
+# -------------------------------------------------------------------------------------- commands
+
+@examples(40)
+@given(st.sampled_from(('rk45', 'exact')), st.lists(st.tuples(
+    st.floats() | st.sampled_from((0.0, 5e-324, 1.6)), st.floats() | st.sampled_from((0.0, 1.4))),
+    min_size=1, max_size=4))
+def test_the_motion_goes_on_after_any_command(method, given_commands):
+    from helpers.simulations import MILLISECOND, record, simulate, times
+
+    simulation = simulate(solver__method=method)
+    taken, now_ns = record(simulation, 'pose'), 0
+    for command in given_commands:
+        now_ns += 10 * MILLISECOND
+        before = simulation.l3, simulation.lz
+        assert simulation.advance(now_ns)
+        try:
+            simulation.command(*command)
+        except (ValueError, IntegrationError) as refusal:
+            assert is_a_line(str(refusal))
+            assert (simulation.l3, simulation.lz) == before
+        else:
+            assert (simulation.l3, simulation.lz) == command
+            if max(map(abs, command)) > 1e4:
+                return          # as fast as it is allowed: not in the time of a test
+    simulation.advance(now_ns + 10 * MILLISECOND)
+    assert times(taken, 'pose') == list(range(0, now_ns + 10 * MILLISECOND + 1, 10 * MILLISECOND))
+    assert np.isfinite(simulation.state().quaternion).all()
+
+
