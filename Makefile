@@ -113,6 +113,7 @@ stress: dependencies
 	for part in logs values nodes services disk sensor; do \
 	    '$(VENV)/bin/python' test/stress $$part --seconds $(SECONDS) || failed=1; \
 	done; \
+	'$(VENV)/bin/python' test/stress exam --count 20 || failed=1; \
 	'$(VENV)/bin/python' test/stress tops --count $(STRESS) && test -z "$$failed"
 
 # The programs to compare with need hundreds of megabytes, so they have their own environment.

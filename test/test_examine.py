@@ -406,7 +406,9 @@ def test_the_command_examines_a_published_filter(capsys):
     (['{log}', '--topic', '/nix'], 2, 'has no topic /nix; it has /pose'),
     (['{log}', '--topic', '/joint_states'], 2, 'has the type sensor_msgs/msg/JointState'),
     (['{log}', '--topic', '/imu/data_raw'], 2, 'it has no orientation'),
-    (['{log}'], 2, '--topic'), ([], 2, 'give either a log'),
+    (['{log}'], 2, '--topic'), ([], 2, '--topic: which topic'),
+    (['{log}', '--topic', '/pose', '--filter', 'vqf'], 2, 'give either a log'),
+    (['--filter', 'vqf', '--workers', '0'], 2, 'workers = 0: must be from 1'),
     (['nix.mcap', '--topic', '/a'], 1, 'nix.mcap'),
     (['{log}', '--topic', '/pose', '--page', 'a.gif'], 2, 'must end in .png'),
     (['--filter', 'vqf', '--seeds', '0'], 2, 'seeds = 0')])

@@ -28,7 +28,7 @@ def test_a_node_says_what_its_filter_says_in_every_run(run):
 
     # The node takes the first sample for the begin of its first step.
     direct = follow(partial(Vqf, magnetic=False), run.part(slice(1, None)))
-    with NodeExam(NODE, 'imu/data') as node:
+    with NodeExam('imu/data', NODE) as node:
         for _ in range(2):
             outcome = follow(node.make_filter, run)
             assert np.max(np.abs(outcome.estimates[1:] - direct.estimates)) < 1e-9
@@ -38,7 +38,7 @@ def test_a_node_says_what_its_filter_says_in_every_run(run):
 def test_a_node_that_ends_is_told(run):
     from spinning_top_sim.exam.live import NodeExam
 
-    with (NodeExam(f'{sys.executable} -c pass', 'imu/data') as node,
+    with (NodeExam('imu/data', f'{sys.executable} -c pass') as node,
           pytest.raises(InvalidOutputError, match='the node has ended with 0')):
         follow(node.make_filter, run)
 
@@ -51,7 +51,7 @@ def test_a_node_that_does_not_answer_is_told(run, monkeypatch):
             "node = rclpy.create_node('deaf'); node.create_publisher(Imu, 'imu/data', 1); "
             "s = node.create_subscription(Imu, 'imu/data_raw', lambda message: None, 1); "
             'rclpy.spin(node)')
-    with (live.NodeExam(f'{sys.executable} -c "{deaf}"', 'imu/data') as node,
+    with (live.NodeExam('imu/data', f'{sys.executable} -c "{deaf}"') as node,
           pytest.raises(InvalidOutputError, match='update 6 of 300 raises RuntimeError: no '
                         r'attitude has the stamp 1\.0600')):
         follow(node.make_filter, run)
