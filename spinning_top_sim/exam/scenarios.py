@@ -140,7 +140,7 @@ def turning(imu: Mapping[str, Any], first: Reals, last: Reals, seconds: float,
     period = 1.0 / SLOW.rate
     n = round(seconds * SLOW.rate)
     part = np.arange(n + 1) / n
-    t: Reals = period * np.arange(1 - n, 1)
+    t: Reals = np.arange(1 - n, 1) / SLOW.rate
     turns = (Slerp((0.0, 1.0), Rotation.from_quat((first, last)))(part)
              * Rotation.from_euler('zx', np.stack((
                  12.0 * np.pi * part, 0.7 * np.sin(6.0 * np.pi * part)), axis=1)))

@@ -11,6 +11,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import helpers.own_domain  # noqa: F401, before any node starts
+
 from spinning_top_sim.exam import examine
 from spinning_top_sim.exam.live import NodeExam
 
