@@ -26,7 +26,7 @@ from spinning_top_sim.exam.adapters import FILTERS
 from spinning_top_sim.exam.examiner import SEEDS, examine
 from spinning_top_sim.exam.log import NORTHS, examine_log
 from spinning_top_sim.exam.report import Report
-from spinning_top_sim.exam.trial import LostNodeError
+from spinning_top_sim.exam.trial import NodeError
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.tools import cli
 from spinning_top_sim.tools.ensemble_part import EnsembleError
@@ -35,7 +35,7 @@ from spinning_top_sim.tools.ensemble_part import EnsembleError
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
     return cli.run('examine', __doc__, argv, _add_arguments, _run,
-                   (ValueError, LogError, OSError, ImportError, EnsembleError, LostNodeError))
+                   (ValueError, LogError, OSError, ImportError, EnsembleError, NodeError))
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -97,11 +97,11 @@ def _report(arguments: argparse.Namespace) -> Report:
         make_filter = FILTERS[arguments.filter]
         make_filter()           # imports its package, once for all runs
         return examine(make_filter, *options, arguments.filter, arguments.workers)
-    from spinning_top_sim.exam.live import NodeExam  # noqa: PLC0415 - needs ROS
+    if arguments.workers != 1:
+        raise ValueError(f'--workers {arguments.workers}: must be 1 for a node')
+    from spinning_top_sim.exam.live import examine_node  # noqa: PLC0415 - needs ROS
 
-    with NodeExam(arguments.topic, arguments.node) as node:
-        return examine(node.make_filter, *options, arguments.node or arguments.topic,
-                       arguments.workers, isolated=False, restart=node.restarts)
+    return examine_node(arguments.topic, arguments.node, *options)
 
 
 if __name__ == '__main__':

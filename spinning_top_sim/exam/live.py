@@ -12,7 +12,8 @@ import shlex
 import signal
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,9 @@ from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, MagneticField
 
-from spinning_top_sim.exam.trial import LostNodeError
+from spinning_top_sim.exam.examiner import examine
+from spinning_top_sim.exam.report import Report
+from spinning_top_sim.exam.trial import NodeError
 from spinning_top_sim.streams.cdr import NANOSECONDS
 
 try:                            # takes least processor time
@@ -44,9 +47,23 @@ FASTEST, LAST_NS = 50, 2 * 10 ** 9 * NANOSECONDS
 FRAME = 'imu_link'
 
 
+def examine_node(topic: str, command: str | None = None, level: str = 'quick',
+                 imu: Mapping[str, Any] | str | Path | None = None,
+                 seeds: int | Iterable[int] | None = None) -> Report:
+    """
+    Examine a ROS node.
+
+    topic, command : see `NodeExam`
+    level, imu, seeds : see `examine`, which this does and raises
+    """
+    with NodeExam(topic, command) as node:
+        return examine(node.make_filter, level, imu, seeds, command or topic, isolated=False,
+                       restart=command is not None)
+
+
 class NodeExam(contextlib.AbstractContextManager['NodeExam']):
     """
-    Feeds a node: `examine(exam.make_filter, isolated=False, restart=exam.restarts)`.
+    Feeds a node: `make_filter` returns it in the form that the exam takes.
 
     topic : sensor_msgs/Imu with the attitudes that it publishes, each with the stamp of its sample
     command : of the node, which reads `imu/data_raw` and `imu/mag`; None: it runs already
@@ -75,56 +92,46 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         self._node.destroy_node()
         rclpy.shutdown(context=self._context)
 
-    @property
-    def restarts(self) -> bool:
-        """Whether the node is started for every run."""
-        return self._command is not None
-
     def make_filter(self) -> 'NodeFilter':
         """
         Start the node anew, or find the one that runs.
 
-        Raises RuntimeError if it does not start, and LostNodeError if none runs, or others publish
-        what the exam does.
+        Raises RuntimeError if it does not start, and NodeError if none runs, or if others publish
+        on its topics.
         """
         self.said.clear()
-        if self._command is None:
-            self._find()
-            return NodeFilter(self, FASTEST * time.monotonic_ns() % LAST_NS + START_NS)
         self._end_process()
-        self._process = subprocess.Popen(self._command, start_new_session=True)
-        if not self.wait(self._is_there, PATIENCE_S):
-            raise RuntimeError(f'the node does not read {IMU_TOPIC} and publish {self._topic} '
-                               f'within {PATIENCE_S:g} s')
-        return NodeFilter(self, START_NS)
+        if self._command is not None:
+            self._process = subprocess.Popen(self._command, start_new_session=True)
+        there = self.wait(self._is_there, PATIENCE_S)
+        self._find_others()
+        if there:
+            return NodeFilter(self, START_NS if self._process is not None else
+                              FASTEST * time.monotonic_ns() % LAST_NS + START_NS)
+        missing = ' and none '.join(
+            [f'reads {IMU_TOPIC}'] * (not self.imu.get_subscription_count())
+            + [f'publishes {self._topic}'] * (not self._node.count_publishers(self._topic)))
+        text = (f'no node {missing} within {PATIENCE_S:g} s, with ROS_DOMAIN_ID='
+                f'{os.environ.get("ROS_DOMAIN_ID", "0")}: check that it runs, its '
+                'ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE, its namespace and remappings')
+        raise RuntimeError(text) if self._process is not None else NodeError(text)
 
     def check(self) -> None:
-        """Raise LostNodeError if a node that was not started here is there no more."""
+        """Raise NodeError if a node that was not started here is there no more."""
         if self._command is None and not self._is_there():
-            raise LostNodeError(f'the node that reads {IMU_TOPIC} and publishes {self._topic} has '
+            raise NodeError(f'the node that reads {IMU_TOPIC} and publishes {self._topic} has '
                                 'gone')
 
     def _is_there(self) -> bool:
         return bool(self.imu.get_subscription_count() and self._node.count_publishers(self._topic))
 
-    def _find(self) -> None:
-        """Wait for the node.  Raises LostNodeError."""
-        there = self.wait(self._is_there, PATIENCE_S)
-        for name in ('/clock', IMU_TOPIC, FIELD_TOPIC):
-            others = [one.node_name for one in self._node.get_publishers_info_by_topic(name)
-                      if one.node_name != self._node.get_name()]
-            if others:
-                raise LostNodeError(f'{name} is published by {", ".join(others)} too: end it, '
-                                    'because the filter must get the samples of the exam alone')
-        if not there:
-            missing = ([f'reads {IMU_TOPIC}'] * (not self.imu.get_subscription_count())
-                       + [f'publishes {self._topic}'] * (
-                           not self._node.count_publishers(self._topic)))
-            domain = os.environ.get('ROS_DOMAIN_ID', '0')
-            raise LostNodeError(
-                f'no node {" and none ".join(missing)} within {PATIENCE_S:g} s, with '
-                f'ROS_DOMAIN_ID={domain}: check that it runs, with this ROS_DOMAIN_ID and the '
-                'same ROS_AUTOMATIC_DISCOVERY_RANGE, and its namespace and remappings')
+    def _find_others(self) -> None:
+        """Raise NodeError if other nodes publish what the exam does, or several the attitudes."""
+        for name in ('/clock', IMU_TOPIC, FIELD_TOPIC, self._topic):
+            nodes = [one.node_name for one in self._node.get_publishers_info_by_topic(name)]
+            if len(nodes) > 1:
+                raise NodeError(f'{name} is published by {" and ".join(sorted(nodes))}: end the '
+                                'others, because the exam needs the topic alone')
 
     def wait(self, condition: Callable[[], object], seconds: float) -> bool:
         """Spin until a condition holds; return False after so long.  A node that ends raises."""

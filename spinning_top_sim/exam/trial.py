@@ -51,8 +51,8 @@ class InvalidOutputError(Exception):
     """What a filter returned, or that it raised an error, in one line."""
 
 
-class LostNodeError(Exception):
-    """The node that is examined is not there; the text says what to check."""
+class NodeError(Exception):
+    """A node cannot be examined; the text says why, and what to check."""
 
 
 class Readings(NamedTuple):
@@ -149,7 +149,7 @@ def feed(make_filter: MakeFilter, readings: Readings,
                 numbers.append(k - 1)
                 covariances.append(np.array(getattr(filter_, 'covariance', None), dtype=float))
                 biases.append(np.array(getattr(filter_, 'bias', None), dtype=float))
-    except (InvalidOutputError, LostNodeError):
+    except (InvalidOutputError, NodeError):
         raise
     except (Exception, SystemExit) as error:
         raise InvalidOutputError(f'{update_of(k, readings)} raises '

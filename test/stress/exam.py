@@ -13,8 +13,7 @@ from pathlib import Path
 
 import helpers.own_domain  # noqa: F401, before any node starts
 
-from spinning_top_sim.exam import examine
-from spinning_top_sim.exam.live import NodeExam
+from spinning_top_sim.exam.live import examine_node
 
 PATIENCE_S = 1800.0
 MEMORY_MB = 4000            # DDS maps memory that it does not use
@@ -32,9 +31,7 @@ def check(seed, folder):
     try:
         if runs:
             processes.append(subprocess.Popen(node, cwd=folder))
-        with NodeExam('imu/data', None if runs else ' '.join(node)) as exam:
-            report = examine(exam.make_filter, seeds=[seed], isolated=False,
-                             restart=exam.restarts)
+        report = examine_node('imu/data', None if runs else ' '.join(node), seeds=[seed])
     finally:
         for process in processes:
             os.kill(process.pid, signal.SIGKILL)
