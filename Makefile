@@ -146,6 +146,7 @@ stress: dependencies
 	        $(addprefix test/test_,properties.py properties_logs.py ranges.py extremes.py)" \
 	    $(foreach part,logs nodes services disk sensor, \
 	        "'$(VENV)/bin/python' test/stress $(part) --seconds $(SECONDS)") \
+	    "'$(VENV)/bin/python' test/stress exam --count 20" \
 	    "'$(VENV)/bin/python' test/stress tops --count $(STRESS)"
 
 # The programs to compare with need hundreds of megabytes, so they have their own environment.

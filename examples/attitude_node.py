@@ -4,6 +4,7 @@
 A ROS node with an attitude filter, for the exam of nodes:
 
   examine --node "python examples/attitude_node.py" --topic imu/data
+  examine --topic imu/data                      # while it runs
 """
 
 import contextlib
@@ -23,7 +24,7 @@ class AttitudeNode(Node):
 
     def __init__(self) -> None:
         super().__init__('attitude')
-        self._filter, self._last_ns = Vqf(magnetic=False), -10 ** 10
+        self.filter, self._last_ns = Vqf(magnetic=False), -10 ** 10
         profile = QoSProfile(depth=100)
         self._publisher = self.create_publisher(Imu, 'imu/data', profile)
         self.create_subscription(Imu, 'imu/data_raw', self._take, profile)
@@ -36,7 +37,7 @@ class AttitudeNode(Node):
         if dt > 1.0:                # the first: its step is unknown
             return
         q = message.orientation
-        q.x, q.y, q.z, q.w = self._filter.update(
+        q.x, q.y, q.z, q.w = self.filter.update(
             np.array((rate.x, rate.y, rate.z)), np.array((force.x, force.y, force.z)), None,
             dt).tolist()
         message.orientation_covariance[0] = 0.0

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exam of attitude filters: measures, faults by name, bad filters, logs, the command."""
 
+import ctypes
 import json
 import math
+import os
 import re
+import sys
 import time
 from dataclasses import replace
 from functools import partial
@@ -15,7 +18,7 @@ from helpers.faulty_filters import FAULTY, MISREADINGS
 from helpers.reference import ROOT
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam import examine, measures, scenarios
+from spinning_top_sim.exam import examine, isolation, measures, scenarios
 from spinning_top_sim.exam.adapters import FILTERS, Vqf
 from spinning_top_sim.exam.command import main
 from spinning_top_sim.exam.diagnosis import FAULTS
@@ -183,6 +186,33 @@ def test_without_heading_a_world_north_east_down_and_the_sign_of_gravity_are_the
         assert 'cannot be told apart' in report.found[0].evidence
 
 
+@pytest.mark.parametrize('name', ['', *MISREADINGS])
+def test_a_filter_that_goes_on_from_run_to_run_gets_the_same_verdict(name):
+    make = partial(Vqf, magnetic=False) if name else Vqf
+    make = partial(MISREADINGS[name], make) if name else make
+    report = examine(make, seeds=1, restart=False)
+    assert report.faults == examine(make, seeds=1).faults, report
+    if not name:
+        assert report.measures['heading_rms_deg'] < 1.0
+        assert 1.0 < report.measures['convergence_s'] < 30.0
+
+
+def test_a_covariance_is_measured_but_not_judged_from_run_to_run():
+    report = examine(ReferenceFilter, seeds=1, restart=False)
+    assert report.passed and report.measures['nees'] > 0.0
+
+
+def test_any_number_of_workers_gives_the_same_report():
+    pytest.importorskip('distributed')
+    make = partial(MISREADINGS['gyroscope_units'], Vqf)     # its runs are repeated
+    one, two = (examine(make, 'full', seeds=3, workers=workers) for workers in (1, 2))
+    assert one.as_json() == two.as_json() and one.faults == ['gyroscope_units']
+    assert [outcome.run.name for outcome in one.outcomes] == [
+        outcome.run.name for outcome in two.outcomes]
+    assert all(np.array_equal(a.estimates, b.estimates)
+               for a, b in zip(one.outcomes, two.outcomes, strict=True))
+
+
 def test_a_full_exam_has_more_motions():
     report = examine(Vqf, 'full', seeds=2)
     assert report.passed
@@ -243,6 +273,50 @@ def test_a_run_that_fails_leaves_the_others():
     assert report.measures['tilt_rms_deg'] < 0.05 and 'bias_error_s' in report.measures
 
 
+def update_for_ever():
+    while True:
+        pass
+
+
+@pytest.mark.parametrize(('said', 'says'), [
+    (update_for_ever, 'update 1 of 200 takes more than 0.2 s: killed'),
+    (partial(time.sleep, 1e6), 'update 1 of 200 takes more than 0.2 s: killed'),
+    (lambda: ctypes.string_at(0), 'update 1 of 200 ends the process: Segmentation fault'),
+    (partial(os._exit, 3), 'update 1 of 200 ends the process: exit code 3'),
+    (partial(sys.exit, 3), 'update 1 of 200 raises SystemExit: 3')])
+def test_a_filter_that_never_returns_or_crashes_is_told(monkeypatch, said, says):
+    monkeypatch.setattr(isolation, 'LONGEST_S', 0.2)
+    report = examine(partial(Bad, said), seeds=1)
+    assert report.faults == ['invalid_output']
+    assert says in str(report)
+
+
+def test_a_run_that_hangs_leaves_the_others(monkeypatch):
+    class Fragile(Vqf):
+        def update(self, gyroscope, accelerometer, magnetometer, dt):
+            if dt < 0.009:
+                update_for_ever()
+            return super().update(gyroscope, accelerometer, magnetometer, dt)
+
+    monkeypatch.setattr(isolation, 'LONGEST_S', 1.0)
+    report = examine(Fragile, seeds=1)
+    assert report.faults == ['invalid_output']
+    assert 'fast at 200 Hz, seed 0: update 1 of 1600 takes more than 1 s' in str(report)
+    assert report.measures['tilt_rms_deg'] < 0.05 and 'bias_error_s' in report.measures
+
+
+def test_a_filter_may_be_fed_in_this_process():
+    made = []
+
+    def make():
+        made.append(Vqf())
+        return made[-1]
+
+    report = examine(make, seeds=1, isolated=False)
+    assert len(made) > 10
+    assert report.as_json() == examine(make, seeds=1).as_json()
+
+
 @pytest.mark.parametrize(('covariance', 'says'), [
     (-np.eye(3), 'must have no negative eigenvalue'), (np.eye(2), 'must be 3 x 3 finite numbers'),
     (np.full((3, 3), math.nan), 'must be 3 x 3 finite numbers')])
@@ -259,7 +333,8 @@ def test_a_wrong_covariance_is_told(covariance, says):
     ({'level': 'slow'}, "level = 'slow': must be one of quick, full"),
     ({'imu': {'imu.colour': 1.0}}, 'imu.colour = 1.0: there is no such parameter'),
     ({'seeds': 0}, 'seeds = 0: must be'), ({'seeds': [-1]}, 'must be'),
-    ({'seeds': [0.5]}, 'must be')])
+    ({'seeds': [0.5]}, 'must be'), ({'workers': 0}, 'workers = 0: must be from 1'),
+    ({'workers': 2, 'restart': False}, 'workers = 2: must be from 1')])
 def test_wrong_arguments_are_refused(options, says):
     with pytest.raises(ValueError, match=re.escape(says)):
         examine(Vqf, **options)
@@ -406,7 +481,9 @@ def test_the_command_examines_a_published_filter(capsys):
     (['{log}', '--topic', '/nix'], 2, 'has no topic /nix; it has /pose'),
     (['{log}', '--topic', '/joint_states'], 2, 'has the type sensor_msgs/msg/JointState'),
     (['{log}', '--topic', '/imu/data_raw'], 2, 'it has no orientation'),
-    (['{log}'], 2, '--topic'), ([], 2, 'give either a log'),
+    (['{log}'], 2, '--topic'), ([], 2, '--topic: which topic'),
+    (['{log}', '--topic', '/pose', '--filter', 'vqf'], 2, 'give either a log'),
+    (['--filter', 'vqf', '--workers', '0'], 2, 'workers = 0: must be from 1'),
     (['nix.mcap', '--topic', '/a'], 1, 'nix.mcap'),
     (['{log}', '--topic', '/pose', '--page', 'a.gif'], 2, 'must end in .png'),
     (['--filter', 'vqf', '--seeds', '0'], 2, 'seeds = 0')])

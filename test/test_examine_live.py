@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exam of a running node: in lockstep, sample by sample."""
 
+import os
+import subprocess
 import sys
 from dataclasses import replace
 from functools import partial
@@ -11,7 +13,8 @@ from helpers.reference import ROOT
 
 from spinning_top_sim.exam import scenarios
 from spinning_top_sim.exam.adapters import Vqf
-from spinning_top_sim.exam.trial import InvalidOutputError, follow
+from spinning_top_sim.exam.command import main
+from spinning_top_sim.exam.trial import InvalidOutputError, NodeError, follow
 
 pytest.importorskip('rclpy')
 pytest.importorskip('vqf')
@@ -28,17 +31,64 @@ def test_a_node_says_what_its_filter_says_in_every_run(run):
 
     # The node takes the first sample for the begin of its first step.
     direct = follow(partial(Vqf, magnetic=False), run.part(slice(1, None)))
-    with NodeExam(NODE, 'imu/data') as node:
+    with NodeExam('imu/data', NODE) as node:
         for _ in range(2):
             outcome = follow(node.make_filter, run)
             assert np.max(np.abs(outcome.estimates[1:] - direct.estimates)) < 1e-9
             assert outcome.covariances is None
 
 
+@pytest.fixture
+def running():
+    """Run the node beside the test."""
+    process = subprocess.Popen([sys.executable, str(ROOT / 'examples/attitude_node.py')])
+    yield process
+    process.kill()
+    process.wait()
+
+
+def test_a_node_that_runs_gets_one_run_after_the_other(run, running):
+    from spinning_top_sim.exam.live import NodeExam
+
+    twice = run.after(run)
+    direct = follow(partial(Vqf, magnetic=False), twice.part(slice(1, None)))
+    with NodeExam('imu/data') as node:
+        outcome = follow(node.make_filter, twice)
+        assert np.max(np.abs(outcome.estimates[1:] - direct.estimates)) < 1e-9
+    with NodeExam('imu/data') as node:          # later than the first one, for the node
+        follow(node.make_filter, run)
+        running.kill()
+        running.wait()
+        filter_ = node.make_filter()
+        assert node.wait(lambda: not node.imu.get_subscription_count(), 60.0)
+        with pytest.raises(NodeError, match='the node that reads imu/data_raw and publishes imu/d'
+                           'ata has gone'):
+            node.check()
+        del filter_
+
+
+def test_a_node_that_does_not_run_is_told(monkeypatch, capfd):
+    from spinning_top_sim.exam import live
+
+    monkeypatch.setattr(live, 'PATIENCE_S', 0.5)
+    assert main(['--topic', '/imu/data']) == 1
+    said = capfd.readouterr().err
+    assert ('no node reads imu/data_raw and none publishes /imu/data within 0.5 s, with '
+            f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}: check that') in said
+
+
+def test_another_source_of_samples_is_told(running, capfd):
+    from spinning_top_sim.exam.live import NodeExam
+
+    with NodeExam('imu/data'):
+        assert main(['--topic', 'imu/data']) == 1
+    assert '/clock is published by examine and examine: end the others' in capfd.readouterr().err
+
+
 def test_a_node_that_ends_is_told(run):
     from spinning_top_sim.exam.live import NodeExam
 
-    with (NodeExam(f'{sys.executable} -c pass', 'imu/data') as node,
+    with (NodeExam('imu/data', f'{sys.executable} -c pass') as node,
           pytest.raises(InvalidOutputError, match='the node has ended with 0')):
         follow(node.make_filter, run)
 
@@ -51,7 +101,7 @@ def test_a_node_that_does_not_answer_is_told(run, monkeypatch):
             "node = rclpy.create_node('deaf'); node.create_publisher(Imu, 'imu/data', 1); "
             "s = node.create_subscription(Imu, 'imu/data_raw', lambda message: None, 1); "
             'rclpy.spin(node)')
-    with (live.NodeExam(f'{sys.executable} -c "{deaf}"', 'imu/data') as node,
+    with (live.NodeExam('imu/data', f'{sys.executable} -c "{deaf}"') as node,
           pytest.raises(InvalidOutputError, match='update 6 of 300 raises RuntimeError: no '
                         r'attitude has the stamp 1\.0600')):
         follow(node.make_filter, run)

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Examine an attitude filter: its attitudes in a log beside the truth, a running
-node, or a published filter by name.
+Examine an attitude filter: its attitudes in a log beside the truth, a ROS node,
+or a published filter by name.
 
   examine run.mcap --topic /imu/data
   examine --node "python examples/attitude_node.py" --topic imu/data
+  examine --topic imu/data                      # of a node that runs already
   examine --filter vqf --level full --page vqf.png
 
 exit codes:
   0    no fault was found
-  1    the filter has faults, or a file cannot be read or written
+  1    the filter has faults, a file cannot be read or written, or the node or
+       the workers are not there
   2    wrong arguments
   130  interrupted
 The faults and the measures are defined in docs/exam.md.
@@ -24,20 +26,23 @@ from spinning_top_sim.exam.adapters import FILTERS
 from spinning_top_sim.exam.examiner import SEEDS, examine
 from spinning_top_sim.exam.log import NORTHS, examine_log
 from spinning_top_sim.exam.report import Report
+from spinning_top_sim.exam.trial import NodeError
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.tools import cli
+from spinning_top_sim.tools.ensemble_part import EnsembleError
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
     return cli.run('examine', __doc__, argv, _add_arguments, _run,
-                   (ValueError, LogError, OSError, ImportError))
+                   (ValueError, LogError, OSError, ImportError, EnsembleError, NodeError))
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('log', type=Path, nargs='?', help='an MCAP file with the attitudes and the truth')
-    add('--topic', help='of the attitudes')
+    add('--topic', help='of the attitudes; without a log and --node those of a node that runs and '
+        'reads imu/data_raw and imu/mag')
     add('--truth', help='topic of the truth; default: ground_truth/imu, ground_truth/odom or pose')
     add('--heading', choices=NORTHS, help='the heading in the log must be right, from true or '
         'magnetic north; default: it must be steady')
@@ -49,6 +54,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--level', choices=SEEDS, default='quick', help='of the exam of a filter')
     add('--imu', metavar='FILE', help='parameter file of the IMU, as in config/imu')
     add('--seeds', type=int, metavar='N', help='number of noisy runs')
+    add('--workers', type=int, metavar='N', default=1,
+        help='processes that share the seeds of --filter; they take seconds to start')
     add('--json', action='store_true', help='print everything as JSON')
     add('--junit', type=Path, metavar='FILE', help='write JUnit XML')
     add('--page', type=_picture, metavar='FILE',
@@ -78,20 +85,23 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _report(arguments: argparse.Namespace) -> Report:
-    if [arguments.log, arguments.node, arguments.filter].count(None) != 2:
-        raise ValueError('give either a log and --topic, --node and --topic, or --filter')
+    if [arguments.log, arguments.node, arguments.filter].count(None) < 2:
+        raise ValueError('give either a log and --topic, --node and --topic, --topic alone, or '
+                         '--filter')
     if arguments.filter is None and arguments.topic is None:
-        raise ValueError('--topic: which topic has the attitudes?')
+        raise ValueError('--topic: which topic has the attitudes? Or --filter: which filter?')
+    options = arguments.level, arguments.imu, arguments.seeds
     if arguments.log is not None:
         return examine_log(arguments.log, arguments.topic, arguments.truth, arguments.heading)
-    if arguments.node is not None:
-        from spinning_top_sim.exam.live import NodeExam  # noqa: PLC0415 - needs ROS
+    if arguments.filter is not None:
+        make_filter = FILTERS[arguments.filter]
+        make_filter()           # imports its package, once for all runs
+        return examine(make_filter, *options, arguments.filter, arguments.workers)
+    if arguments.workers != 1:
+        raise ValueError(f'--workers {arguments.workers}: must be 1 for a node')
+    from spinning_top_sim.exam.live import examine_node  # noqa: PLC0415 - needs ROS
 
-        with NodeExam(arguments.node, arguments.topic) as node:
-            return examine(node.make_filter, arguments.level, arguments.imu, arguments.seeds,
-                           arguments.node)
-    return examine(FILTERS[arguments.filter], arguments.level, arguments.imu, arguments.seeds,
-                   arguments.filter)
+    return examine_node(arguments.topic, arguments.node, *options)
 
 
 if __name__ == '__main__':

@@ -115,11 +115,12 @@ READINGS = (
                read=_turned((0.0, 0.0, _HALF, _HALF))),
     Hypothesis(('conjugated', 'component_order'), 'read as w, x, y, z and conjugated',
                read=lambda estimates: conjugate(w_last(estimates))))
+# What harms a filter least comes first.
 REPEATED = (
-    Hypothesis(('gyroscope_units',), 'with the gyroscope in deg/s', given=_scaled(180.0 / np.pi)),
+    GRAVITY_SIGN,
     Hypothesis(('gyroscope_units',), 'with the gyroscope multiplied by pi/180',
                given=_scaled(np.pi / 180.0)),
-    GRAVITY_SIGN)
+    Hypothesis(('gyroscope_units',), 'with the gyroscope in deg/s', given=_scaled(180.0 / np.pi)))
 
 
 def marks(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
@@ -156,8 +157,11 @@ def explain(outcome: Outcome, absolute: bool,
         return None
     tried = [(rms(errors_of(one.read(outcome.estimates), outcome.run.truth).attitude(absolute)),
               one) for one in READINGS]
-    if again is not None and min(error for error, _ in tried) > EXPLAINED * before:
-        tried += [(error_of(again(one), absolute), one) for one in REPEATED]
+    if again is not None:
+        for one in REPEATED:
+            if min(error for error, _ in tried) <= EXPLAINED * before:
+                break
+            tried.append((error_of(again(one), absolute), one))
     after, best = min(tried, key=lambda pair: pair[0])
     if after > EXPLAINED * before:
         return None

@@ -2,7 +2,8 @@
 """
 The exam of a ROS node: it gets one sample at a time, and the next one when it has answered.
 
-So the verdict does not depend on the load of the machine.  The node is started for every run.
+So the verdict does not depend on the load of the machine.  A node that the exam starts is started
+for every run.  One that runs already gets all runs one after the other.
 """
 
 import contextlib
@@ -11,44 +12,71 @@ import shlex
 import signal
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rclpy
 from numpy.typing import NDArray
 from rclpy.context import Context
-from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, MagneticField
 
+from spinning_top_sim.exam.examiner import examine
+from spinning_top_sim.exam.report import Report
+from spinning_top_sim.exam.trial import NodeError
 from spinning_top_sim.streams.cdr import NANOSECONDS
+
+try:                            # takes least processor time
+    from rclpy.experimental import EventsExecutor as Executor
+except ImportError:
+    from rclpy.executors import SingleThreadedExecutor as Executor
 
 IMU_TOPIC, FIELD_TOPIC = 'imu/data_raw', 'imu/mag'
 PATIENCE_S = 20.0               # for a node to start, and for an answer
 FIRST_PATIENCE_S, UNANSWERED = 1.0, 5       # some nodes do not answer their first samples
 START_NS = NANOSECONDS          # in ROS a stamp of 0 is "no time"
+# A second exam of a node that runs must not begin before the first one has ended: stamps of the
+# first sample go by so many times as fast as the machine's clock, faster than any exam.  They
+# begin anew before the seconds of a stamp overflow, after 460 days.
+FASTEST, LAST_NS = 50, 2 * 10 ** 9 * NANOSECONDS
 FRAME = 'imu_link'
+
+
+def examine_node(topic: str, command: str | None = None, level: str = 'quick',
+                 imu: Mapping[str, Any] | str | Path | None = None,
+                 seeds: int | Iterable[int] | None = None) -> Report:
+    """
+    Examine a ROS node.
+
+    topic, command : see `NodeExam`
+    level, imu, seeds : see `examine`, which this does and raises
+    """
+    with NodeExam(topic, command) as node:
+        return examine(node.make_filter, level, imu, seeds, command or topic, isolated=False,
+                       restart=command is not None)
 
 
 class NodeExam(contextlib.AbstractContextManager['NodeExam']):
     """
-    Starts a node for every run: `examine(node_exam.make_filter)`.
+    Feeds a node: `make_filter` returns it in the form that the exam takes.
 
-    command : of the node, which reads `imu/data_raw` and `imu/mag`
     topic : sensor_msgs/Imu with the attitudes that it publishes, each with the stamp of its sample
+    command : of the node, which reads `imu/data_raw` and `imu/mag`; None: it runs already
     """
 
-    def __init__(self, command: str, topic: str) -> None:
-        self._command, self._topic = shlex.split(command), topic
+    def __init__(self, topic: str, command: str | None = None) -> None:
+        self._command = None if command is None else shlex.split(command)
+        self._topic = topic
         self._context = Context()
         rclpy.init(context=self._context)
         self._node = Node('examine', context=self._context, parameter_overrides=[
             Parameter('use_sim_time', value=False)])
-        self._executor: Executor = SingleThreadedExecutor(context=self._context)
+        self._executor = Executor(context=self._context)
         self._executor.add_node(self._node)
         profile = QoSProfile(depth=100)
         self.clock, self.imu, self.field = (
@@ -65,15 +93,45 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         rclpy.shutdown(context=self._context)
 
     def make_filter(self) -> 'NodeFilter':
-        """End the node and start it again.  Raises RuntimeError if it does not start."""
-        self._end_process()
+        """
+        Start the node anew, or find the one that runs.
+
+        Raises RuntimeError if it does not start, and NodeError if none runs, or if others publish
+        on its topics.
+        """
         self.said.clear()
-        self._process = subprocess.Popen(self._command, start_new_session=True)
-        if not self.wait(lambda: self.imu.get_subscription_count()
-                         and self._node.count_publishers(self._topic), PATIENCE_S):
-            raise RuntimeError(f'the node does not read {IMU_TOPIC} and publish {self._topic} '
-                               f'within {PATIENCE_S:g} s')
-        return NodeFilter(self)
+        self._end_process()
+        if self._command is not None:
+            self._process = subprocess.Popen(self._command, start_new_session=True)
+        there = self.wait(self._is_there, PATIENCE_S)
+        self._find_others()
+        if there:
+            return NodeFilter(self, START_NS if self._process is not None else
+                              FASTEST * time.monotonic_ns() % LAST_NS + START_NS)
+        missing = ' and none '.join(
+            [f'reads {IMU_TOPIC}'] * (not self.imu.get_subscription_count())
+            + [f'publishes {self._topic}'] * (not self._node.count_publishers(self._topic)))
+        text = (f'no node {missing} within {PATIENCE_S:g} s, with ROS_DOMAIN_ID='
+                f'{os.environ.get("ROS_DOMAIN_ID", "0")}: check that it runs, its '
+                'ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE, its namespace and remappings')
+        raise RuntimeError(text) if self._process is not None else NodeError(text)
+
+    def check(self) -> None:
+        """Raise NodeError if a node that was not started here is there no more."""
+        if self._command is None and not self._is_there():
+            raise NodeError(f'the node that reads {IMU_TOPIC} and publishes {self._topic} has '
+                                'gone')
+
+    def _is_there(self) -> bool:
+        return bool(self.imu.get_subscription_count() and self._node.count_publishers(self._topic))
+
+    def _find_others(self) -> None:
+        """Raise NodeError if other nodes publish what the exam does, or several the attitudes."""
+        for name in ('/clock', IMU_TOPIC, FIELD_TOPIC, self._topic):
+            nodes = [one.node_name for one in self._node.get_publishers_info_by_topic(name)]
+            if len(nodes) > 1:
+                raise NodeError(f'{name} is published by {" and ".join(sorted(nodes))}: end the '
+                                'others, because the exam needs the topic alone')
 
     def wait(self, condition: Callable[[], object], seconds: float) -> bool:
         """Spin until a condition holds; return False after so long.  A node that ends raises."""
@@ -110,9 +168,9 @@ class NodeFilter:
 
     slowest = float('inf')      # it waits itself
 
-    def __init__(self, exam: NodeExam) -> None:
+    def __init__(self, exam: NodeExam, start_ns: int) -> None:
         self._exam = exam
-        self._now_ns = START_NS
+        self._now_ns = start_ns
         self._answered = self._sent = 0
         self.covariance: NDArray[np.float64] | None = None
 
@@ -139,8 +197,11 @@ class NodeFilter:
         patience = PATIENCE_S if self._answered else FIRST_PATIENCE_S
         if not exam.wait(lambda: self._now_ns in said, patience):
             if self._answered or self._sent > UNANSWERED:
-                raise RuntimeError(f'no attitude has the stamp {self._now_ns * 1e-9:.9f} s of '
-                                   f'its sample within {patience:g} s')
+                exam.check()
+                raise RuntimeError(
+                    f'no attitude has the stamp {self._now_ns * 1e-9:.9f} s of its sample within '
+                    f'{patience:g} s' + (f'; others came, such as {min(said) * 1e-9:.9f} s'
+                                         if said else ''))
             return np.array((0.0, 0.0, 0.0, 1.0))
         self._answered += 1
         message = said.pop(self._now_ns)

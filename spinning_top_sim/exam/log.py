@@ -8,7 +8,6 @@ misreadings of them, a wrong stamp, the covariance, and whether they diverge.
 
 import json
 import math
-import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -23,36 +22,14 @@ from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.scenarios import Reals, Truth
 from spinning_top_sim.exam.trial import NORM_TOLERANCE, Outcome
 from spinning_top_sim.recording.reader import LogReader, LogTopic
-from spinning_top_sim.streams.messages import EXACT_VARIANCE
+from spinning_top_sim.tools.attitudes import LAYOUTS, decode
 
 # Of the sensor, and of the body; the first that the log has is the truth.
 TRUTHS = ('ground_truth/imu', 'ground_truth/odom', 'pose')
 OF_SENSOR = 'ground_truth/imu'
 NORTHS = TRUE, MAGNETIC = 'true', 'magnetic'
 LONGEST_GAP_S = 0.1             # of the truth, for attitudes between two of its samples
-NO_ORIENTATION = -1.0           # sensor_msgs/Imu has it in the covariance
 FEWEST = 100                    # attitudes that say something
-
-
-class Layout(NamedTuple):
-    """
-    Where the attitude is in a message after its header.
-
-    strings, skipped : that come before the quaternion; of the skipped ones each has 8 bytes
-    covariance : rows of the matrix after the quaternion; the last three are of turns.  0: none
-    """
-
-    strings: int
-    skipped: int
-    covariance: int
-
-
-LAYOUTS = {
-    'sensor_msgs/msg/Imu': Layout(0, 0, 3),
-    'geometry_msgs/msg/QuaternionStamped': Layout(0, 0, 0),
-    'geometry_msgs/msg/PoseStamped': Layout(0, 3, 0),
-    'geometry_msgs/msg/PoseWithCovarianceStamped': Layout(0, 3, 6),
-    'nav_msgs/msg/Odometry': Layout(1, 3, 6)}
 
 
 class Attitudes(NamedTuple):
@@ -157,38 +134,17 @@ def _first_truth(reader: LogReader) -> LogTopic:
 
 def _read(reader: LogReader, topic: LogTopic) -> Attitudes:
     """Return the attitudes of a topic by ascending stamps, the first of each."""
-    layout = LAYOUTS[topic.type_name]
-    rows = [_decode(message.data, layout, topic.name) for message in reader.messages([topic.name])]
+    rows = []
+    for message in reader.messages([topic.name]):
+        try:
+            rows.append(decode(message.data, topic.type_name))
+        except ValueError as error:
+            raise ValueError(f'a message of {topic.name} cannot be read: {error}') from error
     if len(rows) < FEWEST:
         raise ValueError(f'{topic.name} has {len(rows)} messages: must have {FEWEST} at least')
-    stamps, first = np.unique([stamp for stamp, _, _ in rows], return_index=True)
-    return Attitudes(stamps, np.array([rows[k][1] for k in first]),
-                     np.array([rows[k][2] for k in first]))
-
-
-def _decode(data: bytes, layout: Layout, name: str) -> tuple[int, Reals, Reals]:
-    """Return stamp [ns], quaternion and covariance of a message in CDR (OMG DDS-XTypes, XCDR1)."""
-    order = '<' if data[1:2] == b'\1' else '>'
-    try:
-        seconds, nanoseconds = struct.unpack_from(f'{order}iI', data, 4)
-        at = 12
-        for _ in range(1 + layout.strings):         # first the frame
-            at += -at % 4
-            at += 4 + struct.unpack_from(f'{order}I', data, at)[0]
-        at += (4 - at) % 8 + 8 * layout.skipped     # aligned after the four bytes of the head
-        quaternion = np.frombuffer(data, f'{order}f8', 4, at)
-        covariance = np.full((3, 3), np.nan)
-        if layout.covariance:
-            size = layout.covariance
-            matrix = np.frombuffer(data, f'{order}f8', size * size, at + 32).reshape(size, size)
-            if matrix[0, 0] == NO_ORIENTATION:
-                raise ValueError('it has no orientation')
-            # 0 is unknown (sensor_msgs), and our own streams say so of what is exact.
-            if np.max(matrix[-3:, -3:]) > EXACT_VARIANCE:
-                covariance = matrix[-3:, -3:]
-    except (struct.error, ValueError) as error:
-        raise ValueError(f'a message of {name} cannot be read: {error}') from error
-    return seconds * 10 ** 9 + nanoseconds, quaternion, covariance
+    stamps, first = np.unique([row.stamp_ns for row in rows], return_index=True)
+    return Attitudes(stamps, np.array([rows[k].quaternion for k in first]),
+                     np.array([rows[k].covariance for k in first]))
 
 
 def _beside(name: str, said: Attitudes, true: Attitudes) -> Outcome:

@@ -62,8 +62,8 @@ def drift(t: Reals, heading: Reals) -> float:
 
 
 def convergence_order(rates: Sequence[float], errors: Sequence[float]) -> float:
-    """Return p of errors proportional to rate^-p; NaN where an error is only rounding."""
-    if min(errors) < 1e-9:
+    """Return p of errors proportional to rate^-p; NaN for one rate or mere rounding."""
+    if len(rates) < 2 or min(errors) < 1e-9:
         return math.nan
     return float(-np.polyfit(np.log(rates), np.log(errors), 1)[0])
 

@@ -11,6 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
 
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams import parameters
@@ -119,6 +120,36 @@ class Run(Truth):
     gyroscope: Reals
     accelerometer: Reals
     magnetometer: Reals
+
+    def after(self, lead: 'Run') -> 'Run':
+        """Return this run with another one before it, of the same name; there t <= 0."""
+        return Run(self.name, *(np.concatenate((getattr(lead, one.name), getattr(self, one.name)))
+                                for one in fields(self)[1:]))
+
+
+def turning(imu: Mapping[str, Any], first: Reals, last: Reals, seconds: float,
+            declination: float | Reals = 0.0) -> Run:
+    """
+    Return a slow tumbling from one attitude to another, without noise and acceleration; t <= 0.
+
+    After each third of it, the sensor has gone a third of the way.
+
+    first, last : attitudes q(world <- sensor) as x, y, z, w (4,)
+    declination : by which the field is turned to the west [rad], one or for each sample
+    """
+    period = 1.0 / SLOW.rate
+    n = round(seconds * SLOW.rate)
+    part = np.arange(n + 1) / n
+    t: Reals = np.arange(1 - n, 1) / SLOW.rate
+    turns = (Slerp((0.0, 1.0), Rotation.from_quat((first, last)))(part)
+             * Rotation.from_euler('zx', np.stack((
+                 12.0 * np.pi * part, 0.7 * np.sin(6.0 * np.pi * part)), axis=1)))
+    rates = (turns[:-1].inv() * turns[1:]).as_rotvec() / period
+    to_sensor = turns[1:].inv()
+    field = Rotation.from_euler('z', np.broadcast_to(declination, n)[:, np.newaxis]).apply(
+        imu.get('mag.field', FIELD))
+    return Run('', t, np.full(n, period), turns[1:].as_quat(), rates, rates.copy(),
+               to_sensor.apply((0.0, 0.0, GRAVITY)), to_sensor.apply(field))
 
 
 def record(scenario: Scenario, imu: Mapping[str, Any], seed: int) -> Run:

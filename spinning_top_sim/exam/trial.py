@@ -4,7 +4,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -60,15 +60,41 @@ class InvalidOutputError(Exception):
     """What a filter returned, or that it raised an error, in one line."""
 
 
-@dataclass(frozen=True)
-class Outcome:
+class NodeError(Exception):
+    """A node cannot be examined; the text says why, and what to check."""
+
+
+class Readings(NamedTuple):
+    """What a filter gets: (n, 3) each, the field None for none, and the steps (n,) [s]."""
+
+    gyroscope: Reals
+    accelerometer: Reals
+    magnetometer: Reals | None
+    dt: Reals
+
+
+class Said(NamedTuple):
     """
-    What a filter said along a motion.
+    What a filter said.
 
     estimates : q(world <- sensor) (n, 4), of norm 1
     read : numbers of the samples after which covariance and bias were read (m,)
     covariances, biases : (m, 3, 3) [rad^2] and (m, 3) [rad/s]; None if the filter has none
     """
+
+    estimates: Reals
+    read: NDArray[np.int64]
+    covariances: Reals | None
+    biases: Reals | None
+
+
+# Feeds a new filter.
+Feed = Callable[[MakeFilter, Readings], Said]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a filter said along a motion, as `Said` has it."""
 
     run: Truth
     estimates: Reals
@@ -83,7 +109,10 @@ class Outcome:
 
     def later(self, fraction: float = 0.5) -> 'Outcome':
         """Return the last part of the outcome: when the filter has settled."""
-        first = round(len(self.estimates) * (1.0 - fraction))
+        return self.since(round(len(self.estimates) * (1.0 - fraction)))
+
+    def since(self, first: int) -> 'Outcome':
+        """Return the outcome from a sample on."""
         kept = self.read >= first
         return replace(
             self, run=self.run.part(slice(first, None)), estimates=self.estimates[first:],
@@ -97,46 +126,68 @@ def same(estimates: Reals) -> Reals:
     return estimates
 
 
+def feed(make_filter: MakeFilter, readings: Readings,
+         tell: Callable[[int], object] = lambda number: None) -> Said:
+    """
+    Feed a new filter.
+
+    tell : is called before each update with its number, from 1 on
+
+    Raises InvalidOutputError for a filter that raises, returns no unit quaternion or is too slow.
+    """
+    k = 0
+    said: list[object] = []
+    numbers: list[int] = []
+    covariances: list[object] = []
+    biases: list[object] = []
+    # The filter may keep or change what it gets.
+    gyroscope, accelerometer = readings.gyroscope.copy(), readings.accelerometer.copy()
+    fields = ([None] * len(gyroscope) if readings.magnetometer is None else
+              readings.magnetometer.copy())
+    try:
+        filter_ = make_filter()
+        update = filter_.update
+        slowest = getattr(filter_, 'slowest', SLOWEST)
+        begin = time.perf_counter()
+        for k, (rate, force, field, dt) in enumerate(zip(
+                gyroscope, accelerometer, fields, readings.dt.tolist(), strict=True), start=1):
+            tell(k)
+            said.append(update(rate, force, field, dt))
+            if k % READ_EVERY == 0:
+                _check_speed(time.perf_counter() - begin, k, dt, slowest)
+                numbers.append(k - 1)
+                covariances.append(np.array(getattr(filter_, 'covariance', None), dtype=float))
+                biases.append(np.array(getattr(filter_, 'bias', None), dtype=float))
+    except (InvalidOutputError, NodeError):
+        raise
+    except (Exception, SystemExit) as error:
+        raise InvalidOutputError(f'{update_of(k, readings)} raises '
+                                 f'{type(error).__name__}: {error}') from error
+    return Said(_quaternions(said), np.array(numbers), _checked('covariance', covariances, (3, 3)),
+                _checked('bias', biases, (3,)))
+
+
+def update_of(number: int, readings: Readings) -> str:
+    """Return in words which update it is, from 1 on; 0: the filter is not made yet."""
+    return f'update {number} of {len(readings.dt)}' if number else 'making the filter'
+
+
 def follow(make_filter: MakeFilter, run: Run, given: Input | None = None, read: Output = same,
-           magnetometer: bool = True) -> Outcome:
+           magnetometer: bool = True, feed: Feed = feed) -> Outcome:
     """
     Feed a new filter with a run.
 
     given, read : how the readings are changed before the filter gets them, and its attitudes after
     magnetometer : False gives None
 
-    Raises InvalidOutputError for a filter that raises, returns no unit quaternion or is too slow.
+    Raises InvalidOutputError as `feed` does.
     """
     gyroscope, accelerometer = run.gyroscope, run.accelerometer
     if given is not None:
         gyroscope, accelerometer = given(gyroscope, accelerometer, run.dt)
-    said: list[object] = []
-    numbers: list[int] = []
-    covariances: list[object] = []
-    biases: list[object] = []
-    try:
-        filter_ = make_filter()
-        update = filter_.update
-        slowest = getattr(filter_, 'slowest', SLOWEST)
-        begin = time.perf_counter()
-        # The filter may keep or change what it gets.
-        for k, (rate, force, field, dt) in enumerate(zip(
-                gyroscope.copy(), accelerometer.copy(), run.magnetometer.copy(),
-                run.dt.tolist(), strict=True)):
-            said.append(update(rate, force, field if magnetometer else None, dt))
-            if k % READ_EVERY == READ_EVERY - 1:
-                _check_speed(time.perf_counter() - begin, k + 1, dt, slowest)
-                numbers.append(k)
-                covariances.append(np.array(getattr(filter_, 'covariance', None), dtype=float))
-                biases.append(np.array(getattr(filter_, 'bias', None), dtype=float))
-    except InvalidOutputError:
-        raise
-    except Exception as error:
-        raise InvalidOutputError(
-            f'update {len(said) + 1} of {len(run.t)} raises {type(error).__name__}: {error}'
-        ) from error
-    return Outcome(run, read(_quaternions(said)), np.array(numbers),
-                   _checked('covariance', covariances, (3, 3)), _checked('bias', biases, (3,)))
+    said = feed(make_filter, Readings(gyroscope, accelerometer,
+                                      run.magnetometer if magnetometer else None, run.dt))
+    return Outcome(run, read(said.estimates), said.read, said.covariances, said.biases)
 
 
 def _check_speed(spent: float, updates: int, dt: float, slowest: float) -> None:

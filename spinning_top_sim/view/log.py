@@ -6,7 +6,6 @@ import dataclasses
 import html
 import itertools
 import math
-import struct
 import time
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
@@ -21,6 +20,7 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import recorded_run
+from spinning_top_sim.tools.attitudes import LAYOUTS, decode
 from spinning_top_sim.view.page import CATCH_UP_S, RATE, Page, set_value
 from spinning_top_sim.view.track import WIDTHS, Motion, Track
 
@@ -28,9 +28,6 @@ BLOCK = 16384               # messages decoded together
 SPEEDS = ('0.1', '0.25', '0.5', '1', '2', '4', '8')
 MOST_MARKS = 40             # commands marked on the slider
 LONGEST_HTML_S = 60.0
-# Where the attitude is in the messages of others: strings and doubles before it, after the stamp.
-FOREIGN = {'geometry_msgs/msg/PoseStamped': (1, 3), 'sensor_msgs/msg/Imu': (1, 0),
-           'nav_msgs/msg/Odometry': (2, 3)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,24 +94,17 @@ def _read_samples(reader: LogReader, track: Track, topics: Mapping[str, str]) ->
 def _read_foreign(reader: LogReader, name: str, values: Mapping[str, Any],
                   reason: str) -> Track:
     """Read the first topic of a log that has an attitude."""
-    topic = next((topic for topic in reader.topics if topic.type_name in FOREIGN), None)
+    topic = next((topic for topic in reader.topics if topic.type_name in LAYOUTS), None)
     if topic is None:
-        raise LogError(f'{reader.path}: no topic with an attitude ({", ".join(FOREIGN)}); '
+        raise LogError(f'{reader.path}: no topic with an attitude ({", ".join(LAYOUTS)}); '
                        f'{reason}')
-    strings, doubles = FOREIGN[topic.type_name]
     track, stamps_ns, rows = Track(name, values), [], []
     for message in reader.messages(topics=[topic.name]):
-        with contextlib.suppress(struct.error):
-            seconds, nanoseconds = struct.unpack_from('<iI', message.data, 4)
-            at = 12
-            for _ in range(strings):
-                at += -at % 4
-                at += 4 + struct.unpack_from('<I', message.data, at)[0]
-            at += (4 - at) % 8 + 8 * doubles        # aligned from behind the first four bytes
-            row = struct.unpack_from('<4d', message.data, at)
-            if 0.5 < math.hypot(*row) < 2.0:
-                stamps_ns.append(seconds * NANOSECONDS + nanoseconds)
-                rows.append(row)
+        with contextlib.suppress(ValueError):
+            attitude = decode(message.data, topic.type_name)
+            if 0.5 < math.hypot(*attitude.quaternion) < 2.0:
+                stamps_ns.append(attitude.stamp_ns)
+                rows.append(attitude.quaternion)
     if rows:
         track.columns['pose'].append(np.array(stamps_ns), np.array(rows))
     return track
