@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import re
 import sys
 import time
 from collections import Counter
@@ -56,8 +57,8 @@ def marks_of(name: str) -> tuple[str, ...] | None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--exams', type=int, default=20, help='of each fault')
-    parser.add_argument('--unharmed', type=int, default=100, help='of each filter without fault')
+    parser.add_argument('--exams', type=int, default=100, help='of each fault')
+    parser.add_argument('--unharmed', type=int, default=200, help='of each filter without fault')
     parser.add_argument('--workers', type=int, default=os.cpu_count())
     arguments = parser.parse_args()
     examine(Vqf, seeds=1)           # imports
@@ -70,10 +71,11 @@ def main() -> None:
                     for name in UNHARMED}
         harmed = {name: list(pool.map(partial(faults_of, name), range(arguments.exams)))
                   for name in FAULTY}
+    table = report.table(HEADS, marks)
     report.write('exam_marks.md', '\n'.join((
         report.preamble('Marks of published filters', PACKAGES),
         'With the settings of their packages, on a calibrated IMU, at level `full`. '
-        '[exam.md](exam.md) defines the columns.\n', report.table(HEADS, marks),
+        '[exam.md](exam.md) defines the columns.\n', table,
         f'A quick exam of VQF takes {quick_s:.2g} s.\n',
         '## Faults that are named\n', 'Each exam has seeds of its own.\n',
         report.table(('fault', 'exams', 'named', 'alone'), [
@@ -84,6 +86,10 @@ def main() -> None:
                 f'{fault} {count}' for fault, count in Counter(
                     fault for one in found for fault in one).items()) or '–')
             for name, found in unharmed.items()]))))
+    readme = ROOT / 'README.md'
+    text = re.sub(r'(<!-- exam_marks -->\n).*?(<!-- end -->\n)',
+                  lambda match: match[1] + table + match[2], readme.read_text(), flags=re.DOTALL)
+    readme.write_text(text)
 
 
 if __name__ == '__main__':

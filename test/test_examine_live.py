@@ -59,12 +59,10 @@ def test_a_node_that_runs_gets_one_run_after_the_other(run, running):
         follow(node.make_filter, run)
         running.kill()
         running.wait()
-        filter_ = node.make_filter()
         assert node.wait(lambda: not node.imu.get_subscription_count(), 60.0)
         with pytest.raises(NodeError, match='the node that reads imu/data_raw and publishes imu/d'
                            'ata has gone'):
             node.check()
-        del filter_
 
 
 def test_a_node_that_does_not_run_is_told(monkeypatch, capfd):
@@ -105,3 +103,13 @@ def test_a_node_that_does_not_answer_is_told(run, monkeypatch):
           pytest.raises(InvalidOutputError, match='update 6 of 300 raises RuntimeError: no '
                         r'attitude has the stamp 1\.0600')):
         follow(node.make_filter, run)
+
+
+def test_the_example_for_launch_testing_passes(tmp_path):
+    pytest.importorskip('launch_testing', reason='launch comes with ROS: it is not on PyPI')
+    ended = subprocess.run(
+        [sys.executable, '-m', 'launch_testing.launch_test',
+         str(ROOT / 'examples/test_attitude_node.launch.py')],
+        cwd=tmp_path, capture_output=True, text=True, timeout=900, check=False)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    assert 'Ran 1 test' in ended.stdout + ended.stderr
