@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """
-What the page costs: `python benchmark/view.py` (extras `ros` and `view`).
+What the page costs: `python benchmark/view.py` (extras `ros` and `view`) writes docs/view_cost.md.
 
 Two sim_nodes record at 200 Hz, each in a domain of its own.  In turn one has the page, which has
 one client that counts the attitudes that arrive, and the other has not.  Both are measured at the
@@ -19,6 +19,7 @@ import time
 from collections.abc import Sequence
 
 import msgspec
+import report
 import viser
 import zstandard
 from processes import SIM_NODE, Process, median, ros_arguments, script
@@ -28,6 +29,9 @@ NAMESPACE = '/view_cost'
 VIEW = ('-P', '-u', '-m', 'spinning_top_sim.view.command', '--no-browser')
 DOMAINS = os.environ['ROS_DOMAIN_ID'], str((int(os.environ['ROS_DOMAIN_ID']) + 100) % 200)
 WARM_UP_S = 5.0
+HEADS = ('sim_node', 'of a core', 'with the page', 'ratio', 'page, of a core',
+         'attitudes a second')
+PACKAGES = ('ros-jazzy-rclpy', 'viser', 'websockets')
 
 
 class Client(threading.Thread):
@@ -66,8 +70,8 @@ def measure(processes: Sequence[Process], client: Client, seconds: float) -> lis
             (client.count - count) / taken]
 
 
-def compare(title: str, sims: Sequence[Process], options: argparse.Namespace) -> None:
-    """Print what the page costs the node, and itself."""
+def compare(title: str, sims: Sequence[Process], options: argparse.Namespace) -> list[str]:
+    """Return a row of HEADS: what the page costs the node, and itself."""
     ratios, parts = [], []
     for _ in range(options.rounds):
         part = []
@@ -82,9 +86,11 @@ def compare(title: str, sims: Sequence[Process], options: argparse.Namespace) ->
         ratios.append(math.sqrt(math.prod(watched / alone for watched, alone, *_ in part)))
         parts += part
     watched, alone, page, rate = (median(column) for column in zip(*parts, strict=True))
-    print(f'{title}: {alone:.1%} of a core; with the page {watched:.1%}, {median(ratios):.2f} '
-          f'times ({min(ratios):.2f} to {max(ratios):.2f})')
-    print(f'page: {page:.1%} of a core, {rate:.1f} attitudes a second', flush=True)
+    row = [title, f'{alone:.1%}', f'{watched:.1%}',
+           f'{median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})', f'{page:.1%}',
+           f'{rate:.1f}']
+    print(*row, sep=' | ', flush=True)
+    return row
 
 
 def main() -> None:
@@ -100,14 +106,19 @@ def main() -> None:
             NAMESPACE, {**parameters, 'record.uri': f'{folder}/run{number}.mcap'})))
             for number in range(2)]
         time.sleep(WARM_UP_S)
-        compare('sim_node, recording at 200 Hz', sims, options)
+        rows = [compare('recording at 200 Hz', sims, options)]
         listeners = [stack.enter_context(started(number, script('listener.py'), [NAMESPACE],
                                                  talks=True)) for number in range(2)]
         for listener in listeners:
             listener.line()         # it is ready
-        compare('the same with another subscriber of pose, joint_states and imu', sims, options)
+        rows.append(compare('and publishing pose, joint_states and imu', sims, options))
         for listener in listeners:
             listener.tell('')
+    assert __doc__
+    report.write('view_cost.md', '\n'.join((
+        report.preamble('What the page costs', PACKAGES), __doc__.strip().split('\n\n')[-1] + '\n',
+        'The ratio is the median of the rounds, and their range.\n',
+        report.table(HEADS, rows))))
 
 
 if __name__ == '__main__':
