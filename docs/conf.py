@@ -51,7 +51,10 @@ autodoc_member_order = 'bysource'
 autodoc_typehints = 'none'
 autodoc_preserve_defaults = True
 numpydoc_show_class_members = False
-numpydoc_xref_param_type = False
+# Parameters, returns and yields are described, with their types.
+numpydoc_validation_checks = {'PR01', 'PR02', 'PR03', 'PR04', 'PR07', 'RT01', 'RT03', 'YD01'}
+# Made by solvers; a protocol.
+numpydoc_validation_exclude = {r'\.States$', r'\.Filter$'}
 
 html_theme = 'furo' if installed('furo') else 'alabaster'
 html_title = f'{project} {release}'

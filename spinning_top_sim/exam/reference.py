@@ -24,10 +24,18 @@ class ReferenceFilter:
     and the known field; a force of another size than gravity is hardly believed.  The covariance
     is of the error's rotation vector in the frame of the sensor.
 
-    gyroscope_density : [rad/s/sqrt(Hz)]
-    accelerometer_density : [m/s^2/sqrt(Hz)]
-    field, field_density : in the world, east, north, up [T], and of its noise [T/sqrt(Hz)]
-    bias_stddev : of the gyroscope's bias before it is estimated [rad/s]
+    Parameters
+    ----------
+    gyroscope_density : float
+        Of its white noise [rad/s/sqrt(Hz)].
+    accelerometer_density : float
+        Of its white noise [m/s^2/sqrt(Hz)].
+    field : tuple of three float
+        In the world, east, north, up [T].
+    field_density : float
+        Of the white noise of the magnetometer [T/sqrt(Hz)].
+    bias_stddev : float
+        Standard deviation of the gyroscope's bias before it is estimated [rad/s].
     """
 
     is_gravity_trusted = False      # every specific force is taken for gravity
@@ -52,7 +60,23 @@ class ReferenceFilter:
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
-        """Take the readings of a step of dt [s]; return q(world <- sensor) as x, y, z, w."""
+        """
+        Take the readings of a step, as `Filter.update`.
+
+        Parameters
+        ----------
+        gyroscope, accelerometer : (3,) array
+            Mean angular velocity [rad/s], and specific force at the end [m/s^2].
+        magnetometer : (3,) array or None
+            Field at the end [T].
+        dt : float
+            Length of the step [s].
+
+        Returns
+        -------
+        (4,) array
+            q(world <- sensor) as x, y, z, w.
+        """
         if not len(self._quaternion):
             self._quaternion = from_two_vectors(accelerometer, magnetometer)
         else:

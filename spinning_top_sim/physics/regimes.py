@@ -34,10 +34,12 @@ class Description:
         Period of theta [s], None where it rests.
     theta_min, theta_max : float
         Between which the axis swings [rad].
-    mean_precession_rate, mean_spin_rate : float
-        Means over a nutation [rad/s].
+    mean_precession_rate : float
+        Mean over a nutation [rad/s].
     precession_min, precession_max : float
         Least and greatest precession rate [rad/s].
+    mean_spin_rate : float
+        Mean over a nutation [rad/s].
     separatrix_distance : float
         1 - m of the elliptic functions; 0 is the motion that rises for ever.
     gyroscopic_ratio : float

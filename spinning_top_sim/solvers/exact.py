@@ -42,17 +42,33 @@ class ExactSolution:
     relative to the value or to its start where these are larger than 1.  Symbols and sources are
     those of `theta_setup`.
 
+    Parameters
+    ----------
+    top : Top
+        What moves.
+    start : State
+        The state at t = 0; of a `ContinuedState` theta may be any number.
+
     Attributes
     ----------
-    start : State with theta in [0, pi]; a `ContinuedState` is taken, whose theta may be any number
-    nutation_period : [s], None if theta is constant
-    mean_precession_rate, mean_spin_rate : [rad/s], over a nutation
-    theta_min, theta_max : [rad], of theta folded into [0, pi]
-    m, m1 : parameter of the elliptic functions and m1 = 1 - m, which is 0 on the separatrix
-    time_limit, ns_limit : the farthest time either way [s], [ns]
+    start : State
+        The same with theta in [0, pi].
+    nutation_period : float or None
+        Period of theta [s], None if it is constant.
+    mean_precession_rate, mean_spin_rate : float
+        Means over a nutation [rad/s].
+    theta_min, theta_max : float
+        Bounds of theta folded into [0, pi] [rad].
+    m, m1 : float
+        Parameter of the elliptic functions and m1 = 1 - m, which is 0 on the separatrix.
+    time_limit, ns_limit : float, int
+        The farthest time either way [s], [ns].
 
-    Raises ValueError for motions whose constants doubles cannot hold, and, from every evaluation,
-    for times that are not of the kind that it takes or beyond the limits.
+    Raises
+    ------
+    ValueError
+        For motions whose constants doubles cannot hold, and, from every evaluation, for times that
+        are not of the kind that it takes or beyond the limits.
     """
 
     steps = evaluations = 0
