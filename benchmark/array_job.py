@@ -24,11 +24,14 @@ START = State(theta=THETA, l3=L3, lz=L3 * math.cos(THETA))
 LAST = {'exact': 100.0, 'rk45': 20.0}
 
 
+def cost(method):
+    t = np.linspace(0.0, LAST[method], round(2000 * LAST[method]))
+    return seconds_of(lambda: solve(TOP, START, t, method=method).quaternion)[0]
+
+
 def main():
     for line in sys.stdin:
-        method = line.strip()
-        t = np.linspace(0.0, LAST[method], round(2000 * LAST[method]))
-        print(seconds_of(lambda: solve(TOP, START, t, method=method).quaternion)[0], flush=True)
+        print(cost(line.strip()), flush=True)
 
 
 if __name__ == '__main__':

@@ -70,8 +70,9 @@ def program(kind: str, rate: float, namespace: str, folder: Path) -> list[str]:
                       **{f'{name}.enabled': False for name in OTHERS}}
         return [*SIM_NODE, *ros_arguments(namespace, parameters)]
     if kind in (STRAIGHT, EVENTS):
-        return [*script('straightforward_node.py'), *ros_arguments(
-            namespace, {'rate': float(rate), 'executor': 'events' if kind == EVENTS else 'single'})]
+        executor = 'events' if kind == EVENTS else 'single'
+        return [*script('straightforward_node.py'),
+                *ros_arguments(namespace, {'rate': float(rate), 'executor': executor})]
     return [*script('bare_node.py'),
             *ros_arguments(namespace, {'rate': float(rate), 'pacing': 'thread'})]
 

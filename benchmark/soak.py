@@ -166,8 +166,8 @@ def judge(seen: dict) -> tuple[list[tuple[str, str]], bool]:
             ('logs', str(len(seen['logs']))), ('samples in them', str(count)),
             ('samples missing in them', str(missing)),
             ('lines of errors', str(len(trouble))), ('exit code', str(seen['code']))]
-    fine = (growth <= GROWTH_BYTES and slope <= GROWTH_BYTES_PER_HOUR and missing == 0 and count > 0 and not trouble
-            and seen['code'] == 0)
+    fine = (growth <= GROWTH_BYTES and slope <= GROWTH_BYTES_PER_HOUR and missing == 0
+            and count > 0 and not trouble and seen['code'] == 0)
     print('\n'.join(trouble))
     return rows, fine
 
@@ -182,7 +182,7 @@ def main() -> int:
     parser.add_argument('--no-report', action='store_true', help='print only')
     arguments = parser.parse_args()
     if arguments.minutes <= 1.0:
-        parser.error(f'--minutes {arguments.minutes:g}: more than 1, for the first one is not judged')
+        parser.error(f'--minutes {arguments.minutes:g}: must be more than 1')
     head = preamble('A long run')        # with the commit that is there now
     with tempfile.TemporaryDirectory() as name:
         seen = soak(arguments.minutes, arguments.log_every, arguments.listen_every, Path(name))
