@@ -56,6 +56,9 @@ help:
 	@echo '             which has WORKERS=$(WORKERS) processes (0: its own, for ARGS=--pdb)'
 	@echo 'make coverage'
 	@echo '             the same, and tell what no test runs, in all processes and by folder'
+	@echo 'make mutation'
+	@echo '             change physics, solvers and the reader of logs in one place at a time, and'
+	@echo '             tell which changes no test notices; MUTANTS=... selects some; hours'
 	@echo 'make stress  kill 200 recording nodes (KILLS=...), try 30 times the random inputs'
 	@echo '             of the tests (EXAMPLES=...), then random logs, parameters,'
 	@echo '             commands, service calls, disk faults and the statistics of the'
@@ -135,6 +138,12 @@ coverage: dependencies
 	done
 	$(COVERAGE) report --fail-under=95
 
+# Of the sources, in a copy in mutants/: fast tests, and one process for each mutant.
+MUTANTS ?=
+mutation: $(VENV)/.deps-mutation dependencies
+	'$(VENV)/bin/mutmut' run --max-children $(WORKERS) $(MUTANTS)
+	'$(VENV)/bin/mutmut' results
+
 STRESS ?= 40000
 KILLS ?= 200
 EXAMPLES ?= 30
@@ -194,7 +203,7 @@ build: $(VENV)/.deps-colcon $(VENV)/.deps-test $(VENV)/.package
 
 clean:
 	test ! -e '$(VENV)/.made' || rm -rf '$(VENV)'
-	rm -rf .mypy_cache .pytest_cache .ruff_cache site
+	rm -rf .hypothesis .mypy_cache .pytest_cache .ruff_cache mutants site
 	find $(wildcard benchmark examples launch spinning_top_sim test) -name __pycache__ -prune \
 	    -exec rm -rf {} +
 

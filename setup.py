@@ -71,7 +71,7 @@ setup(
             'coverage>=7.10,<8',        # make coverage
             'distributed>=2024.5,<2028',
             'docutils>=0.20,<1',
-            'hypothesis>=6.100,<7',
+            'hypothesis>=6.98,<7',
             'imufusion>=1.3,<2',
             'ipykernel>=6.20,<8',       # with nbclient: runs examples/tour.ipynb
             'matplotlib>=3.6,<4',
@@ -103,6 +103,7 @@ setup(
             'mypy>=2.4.1,<2.5',
             'ruff>=0.17.5,<0.18',
         ],
+        'mutation': ['mutmut>=3.8,<3.9'],   # make mutation
         # `setup.py install`, which colcon calls, and wheels without a package `wheel`.
         'build': ['setuptools>=70.1,<80'],
         'colcon': [

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.regimes import nutation_cubic, regime, swing
+from spinning_top_sim.physics.regimes import nutation_cubic, precession_extremes, regime, swing
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.pipeline import Simulation
@@ -373,3 +373,15 @@ def test_the_cubic_keeps_its_digits_next_to_both_poles(theta):
     assert found[0] == 0.0
     for value, exact in zip(found[1:3], expected, strict=True):
         assert value == pytest.approx(float(exact), rel=1e-14, abs=0.0)
+
+
+@pytest.mark.parametrize('momenta', [(1.0, 1.3), (1.0, -1.3), (-1.0, 1.3), (0.0, 1.3), (0.0, -1.3),
+                                     (1.3, 1.0), (1.0, 1.0), (0.0, 0.0)])
+@pytest.mark.parametrize('tilts', [(0.3, 0.9), (0.5, 2.0), (1.2, 2.9), (2.3, 2.9)])
+def test_the_extremes_of_the_precession_are_those_of_its_samples(momenta, tilts):
+    """At the turning points, or between them, where L3 u^2 - 2 Lz u + L3 = 0."""
+    l3, lz = momenta
+    theta = np.linspace(*tilts, 200_001)
+    rates = (lz - l3 * np.cos(theta)) / (TOP['lambda1'] * np.sin(theta) ** 2)
+    found = precession_extremes(Top(**TOP), State(theta=tilts[0], l3=l3, lz=lz), *tilts)
+    assert found == pytest.approx((rates.min(), rates.max()), rel=1e-9, abs=1e-12)

@@ -181,7 +181,7 @@ def precession_extremes(top: Top, state: State, theta_min: float,
     # They lie at the ends, or where d phi'/du = 0: L3 u^2 - 2 Lz u + L3 = 0.
     tilts = [theta_min, theta_max]
     l3, lz = state.l3, state.lz
-    if abs(lz) > abs(l3) > 0.0:
+    if abs(lz) > abs(l3):
         inner = math.acos(l3 / (lz + math.copysign(math.sqrt(lz * lz - l3 * l3), lz)))
         if theta_min < inner < theta_max:
             tilts.append(inner)
