@@ -55,8 +55,11 @@ def write_pages(app):
             continue
         text = (root / name).read_text(encoding='utf-8')
         if name.endswith('.md'):        # links from the top
+            text = re.sub(r'\]\((?:docs/?|README\.md(?:#[^)]*)?)\)', '](../index.rst)', text)
             text = re.sub(r'\]\(docs/', '](../', text)
             text = re.sub(r'\]\((?![a-z]+:|#|\.\./)', '](../../', text)
+            for other in PAGES:
+                text = text.replace(f'](../../{other}', f'](top_{other.lower()}')
         if not page.exists() or page.read_text(encoding='utf-8') != text:
             page.write_text(text, encoding='utf-8')
 
