@@ -6,12 +6,19 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
+from helpers.random_tops import random_case
 from helpers.reference import CASES, SCENES, scene_parameters, start_of, top_of
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.regimes import nutation_cubic, precession_extremes, regime, swing
+from spinning_top_sim.physics.regimes import (
+    Description,
+    nutation_cubic,
+    precession_extremes,
+    regime,
+    swing,
+)
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.pipeline import Simulation
@@ -385,3 +392,31 @@ def test_the_extremes_of_the_precession_are_those_of_its_samples(momenta, tilts)
     rates = (lz - l3 * np.cos(theta)) / (TOP['lambda1'] * np.sin(theta) ** 2)
     found = precession_extremes(Top(**TOP), State(theta=tilts[0], l3=l3, lz=lz), *tilts)
     assert found == pytest.approx((rates.min(), rates.max()), rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize(('low', 'high', 'text'), [
+    (12.3456, 45.6789, '12.35 to 45.68'), (30.0, 30.00123, '30 to 30.001'),
+    (12.3456, 12.3456, '12.35 to 12.35'), (-1e-17, 2.0, '0 to 2'), (-3.0, 1e-17, '-3 to 0')])
+def test_a_description_shows_ranges_with_as_many_digits_as_tell_their_ends_apart(low, high, text):
+    motion = Description('waves', 1.0, 0.5, 0.7, 0.0, low, high, 0.0, 0.5, 2.0)
+    assert f'precession 0 rad/s ({text}), spin' in str(motion)
+
+
+def test_the_swing_is_that_of_the_samples_of_a_nutation():
+    """Of random tops on both sides of the horizontal, and through the poles."""
+    compared = 0
+    for seed in range(80):
+        case = random_case(seed)
+        period = ExactSolution(case.top, case.start).nutation_period
+        if not period:
+            continue
+        motion = solve(case.top, case.start, np.linspace(0.0, period, 2001))
+        u = np.cos(motion.theta)
+        low, high = swing(case.top, case.start)
+        # Turning points lie between samples; they are of second order in their distance.  Next
+        # to the separatrix two roots of the cubic are one, and half of the digits are lost.
+        apart = 1e-4 * (high - low) + 1e-7
+        assert low - 1e-7 <= u.min() <= low + apart, case
+        assert high - apart <= u.max() <= high + 1e-7, case
+        compared += 1
+    assert compared > 60
