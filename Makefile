@@ -161,7 +161,7 @@ stress: dependencies
 # The programs to compare with need hundreds of megabytes, so they have their own environment.
 PERFORMANCE := node_cpu wake_up startup solvers offline offline_scaling log_compression soak
 COMPARISONS := heavy_top exact_cost gauge stability work_precision allan increments \
-    attitude_filter ensemble exam
+    attitude_filter ensemble exam view
 offline_options := --hour
 offline_scaling_options := --long
 benchmark performance: export OMP_NUM_THREADS ?= 1
