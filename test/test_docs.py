@@ -19,7 +19,7 @@ PAGES = {str(path.relative_to(ROOT)): path.read_text(encoding='utf-8')
 # Why blocks are not run, and how many.
 NOT_RUN = {
     'installs packages from the network': 3,
-    'needs the command line tools of a ROS installation': 6,
+    'needs the command line tools of a ROS installation': 8,
     'runs until Ctrl-C, after it has installed packages': 5,
     'takes minutes or hours': 3,
     'serves a page until Ctrl-C; test_view_browser.py opens one': 1,

@@ -152,3 +152,23 @@ def test_simulated_time_knows_when_it_will_be_what():
     clock.set(clock.now(), running=False)
     now[0] += 100
     assert (clock.now(), clock.when(250)) == (250, None)
+
+
+def test_a_shorter_period_ends_a_long_sleep(monkeypatch):
+    clock, grid, seen = Time(), [BEGIN, 100.0], []
+
+    def sleep(seconds):
+        clock.now += seconds
+        if clock.now > BEGIN + 1.0:
+            grid[:] = BEGIN, PERIOD
+
+    def tick():
+        seen.append(clock.now)
+        thread._stopped = len(seen) == 3
+
+    clock.sleep = sleep
+    monkeypatch.setattr(pacing, 'time', clock)
+    thread = pacing.DeadlineThread(tick, pytest.fail, lambda: tuple(grid), pytest.fail)
+    thread.run()
+    assert BEGIN + 1.0 < seen[0] < BEGIN + 1.0 + 2 * thread.LONGEST_SLEEP
+    assert [later - seen[0] for later in seen] == pytest.approx([0.0, PERIOD, 2 * PERIOD])

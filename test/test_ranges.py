@@ -201,8 +201,8 @@ def test_every_combination_that_the_ranges_allow_runs_or_is_refused(rng):
 
 
 def test_most_combinations_run():
-    found = [short_life(random.Random(seed)) for seed in range(10)]
-    assert found.count('ran') >= 5 and 'refused' in found
+    found = [short_life(random.Random(seed)) for seed in range(30)]
+    assert found.count('ran') >= 15 and 'refused' in found
 
 
 def test_numbers_of_any_size_are_among_them():

@@ -163,7 +163,7 @@ def test_the_default_scene_imports_just_what_it_uses(finished):
             if name.startswith('spinning_top_sim.') and name.count('.') == 2}
     assert {name for name in ours if name.startswith(('nodes.', 'recording.', 'tools.'))} == {
         'nodes.executable', 'nodes.pacing', 'nodes.recording_session', 'nodes.reports',
-        'nodes.ros_parameters', 'nodes.simulator', 'nodes.tick_loop',
+        'nodes.ros_parameters', 'nodes.simulator', 'nodes.throttle', 'nodes.tick_loop',
         'recording.errors'}
     messages = {name.split('.')[0] for name in modules if name.endswith('_msgs')}
     assert messages <= {

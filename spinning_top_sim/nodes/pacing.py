@@ -92,10 +92,7 @@ class DeadlineThread(threading.Thread):
                 origin, period = grid
                 passed = int((time.monotonic() - origin) // period)
                 newest = max(passed, newest + 1) if grid == before else passed + 1
-                deadline = origin + newest * period
-                while (left := deadline - time.monotonic()) > 0.0 and not self._stopped:
-                    time.sleep(min(left, self.LONGEST_SLEEP))
-                if not self._stopped and self._tick():
+                if self._sleep_until(origin + newest * period, grid) and self._tick():
                     nap = min(self.NAP * period, self.LONGEST_SLEEP)
                     if nap >= self.SHORTEST_NAP:
                         time.sleep(nap)
@@ -103,6 +100,14 @@ class DeadlineThread(threading.Thread):
             except Exception as error:
                 self._failed(error)
                 time.sleep(self.LONGEST_SLEEP)
+
+    def _sleep_until(self, deadline: float, grid: tuple[float, float]) -> bool:
+        """Return True at the deadline, and False if it is stopped or the grid changes before."""
+        while (left := deadline - time.monotonic()) > 0.0:
+            if self._stopped or (left > self.LONGEST_SLEEP and self._grid() != grid):
+                return False
+            time.sleep(min(left, self.LONGEST_SLEEP))
+        return not self._stopped
 
     def stop(self) -> None:
         self._stopped = True

@@ -266,7 +266,7 @@ class Scanner:
             end = self._limit
         elif not self._finder.is_record(end):
             # Bytes are missing in it if another record begins before.
-            following = self._finder.find(offset)
+            following = self._finder.find(offset, end + 1)
             if following > end:
                 return offset
             end = following

@@ -166,16 +166,19 @@ class RecordFinder:
             return offset == self._limit
         return True
 
-    def find(self, offset: int) -> int:
-        """Return where the next chunk, schema, channel or metadata begins, or the limit."""
-        while offset < self._limit:
+    def find(self, offset: int, before: int | None = None) -> int:
+        """Return where the next chunk, schema, channel or metadata begins, or `before`."""
+        limit = self._limit if before is None else min(before, self._limit)
+        while offset < limit:
             block = self._source.read(offset, _BLOCK + HEAD.size)
             for match in _CANDIDATE.finditer(block, 0, _BLOCK + HEAD.size - 1):
                 place = offset + match.start()
+                if place >= limit:
+                    break
                 if self.is_record(place):
                     return place
             offset += _BLOCK
-        return self._limit
+        return limit
 
     def _is_proven(self, opcode: int, offset: int, end: int) -> bool:
         """Return whether it is a chunk, schema, channel or metadata; raises DamagedError."""
