@@ -378,10 +378,12 @@ class Simulator(Node):
     def _show(self, names: Iterable[str]) -> None:
         """Let parameters show values that are in effect already."""
         self.remove_on_set_parameters_callback(self._on_set_parameters)
-        self.set_parameters([Parameter(name, value=list(value) if isinstance(value, tuple)
-                                       else value)
-                             for name, value in ((name, self._values[name]) for name in names)])
-        self.add_on_set_parameters_callback(self._on_set_parameters)
+        try:
+            self.set_parameters([
+                Parameter(name, value=list(value) if isinstance(value, tuple) else value)
+                for name, value in ((name, self._values[name]) for name in names)])
+        finally:
+            self.add_on_set_parameters_callback(self._on_set_parameters)
 
     def can_send(self) -> bool:
         """Return False when a signal has ended the context."""
