@@ -236,7 +236,7 @@ def test_a_cluster_whose_scheduler_is_killed(dataset, tmp_path):
     with process('-m', 'dask', 'scheduler', '--port', 0, *common) as scheduler, process(
             '-m', 'dask', 'worker', '--nthreads', 1, '--no-nanny', *common):
         end = time.monotonic() + PATIENCE
-        while not place.exists() and time.monotonic() < end:
+        while not (place.exists() and place.read_text()) and time.monotonic() < end:
             time.sleep(0.01)
         address = json.loads(place.read_text())['address']
         with ensemble(path, '-o', folder, '--scheduler', address) as running:
