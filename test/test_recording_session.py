@@ -199,7 +199,7 @@ def test_a_disk_that_is_too_slow_is_told_with_what_may_be_lost(tmp_path, monkeyp
     assert 'max_loss = 0.02 s' in recorded.session.warning
     numbers = recorded.session.numbers()
     assert numbers['recorder'] == 'recording'
-    assert float(numbers['possible loss [s]']) > 0.02
+    assert float(numbers['possible loss [s]']) >= 0.02      # rounded to 1 ms
     disk_is_back.set()
     log, _ = recorded.stop()
     assert len(log['/ns/pose']) == 101
