@@ -269,6 +269,7 @@ def test_a_follower_moves_with_the_clock_of_another_node(peer, diagnostics, tmp_
                      namespace='/lead') as lead:
             clock = peer.listen('/clock', Clock)
             pose.wait(200)
+            clock.wait(100)         # found later by this process, perhaps, than by the follower
             assert set(stamps_of(pose) % PERIODS_NS['pose']) == {0}
             assert peer.switch(lead, 'set_pause', True).success
             settled(clock)
