@@ -167,10 +167,10 @@ def test_a_filter_without_faults_passes():
     assert found['nees_low'] < found['nees'] < found['nees_high']
 
 
-def test_vqf_passes_with_and_without_magnetometer_and_twice_the_same(pass_exam):    # noqa: F811
+def test_vqf_passes_with_and_without_magnetometer(pass_exam):   # noqa: F811
     report = pass_exam(Vqf)
-    assert pass_exam(Vqf).as_json() == report.as_json()
-    assert pass_exam(partial(Vqf, magnetic=False)).measures['heading_rms_deg'] < 0.1
+    assert all(type(value) is float for value in report.measures.values())
+    assert pass_exam(partial(Vqf, magnetic=False), seeds=1).measures['heading_rms_deg'] < 0.1
     assert report.measures['tilt_rms_deg'] < 0.05
     assert 'nees' not in report.measures
     with pytest.raises(pytest.fail.Exception, match='conjugated, the error falls'):
@@ -186,7 +186,7 @@ def test_without_heading_a_world_north_east_down_and_the_sign_of_gravity_are_the
         assert 'cannot be told apart' in report.found[0].evidence
 
 
-@pytest.mark.parametrize('name', ['', *MISREADINGS])
+@pytest.mark.parametrize('name', ['', 'gyroscope_units', 'frame_ned', 'stamp_offset'])
 def test_a_filter_that_goes_on_from_run_to_run_gets_the_same_verdict(name):
     make = partial(Vqf, magnetic=False) if name else Vqf
     make = partial(MISREADINGS[name], make) if name else make
@@ -198,14 +198,18 @@ def test_a_filter_that_goes_on_from_run_to_run_gets_the_same_verdict(name):
 
 
 def test_a_covariance_is_measured_but_not_judged_from_run_to_run():
-    report = examine(ReferenceFilter, seeds=1, restart=False)
+    class WithCovariance(Vqf):
+        covariance = 1e-12 * np.eye(3)
+
+    assert examine(WithCovariance, seeds=1).faults == ['covariance_small']
+    report = examine(WithCovariance, seeds=1, restart=False)
     assert report.passed and report.measures['nees'] > 0.0
 
 
 def test_any_number_of_workers_gives_the_same_report():
     pytest.importorskip('distributed')
     make = partial(MISREADINGS['gyroscope_units'], Vqf)     # its runs are repeated
-    one, two = (examine(make, 'full', seeds=3, workers=workers) for workers in (1, 2))
+    one, two = (examine(make, 'full', seeds=2, workers=workers) for workers in (1, 2))
     assert one.as_json() == two.as_json() and one.faults == ['gyroscope_units']
     assert [outcome.run.name for outcome in one.outcomes] == [
         outcome.run.name for outcome in two.outcomes]

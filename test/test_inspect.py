@@ -371,7 +371,8 @@ def test_a_changed_bit_is_found_wherever_it_is(name, tmp_path, capsys, request):
     with LogReader(source) as reader:
         sizes = {message.topic: len(message.data) for message in reader.messages()}
     rng = np.random.default_rng(5)
-    for topic, size in sizes.items():
+    # Which topics, differs between the two logs.
+    for topic, size in list(sizes.items())[name == 'columns'::2]:
         if topic.endswith('/events'):
             continue
         byte, bit = int(rng.integers(4, size)), int(rng.integers(8))

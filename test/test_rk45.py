@@ -156,15 +156,16 @@ def cusp_scene():
     return parameters.top_of(values), parameters.start_state(values), values
 
 
-def test_an_hour_of_the_cusp_scene():
+def test_ten_minutes_of_the_cusp_scene():
     """Orientation, invariants, cost and cusps of the default solver at its default tolerance."""
+    seconds = 600.0
     top, start, values = cusp_scene()
     exact = ExactSolution(top, start)
     assert math.degrees(exact.theta_max - exact.theta_min) >= 10.0
     stepped = propagate(top, start, method='rk45', rtol=values['solver.rtol'],
                         atol=values['solver.atol'])
     period = exact.nutation_period
-    cusps = period * np.arange(int(3600.0 / period) + 1)
+    cusps = period * np.arange(int(seconds / period) + 1)
     tenth = int(10.0 / period)
     first, rest = (stepped.states_at_seconds(t) for t in np.split(cusps, [tenth + 1]))
     for states in (first, rest):
@@ -174,10 +175,11 @@ def test_an_hour_of_the_cusp_scene():
         assert np.abs(states.lz / start.lz - 1.0).max() <= 1e-12
     truth = exact.states_at_seconds(cusps[tenth:tenth + 1])
     assert angle(first.quaternion[-1], truth.quaternion[0]) < 1e-8
-    last, truth = stepped.states_at_seconds(np.array([3600.0])), solve(top, start, [3600.0])
-    assert angle(last.quaternion[0], truth.quaternion[0]) < 2e-6
-    assert abs(last.phi[0] - truth.phi[0]) < 2e-6
-    assert stepped.evaluations <= 3600 * 1500
+    last, truth = stepped.states_at_seconds(np.array([seconds])), solve(top, start, [seconds])
+    print(angle(last.quaternion[0], truth.quaternion[0]), last.phi[0] - truth.phi[0])
+    assert angle(last.quaternion[0], truth.quaternion[0]) < 3e-8
+    assert abs(last.phi[0] - truth.phi[0]) < 3e-8
+    assert stepped.evaluations <= seconds * 1500
 
 
 def test_ten_seconds_of_the_cusp_scene_cost_no_more_than_the_average():

@@ -36,7 +36,7 @@ from spinning_top_sim.solvers.propagator import propagate
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.pipeline import Simulation
 
-TOPS = int(os.environ.get('STRESS_TOPS', '600'))
+TOPS = int(os.environ.get('STRESS_TOPS', '250'))
 
 
 @pytest.mark.parametrize('seeds', blocks(0, TOPS), ids=lambda seeds: f'{seeds[0]}-{seeds[-1]}')

@@ -127,7 +127,7 @@ def marks(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
     """Return what docs/exam.md defines of the errors of filters, over several runs."""
     settled = [outcome.later() for outcome in outcomes]
     errors = [outcome.errors for outcome in settled]
-    return {
+    marked = {
         'tilt_rms_deg': np.degrees(rms(np.concatenate([one.tilt for one in errors]))),
         'tilt_max_deg': np.degrees(max(float(np.max(one.tilt)) for one in errors)),
         'heading_rms_deg': np.degrees(rms(np.concatenate(
@@ -137,6 +137,7 @@ def marks(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
         'heading_drift_deg_per_s': np.degrees(float(np.mean([
             abs(measures.drift(outcome.run.t, one.heading))
             for outcome, one in zip(settled, errors, strict=True)])))}
+    return {name: float(mark) for name, mark in marked.items()}
 
 
 def error_of(outcome: Outcome, absolute: bool) -> float:

@@ -72,6 +72,7 @@ class LiveView(Node):
         self.finished: Future = Future()
         self._page = page
         self._inbox: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
+        self._arrived = threading.Event()       # something is in the inbox
         self._listeners: dict[str, Subscription] = {}
         self._sim = self.resolve_topic_name(NODE_NAME)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, QOS)
@@ -105,6 +106,7 @@ class LiveView(Node):
     def _listen(self, topic: str) -> None:
         def _receive(data: Any) -> None:         # serialized: `raw`
             self._inbox.append((topic, data))
+            self._arrived.set()
         self._listeners[topic] = self.create_subscription(
             KIND_OF[topic], throttle.TOPICS.get(topic, topic), _receive, QOS, raw=True)
 
@@ -156,6 +158,8 @@ class LiveView(Node):
                     return
                 self.get_logger().error(traceback.format_exc(), throttle_duration_sec=5.0)
             time.sleep(max(due - time.monotonic(), 0.0))
+            # Messages as frequent as pictures: at fixed times, some pictures would have none.
+            self._arrived.wait(1.0 / RATE)
 
     def _draw_once(self) -> None:
         if self._stale and self._services_of_sim['get_parameters'].service_is_ready():
@@ -167,6 +171,7 @@ class LiveView(Node):
         if self._gone:
             self._controls.tell_end(f'{self._sim} has ended, or does not answer')
         arrived = defaultdict(list)
+        self._arrived.clear()
         while self._inbox:
             topic, data = self._inbox.popleft()
             arrived[topic].append(data)
