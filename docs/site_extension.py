@@ -3,7 +3,8 @@
 What the site needs of Sphinx beyond its own extensions.
 
 - `{help-of} NAME` is what the command says with `--help`.
-- Files at the top of the repository, as the changelog, get a page in docs/project/.
+- Files at the top of the repository, as the changelog, get a page in docs/project/, to which the
+  links of other pages lead.
 """
 
 import os
@@ -64,9 +65,17 @@ def write_pages(app):
             page.write_text(text, encoding='utf-8')
 
 
+def lead_to_pages(app, name, source):
+    """Turn links to the files of PAGES into links to their pages."""
+    for page in PAGES:
+        source[0] = re.sub(rf'\]\((?:\.\./)+{re.escape(page)}', f'](/project/top_{page.lower()}',
+                           source[0])
+
+
 def setup(app):
     """Register all this."""
     app.add_config_value('site_root', Path(app.confdir).parent, 'env')
     app.add_directive('help-of', HelpOf)
     app.connect('builder-inited', write_pages)
+    app.connect('source-read', lead_to_pages)
     return {'parallel_read_safe': True, 'parallel_write_safe': True}

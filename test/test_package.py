@@ -109,6 +109,15 @@ def test_versions_agree(setup_py):
     assert package.version == newest == setup_py.get_version()
 
 
+@pytest.mark.parametrize('name', [path.name for path in SCRIPTS])
+def test_every_executable_says_its_version(name, setup_py):
+    if name in ('sim_node', 'replay_node', 'view'):
+        pytest.importorskip('rclpy')
+    told = subprocess.run([sys.executable, ROOT / 'scripts' / name, '--version'], check=True,
+                          capture_output=True, text=True, timeout=60)
+    assert told.stdout.split() == [name, setup_py.get_version()]
+
+
 def test_manifest_and_setup_py_tell_the_same(setup_py):
     package = parse_package(str(ROOT / 'package.xml'))
     (maintainer,) = package.maintainers

@@ -30,6 +30,20 @@ simulate, inspect, recover, ensemble, examine = (partial(_start, module) for mod
     'tools.simulate', 'tools.inspect', 'tools.recover', 'tools.ensemble', 'exam.command'))
 
 
+class _Version(argparse.Action):
+    """Print the version, which takes time to find, where it is asked for."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from spinning_top_sim.recording.provenance import version  # noqa: PLC0415
+        print(parser.prog, version('spinning_top_sim'))
+        parser.exit()
+
+
+def add_version(parser: argparse.ArgumentParser) -> None:
+    """Add the option `--version`."""
+    parser.add_argument('--version', action=_Version, nargs=0, help='print the version, then end')
+
+
 def run(name: str, help_text: str | None, argv: Sequence[str] | None,
         add_arguments: Callable[[argparse.ArgumentParser], object],
         command: Callable[[argparse.Namespace], int], errors: tuple[type[Exception], ...]) -> int:
@@ -44,6 +58,7 @@ def run(name: str, help_text: str | None, argv: Sequence[str] | None,
     parser = argparse.ArgumentParser(prog=name, description=help_text,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     add_arguments(parser)
+    add_version(parser)
     arguments = parser.parse_args(argv)
     try:
         code = command(arguments)

@@ -45,6 +45,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser('view', description=DESCRIPTION,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     _add_arguments(parser)
+    cli.add_version(parser)
     return parser
 
 
@@ -57,7 +58,6 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--html', type=Path, metavar='FILE',
         help='write the first minute of the logs as a page that needs no server, and end')
     add('--no-browser', action='store_true', help='only print the address')
-    add('--version', action='store_true', help='print the version, then end')
 
 
 def _show_logs(arguments: argparse.Namespace) -> int:
