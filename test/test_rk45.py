@@ -297,6 +297,45 @@ def test_away_from_the_poles_the_literal_equations_are_right(name):
         assert motion.psi[i] == pytest.approx(float(state['psi']), abs=1e-8)
 
 
+def test_the_literal_equations_are_the_derivatives_of_the_exact_motion():
+    """For a top none of whose constants is 1."""
+    top = Top(lambda1=0.3, lambda3=0.2, mass=2.0, com_distance=0.15, gravity=9.8)
+    start = State(theta=0.9, theta_dot=0.7, phi=0.3, psi=-0.4, l3=1.1, lz=0.6)
+    exact, equations = ExactSolution(top, start), EulerEquations(top, start, 1e-9, 0.0)
+
+    def angles_at(t):
+        states = exact.states_at_seconds(t)
+        return np.array([states.theta, states.theta_dot, states.phi, states.psi])
+
+    def derivatives_at(t):
+        return np.transpose([equations.derivative(*y) for y in angles_at(t).T.tolist()])
+
+    t, h = np.linspace(0.1, 3.0, 30), 1e-4
+    slope = (angles_at(t + h) - angles_at(t - h)) / (2.0 * h)
+    assert derivatives_at(t) == pytest.approx(slope, rel=1e-5, abs=1e-5)
+    slope = (derivatives_at(t + h) - derivatives_at(t - h)) / (2.0 * h)
+    second = equations.second_derivative(angles_at(t), derivatives_at(t))
+    assert second == pytest.approx(slope, rel=1e-5, abs=1e-4)
+
+
+def test_the_literal_equations_begin_with_a_step_for_the_fastest_rate():
+    top = Top(lambda1=0.5, lambda3=0.25, mass=2.0, com_distance=0.25, gravity=4.0)
+    equations = EulerEquations(top, State(theta=1.0, theta_dot=-1.0, l3=2.0, lz=-3.0), 1e-6, 2e-6)
+    assert equations.fastest_rate == 1.0 + 5.0 / 0.5 + 2.0 / 0.25 + 2.0
+    assert equations.tolerance == pytest.approx(3e-6)
+
+
+@pytest.mark.parametrize('start', [
+    State(theta=0.8, theta_dot=-9.0, l3=0.4, lz=0.4),
+    State(theta=2.6, theta_dot=3.0, l3=0.4, lz=-0.4)])
+def test_rates_are_right_on_the_way_through_a_pole(start):
+    top = Top(lambda1=0.3, lambda3=0.2, mass=2.0, com_distance=0.15, gravity=9.8)
+    t = np.linspace(0.0, 3.0, 3001)
+    stepped, truth = solve(top, start, t, method='rk45', rtol=1e-12), solve(top, start, t)
+    assert np.abs(np.sin(truth.theta)).min() < 1e-2
+    assert stepped.angular_velocity == pytest.approx(truth.angular_velocity, abs=1e-7)
+
+
 # ------------------------------------------------------------------------- bad arguments
 
 @pytest.mark.parametrize(('arguments', 'message'), [
