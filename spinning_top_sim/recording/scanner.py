@@ -70,7 +70,7 @@ class ScannedRecord:
     # Of a schema or channel the version that is valid, of an attachment its index.  None for
     # single messages, message indexes and unknown kinds.
     record: McapRecord | None = None
-    raw: bytes = b''    # with head and extra fields; b'' for attachments and unknown kinds
+    raw: bytes = b''    # of a record, with head and extra fields; b'' for attachments
     # Messages of known channels, of a chunk or a single one.
     contents: ChunkContents | None = None
 
@@ -172,7 +172,7 @@ class Scanner:
                 if not self._finder.is_record(end):
                     raise DamagedError('its length is not that of its content')
                 self._defects.append(f'the message index at byte {offset} is wrong')
-            return ScannedRecord(opcode, offset, end, raw=raw)
+            return ScannedRecord(opcode, offset, end)
         record, extra = records.parse(raw)
         self._check_extra(extra, end)
         if isinstance(record, DataEnd) and (
@@ -210,7 +210,7 @@ class Scanner:
         # Nothing in a message proves its length but the record that follows, perhaps truncated.
         if end < self._limit and not 0 < self.source.read(end, 1)[0] <= Opcode.DATA_END:
             self.source.head(end, self._limit)
-        return ScannedRecord(Opcode.MESSAGE, offset, end, raw=raw, contents=contents)
+        return ScannedRecord(Opcode.MESSAGE, offset, end, contents=contents)
 
     def _open_chunk(self, offset: int, chunk: Chunk) -> ChunkContents:
         contents = records.open_chunk(chunk, self.source.max_bytes)
