@@ -396,6 +396,7 @@ BAD_WORLDS = [
     ({'uri': str(ROOT / 'README.md')}, BAD_FORMAT, '*.yaml'),
     ({'uri': str(ROOT / 'config/imu/bmi088.yaml')}, PARSE_ERROR, 'is no world'),
     ({'text': '{'}, PARSE_ERROR, 'is not YAML'),
+    ({'text': '/**: {ros__parameters: {top.mass: !!bool maybe}}'}, PARSE_ERROR, 'bool: must be'),
     ({'text': 'x: 1'}, PARSE_ERROR, 'ros__parameters'),
     ({'text': '/**: {ros__parameters: {top.mass: -1.0}}'}, PARSE_ERROR, 'top.mass = -1.0'),
     ({'text': '/**: {ros__parameters: {top.mass: }}'}, PARSE_ERROR, 'has no value'),
