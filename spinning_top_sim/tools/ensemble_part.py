@@ -11,7 +11,7 @@ import hashlib
 import json
 import platform
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -57,24 +57,25 @@ def versions() -> dict[str, str]:
             **{name: version(name) for name in ('spinning_top_sim', 'numpy', 'pyarrow', 'mcap')}}
 
 
-def samples(values: Mapping[str, Any]) -> dict[str, Samples]:
+def samples(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Samples]:
     """
-    Return the samples of a run by topic, of the streams that `record.streams` chooses.
+    Return the samples of a run by topic, of the streams with these names.
 
-    values : checked parameters with a duration > 0
+    values : checked parameters with a duration > 0; a stream that they do not enable, or that
+        `record.streams` does not choose, has no samples
 
     Raises ValueError if no motion begins, IntegrationError if it ends early.
     """
     simulation = Simulation(values, EPOCH_NS)
-    streams = [stream for stream in journal.recorded_streams(simulation.streams, values)
-               if stream.parameter not in WITHOUT_COLUMNS]
+    streams = [stream for stream in simulation.streams
+               if stream.parameter in names and stream.parameter not in WITHOUT_COLUMNS]
     blocks: dict[str, list[tuple[NDArray[np.int64], tuple[NDArray[np.float64], ...]]]] = {
-        stream.topic: [] for stream in streams}
+        stream.topic: [(np.empty(0, np.int64), stream.template.decode(b''))] for stream in streams}
 
     def take(stream: Stream, stamps_ns: NDArray[np.int64], rows: NDArray[np.uint8]) -> None:
         blocks[stream.topic].append((stamps_ns - EPOCH_NS, stream.template.decode(rows.tobytes())))
 
-    simulation.log_to(None, streams)
+    simulation.log_to(None, journal.recorded_streams(streams, values))
     simulation.advance_in_blocks(round(values['duration'] * NANOSECONDS), take)
     found = {}
     for stream in streams:
@@ -91,17 +92,23 @@ def table(specification: Specification, run: int) -> 'pyarrow.Table':
     """
     Return a run as a table: run, t [s], what is drawn for it, and its samples.
 
-    A row has the samples of one time; where a stream has none, its columns are null.
+    A row has the samples of one time; where a stream has none, its columns are null.  All runs
+    have the same columns.
     Raises ValueError or IntegrationError as `samples` does.
     """
     import pyarrow as pa  # noqa: PLC0415
 
-    found = samples(specification.values(run))
+    found = samples(specification.values(run), specification.kept)
+    if not found:
+        raise ValueError(f'the streams {", ".join(specification.kept)} have no columns: only a '
+                         'log (.mcap) can have them')
     rows_ns = np.unique(np.concatenate([times_ns for times_ns, _ in found.values()]))
     columns = {'run': pa.repeat(pa.scalar(run), len(rows_ns)),
                't': pa.array(rows_ns / NANOSECONDS)}
     for name, value in specification.drawn(run).items():
-        columns[name] = pa.repeat(pa.scalar(value), len(rows_ns))
+        # An unset one (spin.lz) is a null of the type that the other runs have.
+        one = pa.scalar(value, pa.float64() if value is None else None)
+        columns[name] = pa.repeat(one, len(rows_ns))
     for topic, (times_ns, fields) in found.items():
         rows = np.searchsorted(rows_ns, times_ns)
         missing = np.ones(len(rows_ns), bool)
