@@ -241,6 +241,20 @@ def test_simulate_steps_ends_as_it_is_told_to(top):
     top.done('StepSimulation', steps=1)         # the next ones may begin
 
 
+def test_simulate_steps_says_that_the_duration_ends_or_the_motion_fails(monkeypatch, tmp_path):
+    with StandardNode('stand-in', monkeypatch, tmp_path, duration=0.02) as top:
+        goal, coroutine = top.pause().steps(3)
+        assert finished(coroutine).result.error_message == (
+            'interrupted after 2 of 3 steps: `duration` ends before the steps do')
+        assert goal.end == 'aborted'
+    with StandardNode('stand-in', monkeypatch, tmp_path) as top:
+        _, coroutine = top.pause().steps(3)
+        coroutine.send(None)
+        top.loop.fail('the equations end')
+        assert finished(coroutine).result.error_message == (
+            'interrupted after 1 of 3 steps: the equations end')
+
+
 @pytest.mark.parametrize('how', ['reset', 'play', 'stop', 'quit'])
 def test_a_reset_or_another_state_ends_the_steps(top, how):
     top.pause()

@@ -214,9 +214,11 @@ class SimulationHandlers:
         interruptions = self._loop.interruptions
 
         def step() -> None:
-            if self._quits or self._loop.interruptions != interruptions:
-                raise RuntimeError(f'interrupted after {done} of {steps} steps: the simulation '
-                                   'was reset, or its state set')
+            loop = self._loop
+            if self._quits or loop.interruptions != interruptions:
+                why = ('`duration` ends before the steps do' if loop.state is State.ENDED else
+                       loop.failure or 'the simulation was reset, or its state set')
+                raise RuntimeError(f'interrupted after {done} of {steps} steps: {why}')
             self._step(1)
 
         try:
