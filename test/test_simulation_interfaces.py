@@ -327,7 +327,7 @@ def test_sources_of_worlds(top, tmp_path):
         found = top.done('GetAvailableWorlds', additional_sources=[source]).worlds
         assert found[-1].name == 'mine'
         assert len(found) == len(list(ROOT.glob('config/*.yaml'))) + 1
-    for source in (str(tmp_path / 'none'), 'https://example.org/worlds',
+    for source in (str(tmp_path / 'none'), 'https://example.org/worlds', '~nosuchuser/x',
                    str(folder / 'broken.yaml')):
         code, text = top.refused('GetAvailableWorlds', additional_sources=[source])
         assert code == FAILED
@@ -406,6 +406,7 @@ BAD_WORLDS = [
     ({'uri': 'no_scene'}, NOT_FOUND, 'there are the scenes cusp, '),
     ({'uri': '/nowhere/x.yaml'}, NOT_FOUND, 'there is no such file'),
     ({'uri': 'https://example.org/x.yaml'}, BAD_FORMAT, 'file:// URI'),
+    ({'uri': '~nosuchuser/x.yaml'}, BAD_FORMAT, 'there is no such user'),
     ({'uri': 'a\0b'}, BAD_FORMAT, 'file:// URI'),
     ({'uri': str(ROOT / 'README.md')}, BAD_FORMAT, '*.yaml'),
     ({'uri': str(ROOT / 'config/imu/bmi088.yaml')}, PARSE_ERROR, 'is no world'),

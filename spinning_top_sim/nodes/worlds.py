@@ -142,9 +142,13 @@ def worlds_in(source: str) -> list[World]:
 
 
 def local_path(uri: str) -> Path:
-    """Return the path of a file URI, or of a path.  Raises FormatError for other URIs."""
+    """Return the path of a file URI, or of a path.  Raises FormatError for others."""
     parts = urlsplit(uri)
     if '\0' in uri or (parts.scheme and not (parts.scheme == 'file'
                                              and parts.netloc in ('', 'localhost'))):
         raise FormatError(f'{uri!r}: must be the name of a scene, a path or a file:// URI')
-    return Path(unquote(parts.path) if parts.scheme else uri).expanduser()
+    path = Path(unquote(parts.path) if parts.scheme else uri)
+    try:
+        return path.expanduser()
+    except RuntimeError as error:
+        raise FormatError(f'{uri!r}: there is no such user') from error
