@@ -230,6 +230,39 @@ def test_a_killed_and_an_interrupted_command_are_resumed(dataset, tmp_path):
         assert (now.st_ino, now.st_mtime_ns) == (then.st_ino, then.st_mtime_ns)
 
 
+@pytest.mark.parametrize('change', [
+    {'versions': 1}, {'files': None}, {'complete': 1}, {'specification': []}, {'format': 2}])
+def test_what_is_no_manifest_is_refused(dataset, tmp_path, capsys, change):
+    manifest = json.loads((dataset[0] / 'manifest.json').read_text())
+    place = tmp_path / 'manifest.json'
+    for text in (json.dumps({**manifest, **change}), '[' * 100_000, '[]', '{"format": 1}'):
+        place.write_text(text)
+        for arguments in ([str(tmp_path), '--row', '0', '-o', str(tmp_path / 'one.mcap')],
+                          [str(dataset[1]), '--resume', '-o', str(tmp_path)]):
+            assert main(arguments) == 2
+            error = capsys.readouterr().err
+            assert error.startswith(f'ensemble: {place} is no manifest') and error.count('\n') == 1
+
+
+def test_damaged_files_of_a_complete_dataset_are_computed_again(tmp_path):
+    """And no others; runs that failed are as they were."""
+    folder = tmp_path / 'logs'
+    command = (written(tmp_path, runs=6, duration=0.1, format='mcap', sample={
+        'spin.lz': {'values': [1.42, 1e30, 1.4, 1.41]}}), '-o', folder, '--workers', 1)
+    with ensemble(*command) as running:
+        assert finish(running)[0] == 0
+    before = contents(folder)
+    lost, damaged, _, *kept = sorted((folder / 'data').iterdir())       # runs 0, 2, 3, and 4
+    then = [(path.stat().st_ino, path.stat().st_mtime_ns) for path in kept]
+    lost.unlink()
+    damaged.write_bytes(bytes(100))
+    with ensemble(*command, '--resume') as running:
+        code, said = finish(running)
+    assert code == 0 and said.startswith('ensemble: 2 of 6 runs failed, see manifest.json; run 1:')
+    assert contents(folder) == before
+    assert [(path.stat().st_ino, path.stat().st_mtime_ns) for path in kept] == then
+
+
 def test_a_cluster_whose_scheduler_is_killed(dataset, tmp_path):
     whole, path = dataset
     folder, place = tmp_path / 'other', tmp_path / 'scheduler.json'

@@ -27,7 +27,7 @@ from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING
 from spinning_top_sim.tools.ensemble_spec import WITHOUT_COLUMNS, Specification
-from spinning_top_sim.tools.recorded_run import field_names, reason_of
+from spinning_top_sim.tools.recorded_run import ODD, field_names, reason_of
 from spinning_top_sim.tools.simulate import write_log
 
 if TYPE_CHECKING:
@@ -177,9 +177,10 @@ def compute_part(specification: Specification, part: int, folder: str,
     if versions() != wanted:
         raise EnsembleError(f'a worker has {versions()}, which gives other bytes than {wanted}')
     record_path = Path(folder, PROGRESS, f'part-{part:06d}.json')
-    with contextlib.suppress(OSError, ValueError):
-        record: dict[str, Any] = json.loads(record_path.read_bytes())
-        if all(sha256(Path(folder, name)) == digest for name, digest in record['files'].items()):
+    record: dict[str, Any]
+    with contextlib.suppress(OSError, *ODD):
+        record = json.loads(record_path.read_bytes())
+        if record.keys() == {'files', 'failed'} and is_whole(Path(folder), record):
             return record
     record = {'files': {}, 'failed': {}}
     with tempfile.TemporaryDirectory(dir=Path(folder, PROGRESS)) as name:
@@ -192,6 +193,26 @@ def compute_part(specification: Specification, part: int, folder: str,
         written.write_text(json.dumps(record))
         written.replace(record_path)
     return record
+
+
+def write_records(specification: Specification, folder: Path, whole: Mapping[str, Any]) -> None:
+    """Write the record of each part, from `files` and `failed` of all.  Raises OSError."""
+    (folder / PROGRESS).mkdir(exist_ok=True)
+    for part in range(specification.parts):
+        runs = specification.part(part)
+        names = [f'part-{part:06d}.parquet', *(f'run-{run:09d}.mcap' for run in runs)]
+        record = {what: {key: whole[what][key] for key in keys if key in whole[what]}
+                  for what, keys in (('files', [f'{DATA}/{name}' for name in names]),
+                                     ('failed', map(str, runs)))}
+        (folder / PROGRESS / f'part-{part:06d}.json').write_text(json.dumps(record))
+
+
+def is_whole(folder: Path, record: Mapping[str, Any]) -> bool:
+    """Return whether each of `files` is there with its hash."""
+    try:
+        return all(sha256(folder / name) == digest for name, digest in record['files'].items())
+    except OSError:
+        return False
 
 
 def sha256(path: Path) -> str:
