@@ -7,6 +7,7 @@ installed ones where there are some.  test_simulation_interfaces_dds.py calls se
 """
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -323,6 +324,8 @@ def test_sources_of_worlds(top, tmp_path):
     (folder / 'mine.yaml').write_text('/**: {ros__parameters: {top.mass: 3.0}}')
     (folder / 'other.yaml').write_text('/**: {ros__parameters: {imu.rate: 3.0}}')
     (folder / 'broken.yaml').write_text('{')
+    # No message can hold this name.
+    (folder / os.fsdecode(b'\xff.yaml')).write_bytes((folder / 'mine.yaml').read_bytes())
     for source in (str(folder), folder.as_uri(), str(folder / 'mine.yaml')):
         found = top.done('GetAvailableWorlds', additional_sources=[source]).worlds
         assert found[-1].name == 'mine'
@@ -411,6 +414,7 @@ BAD_WORLDS = [
     ({'uri': str(ROOT / 'README.md')}, BAD_FORMAT, '*.yaml'),
     ({'uri': str(ROOT / 'config/imu/bmi088.yaml')}, PARSE_ERROR, 'is no world'),
     ({'text': '{'}, PARSE_ERROR, 'is not YAML'),
+    ({'text': '#' * 1_000_001}, BAD_FORMAT, '1000001 characters; must be at most 1000000'),
     ({'text': '/**: {ros__parameters: {top.mass: !!bool maybe}}'}, PARSE_ERROR, 'bool: must be'),
     ({'text': 'x: 1'}, PARSE_ERROR, 'ros__parameters'),
     ({'text': '/**: {ros__parameters: {top.mass: -1.0}}'}, PARSE_ERROR, 'top.mass = -1.0'),
@@ -436,6 +440,13 @@ def test_a_bad_world_changes_nothing(top, given, code, text):
     assert top.state == PLAYING
     assert top.done('GetCurrentWorld').world.name == 'cusp'
     top.wait_until(top.simulation.now_ns + 20_000_000)
+
+
+def test_an_element_that_no_message_can_hold_is_named_too(top):
+    text = '/**: {ros__parameters: {top.mass: 3.0, "top.\\ud800": 1}}'
+    response = top.done('LoadWorld', **load(top, text=text))
+    assert response.result.error_message.endswith(': top.\\ud800')
+    assert response.result.error_message.isascii()
 
 
 def test_unsupported_elements_are_named(top):

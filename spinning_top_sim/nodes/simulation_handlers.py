@@ -51,7 +51,9 @@ class SimulationHandlers:
         act = getattr(self, f'_{service_name(name)}')
         code, text = self._outcome(lambda: act(request, response))
         if result is not None:
-            result.result, result.error_message = code, text
+            # YAML can name what UTF-8 cannot: such a response would end the executor.
+            result.result = code
+            result.error_message = text.encode(errors='backslashreplace').decode()
         return response
 
     def _outcome(self, act: Callable[[], str | None]) -> tuple[int, str]:
