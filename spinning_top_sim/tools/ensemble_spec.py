@@ -3,6 +3,7 @@
 
 import hashlib
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -40,11 +41,12 @@ def _log_uniform(random: np.random.Generator, low: float, high: float) -> float:
 # The function that draws, its two numbers, and what these must be.
 DISTRIBUTIONS: Mapping[str, tuple[Callable[[np.random.Generator, float, float], float], str,
                                   Callable[[float, float], bool]]] = {
-    'uniform': (_uniform, '[low, high] with low <= high', lambda low, high: low <= high),
+    'uniform': (_uniform, '[low, high] with low <= high and a finite difference',
+                lambda low, high: 0.0 <= high - low < math.inf),
     'normal': (_normal, '[mean, deviation] with deviation >= 0',
                lambda mean, deviation: deviation >= 0.0),
-    'log_uniform': (_log_uniform, '[low, high] with 0 < low <= high',
-                    lambda low, high: 0.0 < low <= high)}
+    'log_uniform': (_log_uniform, '[low, high] with 0 < low <= high and a finite ratio',
+                    lambda low, high: 0.0 < low <= high and high / low < math.inf)}
 
 
 def generator(seed: int, run: int, name: str) -> np.random.Generator:
@@ -212,7 +214,7 @@ def _list(value: object, what: str) -> Sequence[Any]:
 
 def _set_of(given: object, source: str, folder: Path) -> dict[str, Any]:
     """Return a set of parameters, of which each value is checked."""
-    if isinstance(given, str):
+    if isinstance(given, str) and '\0' not in given:
         beside = folder / given
         found = read_scene(beside if beside.exists() else given)
     elif isinstance(given, Mapping):
@@ -258,8 +260,9 @@ def _rule(name: object, rule: object, source: str, folder: Path) -> dict[str, li
         raise ValueError(f'{what}: {kind}: must be values, because the parameter is no double')
     _, allowed, is_allowed = DISTRIBUTIONS[kind]
     if len(items) != 2 or not all(
-            isinstance(item, int | float) and not isinstance(item, bool) and math.isfinite(item)
-            for item in items) or not is_allowed(*items):
+            isinstance(item, int | float) and not isinstance(item, bool)
+            and abs(item) <= sys.float_info.max for item in items) or not is_allowed(
+                *map(float, items)):
         raise ValueError(f'{what}: {kind} = {shown(given)}: must be {allowed}')
     for bound in items[:1] if kind == 'normal' else items:
         _check(source, str(name), bound)
