@@ -28,6 +28,7 @@ from spinning_top_sim.tools.ensemble_part import (
 )
 
 pytest.importorskip('distributed')
+pa = pytest.importorskip('pyarrow')
 parquet = pytest.importorskip('pyarrow.parquet')
 
 SPEC = {
@@ -229,6 +230,39 @@ def test_a_killed_and_an_interrupted_command_are_resumed(dataset, tmp_path):
         assert (now.st_ino, now.st_mtime_ns) == (then.st_ino, then.st_mtime_ns)
 
 
+@pytest.mark.parametrize('change', [
+    {'versions': 1}, {'files': None}, {'complete': 1}, {'specification': []}, {'format': 2}])
+def test_what_is_no_manifest_is_refused(dataset, tmp_path, capsys, change):
+    manifest = json.loads((dataset[0] / 'manifest.json').read_text())
+    place = tmp_path / 'manifest.json'
+    for text in (json.dumps({**manifest, **change}), '[' * 100_000, '[]', '{"format": 1}'):
+        place.write_text(text)
+        for arguments in ([str(tmp_path), '--row', '0', '-o', str(tmp_path / 'one.mcap')],
+                          [str(dataset[1]), '--resume', '-o', str(tmp_path)]):
+            assert main(arguments) == 2
+            error = capsys.readouterr().err
+            assert error.startswith(f'ensemble: {place} is no manifest') and error.count('\n') == 1
+
+
+def test_damaged_files_of_a_complete_dataset_are_computed_again(tmp_path):
+    """And no others; runs that failed are as they were."""
+    folder = tmp_path / 'logs'
+    command = (written(tmp_path, runs=6, duration=0.1, format='mcap', sample={
+        'spin.lz': {'values': [1.42, 1e30, 1.4, 1.41]}}), '-o', folder, '--workers', 1)
+    with ensemble(*command) as running:
+        assert finish(running)[0] == 0
+    before = contents(folder)
+    lost, damaged, _, *kept = sorted((folder / 'data').iterdir())       # runs 0, 2, 3, and 4
+    then = [(path.stat().st_ino, path.stat().st_mtime_ns) for path in kept]
+    lost.unlink()
+    damaged.write_bytes(bytes(100))
+    with ensemble(*command, '--resume') as running:
+        code, said = finish(running)
+    assert code == 0 and said.startswith('ensemble: 2 of 6 runs failed, see manifest.json; run 1:')
+    assert contents(folder) == before
+    assert [(path.stat().st_ino, path.stat().st_mtime_ns) for path in kept] == then
+
+
 def test_a_cluster_whose_scheduler_is_killed(dataset, tmp_path):
     whole, path = dataset
     folder, place = tmp_path / 'other', tmp_path / 'scheduler.json'
@@ -327,16 +361,52 @@ def test_a_worker_with_other_versions_computes_nothing(tmp_path):
 
 def test_samples_of_a_run_are_arrays():
     values = parameters.checked({'duration': 0.5, 'record.streams': ('imu', 'invariants')})
-    found = samples(values)
-    assert set(found) == {'imu/data_raw', 'ground_truth/imu_bias', '~/invariants'}
+    found = samples(values, ('imu', 'invariants', 'mag'))
+    assert set(found) == {'imu/data_raw', 'ground_truth/imu_bias', '~/invariants', 'imu/mag',
+                          'ground_truth/mag'}
+    assert len(found['imu/mag'][0]) == 0
     times, fields = found['imu/data_raw']
     assert times.tolist() == [5_000_000 * k for k in range(101)]
     assert {name: field.shape for name, field in fields.items()} == {
         'angular_velocity': (101, 3), 'linear_acceleration': (101, 3)}
 
 
+def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(tmp_path):
+    """An IMU with a magnetometer beside one without; a value that is unset in some runs."""
+    grades = [str(ROOT / f'config/imu/{name}.yaml') for name in ('bmi088', 'icm_20948')]
+    specification = ensemble_spec.parse({
+        'runs': 4, 'duration': 0.05, 'runs_per_part': 4, 'sample': {
+            'params': {'values': [*grades]}, 'spin.lz': {'values': [None, 1.4]}}}, 'test')
+    (tmp_path / 'progress').mkdir()
+    (tmp_path / 'data').mkdir()
+    record = compute_part(specification, 0, str(tmp_path), ensemble_part.versions())
+    assert (len(record['files']), record['failed']) == (1, {})
+    runs = [table(specification, run) for run in range(4)]
+    assert parquet.read_table(tmp_path / 'data').equals(
+        pa.concat_tables(runs).combine_chunks())
+    for run, one in enumerate(runs):
+        assert one.schema == runs[0].schema
+        assert set(one['spin.lz'].to_pylist()) == {None if run < 2 else 1.4}
+        samples_of_mag = len(one) - one['imu/mag.magnetic_field.x'].null_count
+        assert samples_of_mag == [0, 6][run % 2]
+
+
+def test_streams_that_are_named_have_the_same_columns_in_all_runs():
+    specification = ensemble_spec.parse({
+        'runs': 2, 'duration': 0.05, 'streams': ['imu', 'mag'], 'sample': {'params': {'values': [
+            {'mag.enabled': False, 'increments.enabled': True}, {'imu.enabled': False}]}}}, 'test')
+    assert table(specification, 0).schema == table(specification, 1).schema
+    assert table(specification, 0)['imu/mag.magnetic_field.x'].null_count < 11
+
+
+def test_a_row_of_logs_without_columns_is_refused(tmp_path, capsys):
+    path = written(tmp_path, format='mcap', streams=['clock'])
+    assert main([str(path), '--row', '0', '-o', str(tmp_path / 'one.parquet')]) == 2
+    assert capsys.readouterr().err == (
+        'ensemble: the streams clock have no columns: only a log (.mcap) can have them\n')
+
+
 def test_columns_have_the_names_of_joints_and_invariants():
-    pytest.importorskip('pyarrow')
     specification = ensemble_spec.parse({
         'runs': 1, 'duration': 0.1, 'streams': ['pose', 'joint_states', 'invariants'],
         'sample': {'imu.lever_arm': {'values': [[0.1, 0.0, 0.0]]}}}, 'test')
@@ -358,6 +428,10 @@ def test_columns_have_the_names_of_joints_and_invariants():
     ({'sample': {'spin.l3': {'gauss': [1, 2]}}},
      'spin.l3: there is no distribution gauss; there are uniform, normal, log_uniform, values'),
     ({'sample': {'spin.l3': {'uniform': [2, 1]}}}, 'uniform = [2, 1]: must be [low, high] with'),
+    ({'sample': {'spin.l3': {'uniform': [1, 10 ** 400]}}}, 'must be [low, high] with low <= high'),
+    ({'sample': {'spin.l3': {'uniform': [-1e308, 1e308]}}}, 'and a finite difference'),
+    ({'sample': {'spin.l3': {'log_uniform': [1e-300, 1e300]}}}, 'and a finite ratio'),
+    ({'params': ['a\0b']}, "'a\\x00b': must be a parameter file"),
     ({'sample': {'spin.l3': {'uniform': [2]}}}, 'uniform = [2]: must be [low, high]'),
     ({'sample': {'spin.l3': {'normal': [2, -1]}}}, 'deviation >= 0'),
     ({'sample': {'top.mass': {'log_uniform': [0, 1]}}}, '0 < low <= high'),
@@ -367,6 +441,8 @@ def test_columns_have_the_names_of_joints_and_invariants():
     ({'sample': {'solver.method': {'values': ['exact', 'euler']}}}, "'euler': must be one of"),
     ({'sample': {'markers.trace_points': {'uniform': [1, 2]}}}, 'must be values'),
     ({'sample': {'use_sim_time': {'values': [True]}}}, 'use_sim_time is of ROS'),
+    ({'sample': {'imu.enabled': {'values': [True, False]}}}, 'imu.enabled must not be sampled'),
+    ({'sample': {'record.streams': {'values': [['imu']]}}}, 'record.streams must not be sampled'),
     ({'streams': ['imu', 'lidar']}, "streams: 'lidar': must be some of pose"),
     ({'streams': ['markers']}, "'markers': must be some of"),
     ({'runs': 0}, 'runs = 0: must be an integer >= 1'),

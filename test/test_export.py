@@ -2,13 +2,16 @@
 """Exports, read as their formats are documented, beside what the log has."""
 
 import csv
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
 from rosbags.highlevel import AnyReader
 
-from spinning_top_sim.tools import inspect, simulate
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.tools import export, inspect, simulate
+from spinning_top_sim.tools.recorded_run import read_run_description
 
 NOISY = {'imu.gyroscope_noise_density': 1e-3, 'imu.gyroscope_random_walk': 1e-5,
          'imu.gyroscope_turn_on_bias': 0.01, 'imu.accelerometer_noise_density': 0.02,
@@ -172,3 +175,13 @@ def test_inspect_refuses_what_the_log_lacks_and_what_is_there(tmp_path, folder, 
     assert 'no ground_truth/imu_odom' in capsys.readouterr().err
     assert inspect.main([str(folder / 'run.mcap'), *exports(folder, 'tum')]) == 1
     assert 'File exists' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('count', [0, 1])
+def test_a_log_whose_biases_are_not_whole_is_refused(folder, count):
+    """Messages of another length are none."""
+    with LogReader(folder / 'run.mcap') as reader:
+        run = read_run_description(reader)
+    odd = SimpleNamespace(messages=lambda topics: iter(count * [SimpleNamespace(data=b'odd')]))
+    with pytest.raises(export.ExportError, match='has no sample of ground_truth/imu_bias'):
+        next(export.KINDS['euroc'][1](odd, run))

@@ -96,6 +96,17 @@ def test_a_file_may_have_parameters_of_ros_only(tmp_path, section):
                  '-p', 'use_sim_time:=true', '-p', 'qos_overrides./a.b:=1', '--quiet']) == 0
 
 
+@pytest.mark.parametrize('text', [
+    '!!bool maybe', '!!timestamp abc', '!!int ""', '!!float ""', '!!float 1', '!!binary aGk=',
+    '!!set {a}', '!own [1.0]', '[!!int 1]'])
+def test_a_tag_that_rcl_ignores_is_refused_in_one_line(tmp_path, capsys, text):
+    path = scene(tmp_path / 'p.yaml', **{'spin.l3': text})
+    assert main(['-o', str(tmp_path / 'run.mcap'), '--duration', '1', '--params', str(path)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f'simulate: {path} is not YAML: the tag ') and error.count('\n') == 1
+    assert error.endswith(': must be !!str, as rcl ignores all others\n')
+
+
 def test_a_deep_file_is_refused(tmp_path):
     path = scene(tmp_path / 'p.yaml', **{'spin.l3': '[' * 10_000})
     with pytest.raises(ValueError, match=r'p\.yaml'):

@@ -7,6 +7,7 @@ installed ones where there are some.  test_simulation_interfaces_dds.py calls se
 """
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -241,6 +242,20 @@ def test_simulate_steps_ends_as_it_is_told_to(top):
     top.done('StepSimulation', steps=1)         # the next ones may begin
 
 
+def test_simulate_steps_says_that_the_duration_ends_or_the_motion_fails(monkeypatch, tmp_path):
+    with StandardNode('stand-in', monkeypatch, tmp_path, duration=0.02) as top:
+        goal, coroutine = top.pause().steps(3)
+        assert finished(coroutine).result.error_message == (
+            'interrupted after 2 of 3 steps: `duration` ends before the steps do')
+        assert goal.end == 'aborted'
+    with StandardNode('stand-in', monkeypatch, tmp_path) as top:
+        _, coroutine = top.pause().steps(3)
+        coroutine.send(None)
+        top.loop.fail('the equations end')
+        assert finished(coroutine).result.error_message == (
+            'interrupted after 1 of 3 steps: the equations end')
+
+
 @pytest.mark.parametrize('how', ['reset', 'play', 'stop', 'quit'])
 def test_a_reset_or_another_state_ends_the_steps(top, how):
     top.pause()
@@ -309,11 +324,13 @@ def test_sources_of_worlds(top, tmp_path):
     (folder / 'mine.yaml').write_text('/**: {ros__parameters: {top.mass: 3.0}}')
     (folder / 'other.yaml').write_text('/**: {ros__parameters: {imu.rate: 3.0}}')
     (folder / 'broken.yaml').write_text('{')
+    # No message can hold this name.
+    (folder / os.fsdecode(b'\xff.yaml')).write_bytes((folder / 'mine.yaml').read_bytes())
     for source in (str(folder), folder.as_uri(), str(folder / 'mine.yaml')):
         found = top.done('GetAvailableWorlds', additional_sources=[source]).worlds
         assert found[-1].name == 'mine'
         assert len(found) == len(list(ROOT.glob('config/*.yaml'))) + 1
-    for source in (str(tmp_path / 'none'), 'https://example.org/worlds',
+    for source in (str(tmp_path / 'none'), 'https://example.org/worlds', '~nosuchuser/x',
                    str(folder / 'broken.yaml')):
         code, text = top.refused('GetAvailableWorlds', additional_sources=[source])
         assert code == FAILED
@@ -392,10 +409,13 @@ BAD_WORLDS = [
     ({'uri': 'no_scene'}, NOT_FOUND, 'there are the scenes cusp, '),
     ({'uri': '/nowhere/x.yaml'}, NOT_FOUND, 'there is no such file'),
     ({'uri': 'https://example.org/x.yaml'}, BAD_FORMAT, 'file:// URI'),
+    ({'uri': '~nosuchuser/x.yaml'}, BAD_FORMAT, 'there is no such user'),
     ({'uri': 'a\0b'}, BAD_FORMAT, 'file:// URI'),
     ({'uri': str(ROOT / 'README.md')}, BAD_FORMAT, '*.yaml'),
     ({'uri': str(ROOT / 'config/imu/bmi088.yaml')}, PARSE_ERROR, 'is no world'),
     ({'text': '{'}, PARSE_ERROR, 'is not YAML'),
+    ({'text': '#' * 1_000_001}, BAD_FORMAT, '1000001 characters; must be at most 1000000'),
+    ({'text': '/**: {ros__parameters: {top.mass: !!bool maybe}}'}, PARSE_ERROR, 'bool: must be'),
     ({'text': 'x: 1'}, PARSE_ERROR, 'ros__parameters'),
     ({'text': '/**: {ros__parameters: {top.mass: -1.0}}'}, PARSE_ERROR, 'top.mass = -1.0'),
     ({'text': '/**: {ros__parameters: {top.mass: }}'}, PARSE_ERROR, 'has no value'),
@@ -420,6 +440,13 @@ def test_a_bad_world_changes_nothing(top, given, code, text):
     assert top.state == PLAYING
     assert top.done('GetCurrentWorld').world.name == 'cusp'
     top.wait_until(top.simulation.now_ns + 20_000_000)
+
+
+def test_an_element_that_no_message_can_hold_is_named_too(top):
+    text = '/**: {ros__parameters: {top.mass: 3.0, "top.\\ud800": 1}}'
+    response = top.done('LoadWorld', **load(top, text=text))
+    assert response.result.error_message.endswith(': top.\\ud800')
+    assert response.result.error_message.isascii()
 
 
 def test_unsupported_elements_are_named(top):

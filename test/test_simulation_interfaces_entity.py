@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The top as the entity of simulation_interfaces: what it says, what can be set, filters."""
 
+import contextlib
+import itertools
 import math
+import re
 import subprocess
 
 import numpy as np
@@ -15,6 +18,7 @@ from helpers.standard_node import KINDS, StandardNode
 from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message
 
+from spinning_top_sim.nodes.name_filter import is_found
 from spinning_top_sim.physics.placement import Box
 from spinning_top_sim.physics.top import Top
 from spinning_top_sim.tools import inspect
@@ -202,7 +206,9 @@ def chosen(top, **filters):
     ('', True), ('spin', True), ('^spinning_top$', True), ('^top', False),
     ('t[[:alpha:]]p$', True), ('[[:digit:]]', False), ('^[[:lower:]_]+$', True),
     ('(spin|roll)ning', True), ('x*', True),
-    ('s.{3}ning', True), ('[^[:alnum:]]', True), ('SPIN', False)])
+    ('s.{3}ning', True), ('[^[:alnum:]]', True), ('SPIN', False), ('n{2,}in|ro', True),
+    ('(n?[^n]{1,2}){9,}$', False), ('n**', True), ('(|x)g_[]_t]', True), (r'[\]]', False),
+    (r'\^|\.', False), ('()', True), ('a$|g_to', True), ('^(spin|_|ning|top)+$', True)])
 def test_names_by_regular_expressions(top, expression, found):
     assert chosen(top, filter=expression) is found
     # POSIX's own implementation agrees.
@@ -211,13 +217,33 @@ def test_names_by_regular_expressions(top, expression, found):
     assert (grep.returncode == 0) is found
 
 
-@pytest.mark.parametrize('expression', ['(', '[', '*a(', '[[:letter:]]'])
+def test_small_expressions_match_as_those_of_python():
+    """All of five characters at most; Python refuses what has two counts."""
+    count = 0
+    for length in range(6):
+        for expression in map(''.join, itertools.product('ab()|*', repeat=length)):
+            with contextlib.suppress(re.error):
+                expected = re.search(expression, 'aba') is not None
+                assert is_found(expression, 'aba') is expected, expression
+                count += 1
+    assert count > 1000
+
+
+@pytest.mark.parametrize('expression', [
+    '(((.+)+)+)+x1', '.*' * 120 + 'x1', '(|)' * 80 + 'x1', '((((((((.{9,99})*)*)*)*)*)*)*)*x1'])
+def test_no_expression_takes_for_ever(expression):
+    assert not is_found(expression, NAME)
+
+
+@pytest.mark.parametrize('expression', [
+    '(', '[', '*a(', '[[:letter:]]', ')', 'a{2,1}', 'a{', '[[:digit:]', '[z-a]', '[[.a.]]', '\\',
+    r'\1', '(' * 255, 256 * 'x'])
 def test_bad_expressions_are_refused(top, expression):
     filters = top.messages.EntityFilters(filter=expression)
     for service in ('GetEntities', 'GetEntitiesStates'):
         code, text = top.refused(service, filters=filters)
         assert code == FAILED
-        assert f'filter = {expression!r}' in text
+        assert f'filter = {expression!r}: must be a POSIX' in text
 
 
 def test_categories_and_tags(top):

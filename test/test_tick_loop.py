@@ -370,8 +370,9 @@ def test_steps_end_with_the_duration():
     assert run.loop.now_ns == max(run.stamps) - run.simulation.epoch_ns == 750_000_000
 
 
-def test_after_a_failure_a_step_is_refused_and_sends_nothing():
-    run = started(start_paused=True)
+@pytest.mark.parametrize('paused', [True, False])
+def test_after_a_failure_a_step_is_refused_and_sends_nothing(paused):
+    run = started(start_paused=paused)
     run.loop.fail('for a test')
     sent = len(run.stamps)
     with pytest.raises(RuntimeError, match='stands still: for a test'):

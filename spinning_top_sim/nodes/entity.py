@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The top as the one entity of a simulator, in messages of simulation_interfaces."""
 
-import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Vector3
 
+from spinning_top_sim.nodes.name_filter import is_found
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.placement import Box, Reals, rotation_matrix, state_of
 from spinning_top_sim.physics.states import States
@@ -20,10 +20,6 @@ TAGS = ('spinning_top', 'heavy_symmetric_top', 'imu')
 # How far the pivot may be from the origin [m], how fast it may move [m/s], and by how much the
 # length of a quaternion may differ from 1: what a client's rounding makes.
 SMALLEST_LENGTH, SMALLEST_SPEED, LENGTH_ERROR = 1e-6, 1e-6, 1e-3
-# Character classes of POSIX, within brackets, in the syntax of `re`.
-CLASSES = {'alnum': 'a-zA-Z0-9', 'alpha': 'a-zA-Z', 'blank': ' \\t', 'cntrl': '\\x00-\\x1f\\x7f',
-           'digit': '0-9', 'graph': '!-~', 'lower': 'a-z', 'print': ' -~',
-           'punct': '!-/:-@\\[-`{-~', 'space': '\\s', 'upper': 'A-Z', 'xdigit': '0-9A-Fa-f'}
 
 
 class UnsupportedError(ValueError):
@@ -103,7 +99,7 @@ def is_chosen(filters: Message, name: str, category: int, top: Top,
 
     Raises UnsupportedError or ValueError for filters that cannot be applied.
     """
-    chosen = _matches(filters.filter, name)
+    chosen = is_found(filters.filter, name)
     if filters.categories:
         chosen &= category in [one.category for one in filters.categories]
     if filters.tags.tags:
@@ -116,20 +112,6 @@ def is_chosen(filters: Message, name: str, category: int, top: Top,
     if filters.bounds.type != filters.bounds.TYPE_EMPTY:
         chosen &= _overlaps(filters.bounds, top, present)
     return bool(chosen)
-
-
-def _matches(expression: str, name: str) -> bool:
-    """Return whether a POSIX extended regular expression matches some part of a name."""
-    def characters(found: re.Match[str]) -> str:
-        if found[1] not in CLASSES:
-            raise ValueError(f'filter = {expression!r}: there is no class {found[0]}')
-        return CLASSES[found[1]]
-    try:
-        pattern = re.compile(re.sub(r'\[:(\w*):\]', characters, expression))
-    except (re.error, OverflowError, RecursionError) as error:
-        raise ValueError(f'filter = {expression!r}: must be a regular expression: '
-                         f'{error}') from error
-    return pattern.search(name) is not None
 
 
 def _overlaps(bounds: Message, top: Top, present: Callable[[], States]) -> bool:

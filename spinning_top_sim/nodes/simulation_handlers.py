@@ -51,7 +51,9 @@ class SimulationHandlers:
         act = getattr(self, f'_{service_name(name)}')
         code, text = self._outcome(lambda: act(request, response))
         if result is not None:
-            result.result, result.error_message = code, text
+            # YAML can name what UTF-8 cannot: such a response would end the executor.
+            result.result = code
+            result.error_message = text.encode(errors='backslashreplace').decode()
         return response
 
     def _outcome(self, act: Callable[[], str | None]) -> tuple[int, str]:
@@ -214,9 +216,11 @@ class SimulationHandlers:
         interruptions = self._loop.interruptions
 
         def step() -> None:
-            if self._quits or self._loop.interruptions != interruptions:
-                raise RuntimeError(f'interrupted after {done} of {steps} steps: the simulation '
-                                   'was reset, or its state set')
+            loop = self._loop
+            if self._quits or loop.interruptions != interruptions:
+                why = ('`duration` ends before the steps do' if loop.state is State.ENDED else
+                       loop.failure or 'the simulation was reset, or its state set')
+                raise RuntimeError(f'interrupted after {done} of {steps} steps: {why}')
             self._step(1)
 
         try:

@@ -216,10 +216,10 @@ class TickLoop:
 
     def step_by(self, length_ns: int) -> None:
         """Move a paused motion on by this time [ns], as `step` does."""
-        if not self.paused:
-            raise RuntimeError('running: ~/step works while paused (~/set_pause true)')
         if self.failure:
             raise RuntimeError(f'the motion stands still: {self.failure}')
+        if not self.paused:
+            raise RuntimeError('running: ~/step works while paused (~/set_pause true)')
         self._update_subscribers()
         target_ns = min(self.now_ns + length_ns, self._duration_ns)
         last_ns = LAST_LIVE_STAMP_NS - self._simulation.epoch_ns

@@ -2,6 +2,7 @@
 """Scenes as worlds: parameter files that a running node can start again with."""
 
 import contextlib
+import re
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from spinning_top_sim.tools.scene_file import is_of_ros, known, parse_scene
 
 # What a world sets: a parameter of these that it does not have gets its default.
 OF_A_WORLD = ('top.', 'initial.', 'spin.', 'solver.')
-LARGEST_FILE = 1_000_000        # [bytes]
+LARGEST_FILE = 1_000_000        # [bytes], and characters of a text
 
 
 class FormatError(ValueError):
@@ -55,6 +56,8 @@ class World:
     def parse(cls, text: str, uri: str = '') -> Self:
         """Return the world of a text.  Raises ValueError, which says what is wrong with it."""
         source = uri or 'resource_string'
+        if len(text) > LARGEST_FILE:
+            raise FormatError(f'{source}: {len(text)} characters; must be at most {LARGEST_FILE}')
         found = parse_scene(text, source)
         usable = {name: value for name, value in found.items() if name in parameters.BY_NAME
                   and parameters.BY_NAME[name].effect is not parameters.Effect.START}
@@ -75,6 +78,8 @@ class World:
         ValueError where it cannot be read.
         """
         path = local_path(uri)
+        if re.search('[\ud800-\udfff]', str(path.absolute())):      # no message can hold these
+            raise FormatError(f'{uri!r}: must be a path in UTF-8')
         if uri in (scenes := scene_files()):
             path = scenes[uri]
         if path.suffix not in ('.yaml', '.yml') and not path.is_file():
@@ -142,9 +147,13 @@ def worlds_in(source: str) -> list[World]:
 
 
 def local_path(uri: str) -> Path:
-    """Return the path of a file URI, or of a path.  Raises FormatError for other URIs."""
+    """Return the path of a file URI, or of a path.  Raises FormatError for others."""
     parts = urlsplit(uri)
     if '\0' in uri or (parts.scheme and not (parts.scheme == 'file'
                                              and parts.netloc in ('', 'localhost'))):
         raise FormatError(f'{uri!r}: must be the name of a scene, a path or a file:// URI')
-    return Path(unquote(parts.path) if parts.scheme else uri).expanduser()
+    path = Path(unquote(parts.path) if parts.scheme else uri)
+    try:
+        return path.expanduser()
+    except RuntimeError as error:
+        raise FormatError(f'{uri!r}: there is no such user') from error

@@ -20,9 +20,13 @@ TOPICS = ((COMMANDS, 'std_msgs/msg/Float64MultiArray'), (EVENTS, 'std_msgs/msg/S
 
 def recorded_streams(streams: Sequence[Stream], values: Mapping[str, Any]) -> list[Stream]:
     """Return the streams that `record.streams` chooses among those there are."""
+    return [stream for stream in streams if is_recorded(stream.parameter, values)]
+
+
+def is_recorded(parameter: str, values: Mapping[str, Any]) -> bool:
+    """Return whether a stream is switched on and `record.streams` chooses it."""
     chosen = values['record.streams']
-    return [stream for stream in streams if is_enabled(stream.parameter, values)
-            and ('all' in chosen or stream.parameter in chosen)]
+    return is_enabled(parameter, values) and ('all' in chosen or parameter in chosen)
 
 
 def resolve_topic(topic: str, namespace: str) -> str:

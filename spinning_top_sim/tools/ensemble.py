@@ -52,12 +52,18 @@ from spinning_top_sim.tools.ensemble_part import (
     PROGRESS,
     EnsembleError,
     compute_part,
+    is_whole,
     versions,
+    write_records,
     write_row,
 )
 from spinning_top_sim.tools.ensemble_spec import Specification
+from spinning_top_sim.tools.recorded_run import ODD, reason_of
 
 MANIFEST = 'manifest.json'
+# What a manifest has besides its format.
+ENTRIES = {'complete': bool, 'versions': dict, 'specification': dict, 'files': dict,
+           'failed': dict}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -80,7 +86,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help='of a Dask cluster, such as tcp://host:8786, whose machines all have the package and '
         'DIR')
     add('--resume', action='store_true',
-        help='go on with the dataset in DIR; what is complete is not computed again')
+        help='go on with the dataset in DIR; files that are complete are not computed again')
     add('--row', metavar='K', type=int, help='compute run K alone')
     add('--quiet', action='store_true', help='no progress, no summary')
 
@@ -108,6 +114,9 @@ def _compute_dataset(arguments: argparse.Namespace) -> int:
     specification = ensemble_spec.read(arguments.specification)
     folder = arguments.output.absolute()
     manifest = _manifest(folder, specification, resume=arguments.resume)
+    if manifest['complete'] and not is_whole(folder, manifest):
+        write_records(specification, folder, manifest)
+        manifest['complete'] = False
     if not manifest['complete']:
         try:
             with (cli.progress('computed', specification.runs, 'runs',
@@ -185,10 +194,11 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
     path = folder / MANIFEST
     try:
         manifest: dict[str, Any] = json.loads(path.read_bytes())
-        missing = {'format', 'complete', 'versions', 'specification'} - manifest.keys()
-    except (AttributeError, ValueError) as error:
-        raise ValueError(f'{path} is no manifest of an ensemble: {error}') from error
-    if missing or manifest['format'] != 1:
+        is_one = manifest['format'] == 1 and all(
+            isinstance(manifest[name], kind) for name, kind in ENTRIES.items())
+    except ODD as error:
+        raise ValueError(f'{path} is no manifest of an ensemble: {reason_of(error)}') from error
+    if not is_one:
         raise ValueError(f'{path} is no manifest of format 1 of an ensemble')
     return manifest
 
@@ -207,7 +217,7 @@ def _manifest(folder: Path, specification: Specification, *, resume: bool) -> di
     """
     manifest: dict[str, Any] = json.loads(json.dumps({
         'format': 1, 'complete': False, 'versions': versions(),
-        'specification': asdict(specification)}))
+        'specification': asdict(specification), 'files': {}, 'failed': {}}))
     if resume and (folder / MANIFEST).exists():
         old = _read_manifest(folder)
         for what in ('specification', 'versions'):

@@ -11,7 +11,7 @@ import hashlib
 import json
 import platform
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,7 +27,7 @@ from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING
 from spinning_top_sim.tools.ensemble_spec import WITHOUT_COLUMNS, Specification
-from spinning_top_sim.tools.recorded_run import field_names, reason_of
+from spinning_top_sim.tools.recorded_run import ODD, field_names, reason_of
 from spinning_top_sim.tools.simulate import write_log
 
 if TYPE_CHECKING:
@@ -57,24 +57,25 @@ def versions() -> dict[str, str]:
             **{name: version(name) for name in ('spinning_top_sim', 'numpy', 'pyarrow', 'mcap')}}
 
 
-def samples(values: Mapping[str, Any]) -> dict[str, Samples]:
+def samples(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Samples]:
     """
-    Return the samples of a run by topic, of the streams that `record.streams` chooses.
+    Return the samples of a run by topic, of the streams with these names.
 
-    values : checked parameters with a duration > 0
+    values : checked parameters with a duration > 0; a stream that they do not enable, or that
+        `record.streams` does not choose, has no samples
 
     Raises ValueError if no motion begins, IntegrationError if it ends early.
     """
     simulation = Simulation(values, EPOCH_NS)
-    streams = [stream for stream in journal.recorded_streams(simulation.streams, values)
-               if stream.parameter not in WITHOUT_COLUMNS]
+    streams = [stream for stream in simulation.streams
+               if stream.parameter in names and stream.parameter not in WITHOUT_COLUMNS]
     blocks: dict[str, list[tuple[NDArray[np.int64], tuple[NDArray[np.float64], ...]]]] = {
-        stream.topic: [] for stream in streams}
+        stream.topic: [(np.empty(0, np.int64), stream.template.decode(b''))] for stream in streams}
 
     def take(stream: Stream, stamps_ns: NDArray[np.int64], rows: NDArray[np.uint8]) -> None:
         blocks[stream.topic].append((stamps_ns - EPOCH_NS, stream.template.decode(rows.tobytes())))
 
-    simulation.log_to(None, streams)
+    simulation.log_to(None, journal.recorded_streams(streams, values))
     simulation.advance_in_blocks(round(values['duration'] * NANOSECONDS), take)
     found = {}
     for stream in streams:
@@ -91,17 +92,23 @@ def table(specification: Specification, run: int) -> 'pyarrow.Table':
     """
     Return a run as a table: run, t [s], what is drawn for it, and its samples.
 
-    A row has the samples of one time; where a stream has none, its columns are null.
+    A row has the samples of one time; where a stream has none, its columns are null.  All runs
+    have the same columns.
     Raises ValueError or IntegrationError as `samples` does.
     """
     import pyarrow as pa  # noqa: PLC0415
 
-    found = samples(specification.values(run))
+    found = samples(specification.values(run), specification.kept)
+    if not found:
+        raise ValueError(f'the streams {", ".join(specification.kept)} have no columns: only a '
+                         'log (.mcap) can have them')
     rows_ns = np.unique(np.concatenate([times_ns for times_ns, _ in found.values()]))
     columns = {'run': pa.repeat(pa.scalar(run), len(rows_ns)),
                't': pa.array(rows_ns / NANOSECONDS)}
     for name, value in specification.drawn(run).items():
-        columns[name] = pa.repeat(pa.scalar(value), len(rows_ns))
+        # An unset one (spin.lz) is a null of the type that the other runs have.
+        one = pa.scalar(value, pa.float64() if value is None else None)
+        columns[name] = pa.repeat(one, len(rows_ns))
     for topic, (times_ns, fields) in found.items():
         rows = np.searchsorted(rows_ns, times_ns)
         missing = np.ones(len(rows_ns), bool)
@@ -170,9 +177,10 @@ def compute_part(specification: Specification, part: int, folder: str,
     if versions() != wanted:
         raise EnsembleError(f'a worker has {versions()}, which gives other bytes than {wanted}')
     record_path = Path(folder, PROGRESS, f'part-{part:06d}.json')
-    with contextlib.suppress(OSError, ValueError):
-        record: dict[str, Any] = json.loads(record_path.read_bytes())
-        if all(sha256(Path(folder, name)) == digest for name, digest in record['files'].items()):
+    record: dict[str, Any]
+    with contextlib.suppress(OSError, *ODD):
+        record = json.loads(record_path.read_bytes())
+        if record.keys() == {'files', 'failed'} and is_whole(Path(folder), record):
             return record
     record = {'files': {}, 'failed': {}}
     with tempfile.TemporaryDirectory(dir=Path(folder, PROGRESS)) as name:
@@ -185,6 +193,26 @@ def compute_part(specification: Specification, part: int, folder: str,
         written.write_text(json.dumps(record))
         written.replace(record_path)
     return record
+
+
+def write_records(specification: Specification, folder: Path, whole: Mapping[str, Any]) -> None:
+    """Write the record of each part, from `files` and `failed` of all.  Raises OSError."""
+    (folder / PROGRESS).mkdir(exist_ok=True)
+    for part in range(specification.parts):
+        runs = specification.part(part)
+        names = [f'part-{part:06d}.parquet', *(f'run-{run:09d}.mcap' for run in runs)]
+        record = {what: {key: whole[what][key] for key in keys if key in whole[what]}
+                  for what, keys in (('files', [f'{DATA}/{name}' for name in names]),
+                                     ('failed', map(str, runs)))}
+        (folder / PROGRESS / f'part-{part:06d}.json').write_text(json.dumps(record))
+
+
+def is_whole(folder: Path, record: Mapping[str, Any]) -> bool:
+    """Return whether each of `files` is there with its hash."""
+    try:
+        return all(sha256(folder / name) == digest for name, digest in record['files'].items())
+    except OSError:
+        return False
 
 
 def sha256(path: Path) -> str:

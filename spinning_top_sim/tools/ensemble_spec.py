@@ -3,15 +3,17 @@
 
 import hashlib
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from spinning_top_sim.physics.top import shown
-from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.tools.scene_file import parse_section, parse_yaml, read_scene
 
 FORMATS = ('parquet', 'mcap')
@@ -39,11 +41,12 @@ def _log_uniform(random: np.random.Generator, low: float, high: float) -> float:
 # The function that draws, its two numbers, and what these must be.
 DISTRIBUTIONS: Mapping[str, tuple[Callable[[np.random.Generator, float, float], float], str,
                                   Callable[[float, float], bool]]] = {
-    'uniform': (_uniform, '[low, high] with low <= high', lambda low, high: low <= high),
+    'uniform': (_uniform, '[low, high] with low <= high and a finite difference',
+                lambda low, high: 0.0 <= high - low < math.inf),
     'normal': (_normal, '[mean, deviation] with deviation >= 0',
                lambda mean, deviation: deviation >= 0.0),
-    'log_uniform': (_log_uniform, '[low, high] with 0 < low <= high',
-                    lambda low, high: 0.0 < low <= high)}
+    'log_uniform': (_log_uniform, '[low, high] with 0 < low <= high and a finite ratio',
+                    lambda low, high: 0.0 < low <= high and high / low < math.inf)}
 
 
 def generator(seed: int, run: int, name: str) -> np.random.Generator:
@@ -67,7 +70,7 @@ class Specification:
     duration : of a run [s]
     params : sets of parameters by name, one on top of the other; see `parse`
     sample : name of a parameter to {distribution: [a, b]}, or to {values: [...]}
-    streams : names of the streams that are kept; empty: those that the parameters enable
+    streams : names of the streams that are kept; empty: those that the parameters of a run enable
     format : 'parquet' or 'mcap'
     runs_per_part : runs that are computed together, and in Parquet share a file
     """
@@ -113,19 +116,39 @@ class Specification:
     def values(self, run: int) -> dict[str, Any]:
         """Return the checked parameters of a run.  Raises ValueError as `parameters.checked`."""
         drawn = self.drawn(run)
+        values = parameters.checked({**self._given(self._sets[drawn.pop(PARAMS, 0)]), **drawn})
+        if not values['duration'] > 0.0:
+            raise ValueError(f'duration = {values["duration"]!r} s: must be > 0')
+        return values
+
+    @property
+    def _sets(self) -> Sequence[Mapping[str, Any]]:
+        """The sets of parameters that a run chooses from."""
+        rule = (self.sample or {}).get(PARAMS, {VALUES: [{}]})
+        return rule[VALUES]
+
+    def _given(self, chosen: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what is given for the runs with one of the sets."""
         given: dict[str, Any] = {}
-        for some in self.params:
+        for some in (*self.params, chosen):
             given.update(some)
-        if PARAMS in drawn:
-            given.update((self.sample or {})[PARAMS][VALUES][drawn.pop(PARAMS)])
         given['duration'] = self.duration
         if self.streams:
             given['record.streams'] = self.streams
             given.update((f'{name}.enabled', True) for name in self.streams)
-        values = parameters.checked({**given, **drawn})
-        if not values['duration'] > 0.0:
-            raise ValueError(f'duration = {values["duration"]!r} s: must be > 0')
-        return values
+        return given
+
+    @cached_property
+    def kept(self) -> Sequence[str]:
+        """
+        The streams that some run keeps, by name.
+
+        All tables of an ensemble have the columns of these: else its files are no one table.
+        """
+        defaults = {parameter.name: parameter.default for parameter in parameters.TABLE}
+        alternatives = [{**defaults, **self._given(one)} for one in self._sets]
+        return [name for name in STREAMS
+                if any(journal.is_recorded(name, values) for values in alternatives)]
 
 
 def read(path: Path) -> Specification:
@@ -191,7 +214,7 @@ def _list(value: object, what: str) -> Sequence[Any]:
 
 def _set_of(given: object, source: str, folder: Path) -> dict[str, Any]:
     """Return a set of parameters, of which each value is checked."""
-    if isinstance(given, str):
+    if isinstance(given, str) and '\0' not in given:
         beside = folder / given
         found = read_scene(beside if beside.exists() else given)
     elif isinstance(given, Mapping):
@@ -216,6 +239,9 @@ def _rule(name: object, rule: object, source: str, folder: Path) -> dict[str, li
     """Return how a parameter is sampled, checked: {distribution: [a, b]}, or {values: [...]}."""
     if name != PARAMS and not parse_section({name: 0.0}, source):
         raise ValueError(f'{source}: {name} is of ROS and has no effect')
+    if str(name).endswith('.enabled') or name in ('record.streams', 'publish_clock'):
+        raise ValueError(f'{source}: {name} must not be sampled: `streams`, or a set of `params`, '
+                         'says which streams there are')
     what = f'{source}: {name}'
     if not isinstance(rule, Mapping) or len(rule) != 1:
         raise ValueError(f'{what} = {shown(rule)}: must be one of '
@@ -234,8 +260,9 @@ def _rule(name: object, rule: object, source: str, folder: Path) -> dict[str, li
         raise ValueError(f'{what}: {kind}: must be values, because the parameter is no double')
     _, allowed, is_allowed = DISTRIBUTIONS[kind]
     if len(items) != 2 or not all(
-            isinstance(item, int | float) and not isinstance(item, bool) and math.isfinite(item)
-            for item in items) or not is_allowed(*items):
+            isinstance(item, int | float) and not isinstance(item, bool)
+            and abs(item) <= sys.float_info.max for item in items) or not is_allowed(
+                *map(float, items)):
         raise ValueError(f'{what}: {kind} = {shown(given)}: must be {allowed}')
     for bound in items[:1] if kind == 'normal' else items:
         _check(source, str(name), bound)
@@ -248,9 +275,8 @@ def _runs_per_part(specification: Specification, source: str) -> int:
         values = specification.values(0)
     except ValueError:
         values = parameters.checked({'duration': specification.duration})
-    names = specification.streams or [name for name in STREAMS if values[f'{name}.enabled']]
-    if specification.format == 'parquet':
-        names = [name for name in names if name not in WITHOUT_COLUMNS]
+    names = [name for name in specification.kept
+             if specification.format != 'parquet' or name not in WITHOUT_COLUMNS]
     if not names:
         raise ValueError(f'{source}: no stream is enabled; streams: must name one of '
                          f'{", ".join(STREAMS)}')

@@ -113,7 +113,7 @@ def _tum(reader: LogReader, run: RunDescription) -> Iterator[str]:
 
 
 def _euroc(reader: LogReader, run: RunDescription) -> Iterator[str]:
-    biases = list(_blocks(reader, run, BIAS))
+    biases = [block for block in _blocks(reader, run, BIAS) if len(block[0])]
     if not biases:
         raise ExportError(f'--export euroc: the log has no sample of {BIAS}')
     bias_ns = np.concatenate([stamps_ns for stamps_ns, _ in biases])
