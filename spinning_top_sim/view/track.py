@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.physics.attitude import vertical_in_body
 from spinning_top_sim.physics.regimes import Description, regime
 from spinning_top_sim.physics.top import Shape, State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
@@ -189,7 +190,7 @@ def state_of(top: Top, row: Rows) -> tuple[tuple[float, float, float], State]:
     """Return energy, L3 and Lz of a row of RATES, and its state but for phi and psi."""
     x, y, z, w, one, two, spin = row[:7].tolist()
     cos2, sin2 = w * w + z * z, x * x + y * y
-    up_1, up_2, up_3 = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), cos2 - sin2
+    up_1, up_2, up_3 = map(float, vertical_in_body(tuple(row[:4])))
     l3 = top.lambda3 * spin
     lz = top.lambda1 * (one * up_1 + two * up_2) + l3 * up_3
     energy = (0.5 * top.lambda1 * (one * one + two * two) + 0.5 * l3 * spin
