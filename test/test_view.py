@@ -76,6 +76,13 @@ def test_columns_keep_what_is_later_and_forget_what_is_old():
     assert columns.part(2500, 2502)[0].tolist() == [2500, 2501, 2502]
 
 
+def test_columns_order_what_comes_in_disorder():
+    columns = Columns(1)
+    columns.append(np.array([3, 1, 2, 1]), np.array([[3.0], [1.0], [2.0], [9.0]]))
+    assert columns.stamps_ns.tolist() == [1, 2, 3] == columns.rows[:, 0].tolist()
+    assert columns.at(2)[0] == 2
+
+
 def test_a_log_shows_the_published_attitude_at_every_stamp(log, shown):
     from spinning_top_sim.streams.topics import all_streams
     template = next(stream.template for stream in all_streams(shown.track.values)

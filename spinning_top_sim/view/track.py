@@ -51,7 +51,13 @@ class Columns:
         return self._rows[self._begin:self._end]
 
     def append(self, stamps_ns: Stamps, rows: Rows) -> None:
-        """Append samples; those that are not later than the newest one are left out."""
+        """
+        Append samples in the order of their stamps, the first of each stamp.
+
+        Those that are not later than the newest one are left out.
+        """
+        stamps_ns, order = np.unique(stamps_ns, return_index=True)
+        rows = rows[order]
         if self._end > self._begin:
             later = stamps_ns > self._stamps_ns[self._end - 1]
             stamps_ns, rows = stamps_ns[later], rows[later]
