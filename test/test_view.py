@@ -14,6 +14,7 @@ from spinning_top_sim import State, solve
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import simulate
 from spinning_top_sim.view import model
 from spinning_top_sim.view.track import Columns, Motion, Track, state_of
@@ -220,6 +221,29 @@ def test_the_server_is_on_loopback_and_takes_the_next_free_port():
         for page in pages:
             page.close()
     assert threading.active_count() < 50
+
+
+@pytest.fixture
+def page():
+    pytest.importorskip('viser')
+    from spinning_top_sim.view.page import Page
+    page = Page('one', '127.0.0.1', None)
+    yield page
+    page.close()
+
+
+def test_a_part_that_is_switched_on_at_one_stamp_is_drawn_for_it(page, shown):
+    stamp_ns = shown.origin_ns + NANOSECONDS
+    page.set_tracks([shown.track])
+    page.draw([shown.origin_ns], shown.origin_ns)
+    page._trace.value = False
+    page.draw([stamp_ns], shown.origin_ns)
+    page._trace.value = page.arrows[0].value = True
+    page.draw([stamp_ns], shown.origin_ns)
+    (top,) = page._tops
+    assert top._arrows[0].points[0, 1] == pytest.approx(
+        model.arrow(shown.track, model.ARROWS[0], stamp_ns), abs=1e-6)
+    assert (top._trace.points == model.trace(shown.track, stamp_ns)).all()
 
 
 def test_a_page_of_another_site_is_refused():

@@ -67,6 +67,7 @@ class DrawnTop:
             visible=False) for arrow, colour in zip(model.ARROWS, ARROW_COLOURS, strict=True)]
         self._theta_range: tuple[float, float] | None = None
         self.drawn: tuple[int, Rows] | None = None      # stamp [ns] and row of the attitude
+        self._shown: object = None                      # with which stamp and parts
 
     def remove(self) -> None:
         self._root.remove()
@@ -86,9 +87,14 @@ class DrawnTop:
     def draw(self, stamp_ns: int) -> None:
         """Draw the newest samples up to a stamp."""
         sample = self.track.attitudes.at(stamp_ns)
-        if sample is None or (self.drawn is not None and sample[0] == self.drawn[0]):
+        if sample is None:
             return
         self.drawn = sample
+        # While the motion is paused, too, a part may be switched on.
+        shown = sample[0], self._trace.visible, [arrow.visible for arrow in self._arrows]
+        if shown == self._shown:
+            return
+        self._shown = shown
         x, y, z, w = sample[1][:4].tolist()
         self._body.wxyz = (w, x, y, z)
         if self._trace.visible:
