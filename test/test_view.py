@@ -246,6 +246,17 @@ def test_a_part_that_is_switched_on_at_one_stamp_is_drawn_for_it(page, shown):
     assert (top._trace.points == model.trace(shown.track, stamp_ns)).all()
 
 
+def test_a_page_tells_the_attitude_where_it_knows_no_motion(page):
+    track = Track('', parameters.checked({}))
+    page.set_tracks([track])
+    page._tell([NANOSECONDS], 0)
+    assert 'no samples yet' in page._words.content
+    track.columns['pose'].append(np.array([NANOSECONDS]), np.array([[0.0, 0.6, 0.0, 0.8]]))
+    page.draw([NANOSECONDS], 0)
+    assert page._words.content.strip().splitlines() == [
+        '- t = 1.000 s, stamp 1.000000000', '- q = 0.000000, 0.600000, 0.000000, 0.800000']
+
+
 def test_a_page_of_another_site_is_refused():
     """Raw handshakes, as a browser sends them for a page that it has from elsewhere."""
     viser = pytest.importorskip('viser')
