@@ -16,7 +16,7 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import simulate
-from spinning_top_sim.view import model
+from spinning_top_sim.view import command, model
 from spinning_top_sim.view.track import Columns, Motion, Track, state_of
 
 COMMAND_S = 3.0
@@ -221,6 +221,16 @@ def test_the_server_is_on_loopback_and_takes_the_next_free_port():
         for page in pages:
             page.close()
     assert threading.active_count() < 50
+
+
+@pytest.mark.parametrize(('arguments', 'told'), [
+    (['LOG', 'LOG', 'LOG'], '3 logs: must be one or two'),
+    (['LOG', '--port', '99999'], '--port 99999: must be from 0 to 65535'),
+    (['LOG', '--port', '-1'], '--port -1: must be from 0 to 65535')])
+def test_wrong_arguments_are_told_in_one_line(log, capsys, arguments, told):
+    assert command.main(['view', *(str(log) if word == 'LOG' else word
+                                   for word in arguments)]) == 2
+    assert capsys.readouterr().err == f'view: {told}\n'
 
 
 @pytest.fixture
