@@ -256,6 +256,16 @@ def test_a_part_that_is_switched_on_at_one_stamp_is_drawn_for_it(page, shown):
     assert (top._trace.points == model.trace(shown.track, stamp_ns)).all()
 
 
+def test_the_page_follows_a_pause_whatever_else_is_wrong(page):
+    from spinning_top_sim.view.controls import Controls
+    controls = Controls(page, None, [])
+    for state, label in (('paused', 'Resume'), ('failed', 'Resume'), ('running', 'Pause')):
+        controls.tell_status('this machine cannot keep up', {
+            'state': state, 'recorder': 'off', 'simulated time [s]': '1.0',
+            'real-time factor': '0.9'})
+        assert controls._pause.label == label
+
+
 def test_a_page_tells_the_attitude_where_it_knows_no_motion(page):
     track = Track('', parameters.checked({}))
     page.set_tracks([track])

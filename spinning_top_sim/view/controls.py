@@ -161,8 +161,8 @@ class Controls:
             f'real-time factor {numbers["real-time factor"]}',
             f'recorder {recorder} {path}'.rstrip())))
         if not self._lock.locked():
-            if message in ('paused', 'running'):        # else it says something worse
-                self._show_paused(message == 'paused')
+            if numbers['state'] in ('paused', 'running'):
+                self._show_paused(numbers['state'] == 'paused')
             set_value(self._record, recorder == 'recording')
 
     def tell_end(self, reason: str) -> None:
