@@ -34,10 +34,26 @@ def test_a_throttle_lets_few_messages_through_and_the_last_one(monkeypatch, peri
         now = number * period
     assert len(sent) == pytest.approx(count, abs=1)
     assert stream.sent == len(sent)
-    one.flush()
-    one.flush()
+    one.flush(at_once=True)
+    one.flush(at_once=True)
     assert sent[-1] == number
     assert len(set(sent)) == len(sent)
+
+
+def test_steps_while_paused_keep_to_the_rate_of_a_throttle(monkeypatch):
+    now, sent, stream = 0.0, [], SimpleNamespace(sent=0)
+    monkeypatch.setattr(throttle.time, 'monotonic', lambda: now)
+    one = throttle.Throttle(SimpleNamespace(
+        publish=sent.append, get_subscription_count=lambda: 1))
+    step = one.sink(stream, None)
+    for tick in range(1000):                # 200 a second, with a step before each
+        step(tick)
+        one.flush()
+        now += 0.005
+    assert len(sent) == pytest.approx(5 * throttle.RATE, abs=1)
+    now += 1.0 / throttle.RATE
+    one.flush()
+    assert sent[-1] == 999
 
 
 def test_a_throttle_is_not_in_the_way_of_others():
@@ -55,7 +71,7 @@ def test_a_throttle_is_not_in_the_way_of_others():
     watchers = 0
     one.sink(stream, every.append)
     sent.clear()
-    one.flush()
+    one.flush(at_once=True)
     assert sent == []                       # nobody waits for it
 
 
@@ -72,7 +88,7 @@ def test_the_throttled_topic_has_messages_of_its_stream(peer, tmp_path):
         shared = [data for data in few.raw if stamp_of(data) in known]
         assert len(shared) >= 20
         assert all(data == known[stamp_of(data)] for data in shared)
-        # A step, too, is shown at once, whatever came shortly before.
+        # A step, too, is shown, whatever came shortly before.
         assert peer.trigger(node, 'step').success
         wait_for('the step', lambda: few.raw[-1] == every.raw[-1]
                  and stamp_of(few.raw[-1]) > max(known))

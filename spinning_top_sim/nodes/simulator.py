@@ -78,10 +78,10 @@ class StreamPublishers:
                 throttle = self._throttles.get(stream.topic)
                 stream.publish = throttle.sink(stream, sink) if throttle else sink
 
-    def flush(self) -> None:
-        """Publish what is withheld for its rate: the motion stands still."""
+    def flush(self, at_once: bool) -> None:
+        """Publish what is withheld, as soon as its rate allows or at once."""
         for throttle in self._throttles.values():
-            throttle.flush()
+            throttle.flush(at_once)
 
     def topics_to_record(self, streams: Sequence[Stream]) -> list[Topic]:
         """Return the topics of these streams, and behind them those of the journal."""
@@ -226,7 +226,7 @@ class Simulator(Node):
         with self._lock:
             wants_idle = self._loop.tick()
             if self._loop.state is not State.RUNNING:
-                self._outputs.flush()
+                self._outputs.flush(at_once=self._loop.state is State.ENDED)
         if self._loop.state is State.ENDED and not self.finished.done():
             wait_for_all_acked(self._outputs.by_topic.values(), 1.0)
             self.finished.set_result(None)
