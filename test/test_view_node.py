@@ -8,13 +8,18 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import rclpy
 from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import SimNode, wait_for
 from helpers.node_logs import stamp_of
+from helpers.simulations import record
 from nav_msgs.msg import Odometry
 
 from spinning_top_sim.nodes import throttle
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.pipeline import Simulation
 
 VIEW = ('-m', 'spinning_top_sim.view.command', '--no-browser', '--port', '0')
 PERIODS = {'/pose': 5_000_000, '/ground_truth/odom': 10_000_000}
@@ -92,6 +97,40 @@ def test_the_throttled_topic_has_messages_of_its_stream(peer, tmp_path):
         assert peer.trigger(node, 'step').success
         wait_for('the step', lambda: few.raw[-1] == every.raw[-1]
                  and stamp_of(few.raw[-1]) > max(known))
+
+
+@pytest.fixture
+def live():
+    """A page whose node, in this process, hears nobody."""
+    pytest.importorskip('viser')
+    from spinning_top_sim.view.live import LiveView
+    from spinning_top_sim.view.page import Page
+    rclpy.init()
+    view = LiveView(Page('one', '127.0.0.1', None))
+    yield view
+    view._page.close()
+    view.destroy_node()
+    rclpy.try_shutdown()
+
+
+def test_the_page_goes_on_where_the_clock_of_a_new_run_is_earlier(live):
+    from spinning_top_sim.view.track import Track
+    values = parameters.checked({'spin.lz': 1.4})
+    live._stale, live._track = False, Track('', values)
+    live._page.set_tracks([live._track])
+    for epoch_ns in (100 * NANOSECONDS, 5 * NANOSECONDS):
+        run = Simulation(values, epoch_ns)
+        taken = record(run, 'ground_truth/odom')
+        run.advance(NANOSECONDS // 2)
+        live._inbox.extend((topic, data) for topic, _, data in taken)
+        live._draw_once()
+        assert live._track.span == (epoch_ns, epoch_ns + NANOSECONDS // 2)
+        assert live._page._tops[0].drawn[0] == epoch_ns + NANOSECONDS // 2
+        assert live._track.values is values
+    # A message that comes late begins nothing.
+    live._inbox.append(('ground_truth/odom', taken[-2][2]))
+    live._draw_once()
+    assert live._track.span == (epoch_ns, epoch_ns + NANOSECONDS // 2)
 
 
 def kill(view):

@@ -47,6 +47,7 @@ QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 INBOX = 2000                    # messages that wait for the next picture
 ANSWER_S = 5.0                  # a service that takes longer does not answer
 SILENT_S = 5.0                  # /diagnostics come every second
+RESTART_NS = NANOSECONDS        # stamps that go back by more are those of another run
 KEPT_NS = 2 * max(WINDOW_NS, model.TRACE_NS)
 KIND_OF = {'pose': PoseStamped, 'joint_states': JointState, 'ground_truth/odom': Odometry,
            'ground_truth/imu': Imu}
@@ -176,7 +177,12 @@ class LiveView(Node):
             topic, data = self._inbox.popleft()
             arrived[topic].append(data)
         for topic, messages in arrived.items():
-            track.add(topic, [_stamp_ns(data) for data in messages], messages)
+            stamps_ns = [_stamp_ns(data) for data in messages]
+            newest = track.columns[topic].at(LATEST_NS)
+            if newest is not None and stamps_ns[-1] < newest[0] - RESTART_NS:
+                # The sim_node was started again; its t = 0 is not known yet.
+                track, self._origin_ns = self._begin_track(track.values), None
+            track.add(topic, stamps_ns, messages)
         if track.span is None:
             return
         newest_ns = track.span[1]
@@ -205,11 +211,17 @@ class LiveView(Node):
         values = {**parameters.checked(dict(zip(names, shown, strict=False))),
                   **dict(zip(SPIN, shown[-len(SPIN):], strict=True))}
         if self._track is None or _drawn(values) != _drawn(self._track.values):
-            self._track = Track('', values)
-            self._page.set_tracks([self._track])
-            self._controls.set_range(self._track.top, *(values[name] for name in SPIN))
-        self._track.values = values
+            self._begin_track(values)
+        else:
+            self._track.values = values
         self._controls.show_values(values)
+
+    def _begin_track(self, values: Mapping[str, Any]) -> Track:
+        """Show what comes from now on instead of what has come."""
+        self._track = Track('', values)
+        self._page.set_tracks([self._track])
+        self._controls.set_range(self._track.top, *(values[name] for name in SPIN))
+        return self._track
 
     # Called by the page's controls, in threads of their own.
 
