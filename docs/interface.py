@@ -69,6 +69,9 @@ AFTER_TOPICS = """| `{throttled}` | nav_msgs/msg/Odometry | at most {rate:g} | y
 The node refuses a command of wrong length, with NaN or infinity, or with Lz ≠ ±L3 while the axis is at a
 pole. It logs the reason and counts the command in `/diagnostics`. The motion continues unchanged.
 
+`spin.l3` and `spin.lz` in one request with a parameter of `initial.*` are no command: they are the spin of the
+next start, and take effect with `~/reset` as the others do.
+
 ## Parameters
 
 An integer is accepted as a double. A change takes effect at once, at the next `~/reset`, with the next

@@ -133,6 +133,18 @@ def test_the_page_goes_on_where_the_clock_of_a_new_run_is_earlier(live):
     assert live._track.span == (epoch_ns, epoch_ns + NANOSECONDS // 2)
 
 
+def test_a_scene_brings_its_start_and_leaves_the_sensor_alone(live, monkeypatch):
+    said = []
+    monkeypatch.setattr(live, 'set_parameters_together', said.append)
+    monkeypatch.setattr(live, 'call', said.append)
+    assert live.load_scene('wavy') == 'scene wavy'
+    values, then = said
+    assert then == 'reset'
+    assert (values['spin.l3'], values['spin.lz']) == (1.6, 1.42)
+    assert values['initial.phi'] == 0.0                 # the default
+    assert not any(name.startswith('imu.') for name in values)
+
+
 def kill(view):
     os.killpg(view.process.pid, signal.SIGKILL)
 

@@ -277,7 +277,7 @@ class Simulator(Node):
         if not changes:
             return SetParametersResult(successful=True)
         successful, reason = self._outcome(self._change, changes)
-        if not (successful or changes.keys().isdisjoint(SPIN)):
+        if ros_parameters.is_command(changes) and not successful:
             self._loop.rejected_commands += 1
         if 'both together' in reason:
             reason += (f', as by: ros2 topic pub --once {self.resolve_topic_name("~/commands")} '
@@ -286,10 +286,10 @@ class Simulator(Node):
         return SetParametersResult(successful=successful, reason=reason)
 
     def _change(self, changes: dict[str, Any]) -> None:
-        values = ros_parameters.changed(self._values, changes, self._start_spin)
+        values, start_spin = ros_parameters.changed(self._values, changes, self._start_spin)
         rest = sorted(changes.keys() - SPIN)
         with self._lock:
-            if len(rest) < len(changes):
+            if ros_parameters.is_command(changes):
                 self._loop.command(values['spin.l3'], values['spin.lz'])
             if rest:
                 changed = {name: values[name] for name in rest}
@@ -302,7 +302,7 @@ class Simulator(Node):
                      and values[name] != self._values[name]]
             if names:
                 self._log.info(f'{", ".join(names)}: {effect.value}')
-        self._values = values
+        self._values, self._start_spin = values, start_spin
 
     def _open_outputs(self, values: Mapping[str, Any]) -> None:
         """Have the publishers and the status line that these parameters ask for."""
