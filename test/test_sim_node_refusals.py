@@ -20,7 +20,9 @@ from helpers.node_logs import (
 )
 from sensor_msgs.msg import JointState
 
+from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.tools.recorded_run import read_run_description
 
 LAMBDA3 = parameters.checked({})['top.lambda3']
 REFUSED_COMMANDS = [(), (1.0,), (1.0, 1.0, 1.0), (math.nan, 1.0), (1.0, math.nan),
@@ -207,3 +209,15 @@ def test_a_spin_with_the_initial_state_is_that_of_the_next_start(peer, diagnosti
         assert peer.trigger(node, 'reset').success
         assert peer.get(node, 'spin.l3', 'spin.lz') == [1.0, 0.4]
         assert_clean_end(node, node.end())
+
+
+def test_a_log_can_be_read_that_begins_between_a_new_start_and_its_reset(peer, tmp_path):
+    path = tmp_path / 'run.mcap'
+    with SimNode(tmp_path, {**QUIET, 'record.uri': str(path)}) as node:
+        # Upright; what moves now has an Lz that is not possible there.
+        assert peer.set_together(node, initial__theta=0.0).successful
+        assert peer.switch(node, 'record', True).success
+        assert peer.trigger(node, 'reset').success
+        assert_clean_end(node, node.end())
+    with LogReader(path) as reader:
+        assert read_run_description(reader).values_at_recording['initial.theta'] == 0.0

@@ -191,7 +191,8 @@ class Simulator(Node):
         if not self._follows:
             time.sleep((self._simulation.epoch_ns - now_ns) / NANOSECONDS)
         self._loop.start()
-        open_log = self._session.start(self._values) if self._values['record.enabled'] else None
+        open_log = (self._session.start(self.start_values) if self._values['record.enabled']
+                    else None)
         self._pacer.start()
         if open_log is not None:
             try:
@@ -398,7 +399,7 @@ class Simulator(Node):
         if not request.data:
             return self._session.stop() or 'not recording'
         self.check_started()
-        return self._session.start(self._values)()
+        return self._session.start(self.start_values)()
 
     def _publish_diagnostics(self) -> None:
         """Look at /clock, the recording and other nodes, and publish /diagnostics."""
