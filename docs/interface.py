@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write docs/interface.md from the tables of the code: `python docs/interface.py`."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from spinning_top_sim.nodes import throttle
+from spinning_top_sim.nodes.tick_loop import State
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING, all_streams
 
@@ -48,6 +50,8 @@ AFTER_TOPICS = """| `{throttled}` | nav_msgs/msg/Odometry | at most {rate:g} | y
   of the top, lines on it that show the spin, and the trace of the tip over the last
   `markers.trace_length`. Every message has the whole trace. The trace is that of the exact solution; its
   last point is the tip according to the solver.
+- `/diagnostics`: level and message are those of the worst problem. Among the values, `state` is one of
+  {states}.
 - A stamp is the time of its sample, on the grid k × period. A paused node publishes no samples.
 
 ## Subscribed topics and services
@@ -64,6 +68,9 @@ AFTER_TOPICS = """| `{throttled}` | nav_msgs/msg/Odometry | at most {rate:g} | y
 
 The node refuses a command of wrong length, with NaN or infinity, or with Lz ≠ ±L3 while the axis is at a
 pole. It logs the reason and counts the command in `/diagnostics`. The motion continues unchanged.
+
+`spin.l3` and `spin.lz` in one request with a parameter of `initial.*` are no command: they are the spin of the
+next start, and take effect with `~/reset` as the others do.
 
 ## Parameters
 
@@ -87,10 +94,14 @@ def page() -> str:
         lines.append(f'| `{stream.topic}` | {stream.type_name} | {rate:g} | '
                      f'{"yes" if on else "no"} | `{stream.parameter}.enabled`, '
                      f'`{stream.rate_parameter.removeprefix(stream.parameter)}` |\n')
-    lines.append(AFTER_TOPICS.format(throttled=throttle.TOPICS['ground_truth/odom'],
-                                     rate=throttle.RATE, joints=', '.join(f'`{name}`' for name in JOINTS),
-                                     invariants=', '.join(f'`{name}`' for name in INVARIANTS),
-                                     timing=', '.join(f'`{name}`' for name in TIMING)))
+
+    def listed(names: Iterable[str]) -> str:
+        return ', '.join(f'`{name}`' for name in names)
+
+    lines.append(AFTER_TOPICS.format(
+        throttled=throttle.TOPICS['ground_truth/odom'], rate=throttle.RATE,
+        states=listed(state.name.lower() for state in State), joints=listed(JOINTS),
+        invariants=listed(INVARIANTS), timing=listed(TIMING)))
     for parameter in parameters.TABLE:
         default = parameter.default
         shown = 'unset' if default is None else list(default) if isinstance(

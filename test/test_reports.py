@@ -99,7 +99,10 @@ def test_the_worst_problem_is_the_level_and_the_message(reported):
     reported.loop.slipped_ns = 1_500_000_000
     level, message, numbers = status_of(reported)
     assert (level, message) == (1, 'this machine cannot keep up')
-    assert numbers['clock slip [s]'] == '1.500'
+    assert (numbers['clock slip [s]'], numbers['state']) == ('1.500', 'paused')
+    reported.loop.resume()
+    assert status_of(reported)[2]['state'] == 'running'
+    reported.loop.pause()
     reported.loop.slipped_ns = 0
     reported.session.warning = 'the disk is slow'
     assert status_of(reported)[:2] == (1, 'recording: the disk is slow')

@@ -20,7 +20,9 @@ from helpers.node_logs import (
 )
 from sensor_msgs.msg import JointState
 
+from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.tools.recorded_run import read_run_description
 
 LAMBDA3 = parameters.checked({})['top.lambda3']
 REFUSED_COMMANDS = [(), (1.0,), (1.0, 1.0, 1.0), (math.nan, 1.0), (1.0, math.nan),
@@ -190,3 +192,32 @@ def test_an_unset_lz_is_the_cusp_of_the_tilt_at_the_reset(peer, tmp_path):
             assert peer.trigger(node, 'reset').success
             assert peer.get(node, 'spin.lz') == [1.6 * math.cos(theta)]
         assert_clean_end(node, node.end())
+
+
+def test_a_spin_with_the_initial_state_is_that_of_the_next_start(peer, diagnostics, tmp_path):
+    with SimNode(tmp_path, {**QUIET, 'start_paused': True, 'spin.lz': 1.42}) as node:
+        # Upright, as 1.42 could not be; and away from the pole, where now only 2.0 could be.
+        for theta, l3, lz in ((0.0, 2.0, 2.0), (0.5, 1.0, 0.4)):
+            result = peer.set_together(node, initial__theta=theta, spin__l3=l3, spin__lz=lz)
+            assert result.successful, result.reason
+            assert peer.trigger(node, 'reset').success
+            assert peer.get(node, 'initial.theta', 'spin.l3', 'spin.lz') == [theta, l3, lz]
+        assert 'pole' in peer.set_together(node, initial__theta=0.0, spin__l3=1.0).reason
+        by_parameters(peer, node, 2.0, 0.3)         # without it, a command
+        numbers = diagnostics.next(node)
+        assert (numbers['commands'], numbers['rejected commands']) == ('1', '0')
+        assert peer.trigger(node, 'reset').success
+        assert peer.get(node, 'spin.l3', 'spin.lz') == [1.0, 0.4]
+        assert_clean_end(node, node.end())
+
+
+def test_a_log_can_be_read_that_begins_between_a_new_start_and_its_reset(peer, tmp_path):
+    path = tmp_path / 'run.mcap'
+    with SimNode(tmp_path, {**QUIET, 'record.uri': str(path)}) as node:
+        # Upright; what moves now has an Lz that is not possible there.
+        assert peer.set_together(node, initial__theta=0.0).successful
+        assert peer.switch(node, 'record', True).success
+        assert peer.trigger(node, 'reset').success
+        assert_clean_end(node, node.end())
+    with LogReader(path) as reader:
+        assert read_run_description(reader).values_at_recording['initial.theta'] == 0.0

@@ -14,8 +14,9 @@ from spinning_top_sim import State, solve
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import simulate
-from spinning_top_sim.view import model
+from spinning_top_sim.view import command, model
 from spinning_top_sim.view.track import Columns, Motion, Track, state_of
 
 COMMAND_S = 3.0
@@ -74,6 +75,13 @@ def test_columns_keep_what_is_later_and_forget_what_is_old():
     assert columns.at(2500)[0] == 2500
     assert columns.at(99999)[0] == 3049
     assert columns.part(2500, 2502)[0].tolist() == [2500, 2501, 2502]
+
+
+def test_columns_order_what_comes_in_disorder():
+    columns = Columns(1)
+    columns.append(np.array([3, 1, 2, 1]), np.array([[3.0], [1.0], [2.0], [9.0]]))
+    assert columns.stamps_ns.tolist() == [1, 2, 3] == columns.rows[:, 0].tolist()
+    assert columns.at(2)[0] == 2
 
 
 def test_a_log_shows_the_published_attitude_at_every_stamp(log, shown):
@@ -213,6 +221,60 @@ def test_the_server_is_on_loopback_and_takes_the_next_free_port():
         for page in pages:
             page.close()
     assert threading.active_count() < 50
+
+
+@pytest.mark.parametrize(('arguments', 'told'), [
+    (['LOG', 'LOG', 'LOG'], '3 logs: must be one or two'),
+    (['LOG', '--port', '99999'], '--port 99999: must be from 0 to 65535'),
+    (['LOG', '--port', '-1'], '--port -1: must be from 0 to 65535')])
+def test_wrong_arguments_are_told_in_one_line(log, capsys, arguments, told):
+    assert command.main(['view', *(str(log) if word == 'LOG' else word
+                                   for word in arguments)]) == 2
+    assert capsys.readouterr().err == f'view: {told}\n'
+
+
+@pytest.fixture
+def page():
+    pytest.importorskip('viser')
+    from spinning_top_sim.view.page import Page
+    page = Page('one', '127.0.0.1', None)
+    yield page
+    page.close()
+
+
+def test_a_part_that_is_switched_on_at_one_stamp_is_drawn_for_it(page, shown):
+    stamp_ns = shown.origin_ns + NANOSECONDS
+    page.set_tracks([shown.track])
+    page.draw([shown.origin_ns], shown.origin_ns)
+    page._trace.value = False
+    page.draw([stamp_ns], shown.origin_ns)
+    page._trace.value = page.arrows[0].value = True
+    page.draw([stamp_ns], shown.origin_ns)
+    (top,) = page._tops
+    assert top._arrows[0].points[0, 1] == pytest.approx(
+        model.arrow(shown.track, model.ARROWS[0], stamp_ns), abs=1e-6)
+    assert (top._trace.points == model.trace(shown.track, stamp_ns)).all()
+
+
+def test_the_page_follows_a_pause_whatever_else_is_wrong(page):
+    from spinning_top_sim.view.controls import Controls
+    controls = Controls(page, None, [])
+    for state, label in (('paused', 'Resume'), ('failed', 'Resume'), ('running', 'Pause')):
+        controls.tell_status('this machine cannot keep up', {
+            'state': state, 'recorder': 'off', 'simulated time [s]': '1.0',
+            'real-time factor': '0.9'})
+        assert controls._pause.label == label
+
+
+def test_a_page_tells_the_attitude_where_it_knows_no_motion(page):
+    track = Track('', parameters.checked({}))
+    page.set_tracks([track])
+    page._tell([NANOSECONDS], 0)
+    assert 'no samples yet' in page._words.content
+    track.columns['pose'].append(np.array([NANOSECONDS]), np.array([[0.0, 0.6, 0.0, 0.8]]))
+    page.draw([NANOSECONDS], 0)
+    assert page._words.content.strip().splitlines() == [
+        '- t = 1.000 s, stamp 1.000000000', '- q = 0.000000, 0.600000, 0.000000, 0.800000']
 
 
 def test_a_page_of_another_site_is_refused():

@@ -109,6 +109,7 @@ def test_live(browser, peer, tmp_path):
             wait_for('a log', lambda: list(tmp_path.glob('*.mcap')))
             visit.press('Reset')
             visit.read('reset: at t = 0')
+            visit.read('loops')             # the start of the scene, not of the node
             assert visit.errors == []
             assert visit.hosts <= {'127.0.0.1', None}
 

@@ -8,13 +8,18 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import rclpy
 from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import SimNode, wait_for
 from helpers.node_logs import stamp_of
+from helpers.simulations import record
 from nav_msgs.msg import Odometry
 
 from spinning_top_sim.nodes import throttle
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.pipeline import Simulation
 
 VIEW = ('-m', 'spinning_top_sim.view.command', '--no-browser', '--port', '0')
 PERIODS = {'/pose': 5_000_000, '/ground_truth/odom': 10_000_000}
@@ -34,10 +39,26 @@ def test_a_throttle_lets_few_messages_through_and_the_last_one(monkeypatch, peri
         now = number * period
     assert len(sent) == pytest.approx(count, abs=1)
     assert stream.sent == len(sent)
-    one.flush()
-    one.flush()
+    one.flush(at_once=True)
+    one.flush(at_once=True)
     assert sent[-1] == number
     assert len(set(sent)) == len(sent)
+
+
+def test_steps_while_paused_keep_to_the_rate_of_a_throttle(monkeypatch):
+    now, sent, stream = 0.0, [], SimpleNamespace(sent=0)
+    monkeypatch.setattr(throttle.time, 'monotonic', lambda: now)
+    one = throttle.Throttle(SimpleNamespace(
+        publish=sent.append, get_subscription_count=lambda: 1))
+    step = one.sink(stream, None)
+    for tick in range(1000):                # 200 a second, with a step before each
+        step(tick)
+        one.flush()
+        now += 0.005
+    assert len(sent) == pytest.approx(5 * throttle.RATE, abs=1)
+    now += 1.0 / throttle.RATE
+    one.flush()
+    assert sent[-1] == 999
 
 
 def test_a_throttle_is_not_in_the_way_of_others():
@@ -55,7 +76,7 @@ def test_a_throttle_is_not_in_the_way_of_others():
     watchers = 0
     one.sink(stream, every.append)
     sent.clear()
-    one.flush()
+    one.flush(at_once=True)
     assert sent == []                       # nobody waits for it
 
 
@@ -72,10 +93,56 @@ def test_the_throttled_topic_has_messages_of_its_stream(peer, tmp_path):
         shared = [data for data in few.raw if stamp_of(data) in known]
         assert len(shared) >= 20
         assert all(data == known[stamp_of(data)] for data in shared)
-        # A step, too, is shown at once, whatever came shortly before.
+        # A step, too, is shown, whatever came shortly before.
         assert peer.trigger(node, 'step').success
         wait_for('the step', lambda: few.raw[-1] == every.raw[-1]
                  and stamp_of(few.raw[-1]) > max(known))
+
+
+@pytest.fixture
+def live():
+    """A page whose node, in this process, hears nobody."""
+    pytest.importorskip('viser')
+    from spinning_top_sim.view.live import LiveView
+    from spinning_top_sim.view.page import Page
+    rclpy.init()
+    view = LiveView(Page('one', '127.0.0.1', None))
+    yield view
+    view._page.close()
+    view.destroy_node()
+    rclpy.try_shutdown()
+
+
+def test_the_page_goes_on_where_the_clock_of_a_new_run_is_earlier(live):
+    from spinning_top_sim.view.track import Track
+    values = parameters.checked({'spin.lz': 1.4})
+    live._stale, live._track = False, Track('', values)
+    live._page.set_tracks([live._track])
+    for epoch_ns in (100 * NANOSECONDS, 5 * NANOSECONDS):
+        run = Simulation(values, epoch_ns)
+        taken = record(run, 'ground_truth/odom')
+        run.advance(NANOSECONDS // 2)
+        live._inbox.extend((topic, data) for topic, _, data in taken)
+        live._draw_once()
+        assert live._track.span == (epoch_ns, epoch_ns + NANOSECONDS // 2)
+        assert live._page._tops[0].drawn[0] == epoch_ns + NANOSECONDS // 2
+        assert live._track.values is values
+    # A message that comes late begins nothing.
+    live._inbox.append(('ground_truth/odom', taken[-2][2]))
+    live._draw_once()
+    assert live._track.span == (epoch_ns, epoch_ns + NANOSECONDS // 2)
+
+
+def test_a_scene_brings_its_start_and_leaves_the_sensor_alone(live, monkeypatch):
+    said = []
+    monkeypatch.setattr(live, 'set_parameters_together', said.append)
+    monkeypatch.setattr(live, 'call', said.append)
+    assert live.load_scene('wavy') == 'scene wavy'
+    values, then = said
+    assert then == 'reset'
+    assert (values['spin.l3'], values['spin.lz']) == (1.6, 1.42)
+    assert values['initial.phi'] == 0.0                 # the default
+    assert not any(name.startswith('imu.') for name in values)
 
 
 def kill(view):

@@ -48,6 +48,7 @@ class MotionReport:
         _, level, message = max(filter(itemgetter(0), states), key=itemgetter(1))
         now_ns = loop.now_ns
         numbers = {
+            'state': loop.state.name.lower(),
             'simulated time [s]': f'{now_ns / NANOSECONDS:.6f}',
             'stamp of t = 0 [ns]': simulation.epoch_ns,
             'real-time factor': f'{self._measure_speed(now_ns):.3f}',

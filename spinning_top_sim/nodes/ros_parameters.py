@@ -131,14 +131,27 @@ def _as_double(value: object) -> object:
     return value
 
 
+def is_command(changes: Mapping[str, Any]) -> bool:
+    """Return whether changes let the spin jump: with `initial.*` it is that of the next start."""
+    return not changes.keys().isdisjoint(SPIN) and not any(
+        name.startswith('initial.') for name in changes)
+
+
 def changed(values: Mapping[str, Any], changes: Mapping[str, Any],
-            start_spin: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values with changes put in, all validated.  Raises ValueError."""
+            start_spin: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """
+    Return the values, and the spin of the next start, with changes put in, all validated.
+
+    Raises ValueError.
+    """
     for name, value in changes.items():
         if value is None:
             raise ValueError(f'{name}: cannot be unset while the node runs')
-    # `start_spin` is checked, as a reset combines it with the other parameters.  The present spin
-    # goes with the present state; `TickLoop.command` refuses one that is not possible there.
-    checked = parameters.checked({**values, **changes, **start_spin})
-    return {**checked, **{name: parameters.BY_NAME[name].check(changes.get(name, values[name]))
-                          for name in SPIN}}
+    spin = {name: value for name, value in changes.items() if name in SPIN}
+    present, start = {name: values[name] for name in SPIN}, dict(start_spin)
+    (present if is_command(changes) else start).update(spin)
+    # `start` is checked, as a reset combines it with the other parameters.  The present spin goes
+    # with the present state; `TickLoop.command` refuses one that is not possible there.
+    checked = parameters.checked({**values, **changes, **start})
+    return ({**checked, **{name: parameters.BY_NAME[name].check(present[name]) for name in SPIN}},
+            {name: checked[name] for name in SPIN})

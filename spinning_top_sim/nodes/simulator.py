@@ -78,10 +78,10 @@ class StreamPublishers:
                 throttle = self._throttles.get(stream.topic)
                 stream.publish = throttle.sink(stream, sink) if throttle else sink
 
-    def flush(self) -> None:
-        """Publish what is withheld for its rate: the motion stands still."""
+    def flush(self, at_once: bool) -> None:
+        """Publish what is withheld, as soon as its rate allows or at once."""
         for throttle in self._throttles.values():
-            throttle.flush()
+            throttle.flush(at_once)
 
     def topics_to_record(self, streams: Sequence[Stream]) -> list[Topic]:
         """Return the topics of these streams, and behind them those of the journal."""
@@ -191,7 +191,8 @@ class Simulator(Node):
         if not self._follows:
             time.sleep((self._simulation.epoch_ns - now_ns) / NANOSECONDS)
         self._loop.start()
-        open_log = self._session.start(self._values) if self._values['record.enabled'] else None
+        open_log = (self._session.start(self.start_values) if self._values['record.enabled']
+                    else None)
         self._pacer.start()
         if open_log is not None:
             try:
@@ -226,7 +227,7 @@ class Simulator(Node):
         with self._lock:
             wants_idle = self._loop.tick()
             if self._loop.state is not State.RUNNING:
-                self._outputs.flush()
+                self._outputs.flush(at_once=self._loop.state is State.ENDED)
         if self._loop.state is State.ENDED and not self.finished.done():
             wait_for_all_acked(self._outputs.by_topic.values(), 1.0)
             self.finished.set_result(None)
@@ -277,7 +278,7 @@ class Simulator(Node):
         if not changes:
             return SetParametersResult(successful=True)
         successful, reason = self._outcome(self._change, changes)
-        if not (successful or changes.keys().isdisjoint(SPIN)):
+        if ros_parameters.is_command(changes) and not successful:
             self._loop.rejected_commands += 1
         if 'both together' in reason:
             reason += (f', as by: ros2 topic pub --once {self.resolve_topic_name("~/commands")} '
@@ -286,10 +287,10 @@ class Simulator(Node):
         return SetParametersResult(successful=successful, reason=reason)
 
     def _change(self, changes: dict[str, Any]) -> None:
-        values = ros_parameters.changed(self._values, changes, self._start_spin)
+        values, start_spin = ros_parameters.changed(self._values, changes, self._start_spin)
         rest = sorted(changes.keys() - SPIN)
         with self._lock:
-            if len(rest) < len(changes):
+            if ros_parameters.is_command(changes):
                 self._loop.command(values['spin.l3'], values['spin.lz'])
             if rest:
                 changed = {name: values[name] for name in rest}
@@ -302,7 +303,7 @@ class Simulator(Node):
                      and values[name] != self._values[name]]
             if names:
                 self._log.info(f'{", ".join(names)}: {effect.value}')
-        self._values = values
+        self._values, self._start_spin = values, start_spin
 
     def _open_outputs(self, values: Mapping[str, Any]) -> None:
         """Have the publishers and the status line that these parameters ask for."""
@@ -398,7 +399,7 @@ class Simulator(Node):
         if not request.data:
             return self._session.stop() or 'not recording'
         self.check_started()
-        return self._session.start(self._values)()
+        return self._session.start(self.start_values)()
 
     def _publish_diagnostics(self) -> None:
         """Look at /clock, the recording and other nodes, and publish /diagnostics."""

@@ -18,8 +18,8 @@ class Throttle:
     """
     Publishes at most RATE messages of a stream a second.
 
-    A message to a subscriber costs the node more than to compute it.  None is lost for good before
-    the motion stands still: `flush` publishes the last one.
+    A message to a subscriber costs the node more than to compute it.  `flush`, called while the
+    motion stands still, publishes the last one.
     """
 
     def __init__(self, publisher: Publisher) -> None:
@@ -48,13 +48,17 @@ class Throttle:
             if self._publish_all is None:
                 self._stream.sent -= 1          # who calls this counts it
             return
+        self._send(message, now)
+
+    def _send(self, message: bytes, now: float) -> None:
         # On the average the rate is RATE, whatever the rate of the stream.
         self._due = max(self._due, now - 1.0 / RATE) + 1.0 / RATE
         self._withheld = None
         self.publisher.publish(message)
 
-    def flush(self) -> None:
-        """Publish the newest message, if that has not been done."""
+    def flush(self, at_once: bool = False) -> None:
+        """Publish the newest message if that has not been done; `at_once`: before it is due."""
         if self._withheld is not None:
-            self.publisher.publish(self._withheld)
-            self._withheld = None
+            now = time.monotonic()
+            if at_once or now >= self._due:
+                self._send(self._withheld, now)

@@ -29,6 +29,7 @@ Show a top in the browser: the one that a sim_node simulates, or those of logs.
   view run.mcap --html page.html        a file that opens without this program
 """
 LOOPBACK = '127.0.0.1'
+LAST_PORT = 65535
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -37,7 +38,7 @@ def main(argv: list[str] | None = None) -> int:
     words = argv[1:argv.index('--ros-args')] if '--ros-args' in argv else argv[1:]
     if _parser().parse_args(words).log:
         return cli.run('view', DESCRIPTION, words, _add_arguments, _show_logs,
-                       (LogError, OSError, ImportError))
+                       (ValueError, LogError, OSError, ImportError))
     return run('view', argv, _prepare)
 
 
@@ -80,7 +81,13 @@ def _show_logs(arguments: argparse.Namespace) -> int:
 
 
 def _open_page(arguments: argparse.Namespace, title: str) -> Page:
-    """Return the page, shown by the browser if there is one, and say where it is."""
+    """
+    Return the page, shown by the browser if there is one, and say where it is.
+
+    Raises ValueError for a wrong port, OSError where there cannot be a page.
+    """
+    if arguments.port is not None and not 0 <= arguments.port <= LAST_PORT:
+        raise ValueError(f'--port {arguments.port}: must be from 0 to {LAST_PORT}')
     try:
         from spinning_top_sim.view.page import Page  # noqa: PLC0415
     except ImportError as error:

@@ -25,7 +25,7 @@ class Commands(Protocol):
     def set_parameters_together(self, values: Mapping[str, Any]) -> str: ...
     def command(self, l3: float, lz: float) -> str: ...
     def height(self) -> float | None: ...
-    def load_scene(self, name: str, paused: bool) -> str: ...
+    def load_scene(self, name: str) -> str: ...
 
 
 class Controls:
@@ -59,7 +59,7 @@ class Controls:
         self._on_change(self._record, lambda: node.call('record', self._record.value))
         self._on_change(self._time_scale, lambda: node.set_parameters_together(
             {'time_scale': float(self._time_scale.value)}))
-        self._on_change(scene, lambda: node.load_scene(scene.value, self._paused)
+        self._on_change(scene, lambda: node.load_scene(scene.value)
                         if scene.value != NO_SCENE else '')
 
     def _act(self, action: Callable[[], str]) -> None:
@@ -161,8 +161,8 @@ class Controls:
             f'real-time factor {numbers["real-time factor"]}',
             f'recorder {recorder} {path}'.rstrip())))
         if not self._lock.locked():
-            if message in ('paused', 'running'):        # else it says something worse
-                self._show_paused(message == 'paused')
+            if numbers['state'] in ('paused', 'running'):
+                self._show_paused(numbers['state'] == 'paused')
             set_value(self._record, recorder == 'recording')
 
     def tell_end(self, reason: str) -> None:

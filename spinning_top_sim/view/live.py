@@ -26,11 +26,11 @@ from sensor_msgs.msg import Imu, JointState
 from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes import throttle
-from spinning_top_sim.nodes.worlds import scene_files
+from spinning_top_sim.nodes.ros_parameters import SPIN
+from spinning_top_sim.nodes.worlds import OF_A_WORLD, World, scene_files
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.journal import NODE_NAME
-from spinning_top_sim.tools.scene_file import read_scene
 from spinning_top_sim.view import model
 from spinning_top_sim.view.controls import Controls
 from spinning_top_sim.view.page import CATCH_UP_S, RATE, WINDOW_NS, Page
@@ -47,12 +47,10 @@ QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 INBOX = 2000                    # messages that wait for the next picture
 ANSWER_S = 5.0                  # a service that takes longer does not answer
 SILENT_S = 5.0                  # /diagnostics come every second
+RESTART_NS = NANOSECONDS        # stamps that go back by more are those of another run
 KEPT_NS = 2 * max(WINDOW_NS, model.TRACE_NS)
 KIND_OF = {'pose': PoseStamped, 'joint_states': JointState, 'ground_truth/odom': Odometry,
            'ground_truth/imu': Imu}
-SPIN = ('spin.l3', 'spin.lz')
-# What a scene decides: where it does not, the default holds.
-OF_A_SCENE = ('top.', 'initial.', 'solver.', 'imu.')
 
 
 class RefusedError(Exception):
@@ -176,7 +174,12 @@ class LiveView(Node):
             topic, data = self._inbox.popleft()
             arrived[topic].append(data)
         for topic, messages in arrived.items():
-            track.add(topic, [_stamp_ns(data) for data in messages], messages)
+            stamps_ns = [_stamp_ns(data) for data in messages]
+            newest = track.columns[topic].at(LATEST_NS)
+            if newest is not None and stamps_ns[-1] < newest[0] - RESTART_NS:
+                # The sim_node was started again; its t = 0 is not known yet.
+                track, self._origin_ns = self._begin_track(track.values), None
+            track.add(topic, stamps_ns, messages)
         if track.span is None:
             return
         newest_ns = track.span[1]
@@ -205,11 +208,17 @@ class LiveView(Node):
         values = {**parameters.checked(dict(zip(names, shown, strict=False))),
                   **dict(zip(SPIN, shown[-len(SPIN):], strict=True))}
         if self._track is None or _drawn(values) != _drawn(self._track.values):
-            self._track = Track('', values)
-            self._page.set_tracks([self._track])
-            self._controls.set_range(self._track.top, *(values[name] for name in SPIN))
-        self._track.values = values
+            self._begin_track(values)
+        else:
+            self._track.values = values
         self._controls.show_values(values)
+
+    def _begin_track(self, values: Mapping[str, Any]) -> Track:
+        """Show what comes from now on instead of what has come."""
+        self._track = Track('', values)
+        self._page.set_tracks([self._track])
+        self._controls.set_range(self._track.top, *(values[name] for name in SPIN))
+        return self._track
 
     # Called by the page's controls, in threads of their own.
 
@@ -258,29 +267,22 @@ class LiveView(Node):
         x, y, z, w = sample[1][:4].tolist()
         return float(w * w + z * z - (x * x + y * y))
 
-    def load_scene(self, name: str, paused: bool) -> str:
+    def load_scene(self, name: str) -> str:
         """Start again with a scene; return what it could not change.  Raises RefusedError."""
         try:
-            given = read_scene(scene_files()[name])
-            scene = parameters.checked(given)
-            start = parameters.start_state(scene)
+            world = World.read(name)
+            values = world.values({})
+            start = parameters.start_state(values)
         except (OSError, ValueError) as error:
             raise RefusedError(str(error)) from error
-        chosen = {key: scene[key] for key, parameter in parameters.BY_NAME.items()
-                  if (key in given or key.startswith(OF_A_SCENE)) and key not in SPIN
-                  and parameter.effect in (parameters.Effect.NOW, parameters.Effect.RESET)}
-        fixed = [key for key in given if key not in chosen and key not in SPIN]
-        # At t = 0 of the new start, before time runs, it gets its spin.
-        self.call('set_pause', True)
-        try:
-            self.set_parameters_together(chosen)
-            self.call('reset')
-            self.command(start.l3, start.lz)
-        finally:
-            if not paused:
-                self.call('set_pause', False)
-        return f'scene {name}' + (f'; only at the start of the node: {", ".join(fixed)}'
-                                  if fixed else '')
+        # Together with `initial.*`, the spin is that of the next start.
+        self.set_parameters_together({
+            **{key: value for key, value in values.items()
+               if key in world.given or key.startswith(OF_A_WORLD)},
+            **dict(zip(SPIN, (start.l3, start.lz), strict=True))})
+        self.call('reset')
+        return f'scene {name}' + (f'; only at the start of the node: {", ".join(world.ignored)}'
+                                  if world.ignored else '')
 
 
 def _drawn(values: Mapping[str, Any]) -> list[Any]:

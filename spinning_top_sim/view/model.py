@@ -131,9 +131,8 @@ def _columns(rows: Rows) -> attitude.Quaternion:
 
 
 def in_world(quaternion: Rows, vector: Rows) -> Rows:
-    """Return the components in the world of a vector given in the body."""
-    x, y, z, w = quaternion
-    return np.array(attitude.in_body((-x, -y, -z, w), tuple(vector)))
+    """Return the components in the world of a vector given in the body, as an array."""
+    return np.array(attitude.in_world(tuple(quaternion), tuple(vector)))
 
 
 def arrow(track: Track, name: str, stamp_ns: int) -> Rows | None:

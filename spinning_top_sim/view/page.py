@@ -67,6 +67,7 @@ class DrawnTop:
             visible=False) for arrow, colour in zip(model.ARROWS, ARROW_COLOURS, strict=True)]
         self._theta_range: tuple[float, float] | None = None
         self.drawn: tuple[int, Rows] | None = None      # stamp [ns] and row of the attitude
+        self._shown: object = None                      # with which stamp and parts
 
     def remove(self) -> None:
         self._root.remove()
@@ -86,9 +87,14 @@ class DrawnTop:
     def draw(self, stamp_ns: int) -> None:
         """Draw the newest samples up to a stamp."""
         sample = self.track.attitudes.at(stamp_ns)
-        if sample is None or (self.drawn is not None and sample[0] == self.drawn[0]):
+        if sample is None:
             return
         self.drawn = sample
+        # While the motion is paused, too, a part may be switched on.
+        shown = sample[0], self._trace.visible, [arrow.visible for arrow in self._arrows]
+        if shown == self._shown:
+            return
+        self._shown = shown
         x, y, z, w = sample[1][:4].tolist()
         self._body.wxyz = (w, x, y, z)
         if self._trace.visible:
@@ -232,17 +238,18 @@ class Page:
         """Say which motion this is, and the numbers of the sample that is drawn."""
         lines = []
         for top, stamp_ns in zip(self._tops, stamps_ns, strict=True):
-            motion = top.track.motion_at(stamp_ns)
-            if top.drawn is None or motion is None:
+            if top.drawn is None:
                 lines.append(f'{top.track.name} *{NO_SAMPLES}*')
                 continue
+            motion = top.track.motion_at(stamp_ns)
             seconds, nanoseconds = divmod(top.drawn[0], NANOSECONDS)
-            regime, *numbers = motion.words
+            regime, *numbers = motion.words if motion else ('',)
+            if motion:
+                numbers.append(f'L3 = {motion.l3:.6g}, Lz = {motion.lz:.6g} kg m²/s')
             x, y, z, w = top.drawn[1][:4].tolist()
+            title = ' '.join(filter(None, (top.track.name, regime)))
             lines += [
-                f'**{top.track.name} {regime}**'.replace('** ', '**'), *(
-                    f'- {number}' for number in numbers),
-                f'- L3 = {motion.l3:.6g}, Lz = {motion.lz:.6g} kg m²/s',
+                f'**{title}**' if title else '', *(f'- {number}' for number in numbers),
                 f'- t = {(top.drawn[0] - origin_ns) / NANOSECONDS:.3f} s, stamp '
                 f'{seconds}.{nanoseconds:09d}',
                 f'- q = {x:.6f}, {y:.6f}, {z:.6f}, {w:.6f}', '']

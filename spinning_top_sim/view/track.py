@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.physics.attitude import vertical_in_body
 from spinning_top_sim.physics.regimes import Description, regime
 from spinning_top_sim.physics.top import Shape, State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
@@ -50,7 +51,13 @@ class Columns:
         return self._rows[self._begin:self._end]
 
     def append(self, stamps_ns: Stamps, rows: Rows) -> None:
-        """Append samples; those that are not later than the newest one are left out."""
+        """
+        Append samples in the order of their stamps, the first of each stamp.
+
+        Those that are not later than the newest one are left out.
+        """
+        stamps_ns, order = np.unique(stamps_ns, return_index=True)
+        rows = rows[order]
         if self._end > self._begin:
             later = stamps_ns > self._stamps_ns[self._end - 1]
             stamps_ns, rows = stamps_ns[later], rows[later]
@@ -189,7 +196,7 @@ def state_of(top: Top, row: Rows) -> tuple[tuple[float, float, float], State]:
     """Return energy, L3 and Lz of a row of RATES, and its state but for phi and psi."""
     x, y, z, w, one, two, spin = row[:7].tolist()
     cos2, sin2 = w * w + z * z, x * x + y * y
-    up_1, up_2, up_3 = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), cos2 - sin2
+    up_1, up_2, up_3 = map(float, vertical_in_body(tuple(row[:4])))
     l3 = top.lambda3 * spin
     lz = top.lambda1 * (one * up_1 + two * up_2) + l3 * up_3
     energy = (0.5 * top.lambda1 * (one * one + two * two) + 0.5 * l3 * spin
