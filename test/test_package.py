@@ -282,9 +282,13 @@ def test_the_workflow_calls_what_there_is():
     for name in matrix['libraries']:
         assert name == 'newest' or (ROOT / f'.ci/constraints-{name}.txt').is_file()
     (run,) = (step['run'] for step in jobs['test']['steps'] if 'run' in step)
-    assert run == '.ci/run test ' + ' '.join(
-        f'${{{{ matrix.{key} }}}}' for key in ('python', 'ros', 'libraries'))
-    assert jobs['lint']['strategy']['matrix']['step'] == ['lint', 'build']
+    assert run == '.ci/run ' + ' '.join(
+        f'${{{{ matrix.{key} }}}}' for key in ('step', 'python', 'ros', 'libraries'))
+    steps = {*matrix['step'], *(one['step'] for one in matrix['include'])}
+    assert steps == {'test', 'coverage'}
+    assert jobs['lint']['strategy']['matrix']['step'] == ['lint', 'docs', 'build']
+    cases = re.findall(r'^([\w |]+)\)$', (ROOT / '.ci/run').read_text(), re.MULTILINE)
+    assert {*steps, 'lint', 'docs', 'build'} <= set(re.findall(r'\w+', ' '.join(cases)))
 
 
 @pytest.mark.parametrize(('scene', 'file'), [
