@@ -281,6 +281,20 @@ def test_waiting_for_a_processor_is_not_slowness(monkeypatch, tmp_path):
     assert len(follow(partial(Bad, wait), run).estimates) == 100
 
 
+def test_a_filter_may_return_the_array_that_its_next_update_changes():
+    class InPlace(Vqf):
+        def __init__(self):
+            super().__init__()
+            self._said = np.empty(4)
+
+        def update(self, *readings):
+            self._said[:] = super().update(*readings)
+            return self._said
+
+    run = scenarios.record(scenarios.SLOW, {}, 1).part(slice(100))
+    assert np.array_equal(follow(InPlace, run).estimates, follow(Vqf, run).estimates)
+
+
 def test_a_run_that_fails_leaves_the_others():
     class Fragile(Vqf):
         def update(self, gyroscope, accelerometer, magnetometer, dt):

@@ -4,6 +4,7 @@
 import contextlib
 import time
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -156,7 +157,8 @@ def feed(make_filter: MakeFilter, readings: Readings,
         for k, (rate, force, field, dt) in enumerate(zip(
                 gyroscope, accelerometer, fields, readings.dt.tolist(), strict=True), start=1):
             tell(k)
-            said.append(update(rate, force, field, dt))
+            # A filter may return the array that its next update changes.
+            said.append(copy(update(rate, force, field, dt)))
             if k % READ_EVERY == 0:
                 _check_speed(_working_time() - begin, k, dt, slowest)
                 numbers.append(k - 1)
