@@ -25,7 +25,7 @@ from spinning_top_sim.exam.diagnosis import FAULTS
 from spinning_top_sim.exam.log import examine_log
 from spinning_top_sim.exam.pytest_plugin import pass_exam  # noqa: F401, a fixture
 from spinning_top_sim.exam.reference import ReferenceFilter
-from spinning_top_sim.exam.trial import follow
+from spinning_top_sim.exam.trial import InvalidOutputError, follow
 from spinning_top_sim.tools.simulate import main as simulate
 
 pytest.importorskip('vqf')
@@ -255,13 +255,33 @@ def fail():
     (lambda: 'north', 'update 1 returns north'),
     (lambda: np.full(4, math.inf), 'it is not finite'),
     (lambda: np.ones(4), 'its norm is 2, and must be 1'),
-    (lambda: time.sleep(0.05), ' ms an update, and a sample comes every 10 ms'),
     (lambda: np.eye(4), 'of shape (4, 4)')])
 def test_a_filter_that_returns_no_attitude_is_told(said, says):
     report = examine(partial(Bad, said), seeds=1)
     assert report.faults == ['invalid_output']
     assert says in str(report)
     assert not report.measures
+
+
+@pytest.mark.parametrize(('first', 'others', 'says'), [
+    (1.9, 0.001, None),             # it compiles itself
+    (0.06, 0.06, 'update 40 of 100 ends after 2.4 s, and the last one must end within 2 s'),
+    (2.5, 0.0, 'too slow: update 10 of 100 ends after 2.5 s')])
+def test_a_filter_may_take_twice_the_time_of_the_whole_run(monkeypatch, first, others, says):
+    now = 0.0
+
+    def work():
+        nonlocal now
+        now += others if now else first
+        return 0.0, 0.0, 0.0, 1.0
+
+    monkeypatch.setattr(trial, '_working_time', lambda: now)
+    run = scenarios.record(scenarios.SLOW, {}, 1).part(slice(100))
+    if says is None:
+        assert len(follow(partial(Bad, work), run).estimates) == 100
+        return
+    with pytest.raises(InvalidOutputError, match=says):
+        follow(partial(Bad, work), run)
 
 
 def test_waiting_for_a_processor_is_not_slowness(monkeypatch, tmp_path):
