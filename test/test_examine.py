@@ -127,10 +127,11 @@ def test_the_nees_of_a_linear_filter_is_in_its_band(factor, expected):
 def test_covariances_may_be_about_the_axes_of_the_world():
     said = follow(ReferenceFilter, scenarios.record(scenarios.SLOW, scenarios.CALIBRATED, 1))
     said = said.later(0.75)
-    estimates, truth = said.estimates[said.read], said.run.truth[said.read]
+    samples, of_filter = said.covariances
+    estimates, truth = said.estimates[samples], said.run.truth[samples]
     turn = Rotation.from_quat(estimates).as_matrix()
     for factor in (0.5, 1.0, 2.0):
-        of_sensor = factor * said.covariances
+        of_sensor = factor * of_filter
         of_world = turn @ of_sensor @ turn.transpose(0, 2, 1)
         for absolute in (False, True):
             nees = [measures.nees_of([(estimates, truth, covariances)], absolute)
@@ -301,6 +302,58 @@ def test_waiting_for_a_processor_is_not_slowness(monkeypatch, tmp_path):
     assert len(follow(partial(Bad, wait), run).estimates) == 100
 
 
+class OnDevice:
+    """Numbers that cannot be converted, as a torch tensor with requires_grad."""
+
+    def __array__(self, *arguments, **options):
+        raise RuntimeError('call detach() first')
+
+
+@pytest.mark.parametrize('name', ['said', 'covariance', 'bias'])
+def test_what_cannot_be_converted_is_told(name):
+    class Strange(Vqf):
+        def update(self, *readings):
+            attitude = super().update(*readings)
+            return OnDevice() if name == 'said' else attitude
+
+    if name != 'said':
+        setattr(Strange, name, OnDevice())
+    run = scenarios.record(scenarios.SLOW, {}, 1).part(slice(100))
+    with pytest.raises(InvalidOutputError, match='of 100 raises RuntimeError: call detach'):
+        follow(Strange, run)
+
+
+def test_what_is_not_known_is_left_out():
+    class Forgetful(Vqf):
+        number = 0
+        bias = property(lambda self: None if self.number == 20 else np.zeros(3))
+
+        def update(self, *readings):
+            self.number += 1
+            return super().update(*readings)
+
+        @property
+        def covariance(self):
+            return {30: None, 50: np.zeros((3, 3)), 60: 1e308 * np.ones((3, 3))}.get(
+                self.number, np.eye(3))
+
+    said = follow(Forgetful, scenarios.record(scenarios.SLOW, {}, 1).part(slice(100)))
+    assert said.covariances.samples.tolist() == [9, 19, 39, 59, 69, 79, 89, 99]
+    assert said.biases.samples.tolist() == [9, *range(29, 100, 10)]
+    later = said.since(50)
+    assert later.covariances.samples.tolist() == [9, 19, 29, 39, 49]
+    assert np.all(later.covariances.values[0] == 1e308)
+    assert later.biases.values.shape == (5, 3)
+
+
+def test_a_covariance_of_zeros_is_unknown():
+    class Unknowing(Vqf):
+        covariance = np.zeros((3, 3))
+
+    report = examine(Unknowing, seeds=1)
+    assert report.passed and 'nees' not in report.measures
+
+
 def test_a_filter_may_return_the_array_that_its_next_update_changes():
     class InPlace(Vqf):
         def __init__(self):
@@ -373,7 +426,10 @@ def test_a_filter_may_be_fed_in_this_process():
 
 
 @pytest.mark.parametrize(('covariance', 'says'), [
-    (-np.eye(3), 'must have no negative eigenvalue'), (np.eye(2), 'must be 3 x 3 finite numbers'),
+    (-np.eye(3), 'must have no negative eigenvalue'),
+    (np.eye(2), 'of shape (2, 2): must be 3 x 3 finite numbers'),
+    (0.5, 'covariance is 0.5: must be 3 x 3 finite numbers'),
+    ('large', 'covariance is large: must be 3 x 3 finite numbers'),
     (np.full((3, 3), math.nan), 'must be 3 x 3 finite numbers')])
 def test_a_wrong_covariance_is_told(covariance, says):
     class Wrong(Vqf):

@@ -228,8 +228,9 @@ def bias_effect(plus: Outcome, minus: Outcome, bias: Reals, absolute: bool) -> B
         apart = np.linalg.norm(verticals[0] - verticals[1], axis=1)
     quarter = len(apart) // 4
     found = None
-    if plus.biases is not None and minus.biases is not None:
-        found = float(0.5 * (plus.biases[-1] - minus.biases[-1]) @ bias / size ** 2)
+    if len(plus.biases.values) and len(minus.biases.values):
+        change = 0.5 * (plus.biases.values[-1] - minus.biases.values[-1])
+        found = float(change @ bias / size ** 2)
     return BiasEffect(rms(apart[quarter:2 * quarter]) / (2.0 * size),
                       rms(apart[-quarter:]) / (2.0 * size), found)
 
@@ -250,9 +251,9 @@ def bias_fault(effect: BiasEffect, absolute: bool) -> Fault | None:
 
 def consistency(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, measures.Nees]:
     """Return the NEES of tilt and attitude by name, as far as there are covariances."""
-    runs = [(one.estimates[one.read], one.run.truth[one.read], one.covariances)
-            for outcome in outcomes for one in (outcome.later(0.75),)
-            if one.covariances is not None]
+    runs = [(one.estimates[samples], one.run.truth[samples], covariances)
+            for one in (outcome.later(0.75) for outcome in outcomes)
+            for samples, covariances in (one.covariances,) if len(samples)]
     if not runs:
         return {}
     found = {what: measures.nees_of(runs, whole)

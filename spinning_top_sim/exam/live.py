@@ -30,6 +30,7 @@ from spinning_top_sim.exam.examiner import examine
 from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.trial import NodeError
 from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.tools.attitudes import NO_ORIENTATION
 
 try:                            # takes least processor time
     from rclpy.experimental import EventsExecutor as Executor
@@ -183,7 +184,7 @@ class NodeFilter:
         clock, imu = Clock(), Imu()
         clock.clock.sec, clock.clock.nanosec = divmod(self._now_ns, NANOSECONDS)
         imu.header.stamp, imu.header.frame_id = clock.clock, FRAME
-        imu.orientation_covariance[0] = -1.0
+        imu.orientation_covariance[0] = NO_ORIENTATION
         for vector, values in ((imu.angular_velocity, gyroscope),
                                (imu.linear_acceleration, accelerometer)):
             vector.x, vector.y, vector.z = values.tolist()
@@ -207,6 +208,6 @@ class NodeFilter:
         message = said.pop(self._now_ns)
         said.clear()
         matrix = np.array(message.orientation_covariance).reshape(3, 3)
-        self.covariance = matrix if matrix[0, 0] > 0.0 else None
+        self.covariance = None if matrix[0, 0] == NO_ORIENTATION else matrix
         q = message.orientation
         return np.array((q.x, q.y, q.z, q.w))

@@ -20,7 +20,7 @@ from spinning_top_sim.exam import diagnosis
 from spinning_top_sim.exam.diagnosis import Fault
 from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.scenarios import Reals, Truth
-from spinning_top_sim.exam.trial import NORM_TOLERANCE, Outcome
+from spinning_top_sim.exam.trial import NORM_TOLERANCE, UNKNOWN, Known, Outcome
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.tools.attitudes import LAYOUTS, decode
 
@@ -171,8 +171,8 @@ def _beside(name: str, said: Attitudes, true: Attitudes) -> Outcome:
     middle = 0.5 * (times[1:] + times[:-1])
     rates = np.stack([np.interp(t, middle, column) for column in step.T], axis=1)
     covariances = said.covariances[chosen]
-    known = bool(np.all(np.isfinite(covariances)))
+    known = np.flatnonzero(np.all(np.isfinite(covariances), axis=(1, 2)))
     t = t - t[0]
     return Outcome(Truth(name, t, np.diff(t, prepend=t[0] - (t[1] - t[0])), truth.as_quat(),
-                         rates), said.quaternions[chosen], np.arange(len(t)),
-                   covariances if known else None, None)
+                         rates), said.quaternions[chosen], Known(known, covariances[known]),
+                   UNKNOWN)
