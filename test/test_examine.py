@@ -124,6 +124,25 @@ def test_the_nees_of_a_linear_filter_is_in_its_band(factor, expected):
     assert measures.nees_of(runs, True) is None
 
 
+def summed_autocorrelation_time(values):
+    centred = values - np.mean(values)
+    time = 1.0
+    for lag in range(1, values.shape[1]):
+        time += 2.0 * np.mean(centred[:, lag:] * centred[:, :-lag]) / np.mean(centred ** 2)
+        if lag >= 5.0 * time:
+            break
+    return max(time, 1.0)
+
+
+@pytest.mark.parametrize('scale', [1.0, 2.0 ** 1000])
+@pytest.mark.parametrize('shape', [(1, 1), (1, 2), (3, 7), (3, 1000)])
+def test_the_autocorrelation_time_is_the_direct_sum(shape, scale):
+    noise = np.random.default_rng(1).standard_normal(shape)
+    for values in (noise, np.cumsum(noise, axis=1), np.ones(shape)):
+        assert measures.autocorrelation_time(scale * values) == pytest.approx(
+            summed_autocorrelation_time(values) if np.ptp(values) else 1.0, rel=1e-9)
+
+
 def test_covariances_may_be_about_the_axes_of_the_world():
     said = follow(ReferenceFilter, scenarios.record(scenarios.SLOW, scenarios.CALIBRATED, 1))
     said = said.later(0.75)
