@@ -462,6 +462,8 @@ def test_a_wrong_covariance_is_told(covariance, says):
 @pytest.mark.parametrize(('options', 'says'), [
     ({'level': 'slow'}, "level = 'slow': must be one of quick, full"),
     ({'imu': {'imu.colour': 1.0}}, 'imu.colour = 1.0: there is no such parameter'),
+    ({'imu': {'seed': 3, 'top.mass': 1.0}}, 'imu has seed, top.mass: must have parameters imu.* '),
+    ({'imu': ROOT / 'config/cusp.yaml'}, 'cusp.yaml has top.'),
     ({'seeds': 0}, 'seeds = 0: must be'), ({'seeds': [-1]}, 'must be'),
     ({'seeds': [0.5]}, 'must be'), ({'workers': 0}, 'workers = 0: must be from 1'),
     ({'workers': 2, 'restart': False}, 'workers = 2: must be from 1')])

@@ -65,8 +65,8 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     level : {'quick', 'full'}
         'full' has more seeds and motions.
     imu : mapping or path, optional
-        Parameters of the IMU by name, or the path of a file of them, as in config/imu; default:
-        the noise of a calibrated device, `scenarios.CALIBRATED`.
+        Parameters imu.* and mag.* by name, or the path of a file of them, as in config/imu;
+        default: the noise of a calibrated device, `scenarios.CALIBRATED`.
     seeds : int or iterable of int, optional
         Of noise and start of the noisy runs, or how many; default: SEEDS of the level.
     subject : str, optional
@@ -108,6 +108,10 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     values = (scenarios.CALIBRATED if imu is None else
               imu if isinstance(imu, Mapping) else read_scene(imu))
     parameters.checked(values)
+    others = [name for name in values if not name.startswith(('imu.', 'mag.'))]
+    if others:
+        raise ValueError(f'{"imu" if isinstance(imu, Mapping) else imu} has {", ".join(others)}: '
+                         'must have parameters imu.* and mag.* only')
     numbers = list(SEEDS[level] if seeds is None else
                    range(seeds) if isinstance(seeds, int) else seeds)
     if not numbers or not all(isinstance(seed, int | np.integer) and seed >= 0
