@@ -198,6 +198,19 @@ def test_vqf_passes_with_and_without_magnetometer(pass_exam):   # noqa: F811
     pass_exam(partial(MISREADINGS['conjugated'], Vqf), seeds=1, known=['conjugated'])
 
 
+def test_north_is_magnetic_north_in_every_field():
+    """The declination of this field is 27 degrees."""
+    field = {'mag.field': (10e-6, 20e-6, -40e-6)}
+    level = np.array((0.0, 0.0, 0.0, 1.0))
+    for run in (scenarios.record(scenarios.SLOW, field, 1),
+                scenarios.record(scenarios.PIVOT, field, 1),
+                scenarios.turning(field, level, level, 1.0)):
+        east, north, up = Rotation.from_quat(run.truth).apply(run.magnetometer).T
+        assert east == pytest.approx(0.0, abs=1e-18)
+        assert north == pytest.approx(math.hypot(10e-6, 20e-6))
+        assert up == pytest.approx(-40e-6)
+
+
 def test_without_heading_a_world_north_east_down_and_the_sign_of_gravity_are_the_same():
     without = partial(Vqf, magnetic=False)
     for name in ('frame_ned', 'gravity_sign'):
