@@ -23,6 +23,7 @@ from spinning_top_sim.exam.adapters import FILTERS, Vqf
 from spinning_top_sim.exam.command import main
 from spinning_top_sim.exam.diagnosis import FAULTS
 from spinning_top_sim.exam.log import examine_log
+from spinning_top_sim.exam.page import draw_page
 from spinning_top_sim.exam.pytest_plugin import pass_exam  # noqa: F401, a fixture
 from spinning_top_sim.exam.reference import ReferenceFilter
 from spinning_top_sim.exam.trial import InvalidOutputError, follow
@@ -315,6 +316,19 @@ def test_a_filter_may_take_twice_the_time_of_the_whole_run(monkeypatch, first, o
         return
     with pytest.raises(InvalidOutputError, match=says):
         follow(partial(Bad, work), run)
+
+
+def test_whatever_a_filter_says_can_be_written(tmp_path):
+    class Rude(Vqf):
+        def update(self, *readings):
+            raise ValueError('red\x1b[31m\nand $a^$ \ud800')
+
+    report = examine(Rude, seeds=1, subject='a\x1b $a^$ \ud800')
+    assert 'raises ValueError: red\\x1b[31m and $a^$ \\ud800' in report.found[0].evidence
+    assert report.subject == 'a\\x1b $a^$ \\ud800'
+    ElementTree.fromstring(report.as_junit().encode())
+    draw_page(report, tmp_path / 'page.svg')
+    assert '$a^$' in (tmp_path / 'page.svg').read_text()
 
 
 def test_waiting_for_a_processor_is_not_slowness(monkeypatch, tmp_path):

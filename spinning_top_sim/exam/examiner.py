@@ -26,6 +26,7 @@ from spinning_top_sim.exam.trial import (
     Outcome,
     feed,
     follow,
+    one_line,
 )
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.scene_file import read_scene
@@ -126,7 +127,7 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
         exam = (_Exam if restart else _LastingExam)(
             conditions, [int(seed) for seed in numbers], compute)
         exam.sit(EXTRA if level == 'full' else ())
-    return Report(subject or str(getattr(make_filter, '__name__', 'filter')),
+    return Report(one_line(subject or getattr(make_filter, '__name__', 'filter')),
                   tuple(diagnosis.in_order(exam.faults)), exam.measures, exam.outcomes)
 
 

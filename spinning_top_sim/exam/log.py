@@ -20,7 +20,7 @@ from spinning_top_sim.exam import diagnosis
 from spinning_top_sim.exam.diagnosis import Fault
 from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.scenarios import Reals, Truth
-from spinning_top_sim.exam.trial import NORM_TOLERANCE, UNKNOWN, Known, Outcome
+from spinning_top_sim.exam.trial import NORM_TOLERANCE, UNKNOWN, Known, Outcome, one_line
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.tools.attitudes import LAYOUTS, decode
 
@@ -85,14 +85,14 @@ def examine_log(path: Path, topic: str, truth: str | None = None,
     true = true._replace(quaternions=turns.as_quat())
     bad = np.abs(np.linalg.norm(said.quaternions, axis=1) - 1.0)
     wrong = np.flatnonzero(~(bad <= NORM_TOLERANCE))
-    subject = f'{topic} of {path.name}'
+    subject = one_line(f'{topic} of {path.name}')
     if len(wrong):
         k = int(wrong[0])
         return Report(subject, [Fault(
             'invalid_output', f'{len(wrong)} of {len(bad)} messages have no unit quaternion; the '
             f'first, at {said.stamps_ns[k] * 1e-9:.9f} s, has {said.quaternions[k].tolist()}')],
             {})
-    outcome = _beside(topic, said, true)
+    outcome = _beside(one_line(topic), said, true)
     settled = outcome.later()
     faults = []
     found = diagnosis.explain(settled, heading, None)

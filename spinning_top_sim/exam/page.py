@@ -25,7 +25,8 @@ def draw_page(report: Report, path: Path) -> None:
     path : Path
         File to write, in the format of its ending.
     """
-    with rc_context({'axes.spines.right': False, 'axes.spines.top': False, 'font.size': 9}):
+    with rc_context({'axes.spines.right': False, 'axes.spines.top': False, 'font.size': 9,
+                     'text.parse_math': False}):        # a filter may say '$'
         figure = Figure(figsize=(11.0, 7.0), layout='constrained')
         grid = figure.add_gridspec(2, 2, width_ratios=(3.0, 2.0))
         tilt, heading = (figure.add_subplot(grid[row, 0]) for row in (0, 1))

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spinning_top_sim.exam.measures import Errors, errors_of
 from spinning_top_sim.exam.scenarios import Reals, Run, Truth
+from spinning_top_sim.tools.cli import printable
 
 # A covariance and a bias are read after so many updates.
 READ_EVERY = 10
@@ -177,7 +178,7 @@ def feed(make_filter: MakeFilter, readings: Readings,
         raise
     except (Exception, SystemExit) as error:
         raise InvalidOutputError(f'{update_of(k, readings)} raises '
-                                 f'{type(error).__name__}: {error}') from error
+                                 f'{type(error).__name__}: {one_line(error)}') from error
     return Said(_quaternions(np.array(said)), _known(covariances), _known(biases))
 
 
@@ -283,6 +284,11 @@ def _known(values: dict[int, Reals]) -> Known:
     return Known(np.array([*values]), np.array([*values.values()])) if values else UNKNOWN
 
 
+def one_line(value: object) -> str:
+    """Return what a filter says, or its name, as one printable line."""
+    return printable(' '.join(str(value).split()))
+
+
 def _short(value: object) -> str:
-    text = ' '.join(str(value).split())
+    text = one_line(value)
     return text if len(text) < 80 else f'{text[:77]}...'
