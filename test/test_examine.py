@@ -27,6 +27,10 @@ from spinning_top_sim.exam.page import draw_page
 from spinning_top_sim.exam.pytest_plugin import pass_exam  # noqa: F401, a fixture
 from spinning_top_sim.exam.reference import ReferenceFilter
 from spinning_top_sim.exam.trial import InvalidOutputError, follow
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.rosbag2 import RecordedTopic
+from spinning_top_sim.recording.writer import create_file
+from spinning_top_sim.streams import messages
 from spinning_top_sim.tools.simulate import main as simulate
 
 pytest.importorskip('vqf')
@@ -521,10 +525,6 @@ def beside(log, tmp_path_factory):
     """Return what writes attitudes of a sensor beside its truth, as messages of another writer."""
     from rosbags.typesys import Stores, get_typestore
 
-    from spinning_top_sim.recording.reader import LogReader
-    from spinning_top_sim.recording.rosbag2 import RecordedTopic
-    from spinning_top_sim.recording.writer import create_file
-
     store = get_typestore(Stores.ROS2_JAZZY)
     with LogReader(log) as reader:
         truth = [(message.log_time, message.data)
@@ -597,10 +597,36 @@ def test_attitudes_of_every_type_are_read(beside, type_name):
     ('covariance_large', disturbed, {'variance': 2e-4}),
     ('diverges', lambda q: np.roll(q, 100, axis=0), {}),
     ('invalid_output', lambda q: q * np.where(np.arange(len(q)) == 777, np.nan, 1.0)[:, None],
-     {})])
+     {}),
+    ('invalid_output', disturbed, {'variance': -1e-4})])
 def test_faults_of_attitudes_in_a_log_are_named(beside, name, said, options):
     report = examine_log(beside(said, **options), '/estimate', north='true')
     assert report.faults == [name], report
+
+
+@pytest.mark.parametrize(('odd', 'says'), [
+    ({'parameters': '[]'}, r'the parameters in the metadata of .*run\.mcap cannot be used: Attr'),
+    ({'parameters': 'rpy'}, r'the parameters in the metadata of .*run\.mcap cannot be used: JSON'),
+    ({'parameters': '{"imu.rpy": "level"}'}, "cannot be used: ValueError: imu.rpy = 'level'"),
+    ((0.0, 0.0, 0.0, 0.0), r'/ground_truth/imu has the quaternion \[0\.0, 0\.0, 0\.0, 0\.0\] at '
+     r'1\.070000000 s: its norm must be 1')])
+def test_an_odd_log_is_refused_by_what_is_odd_in_it(tmp_path, odd, says):
+    path = tmp_path / 'run.mcap'
+    names = '/ground_truth/imu', '/estimate'
+    file = create_file(path, [RecordedTopic(name, TYPES[0]) for name in names],
+                       odd if isinstance(odd, dict) else {}, compression='none')
+    template = messages.imu('imu', *3 * (messages.EXACT,))
+    for number in range(100):
+        stamp_ns = 10 ** 9 + number * 10 ** 7
+        for index in range(2):
+            quaternion = odd if (number, index) == (7, 0) and isinstance(odd, tuple) else (
+                0.0, 0.0, 0.0, 1.0)
+            file.append(index, stamp_ns, template.encode_one(
+                stamp_ns, quaternion, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8)))
+    file.write_chunk()
+    file.finish()
+    with pytest.raises(ValueError, match=says):
+        examine_log(path, '/estimate')
 
 
 def test_the_command_judges_a_log(beside, log, tmp_path, capsys):

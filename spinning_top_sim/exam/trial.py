@@ -2,6 +2,7 @@
 """A filter, fed with a run: what it says, and what is wrong with that."""
 
 import contextlib
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -221,15 +222,21 @@ def _check_speed(spent: float, allowed: float, where: str) -> None:
 
 def _quaternions(rows: Reals) -> Reals:
     """Return what was said (n, 4) as unit quaternions.  Raises InvalidOutputError."""
-    norms = np.linalg.norm(rows, axis=1)
-    bad = np.flatnonzero(~(np.abs(norms - 1.0) <= NORM_TOLERANCE))
-    if len(bad):
+    if len(bad := no_attitudes(rows)):
         k = int(bad[0])
-        what = (f'its norm is {norms[k]:.6g}' if np.isfinite(norms[k]) else 'it is not finite')
+        what = (f'its norm is {math.hypot(*rows[k]):.6g}' if np.all(np.isfinite(rows[k])) else
+                'it is not finite')
         raise InvalidOutputError(f'update {k + 1} returns {_short(rows[k])}: {what}, and must '
                                  'be 1')
-    unit: Reals = rows / norms[:, np.newaxis]
+    unit: Reals = rows / np.linalg.norm(rows, axis=1, keepdims=True)
     return unit
+
+
+def no_attitudes(quaternions: Reals) -> NDArray[np.intp]:
+    """Return the numbers of those (n, 4) whose norm is not 1."""
+    with np.errstate(over='ignore'):
+        norms = np.linalg.norm(quaternions, axis=1)
+    return np.flatnonzero(~(np.abs(norms - 1.0) <= NORM_TOLERANCE))
 
 
 def _covariance_of(filter_: Filter) -> Reals | None:
