@@ -503,6 +503,11 @@ def test_wrong_arguments_are_refused(options, says):
         examine(Vqf, **options)
 
 
+def test_only_level_imu_and_seeds_may_be_given_without_their_names():
+    with pytest.raises(TypeError, match='takes from 1 to 4 positional arguments but 5 were given'):
+        examine(Vqf, 'quick', None, 1, 2)       # workers?
+
+
 # --------------------------------------------------------------------------------------- logs
 
 

@@ -96,7 +96,8 @@ def _report(arguments: argparse.Namespace) -> Report:
     if arguments.filter is not None:
         make_filter = FILTERS[arguments.filter]
         make_filter()           # imports its package, once for all runs
-        return examine(make_filter, *options, arguments.filter, arguments.workers)
+        return examine(make_filter, *options, subject=arguments.filter,
+                       workers=arguments.workers)
     if arguments.workers != 1:
         raise ValueError(f'--workers {arguments.workers}: must be 1 for a node')
     from spinning_top_sim.exam.live import examine_node  # noqa: PLC0415 - needs ROS

@@ -54,7 +54,7 @@ Compute = Callable[[Callable[[int], Result], Iterable[int]], Iterable[Result]]
 
 def examine(make_filter: MakeFilter, level: str = 'quick',
             imu: Mapping[str, Any] | str | Path | None = None,
-            seeds: int | Iterable[int] | None = None, subject: str | None = None,
+            seeds: int | Iterable[int] | None = None, *, subject: str | None = None,
             workers: int = 1, isolated: bool = True, restart: bool = True) -> Report:
     """
     Examine an attitude filter.

@@ -58,8 +58,8 @@ def examine_node(topic: str, command: str | None = None, level: str = 'quick',
     level, imu, seeds : see `examine`, which this does and raises
     """
     with NodeExam(topic, command) as node:
-        return examine(node.make_filter, level, imu, seeds, command or topic, isolated=False,
-                       restart=command is not None)
+        return examine(node.make_filter, level, imu, seeds, subject=command or topic,
+                       isolated=False, restart=command is not None)
 
 
 class NodeExam(contextlib.AbstractContextManager['NodeExam']):
