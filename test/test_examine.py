@@ -676,7 +676,16 @@ def test_the_command_examines_a_published_filter(capsys):
     (['--filter', 'vqf', '--workers', '0'], 2, 'workers = 0: must be from 1'),
     (['nix.mcap', '--topic', '/a'], 1, 'nix.mcap'),
     (['{log}', '--topic', '/pose', '--page', 'a.gif'], 2, 'must end in .png'),
-    (['--filter', 'vqf', '--seeds', '0'], 2, 'seeds = 0')])
+    (['--filter', 'vqf', '--seeds', '0'], 2, 'seeds = 0'),
+    (['{log}', '--topic', '/pose', '--level', 'quick'], 2,
+     '--level quick: a log takes --topic, --truth, --heading only'),
+    (['{log}', '--topic', '/pose', '--seeds', '3'], 2, '--seeds 3: a log takes'),
+    (['{log}', '--topic', '/pose', '--imu', 'a'], 2, '--imu a: a log takes'),
+    (['{log}', '--topic', '/pose', '--workers', '1'], 2, '--workers 1: a log takes'),
+    (['--filter', 'vqf', '--truth', 'a'], 2, '--truth a: --filter takes --level, --imu, '),
+    (['--filter', 'vqf', '--topic', 'a'], 2, '--topic a: --filter takes'),
+    (['--topic', 'a', '--heading', 'true'], 2, '--heading true: a node takes --topic, --level, '),
+    (['--node', 'a', '--topic', 'b', '--workers', '2'], 2, '--workers 2: a node takes')])
 def test_wrong_arguments_of_the_command(log, capsys, arguments, code, says):
     arguments = [argument.format(log=log) for argument in arguments]
     try:
