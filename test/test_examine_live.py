@@ -75,6 +75,14 @@ def test_a_node_that_does_not_run_is_told(monkeypatch, capfd):
             f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}: check that') in said
 
 
+@pytest.mark.parametrize('topic', ['a b', 'imu/data/', '{nix}', ''])
+def test_a_name_that_is_none_of_a_topic_is_told(topic, capfd):
+    assert main(['--topic', topic]) == 2
+    assert capfd.readouterr().err == (
+        f'examine: {topic!r} is no name of a topic: must be such as imu/data, with letters, '
+        'digits, _ and /\n')
+
+
 def test_another_source_of_samples_is_told(running, capfd):
     from spinning_top_sim.exam.live import NodeExam
 

@@ -20,6 +20,7 @@ import numpy as np
 import rclpy
 from numpy.typing import NDArray
 from rclpy.context import Context
+from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
@@ -45,7 +46,7 @@ START_NS = NANOSECONDS          # in ROS a stamp of 0 is "no time"
 # first sample go by so many times as fast as the machine's clock, faster than any exam.  They
 # begin anew before the seconds of a stamp overflow, after 460 days.
 FASTEST, LAST_NS = 50, 2 * 10 ** 9 * NANOSECONDS
-FRAME = 'imu_link'
+NAME, FRAME = 'examine', 'imu_link'
 
 
 def examine_node(topic: str, command: str | None = None, level: str = 'quick',
@@ -68,14 +69,21 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
 
     topic : sensor_msgs/Imu with the attitudes that it publishes, each with the stamp of its sample
     command : of the node, which reads `imu/data_raw` and `imu/mag`; None: it runs already
+
+    Raises ValueError for a topic that ROS does not allow.
     """
 
     def __init__(self, topic: str, command: str | None = None) -> None:
+        try:
+            expand_topic_name(topic, NAME, '/')
+        except ValueError:          # its text has the place in rcl's source
+            raise ValueError(f'{topic!r} is no name of a topic: must be such as imu/data, with '
+                             'letters, digits, _ and /') from None
         self._command = None if command is None else shlex.split(command)
         self._topic = topic
         self._context = Context()
         rclpy.init(context=self._context)
-        self._node = Node('examine', context=self._context, parameter_overrides=[
+        self._node = Node(NAME, context=self._context, parameter_overrides=[
             Parameter('use_sim_time', value=False)])
         self._executor = Executor(context=self._context)
         self._executor.add_node(self._node)
