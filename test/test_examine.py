@@ -150,7 +150,7 @@ def test_the_autocorrelation_time_is_the_direct_sum(shape, scale):
 
 def test_covariances_may_be_about_the_axes_of_the_world():
     said = follow(ReferenceFilter, scenarios.record(scenarios.SLOW, scenarios.CALIBRATED, 1))
-    said = said.later(0.75)
+    said = said.last(0.75)
     samples, of_filter = said.covariances
     estimates, truth = said.estimates[samples], said.run.truth[samples]
     turn = Rotation.from_quat(estimates).as_matrix()

@@ -110,7 +110,7 @@ def examine_log(path: Path, topic: str, truth: str | None = None,
                 'invalid_output', f'{len(wrong)} of {len(rows)} messages have {what}; the '
                 f'first, at {said.stamps_ns[k] * 1e-9:.9f} s, has {rows[k].tolist()}')], {})
     outcome = _beside(one_line(topic), said, true)
-    settled = outcome.later()
+    settled = outcome.last()
     faults = []
     found = diagnosis.explain(settled, heading, None)
     if found is not None:
@@ -118,7 +118,7 @@ def examine_log(path: Path, topic: str, truth: str | None = None,
         corrected = replace(outcome, estimates=found.read(outcome.estimates))
     else:
         corrected = outcome
-    offset, fault = diagnosis.stamp_fault(corrected.later(), heading)
+    offset, fault = diagnosis.stamp_fault(corrected.last(), heading)
     measured = {**diagnosis.marks([outcome], heading), 'stamp_offset_s': offset.seconds}
     faults += [fault] if fault is not None else []
     if not faults and (fault := diagnosis.divergence(outcome, heading)) is not None:
@@ -127,7 +127,7 @@ def examine_log(path: Path, topic: str, truth: str | None = None,
     measured |= diagnosis.nees_marks(consistency)
     if not faults and (fault := diagnosis.covariance_fault(consistency)) is not None:
         faults.append(fault)
-    return Report(subject, list(diagnosis.in_order(faults)), measured, [outcome])
+    return Report(subject, list(diagnosis.one_of_each(faults)), measured, [outcome])
 
 
 def _topic(reader: LogReader, name: str) -> LogTopic:

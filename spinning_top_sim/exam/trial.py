@@ -126,8 +126,8 @@ class Outcome:
         """Tilt and heading errors [rad]."""
         return errors_of(self.estimates, self.run.truth)
 
-    def later(self, fraction: float = 0.5) -> 'Outcome':
-        """Return the last part of the outcome: when the filter has settled."""
+    def last(self, fraction: float = 0.5) -> 'Outcome':
+        """Return the last part of the outcome, by default where the filter has settled."""
         return self.since(round(len(self.estimates) * (1.0 - fraction)))
 
     def since(self, first: int) -> 'Outcome':
