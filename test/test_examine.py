@@ -23,9 +23,14 @@ from spinning_top_sim.exam.adapters import FILTERS, Vqf
 from spinning_top_sim.exam.command import main
 from spinning_top_sim.exam.diagnosis import FAULTS
 from spinning_top_sim.exam.log import examine_log
+from spinning_top_sim.exam.page import draw_page
 from spinning_top_sim.exam.pytest_plugin import pass_exam  # noqa: F401, a fixture
 from spinning_top_sim.exam.reference import ReferenceFilter
-from spinning_top_sim.exam.trial import follow
+from spinning_top_sim.exam.trial import InvalidOutputError, follow
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.rosbag2 import RecordedTopic
+from spinning_top_sim.recording.writer import create_file
+from spinning_top_sim.streams import messages
 from spinning_top_sim.tools.simulate import main as simulate
 
 pytest.importorskip('vqf')
@@ -124,13 +129,33 @@ def test_the_nees_of_a_linear_filter_is_in_its_band(factor, expected):
     assert measures.nees_of(runs, True) is None
 
 
+def summed_autocorrelation_time(values):
+    centred = values - np.mean(values)
+    time = 1.0
+    for lag in range(1, values.shape[1]):
+        time += 2.0 * np.mean(centred[:, lag:] * centred[:, :-lag]) / np.mean(centred ** 2)
+        if lag >= 5.0 * time:
+            break
+    return max(time, 1.0)
+
+
+@pytest.mark.parametrize('scale', [1.0, 2.0 ** 1000])
+@pytest.mark.parametrize('shape', [(1, 1), (1, 2), (3, 7), (3, 1000)])
+def test_the_autocorrelation_time_is_the_direct_sum(shape, scale):
+    noise = np.random.default_rng(1).standard_normal(shape)
+    for values in (noise, np.cumsum(noise, axis=1), np.ones(shape)):
+        assert measures.autocorrelation_time(scale * values) == pytest.approx(
+            summed_autocorrelation_time(values) if np.ptp(values) else 1.0, rel=1e-9)
+
+
 def test_covariances_may_be_about_the_axes_of_the_world():
     said = follow(ReferenceFilter, scenarios.record(scenarios.SLOW, scenarios.CALIBRATED, 1))
-    said = said.later(0.75)
-    estimates, truth = said.estimates[said.read], said.run.truth[said.read]
+    said = said.last(0.75)
+    samples, of_filter = said.covariances
+    estimates, truth = said.estimates[samples], said.run.truth[samples]
     turn = Rotation.from_quat(estimates).as_matrix()
     for factor in (0.5, 1.0, 2.0):
-        of_sensor = factor * said.covariances
+        of_sensor = factor * of_filter
         of_world = turn @ of_sensor @ turn.transpose(0, 2, 1)
         for absolute in (False, True):
             nees = [measures.nees_of([(estimates, truth, covariances)], absolute)
@@ -176,6 +201,19 @@ def test_vqf_passes_with_and_without_magnetometer(pass_exam):   # noqa: F811
     with pytest.raises(pytest.fail.Exception, match='conjugated, the error falls'):
         pass_exam(partial(MISREADINGS['conjugated'], Vqf), seeds=1)
     pass_exam(partial(MISREADINGS['conjugated'], Vqf), seeds=1, known=['conjugated'])
+
+
+def test_north_is_magnetic_north_in_every_field():
+    """The declination of this field is 27 degrees."""
+    field = {'mag.field': (10e-6, 20e-6, -40e-6)}
+    level = np.array((0.0, 0.0, 0.0, 1.0))
+    for run in (scenarios.record(scenarios.SLOW, field, 1),
+                scenarios.record(scenarios.PIVOT, field, 1),
+                scenarios.turning(field, level, level, 1.0)):
+        east, north, up = Rotation.from_quat(run.truth).apply(run.magnetometer).T
+        assert east == pytest.approx(0.0, abs=1e-18)
+        assert north == pytest.approx(math.hypot(10e-6, 20e-6))
+        assert up == pytest.approx(-40e-6)
 
 
 def test_without_heading_a_world_north_east_down_and_the_sign_of_gravity_are_the_same():
@@ -255,13 +293,46 @@ def fail():
     (lambda: 'north', 'update 1 returns north'),
     (lambda: np.full(4, math.inf), 'it is not finite'),
     (lambda: np.ones(4), 'its norm is 2, and must be 1'),
-    (lambda: time.sleep(0.05), ' ms an update, and a sample comes every 10 ms'),
     (lambda: np.eye(4), 'of shape (4, 4)')])
 def test_a_filter_that_returns_no_attitude_is_told(said, says):
     report = examine(partial(Bad, said), seeds=1)
     assert report.faults == ['invalid_output']
     assert says in str(report)
     assert not report.measures
+
+
+@pytest.mark.parametrize(('first', 'others', 'says'), [
+    (1.9, 0.001, None),             # it compiles itself
+    (0.06, 0.06, 'update 40 of 100 ends after 2.4 s, and the last one must end within 2 s'),
+    (2.5, 0.0, 'too slow: update 10 of 100 ends after 2.5 s')])
+def test_a_filter_may_take_twice_the_time_of_the_whole_run(monkeypatch, first, others, says):
+    now = 0.0
+
+    def work():
+        nonlocal now
+        now += others if now else first
+        return 0.0, 0.0, 0.0, 1.0
+
+    monkeypatch.setattr(trial, '_working_time', lambda: now)
+    run = scenarios.record(scenarios.SLOW, {}, 1).part(slice(100))
+    if says is None:
+        assert len(follow(partial(Bad, work), run).estimates) == 100
+        return
+    with pytest.raises(InvalidOutputError, match=says):
+        follow(partial(Bad, work), run)
+
+
+def test_whatever_a_filter_says_can_be_written(tmp_path):
+    class Rude(Vqf):
+        def update(self, *readings):
+            raise ValueError('red\x1b[31m\nand $a^$ \ud800')
+
+    report = examine(Rude, seeds=1, subject='a\x1b $a^$ \ud800')
+    assert 'raises ValueError: red\\x1b[31m and $a^$ \\ud800' in report.found[0].evidence
+    assert report.subject == 'a\\x1b $a^$ \\ud800'
+    ElementTree.fromstring(report.as_junit().encode())
+    draw_page(report, tmp_path / 'page.svg')
+    assert '$a^$' in (tmp_path / 'page.svg').read_text()
 
 
 def test_waiting_for_a_processor_is_not_slowness(monkeypatch, tmp_path):
@@ -279,6 +350,72 @@ def test_waiting_for_a_processor_is_not_slowness(monkeypatch, tmp_path):
     waiting.write_text('0 0 0')
     run = scenarios.record(scenarios.SLOW, {}, 1).part(slice(100))
     assert len(follow(partial(Bad, wait), run).estimates) == 100
+
+
+class OnDevice:
+    """Numbers that cannot be converted, as a torch tensor with requires_grad."""
+
+    def __array__(self, *arguments, **options):
+        raise RuntimeError('call detach() first')
+
+
+@pytest.mark.parametrize('name', ['said', 'covariance', 'bias'])
+def test_what_cannot_be_converted_is_told(name):
+    class Strange(Vqf):
+        def update(self, *readings):
+            attitude = super().update(*readings)
+            return OnDevice() if name == 'said' else attitude
+
+    if name != 'said':
+        setattr(Strange, name, OnDevice())
+    run = scenarios.record(scenarios.SLOW, {}, 1).part(slice(100))
+    with pytest.raises(InvalidOutputError, match='of 100 raises RuntimeError: call detach'):
+        follow(Strange, run)
+
+
+def test_what_is_not_known_is_left_out():
+    class Forgetful(Vqf):
+        number = 0
+        bias = property(lambda self: None if self.number == 20 else np.zeros(3))
+
+        def update(self, *readings):
+            self.number += 1
+            return super().update(*readings)
+
+        @property
+        def covariance(self):
+            return {30: None, 50: np.zeros((3, 3)), 60: 1e308 * np.ones((3, 3))}.get(
+                self.number, np.eye(3))
+
+    said = follow(Forgetful, scenarios.record(scenarios.SLOW, {}, 1).part(slice(100)))
+    assert said.covariances.samples.tolist() == [9, 19, 39, 59, 69, 79, 89, 99]
+    assert said.biases.samples.tolist() == [9, *range(29, 100, 10)]
+    later = said.since(50)
+    assert later.covariances.samples.tolist() == [9, 19, 29, 39, 49]
+    assert np.all(later.covariances.values[0] == 1e308)
+    assert later.biases.values.shape == (5, 3)
+
+
+def test_a_covariance_of_zeros_is_unknown():
+    class Unknowing(Vqf):
+        covariance = np.zeros((3, 3))
+
+    report = examine(Unknowing, seeds=1)
+    assert report.passed and 'nees' not in report.measures
+
+
+def test_a_filter_may_return_the_array_that_its_next_update_changes():
+    class InPlace(Vqf):
+        def __init__(self):
+            super().__init__()
+            self._said = np.empty(4)
+
+        def update(self, *readings):
+            self._said[:] = super().update(*readings)
+            return self._said
+
+    run = scenarios.record(scenarios.SLOW, {}, 1).part(slice(100))
+    assert np.array_equal(follow(InPlace, run).estimates, follow(Vqf, run).estimates)
 
 
 def test_a_run_that_fails_leaves_the_others():
@@ -339,7 +476,10 @@ def test_a_filter_may_be_fed_in_this_process():
 
 
 @pytest.mark.parametrize(('covariance', 'says'), [
-    (-np.eye(3), 'must have no negative eigenvalue'), (np.eye(2), 'must be 3 x 3 finite numbers'),
+    (-np.eye(3), 'must have no negative eigenvalue'),
+    (np.eye(2), 'of shape (2, 2): must be 3 x 3 finite numbers'),
+    (0.5, 'covariance is 0.5: must be 3 x 3 finite numbers'),
+    ('large', 'covariance is large: must be 3 x 3 finite numbers'),
     (np.full((3, 3), math.nan), 'must be 3 x 3 finite numbers')])
 def test_a_wrong_covariance_is_told(covariance, says):
     class Wrong(Vqf):
@@ -353,12 +493,19 @@ def test_a_wrong_covariance_is_told(covariance, says):
 @pytest.mark.parametrize(('options', 'says'), [
     ({'level': 'slow'}, "level = 'slow': must be one of quick, full"),
     ({'imu': {'imu.colour': 1.0}}, 'imu.colour = 1.0: there is no such parameter'),
+    ({'imu': {'seed': 3, 'top.mass': 1.0}}, 'imu has seed, top.mass: must have parameters imu.* '),
+    ({'imu': ROOT / 'config/cusp.yaml'}, 'cusp.yaml has top.'),
     ({'seeds': 0}, 'seeds = 0: must be'), ({'seeds': [-1]}, 'must be'),
     ({'seeds': [0.5]}, 'must be'), ({'workers': 0}, 'workers = 0: must be from 1'),
     ({'workers': 2, 'restart': False}, 'workers = 2: must be from 1')])
 def test_wrong_arguments_are_refused(options, says):
     with pytest.raises(ValueError, match=re.escape(says)):
         examine(Vqf, **options)
+
+
+def test_only_level_imu_and_seeds_may_be_given_without_their_names():
+    with pytest.raises(TypeError, match='takes from 1 to 4 positional arguments but 5 were given'):
+        examine(Vqf, 'quick', None, 1, 2)       # workers?
 
 
 # --------------------------------------------------------------------------------------- logs
@@ -382,10 +529,6 @@ TYPES = ('sensor_msgs/msg/Imu', 'geometry_msgs/msg/QuaternionStamped',
 def beside(log, tmp_path_factory):
     """Return what writes attitudes of a sensor beside its truth, as messages of another writer."""
     from rosbags.typesys import Stores, get_typestore
-
-    from spinning_top_sim.recording.reader import LogReader
-    from spinning_top_sim.recording.rosbag2 import RecordedTopic
-    from spinning_top_sim.recording.writer import create_file
 
     store = get_typestore(Stores.ROS2_JAZZY)
     with LogReader(log) as reader:
@@ -459,10 +602,36 @@ def test_attitudes_of_every_type_are_read(beside, type_name):
     ('covariance_large', disturbed, {'variance': 2e-4}),
     ('diverges', lambda q: np.roll(q, 100, axis=0), {}),
     ('invalid_output', lambda q: q * np.where(np.arange(len(q)) == 777, np.nan, 1.0)[:, None],
-     {})])
+     {}),
+    ('invalid_output', disturbed, {'variance': -1e-4})])
 def test_faults_of_attitudes_in_a_log_are_named(beside, name, said, options):
     report = examine_log(beside(said, **options), '/estimate', north='true')
     assert report.faults == [name], report
+
+
+@pytest.mark.parametrize(('odd', 'says'), [
+    ({'parameters': '[]'}, r'the parameters in the metadata of .*run\.mcap cannot be used: Attr'),
+    ({'parameters': 'rpy'}, r'the parameters in the metadata of .*run\.mcap cannot be used: JSON'),
+    ({'parameters': '{"imu.rpy": "level"}'}, "cannot be used: ValueError: imu.rpy = 'level'"),
+    ((0.0, 0.0, 0.0, 0.0), r'/ground_truth/imu has the quaternion \[0\.0, 0\.0, 0\.0, 0\.0\] at '
+     r'1\.070000000 s: its norm must be 1')])
+def test_an_odd_log_is_refused_by_what_is_odd_in_it(tmp_path, odd, says):
+    path = tmp_path / 'run.mcap'
+    names = '/ground_truth/imu', '/estimate'
+    file = create_file(path, [RecordedTopic(name, TYPES[0]) for name in names],
+                       odd if isinstance(odd, dict) else {}, compression='none')
+    template = messages.imu('imu', *3 * (messages.EXACT,))
+    for number in range(100):
+        stamp_ns = 10 ** 9 + number * 10 ** 7
+        for index in range(2):
+            quaternion = odd if (number, index) == (7, 0) and isinstance(odd, tuple) else (
+                0.0, 0.0, 0.0, 1.0)
+            file.append(index, stamp_ns, template.encode_one(
+                stamp_ns, quaternion, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8)))
+    file.write_chunk()
+    file.finish()
+    with pytest.raises(ValueError, match=says):
+        examine_log(path, '/estimate')
 
 
 def test_the_command_judges_a_log(beside, log, tmp_path, capsys):
@@ -507,7 +676,16 @@ def test_the_command_examines_a_published_filter(capsys):
     (['--filter', 'vqf', '--workers', '0'], 2, 'workers = 0: must be from 1'),
     (['nix.mcap', '--topic', '/a'], 1, 'nix.mcap'),
     (['{log}', '--topic', '/pose', '--page', 'a.gif'], 2, 'must end in .png'),
-    (['--filter', 'vqf', '--seeds', '0'], 2, 'seeds = 0')])
+    (['--filter', 'vqf', '--seeds', '0'], 2, 'seeds = 0'),
+    (['{log}', '--topic', '/pose', '--level', 'quick'], 2,
+     '--level quick: a log takes --topic, --truth, --heading only'),
+    (['{log}', '--topic', '/pose', '--seeds', '3'], 2, '--seeds 3: a log takes'),
+    (['{log}', '--topic', '/pose', '--imu', 'a'], 2, '--imu a: a log takes'),
+    (['{log}', '--topic', '/pose', '--workers', '1'], 2, '--workers 1: a log takes'),
+    (['--filter', 'vqf', '--truth', 'a'], 2, '--truth a: --filter takes --level, --imu, '),
+    (['--filter', 'vqf', '--topic', 'a'], 2, '--topic a: --filter takes'),
+    (['--topic', 'a', '--heading', 'true'], 2, '--heading true: a node takes --topic, --level, '),
+    (['--node', 'a', '--topic', 'b', '--workers', '2'], 2, '--workers 2: a node takes')])
 def test_wrong_arguments_of_the_command(log, capsys, arguments, code, says):
     arguments = [argument.format(log=log) for argument in arguments]
     try:

@@ -35,7 +35,7 @@ def test_a_node_says_what_its_filter_says_in_every_run(run):
         for _ in range(2):
             outcome = follow(node.make_filter, run)
             assert np.max(np.abs(outcome.estimates[1:] - direct.estimates)) < 1e-9
-            assert outcome.covariances is None
+            assert not len(outcome.covariances.samples)
 
 
 @pytest.fixture
@@ -73,6 +73,14 @@ def test_a_node_that_does_not_run_is_told(monkeypatch, capfd):
     said = capfd.readouterr().err
     assert ('no node reads imu/data_raw and none publishes /imu/data within 0.5 s, with '
             f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}: check that') in said
+
+
+@pytest.mark.parametrize('topic', ['a b', 'imu/data/', '{nix}', ''])
+def test_a_name_that_is_none_of_a_topic_is_told(topic, capfd):
+    assert main(['--topic', topic]) == 2
+    assert capfd.readouterr().err == (
+        f'examine: {topic!r} is no name of a topic: must be such as imu/data, with letters, '
+        'digits, _ and /\n')
 
 
 def test_another_source_of_samples_is_told(running, capfd):

@@ -180,6 +180,7 @@ def test_messages_of_any_content_are_examined_or_refused(tmp_path, odd, topic):
             one = template.encode_one(stamp % (2 ** 31 * 10 ** 9), numbers[:4],  # noqa: PLW2901
                                       numbers[4:7], numbers[7:])
         file.append(0 if topic.startswith('ground') else 1, 10 ** 18, one)
+    file.write_chunk()
     file.finish()
     try:
         assert isinstance(examine_log(path, 'said'), Report)

@@ -21,6 +21,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from spinning_top_sim.exam.adapters import FILTERS
 from spinning_top_sim.exam.examiner import SEEDS, examine
@@ -30,6 +31,10 @@ from spinning_top_sim.exam.trial import NodeError
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.tools import cli
 from spinning_top_sim.tools.ensemble_part import EnsembleError
+
+# Which options each subject of an exam has.
+OPTIONS = {'a log': ('topic', 'truth', 'heading'), 'a node': ('topic', 'level', 'imu', 'seeds'),
+           '--filter': ('level', 'imu', 'seeds', 'workers')}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -51,10 +56,10 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         'before')
     add('--filter', choices=FILTERS, metavar='NAME',
         help=f'examine a published filter: {", ".join(FILTERS)}')
-    add('--level', choices=SEEDS, default='quick', help='of the exam of a filter')
+    add('--level', choices=SEEDS, help='of the exam of a filter or node; default: quick')
     add('--imu', metavar='FILE', help='parameter file of the IMU, as in config/imu')
     add('--seeds', type=int, metavar='N', help='number of noisy runs')
-    add('--workers', type=int, metavar='N', default=1,
+    add('--workers', type=int, metavar='N',
         help='processes that share the seeds of --filter; they take seconds to start')
     add('--json', action='store_true', help='print everything as JSON')
     add('--junit', type=Path, metavar='FILE', help='write JUnit XML')
@@ -84,24 +89,37 @@ def _run(arguments: argparse.Namespace) -> int:
     return cli.OK if report.passed else cli.FAILED
 
 
+def _options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the options that are given, by name.  Raises ValueError for those of others."""
+    subject = ('a log' if arguments.log is not None else
+               '--filter' if arguments.filter is not None else 'a node')
+    options = {name: value for name in ('topic', 'truth', 'heading', 'level', 'imu', 'seeds',
+                                        'workers')
+               if (value := getattr(arguments, name)) is not None}
+    for name, value in options.items():
+        if name not in OPTIONS[subject]:
+            raise ValueError(f'--{name} {value}: {subject} takes '
+                             f'{", ".join(f"--{one}" for one in OPTIONS[subject])} only')
+    return options
+
+
 def _report(arguments: argparse.Namespace) -> Report:
     if [arguments.log, arguments.node, arguments.filter].count(None) < 2:
         raise ValueError('give either a log and --topic, --node and --topic, --topic alone, or '
                          '--filter')
     if arguments.filter is None and arguments.topic is None:
         raise ValueError('--topic: which topic has the attitudes? Or --filter: which filter?')
-    options = arguments.level, arguments.imu, arguments.seeds
+    options = _options(arguments)
     if arguments.log is not None:
-        return examine_log(arguments.log, arguments.topic, arguments.truth, arguments.heading)
+        options['north'] = options.pop('heading', None)
+        return examine_log(arguments.log, **options)
     if arguments.filter is not None:
         make_filter = FILTERS[arguments.filter]
         make_filter()           # imports its package, once for all runs
-        return examine(make_filter, *options, arguments.filter, arguments.workers)
-    if arguments.workers != 1:
-        raise ValueError(f'--workers {arguments.workers}: must be 1 for a node')
+        return examine(make_filter, subject=arguments.filter, **options)
     from spinning_top_sim.exam.live import examine_node  # noqa: PLC0415 - needs ROS
 
-    return examine_node(arguments.topic, arguments.node, *options)
+    return examine_node(command=arguments.node, **options)
 
 
 if __name__ == '__main__':

@@ -125,7 +125,7 @@ REPEATED = (
 
 def marks(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
     """Return what docs/exam.md defines of the errors of filters, over several runs."""
-    settled = [outcome.later() for outcome in outcomes]
+    settled = [outcome.last() for outcome in outcomes]
     errors = [outcome.errors for outcome in settled]
     marked = {
         'tilt_rms_deg': np.degrees(rms(np.concatenate([one.tilt for one in errors]))),
@@ -228,17 +228,18 @@ def bias_effect(plus: Outcome, minus: Outcome, bias: Reals, absolute: bool) -> B
         apart = np.linalg.norm(verticals[0] - verticals[1], axis=1)
     quarter = len(apart) // 4
     found = None
-    if plus.biases is not None and minus.biases is not None:
-        found = float(0.5 * (plus.biases[-1] - minus.biases[-1]) @ bias / size ** 2)
+    if len(plus.biases.values) and len(minus.biases.values):
+        change = 0.5 * (plus.biases.values[-1] - minus.biases.values[-1])
+        found = float(change @ bias / size ** 2)
     return BiasEffect(rms(apart[quarter:2 * quarter]) / (2.0 * size),
                       rms(apart[-quarter:]) / (2.0 * size), found)
 
 
 def bias_fault(effect: BiasEffect, absolute: bool) -> Fault | None:
     """Judge what a bias does to tilt, and to the heading where there is a magnetometer."""
-    if effect.late < BIAS_LEFT_S or (
-            effect.late < BIAS_REMAINS * effect.early if effect.found is None
-            else effect.found > BIAS_FOUND):
+    estimated = (effect.late < BIAS_REMAINS * effect.early if effect.found is None else
+                 effect.found > BIAS_FOUND)
+    if estimated or effect.late < BIAS_LEFT_S:
         return None
     what = 'attitude' if absolute else 'tilt'
     text = (f'a bias of the gyroscope of 1 deg/s leaves an error of the {what} of '
@@ -250,9 +251,9 @@ def bias_fault(effect: BiasEffect, absolute: bool) -> Fault | None:
 
 def consistency(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, measures.Nees]:
     """Return the NEES of tilt and attitude by name, as far as there are covariances."""
-    runs = [(one.estimates[one.read], one.run.truth[one.read], one.covariances)
-            for outcome in outcomes for one in (outcome.later(0.75),)
-            if one.covariances is not None]
+    runs = [(one.estimates[samples], one.run.truth[samples], covariances)
+            for one in (outcome.last(0.75) for outcome in outcomes)
+            for samples, covariances in (one.covariances,) if len(samples)]
     if not runs:
         return {}
     found = {what: measures.nees_of(runs, whole)
@@ -284,7 +285,7 @@ def covariance_fault(found: Mapping[str, measures.Nees]) -> Fault | None:
 
 def divergence(outcome: Outcome, absolute: bool) -> Fault | None:
     """Judge the error at the end."""
-    last = outcome.later(0.25)
+    last = outcome.last(0.25)
     error = error_of(last, True) if absolute else rms(last.errors.tilt)
     if error < DIVERGED:
         return None
@@ -292,8 +293,8 @@ def divergence(outcome: Outcome, absolute: bool) -> Fault | None:
                  f'{_degrees(error)}, for no reason that is known')
 
 
-def in_order(faults: Sequence[Fault]) -> Iterator[Fault]:
-    """Yield one fault of each name, in the order of FAULTS."""
+def one_of_each(faults: Sequence[Fault]) -> Iterator[Fault]:
+    """Yield the first fault of each name, in the order of FAULTS."""
     by_name = {fault.name: fault for fault in reversed(faults)}
     yield from (by_name[name] for name in FAULTS if name in by_name)
 

@@ -26,6 +26,7 @@ from spinning_top_sim.exam.trial import (
     Outcome,
     feed,
     follow,
+    one_line,
 )
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.scene_file import read_scene
@@ -53,7 +54,7 @@ Compute = Callable[[Callable[[int], Result], Iterable[int]], Iterable[Result]]
 
 def examine(make_filter: MakeFilter, level: str = 'quick',
             imu: Mapping[str, Any] | str | Path | None = None,
-            seeds: int | Iterable[int] | None = None, subject: str | None = None,
+            seeds: int | Iterable[int] | None = None, *, subject: str | None = None,
             workers: int = 1, isolated: bool = True, restart: bool = True) -> Report:
     """
     Examine an attitude filter.
@@ -65,8 +66,8 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     level : {'quick', 'full'}
         'full' has more seeds and motions.
     imu : mapping or path, optional
-        Parameters of the IMU by name, or the path of a file of them, as in config/imu; default:
-        the noise of a calibrated device, `scenarios.CALIBRATED`.
+        Parameters imu.* and mag.* by name, or the path of a file of them, as in config/imu;
+        default: the noise of a calibrated device, `scenarios.CALIBRATED`.
     seeds : int or iterable of int, optional
         Of noise and start of the noisy runs, or how many; default: SEEDS of the level.
     subject : str, optional
@@ -108,6 +109,10 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     values = (scenarios.CALIBRATED if imu is None else
               imu if isinstance(imu, Mapping) else read_scene(imu))
     parameters.checked(values)
+    others = [name for name in values if not name.startswith(('imu.', 'mag.'))]
+    if others:
+        raise ValueError(f'{"imu" if isinstance(imu, Mapping) else imu} has {", ".join(others)}: '
+                         'must have parameters imu.* and mag.* only')
     numbers = list(SEEDS[level] if seeds is None else
                    range(seeds) if isinstance(seeds, int) else seeds)
     if not numbers or not all(isinstance(seed, int | np.integer) and seed >= 0
@@ -118,12 +123,12 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
                          'this process')
     with _computing_by(workers) as compute:
         conditions = (_Conditions(make_filter, feed_apart if isolated else feed, values)
-                      if restart else _Lasting(cache(make_filter), feed, values))
-        exam = (_Exam if restart else _LastingExam)(
+                      if restart else _OneFilter(cache(make_filter), feed, values))
+        exam = (_Exam if restart else _OneFilterExam)(
             conditions, [int(seed) for seed in numbers], compute)
         exam.sit(EXTRA if level == 'full' else ())
-    return Report(subject or str(getattr(make_filter, '__name__', 'filter')),
-                  tuple(diagnosis.in_order(exam.faults)), exam.measures, exam.outcomes)
+    return Report(one_line(subject or getattr(make_filter, '__name__', 'filter')),
+                  tuple(diagnosis.one_of_each(exam.faults)), exam.measures, exam.outcomes)
 
 
 @contextlib.contextmanager
@@ -171,7 +176,7 @@ class _Conditions:
 
 
 @dataclass
-class _Lasting(_Conditions):
+class _OneFilter(_Conditions):
     """
     The conditions of a filter that is made once.
 
@@ -211,7 +216,7 @@ class _Exam:
         if not noisy:
             return
         self.measures |= diagnosis.marks(self.outcomes, self._absolute)
-        offset, fault = diagnosis.stamp_fault(noisy[0].later(), self._absolute)
+        offset, fault = diagnosis.stamp_fault(noisy[0].last(), self._absolute)
         self.measures['stamp_offset_s'] = offset.seconds
         self._add(fault)
         if not self.faults:
@@ -224,7 +229,7 @@ class _Exam:
         self.outcomes += done.values()
         for number, outcome in done.items():
             self.measures[f'tilt_rms_{extra[number].name}_deg'] = math.degrees(
-                rms(outcome.later().errors.tilt))
+                rms(outcome.last().errors.tilt))
         if not self.faults:
             self._add(diagnosis.divergence(noisy[0], self._absolute))
         consistency = diagnosis.consistency(noisy, self._absolute)
@@ -284,9 +289,9 @@ class _Exam:
         first = next(iter(said))
 
         def again(hypothesis: Hypothesis) -> Outcome:
-            return self._run(*runs[first], hypothesis.given).later()
+            return self._run(*runs[first], hypothesis.given).last()
 
-        settled = said[first].later()
+        settled = said[first].last()
         late = diagnosis.stamp_fault(settled, self._absolute)[1] is not None
         try:
             found = diagnosis.explain(settled, self._absolute, None if late else again)
@@ -313,13 +318,13 @@ class _Exam:
         absolute, seed = self._absolute and magnetometer, self._seeds[0]
         finer = [replace(scenarios.FAST, rate=factor * scenarios.FAST.rate)
                  for factor in self.finer]
-        outcomes = [self._run(scenario, seed, magnetometer=magnetometer).later()
+        outcomes = [self._run(scenario, seed, magnetometer=magnetometer).last()
                     for scenario in finer]
         moved = [rms(measures.moved(outcome.estimates, outcome.run.truth))
                  for outcome in outcomes]
         self.measures['order'] = measures.convergence_order(self.finer, moved)
         self.measures['integration_error_deg'] = math.degrees(moved[0])
-        corrected = self._run(finer[0], seed, diagnosis.for_first_order, magnetometer).later()
+        corrected = self._run(finer[0], seed, diagnosis.for_first_order, magnetometer).last()
         self._add(diagnosis.first_order_fault(
             diagnosis.error_of(outcomes[0], absolute), diagnosis.error_of(corrected, absolute),
             finer[0].rate))
@@ -337,15 +342,15 @@ class _Exam:
         # The filter has settled before, so that this is no matter of its start.
         begin = len(still.t) // 3
         arm = self._conditions.follow(replace(moving, accelerometer=np.concatenate(
-            (still.accelerometer[:begin], moving.accelerometer[begin:])))).later()
-        pivot = self._pivot.later()
+            (still.accelerometer[:begin], moving.accelerometer[begin:])))).last()
+        pivot = self._pivot.last()
         effect = rms(measures.errors_of(arm.estimates, pivot.estimates).tilt)
         self.measures['lever_arm_deg'] = math.degrees(effect)
         self._add(diagnosis.lever_arm_fault(
             effect, math.hypot(*scenarios.LEVER_ARM.values['imu.lever_arm'])))
         density = self._imu.get('imu.accelerometer_noise_density', 0.0)
         if density:
-            tilt = rms(measures.errors_of(noisy.later().estimates, pivot.estimates).tilt)
+            tilt = rms(measures.errors_of(noisy.last().estimates, pivot.estimates).tilt)
             sample = density * math.sqrt(scenarios.SLOW.rate) / scenarios.GRAVITY
             self.measures['noise_gain'] = tilt / (math.sqrt(2.0) * sample)
 
@@ -360,7 +365,7 @@ class _Exam:
         self._add(diagnosis.bias_fault(effect, self._absolute))
 
 
-class _LastingExam(_Exam):
+class _OneFilterExam(_Exam):
     """The runs of an exam of one filter that goes on: at one rate, as an IMU has it."""
 
     finer = FINER[:1]

@@ -20,6 +20,7 @@ import numpy as np
 import rclpy
 from numpy.typing import NDArray
 from rclpy.context import Context
+from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
@@ -30,6 +31,7 @@ from spinning_top_sim.exam.examiner import examine
 from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.trial import NodeError
 from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.tools.attitudes import NO_ORIENTATION
 
 try:                            # takes least processor time
     from rclpy.experimental import EventsExecutor as Executor
@@ -44,7 +46,7 @@ START_NS = NANOSECONDS          # in ROS a stamp of 0 is "no time"
 # first sample go by so many times as fast as the machine's clock, faster than any exam.  They
 # begin anew before the seconds of a stamp overflow, after 460 days.
 FASTEST, LAST_NS = 50, 2 * 10 ** 9 * NANOSECONDS
-FRAME = 'imu_link'
+NAME, FRAME = 'examine', 'imu_link'
 
 
 def examine_node(topic: str, command: str | None = None, level: str = 'quick',
@@ -57,8 +59,8 @@ def examine_node(topic: str, command: str | None = None, level: str = 'quick',
     level, imu, seeds : see `examine`, which this does and raises
     """
     with NodeExam(topic, command) as node:
-        return examine(node.make_filter, level, imu, seeds, command or topic, isolated=False,
-                       restart=command is not None)
+        return examine(node.make_filter, level, imu, seeds, subject=command or topic,
+                       isolated=False, restart=command is not None)
 
 
 class NodeExam(contextlib.AbstractContextManager['NodeExam']):
@@ -67,14 +69,21 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
 
     topic : sensor_msgs/Imu with the attitudes that it publishes, each with the stamp of its sample
     command : of the node, which reads `imu/data_raw` and `imu/mag`; None: it runs already
+
+    Raises ValueError for a topic that ROS does not allow.
     """
 
     def __init__(self, topic: str, command: str | None = None) -> None:
+        try:
+            expand_topic_name(topic, NAME, '/')
+        except ValueError:          # its text has the place in rcl's source
+            raise ValueError(f'{topic!r} is no name of a topic: must be such as imu/data, with '
+                             'letters, digits, _ and /') from None
         self._command = None if command is None else shlex.split(command)
         self._topic = topic
         self._context = Context()
         rclpy.init(context=self._context)
-        self._node = Node('examine', context=self._context, parameter_overrides=[
+        self._node = Node(NAME, context=self._context, parameter_overrides=[
             Parameter('use_sim_time', value=False)])
         self._executor = Executor(context=self._context)
         self._executor.add_node(self._node)
@@ -183,7 +192,7 @@ class NodeFilter:
         clock, imu = Clock(), Imu()
         clock.clock.sec, clock.clock.nanosec = divmod(self._now_ns, NANOSECONDS)
         imu.header.stamp, imu.header.frame_id = clock.clock, FRAME
-        imu.orientation_covariance[0] = -1.0
+        imu.orientation_covariance[0] = NO_ORIENTATION
         for vector, values in ((imu.angular_velocity, gyroscope),
                                (imu.linear_acceleration, accelerometer)):
             vector.x, vector.y, vector.z = values.tolist()
@@ -207,6 +216,6 @@ class NodeFilter:
         message = said.pop(self._now_ns)
         said.clear()
         matrix = np.array(message.orientation_covariance).reshape(3, 3)
-        self.covariance = matrix if matrix[0, 0] > 0.0 else None
+        self.covariance = None if matrix[0, 0] == NO_ORIENTATION else matrix
         q = message.orientation
         return np.array((q.x, q.y, q.z, q.w))

@@ -10,7 +10,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +19,20 @@ from scipy.spatial.transform import Rotation, Slerp
 from spinning_top_sim.exam import diagnosis
 from spinning_top_sim.exam.diagnosis import Fault
 from spinning_top_sim.exam.report import Report
-from spinning_top_sim.exam.scenarios import Reals, Truth
-from spinning_top_sim.exam.trial import NORM_TOLERANCE, Outcome
+from spinning_top_sim.exam.scenarios import OF_PLACE, Reals, Truth
+from spinning_top_sim.exam.trial import (
+    UNKNOWN,
+    Known,
+    Outcome,
+    is_indefinite,
+    no_attitudes,
+    one_line,
+)
 from spinning_top_sim.recording.reader import LogReader, LogTopic
+from spinning_top_sim.recording.writer import METADATA_NAME
+from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.attitudes import LAYOUTS, decode
+from spinning_top_sim.tools.recorded_run import ODD, reason_of
 
 # Of the sensor, and of the body; the first that the log has is the truth.
 TRUTHS = ('ground_truth/imu', 'ground_truth/odom', 'pose')
@@ -66,14 +76,20 @@ def examine_log(path: Path, topic: str, truth: str | None = None,
     LogError
         For what is no log.
     ValueError
-        For a log without these topics, or with too few attitudes.
+        For a log without these topics, with too few attitudes, with odd parameters, or whose
+        truth has another norm than 1.
     """
     heading = north is not None
     with LogReader(path) as reader:
         said = _read(reader, _topic(reader, topic))
         true_topic = (_topic(reader, truth) if truth else _first_truth(reader))
         true = _read(reader, true_topic)
-        values = json.loads(reader.metadata.get('spinning_top_sim', {}).get('parameters', '{}'))
+        values = _parameters(reader)
+    wrong = no_attitudes(true.quaternions)
+    if len(wrong):
+        raise ValueError(f'{true_topic.name} has the quaternion '
+                         f'{true.quaternions[wrong[0]].tolist()} at '
+                         f'{true.stamps_ns[wrong[0]] * 1e-9:.9f} s: its norm must be 1')
     turns = Rotation.from_quat(true.quaternions)
     if not true_topic.name.endswith(OF_SENSOR):
         turns = turns * Rotation.from_euler('xyz', values.get('imu.rpy', (0.0, 0.0, 0.0)))
@@ -83,17 +99,18 @@ def examine_log(path: Path, topic: str, truth: str | None = None,
         east_part, north_part, _ = values['mag.field']
         turns = Rotation.from_euler('z', math.atan2(east_part, north_part)) * turns
     true = true._replace(quaternions=turns.as_quat())
-    bad = np.abs(np.linalg.norm(said.quaternions, axis=1) - 1.0)
-    wrong = np.flatnonzero(~(bad <= NORM_TOLERANCE))
-    subject = f'{topic} of {path.name}'
-    if len(wrong):
-        k = int(wrong[0])
-        return Report(subject, [Fault(
-            'invalid_output', f'{len(wrong)} of {len(bad)} messages have no unit quaternion; the '
-            f'first, at {said.stamps_ns[k] * 1e-9:.9f} s, has {said.quaternions[k].tolist()}')],
-            {})
-    outcome = _beside(topic, said, true)
-    settled = outcome.later()
+    subject = one_line(f'{topic} of {path.name}')
+    for what, rows, wrong in (
+            ('no unit quaternion', said.quaternions, no_attitudes(said.quaternions)),
+            ('a covariance that is not finite, or has a negative eigenvalue', said.covariances,
+             _no_covariances(said.covariances))):
+        if len(wrong):
+            k = int(wrong[0])
+            return Report(subject, [Fault(
+                'invalid_output', f'{len(wrong)} of {len(rows)} messages have {what}; the '
+                f'first, at {said.stamps_ns[k] * 1e-9:.9f} s, has {rows[k].tolist()}')], {})
+    outcome = _beside(one_line(topic), said, true)
+    settled = outcome.last()
     faults = []
     found = diagnosis.explain(settled, heading, None)
     if found is not None:
@@ -101,7 +118,7 @@ def examine_log(path: Path, topic: str, truth: str | None = None,
         corrected = replace(outcome, estimates=found.read(outcome.estimates))
     else:
         corrected = outcome
-    offset, fault = diagnosis.stamp_fault(corrected.later(), heading)
+    offset, fault = diagnosis.stamp_fault(corrected.last(), heading)
     measured = {**diagnosis.marks([outcome], heading), 'stamp_offset_s': offset.seconds}
     faults += [fault] if fault is not None else []
     if not faults and (fault := diagnosis.divergence(outcome, heading)) is not None:
@@ -110,7 +127,7 @@ def examine_log(path: Path, topic: str, truth: str | None = None,
     measured |= diagnosis.nees_marks(consistency)
     if not faults and (fault := diagnosis.covariance_fault(consistency)) is not None:
         faults.append(fault)
-    return Report(subject, list(diagnosis.in_order(faults)), measured, [outcome])
+    return Report(subject, list(diagnosis.one_of_each(faults)), measured, [outcome])
 
 
 def _topic(reader: LogReader, name: str) -> LogTopic:
@@ -130,6 +147,25 @@ def _first_truth(reader: LogReader) -> LogTopic:
             if f'/{topic.name}'.endswith(f'/{name}'):
                 return topic
     raise ValueError(f'{reader.path} has no topic {", ".join(TRUTHS)}: name one by --truth')
+
+
+def _parameters(reader: LogReader) -> dict[str, Any]:
+    """Return those of the parameters OF_PLACE that the log has.  Raises ValueError."""
+    text = reader.metadata.get(METADATA_NAME, {}).get('parameters', '{}')
+    try:
+        return {name: parameters.BY_NAME[name].check(value)
+                for name, value in json.loads(text).items() if name in OF_PLACE}
+    except ODD as error:
+        raise ValueError(f'the parameters in the metadata of {reader.path} cannot be used: '
+                         f'{reason_of(error)}') from error
+
+
+def _no_covariances(covariances: Reals) -> NDArray[np.intp]:
+    """Return the numbers of those (n, 3, 3), NaN where unknown, that no errors can have."""
+    finite = np.all(np.isfinite(covariances), axis=(1, 2))
+    wrong = ~finite & ~np.any(np.isnan(covariances), axis=(1, 2))
+    wrong[finite] = is_indefinite(covariances[finite])
+    return np.flatnonzero(wrong)
 
 
 def _read(reader: LogReader, topic: LogTopic) -> Attitudes:
@@ -171,8 +207,8 @@ def _beside(name: str, said: Attitudes, true: Attitudes) -> Outcome:
     middle = 0.5 * (times[1:] + times[:-1])
     rates = np.stack([np.interp(t, middle, column) for column in step.T], axis=1)
     covariances = said.covariances[chosen]
-    known = bool(np.all(np.isfinite(covariances)))
+    known = np.flatnonzero(np.all(np.isfinite(covariances), axis=(1, 2)))
     t = t - t[0]
     return Outcome(Truth(name, t, np.diff(t, prepend=t[0] - (t[1] - t[0])), truth.as_quat(),
-                         rates), said.quaternions[chosen], np.arange(len(t)),
-                   covariances if known else None, None)
+                         rates), said.quaternions[chosen], Known(known, covariances[known]),
+                   UNKNOWN)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -154,7 +155,7 @@ def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees 
         shortest = min(len(squares) for squares, _ in parts)
         values = np.stack([squares[:shortest] for squares, _ in parts])
         mean = max(float(np.mean(values)), 1e-300)
-        independent = len(runs) if absolute else values.size / _autocorrelation_time(values)
+        independent = len(runs) if absolute else values.size / autocorrelation_time(values)
         # The better axes have the greater likelihood, whatever factor the covariances are off by.
         unlikely = dimensions * math.log(mean) + float(np.mean([size for _, size in parts]))
         found.append((unlikely, Nees(mean / dimensions, dimensions * independent)))
@@ -182,19 +183,22 @@ def _normalised_squares(estimates: Reals, truth: Reals, covariances: Reals, abso
     return np.sum(vector * solved, axis=1), float(np.mean(np.sum(np.log(eigenvalues), axis=1)))
 
 
-def _autocorrelation_time(values: Reals) -> float:
+def autocorrelation_time(values: Reals) -> float:
     """
     Return the integrated autocorrelation time of rows (runs, n), in samples, at least 1.
 
     The sum ends at the first lag of 5 such times (Sokal 1997, sect. 3).
     """
     centred = values - np.mean(values)
-    variance = float(np.mean(centred ** 2))
-    if not variance > 0.0:
+    largest = float(np.max(np.abs(centred)))
+    if not largest > 0.0:
         return 1.0
-    time, n = 1.0, values.shape[1]
-    for lag in range(1, n):
-        time += 2.0 * float(np.mean(centred[:, lag:] * centred[:, :-lag])) / variance
-        if lag >= 5.0 * time:
-            break
-    return max(time, 1.0)
+    n = values.shape[1]
+    # By a transform, since the sums take n^2; with zeros, else the end goes on with the begin.
+    size = next_fast_len(2 * n - 1, real=True)
+    power = np.mean(np.abs(rfft(centred / largest, size)) ** 2, axis=0)
+    correlations = irfft(power, size)[:n] / np.arange(n, 0, -1)
+    times = 2.0 * np.cumsum(correlations / correlations[0]) - 1.0
+    ends = np.flatnonzero(np.arange(n) >= 5.0 * times)
+    ends = ends[ends > 0]
+    return max(float(times[ends[0] if len(ends) else -1]), 1.0)

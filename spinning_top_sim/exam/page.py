@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """One page about an exam: the verdict, and the errors over time."""
 
-import math
 import textwrap
 from pathlib import Path
 
@@ -25,7 +24,8 @@ def draw_page(report: Report, path: Path) -> None:
     path : Path
         File to write, in the format of its ending.
     """
-    with rc_context({'axes.spines.right': False, 'axes.spines.top': False, 'font.size': 9}):
+    with rc_context({'axes.spines.right': False, 'axes.spines.top': False, 'font.size': 9,
+                     'text.parse_math': False}):        # a filter may say '$'
         figure = Figure(figsize=(11.0, 7.0), layout='constrained')
         grid = figure.add_gridspec(2, 2, width_ratios=(3.0, 2.0))
         tilt, heading = (figure.add_subplot(grid[row, 0]) for row in (0, 1))
@@ -44,7 +44,6 @@ def draw_page(report: Report, path: Path) -> None:
         text.axis('off')
         lines = [line for fault in report.found
                  for line in (*textwrap.wrap(f'{fault.name}: {fault.evidence}', 58), '')]
-        lines += [f'{name:<26}{value:>12.4g}' for name, value in report.measures.items()
-                  if not math.isnan(value)]
-        text.text(0.0, 1.0, '\n'.join(lines), va='top', family='monospace', fontsize=8)
+        text.text(0.0, 1.0, '\n'.join((*lines, *report.measure_lines())), va='top',
+                  family='monospace', fontsize=8)
         figure.savefig(path, dpi=110)

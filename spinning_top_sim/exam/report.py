@@ -46,9 +46,13 @@ class Report:
     def __str__(self) -> str:
         lines = [f'{self.subject}: {"passed" if self.passed else ", ".join(self.faults)}']
         lines += [f'  {fault.name}: {fault.evidence}' for fault in self.found]
-        lines += [f'  {name:<26}{value:>12.4g}' for name, value in self.measures.items()
-                  if not math.isnan(value)]
+        lines += [f'  {line}' for line in self.measure_lines()]
         return '\n'.join(lines)
+
+    def measure_lines(self) -> list[str]:
+        """Return the measures in words, but for those that could not be measured."""
+        return [f'{name:<26}{value:>12.4g}' for name, value in self.measures.items()
+                if not math.isnan(value)]
 
     def as_json(self) -> str:
         """

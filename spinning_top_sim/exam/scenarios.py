@@ -5,6 +5,7 @@ The motions of the exam, and what an IMU on them reads.
 Each motion shows a fault that the others hide.  A seed decides the noise, and varies the start.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
@@ -22,8 +23,7 @@ from spinning_top_sim.streams.pipeline import Simulation
 
 Reals = NDArray[np.float64]
 
-# East, north, up [T]: the strength and dip of mid-latitudes.  North is magnetic north, so that
-# the heading of a filter needs no declination.
+# East, north, up [T]: the strength and dip of mid-latitudes.
 FIELD = (0.0, 20e-6, -43e-6)
 # Noise densities of config/imu/bmi088.yaml, without its turn-on bias: a calibrated device.  The
 # magnetometer has a noise of 0.2 uT in 100 samples a second.
@@ -147,9 +147,19 @@ def turning(imu: Mapping[str, Any], first: Reals, last: Reals, seconds: float,
     rates = (turns[:-1].inv() * turns[1:]).as_rotvec() / period
     to_sensor = turns[1:].inv()
     field = Rotation.from_euler('z', np.broadcast_to(declination, n)[:, np.newaxis]).apply(
-        imu.get('mag.field', FIELD))
+        without_declination(imu.get('mag.field', FIELD)))
     return Run('', t, np.full(n, period), turns[1:].as_quat(), rates, rates.copy(),
                to_sensor.apply((0.0, 0.0, GRAVITY)), to_sensor.apply(field))
+
+
+def without_declination(field: tuple[float, float, float]) -> tuple[float, float, float]:
+    """
+    Return a field (east, north, up) in a world whose north is magnetic north.
+
+    There the heading of a filter needs no declination.
+    """
+    east, north, up = field
+    return 0.0, math.hypot(east, north), up
 
 
 def record(scenario: Scenario, imu: Mapping[str, Any], seed: int) -> Run:
@@ -164,6 +174,7 @@ def record(scenario: Scenario, imu: Mapping[str, Any], seed: int) -> Run:
     values = parameters.checked({
         'initial.phi': phi, 'initial.psi': psi, 'seed': seed, 'solver.method': 'exact',
         'mag.field': FIELD, **given, **scenario.values})
+    values['mag.field'] = without_declination(values['mag.field'])
     simulation, device = Simulation(values), Imu(values)
     period_ns = 2 * round(0.5 * NANOSECONDS / scenario.rate)
     magnetometer = Magnetometer(values, period_ns)

@@ -67,6 +67,6 @@ def decode(data: bytes, type_name: str) -> Attitude:
         if matrix[0, 0] == NO_ORIENTATION:
             raise ValueError('it has no orientation')
         # 0 is unknown (sensor_msgs), and our own streams say so of what is exact.
-        if np.max(matrix[-3:, -3:]) > EXACT_VARIANCE:
+        if np.max(np.abs(matrix[-3:, -3:])) > EXACT_VARIANCE:
             covariance = matrix[-3:, -3:]
     return Attitude(seconds * NANOSECONDS + nanoseconds, quaternion, covariance)
