@@ -305,7 +305,8 @@ def test_a_filter_that_returns_no_attitude_is_told(said, says):
     (4.9, 0.01, None),              # it compiles itself
     (0.2, 0.2, 'update 30 of 100 ends after 6 s, and must within 5.6 s'),
     (5.5, 0.0, 'too slow: update 10 of 100 ends after 5.5 s')])
-def test_a_filter_may_take_some_seconds_and_twice_the_time_of_the_run(monkeypatch, first, others, says):
+def test_a_filter_may_take_some_seconds_and_twice_the_time_of_the_run(
+        monkeypatch, first, others, says):
     now = 0.0
 
     def work():

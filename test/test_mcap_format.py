@@ -5,6 +5,7 @@ What the MCAP specification allows, and files that are made to harm a reader.
 The files are built record by record with mcap's record classes.
 """
 
+import contextlib
 import os
 import re
 import signal
@@ -50,10 +51,10 @@ from test_recover import (
     write_stranger,
 )
 
-from spinning_top_sim.recording import records
+from spinning_top_sim.recording import reader, records
 from spinning_top_sim.recording.mcap_writer import record_bytes
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.source import McapSource
+from spinning_top_sim.recording.source import McapSource, Summary, read_summary
 from spinning_top_sim.recording.writer import create_file
 
 HEADER = record_bytes(Header(profile='', library='a stranger'))
@@ -191,6 +192,48 @@ def test_a_chunk_that_is_indexed_twice_is_read_once(tmp_path, monkeypatch):
             data, RAW_CHANNEL, statistics, chunk_index, chunk_index,
             record_bytes(Footer(len(data), 0, 0)), MCAP0_MAGIC]))
         assert seen_by_us(path) == [('/a', 5, b'x')]
+
+
+def test_a_whole_log_is_read_by_its_indexes(tmp_path, monkeypatch):
+    """A scan of it would read everything before the first message."""
+    path = tmp_path / 'a.mcap'
+    write_stranger(path, {})
+
+    def scan_all(scanner):
+        raise AssertionError('not needed')
+    monkeypatch.setattr(reader, '_scan_all', scan_all)
+    assert seen_by_us(path)
+
+
+def summary_of(path: Path, *records: bytes) -> Summary:
+    """Return the summary of a file with an empty chunk and these records in its summary."""
+    data = MCAP0_MAGIC + HEADER + chunk_of(b'') + record_bytes(DataEnd(0))
+    path.write_bytes(b''.join([
+        data, *records, record_bytes(Footer(len(data), 0, 0)), MCAP0_MAGIC]))
+    with contextlib.closing(McapSource(path, 1 << 20)) as source:
+        return read_summary(source)
+
+
+@pytest.mark.parametrize(('too_long', 'problem'), [
+    (0, ''), (1, 'the summary is not used: it places a chunk outside of the data section')])
+def test_a_summary_places_chunks_in_the_data_section(tmp_path, too_long, problem):
+    begin, end = len(MCAP0_MAGIC + HEADER), len(MCAP0_MAGIC + HEADER + chunk_of(b'')) + 13
+    index = ChunkIndex(
+        chunk_length=end - begin + too_long, chunk_start_offset=begin, compression='',
+        compressed_size=0, message_end_time=5, message_start_time=5, message_index_length=0,
+        uncompressed_size=0, message_index_offsets={})
+    found = summary_of(tmp_path / 'a.mcap', record_bytes(index))
+    assert found.problem == problem
+
+
+def test_a_summary_declares_a_limited_amount(tmp_path, monkeypatch):
+    channels = [record_bytes(Channel(id=number, topic='/a', message_encoding='x', metadata={},
+                                     schema_id=0)) for number in range(1, 4)]
+    assert summary_of(tmp_path / 'a.mcap', *channels).declared_bytes == sum(map(len, channels))
+    monkeypatch.setattr(records, 'MAX_DECLARED', len(channels[0]) * 5 // 2)
+    statistics = record_bytes(Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0))
+    assert not summary_of(tmp_path / 'a.mcap', *channels[:2], statistics).problem
+    assert 'that are read' in summary_of(tmp_path / 'a.mcap', *channels).problem
 
 
 def test_a_channel_that_only_the_summary_calls_otherwise_costs_nothing(tmp_path):
