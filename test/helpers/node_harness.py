@@ -59,7 +59,7 @@ def wait_for(what, condition, timeout=PATIENCE_S):
 
 
 # Where the test process is itself killed, its nodes shall not live on.
-_DIE_WITH_PARENT = ['setpriv', '--pdeathsig', 'KILL'] if shutil.which('setpriv') else []
+DIE_WITH_PARENT = ['setpriv', '--pdeathsig', 'KILL'] if shutil.which('setpriv') else []
 
 
 class SimNode:
@@ -82,7 +82,7 @@ class SimNode:
         options = [item for name, value in (parameters or {}).items()
                    for item in ('-p', f'{name}:={as_yaml(value)}')]
         self.command = [
-            *_DIE_WITH_PARENT, sys.executable,
+            *DIE_WITH_PARENT, sys.executable,
             *(program or ('-m', 'spinning_top_sim.nodes.sim_node')),
             '--ros-args', '-r', f'__ns:={namespace}', *options, *arguments]
         self.seconds_to_end = None

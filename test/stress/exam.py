@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import helpers.own_domain  # noqa: F401, before any node starts
+from helpers.node_harness import DIE_WITH_PARENT
 
 from spinning_top_sim.exam.live import examine_node
 
@@ -24,7 +25,7 @@ FAULTS = ('', 'conjugated', '', 'stamp_offset', '')
 
 def check(seed, folder):
     fault = FAULTS[seed % len(FAULTS)]
-    node = [sys.executable, str(NODE), *([fault] if fault else [])]
+    node = [*DIE_WITH_PARENT, sys.executable, str(NODE), *([fault] if fault else [])]
     runs = seed % 5 == 4
     processes = [subprocess.Popen([sys.executable, '-c', 'while True: pass'], cwd=folder)
                  for _ in range(BUSY)]
