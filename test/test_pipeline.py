@@ -286,8 +286,8 @@ def test_ticks_leave_nothing_behind(ahead):
         gc.collect()
         return sys.getallocatedblocks()
 
-    run(300)
-    in_use = [run(128) for _ in range(6)]
+    run(500)
+    in_use = [run(256) for _ in range(9)]
     assert min(np.diff(in_use)) < 8
 
 
