@@ -13,6 +13,8 @@ from helpers.reference import ROOT
 from spinning_top_sim import State, solve
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.rosbag2 import RecordedTopic
+from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import simulate
@@ -199,6 +201,56 @@ def test_a_log_without_attitudes_is_refused(tmp_path):
                           'record.streams:=[invariants]']) == 0
     with pytest.raises(LogError, match='no attitude of a top'):
         read_logs([path])
+
+
+@pytest.fixture
+def estimate(log, tmp_path):
+    """Return a log of another program beside `log`: the same attitudes, in disorder."""
+    path = tmp_path / 'estimate.mcap'
+    file = create_file(path, [RecordedTopic('/estimate', 'geometry_msgs/msg/PoseStamped')], {},
+                       compression='zstd')
+    with LogReader(log) as reader:
+        poses = list(reader.messages(['/pose']))
+    for pose in [*poses[100:], *poses[:100]]:
+        file.append(0, pose.log_time, pose.data)
+    file.append(0, poses[-1].log_time, bytes(len(poses[-1].data)))      # no attitude
+    file.write_chunk()
+    file.finish()
+    return path
+
+
+def test_the_log_of_another_program_is_shown_as_the_top_of_ours(log, estimate):
+    from spinning_top_sim.view.log import read_logs
+    ours, theirs = read_logs([log, estimate])
+    assert theirs.track.top == ours.track.top
+    assert (theirs.span, theirs.commands_ns, theirs.note) == (ours.span, [], '')
+    assert not theirs.track.motions
+    for stamp_ns in np.linspace(*ours.span, 7).astype(int):
+        one, other = (each.track.columns['pose'].at(stamp_ns) for each in (ours, theirs))
+        assert one[0] == other[0]
+        assert one[1][:4] == pytest.approx(other[1][:4], abs=1e-15)
+
+
+def test_a_player_follows_its_buttons_and_the_slider(log, estimate, page):
+    from spinning_top_sim.view.log import Player, read_logs
+    player = Player(page, read_logs([estimate, log]))
+    assert player.length == pytest.approx(6.0)
+    player.draw_next(1.0)
+    assert player._slider.value == pytest.approx(1.0)
+    player._go_to_next()
+    player.draw_next(0.0)
+    assert player._slider.value == pytest.approx(COMMAND_S)
+    player._slider.value = 4.0
+    player.draw_next(0.5)
+    assert player._slider.value == pytest.approx(4.5)
+    player._go_to_next()            # behind the last one
+    player.draw_next(0.0)
+    assert player._slider.value == pytest.approx(COMMAND_S)
+    player.draw_next(9.0)
+    assert (player._slider.value, player._button.label) == (pytest.approx(6.0), 'Play')
+    player._switch()
+    player.draw_next(0.5)
+    assert (player._slider.value, player._button.label) == (pytest.approx(0.5), 'Pause')
 
 
 def test_the_server_is_on_loopback_and_takes_the_next_free_port():
