@@ -93,8 +93,7 @@ def _options(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the options that are given, by name.  Raises ValueError for those of others."""
     subject = ('a log' if arguments.log is not None else
                '--filter' if arguments.filter is not None else 'a node')
-    options = {name: value for name in ('topic', 'truth', 'heading', 'level', 'imu', 'seeds',
-                                        'workers')
+    options = {name: value for names in OPTIONS.values() for name in names
                if (value := getattr(arguments, name)) is not None}
     for name, value in options.items():
         if name not in OPTIONS[subject]:

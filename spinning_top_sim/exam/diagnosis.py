@@ -6,6 +6,7 @@ A misreading that stays the same is found by undoing it: the attitudes, or the r
 changed as the fault would have it, and the error vanishes.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -127,17 +128,16 @@ def marks(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
     """Return what docs/exam.md defines of the errors of filters, over several runs."""
     settled = [outcome.last() for outcome in outcomes]
     errors = [outcome.errors for outcome in settled]
-    marked = {
-        'tilt_rms_deg': np.degrees(rms(np.concatenate([one.tilt for one in errors]))),
-        'tilt_max_deg': np.degrees(max(float(np.max(one.tilt)) for one in errors)),
-        'heading_rms_deg': np.degrees(rms(np.concatenate(
+    return {
+        'tilt_rms_deg': math.degrees(rms(np.concatenate([one.tilt for one in errors]))),
+        'tilt_max_deg': math.degrees(max(float(np.max(one.tilt)) for one in errors)),
+        'heading_rms_deg': math.degrees(rms(np.concatenate(
             [one.turned(absolute) for one in errors]))),
         'convergence_s': max(measures.convergence_time(outcome.run.t, outcome.errors.tilt)
                              for outcome in outcomes),
-        'heading_drift_deg_per_s': np.degrees(float(np.mean([
+        'heading_drift_deg_per_s': math.degrees(float(np.mean([
             abs(measures.drift(outcome.run.t, one.heading))
             for outcome, one in zip(settled, errors, strict=True)])))}
-    return {name: float(mark) for name, mark in marked.items()}
 
 
 def error_of(outcome: Outcome, absolute: bool) -> float:
