@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from helpers.faulty_filters import FAULTY, MISREADINGS
 from helpers.reference import ROOT
+from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import examine, isolation, measures, scenarios, trial
@@ -497,11 +498,35 @@ def test_a_wrong_covariance_is_told(covariance, says):
     ({'imu': {'seed': 3, 'top.mass': 1.0}}, 'imu has seed, top.mass: must have parameters imu.* '),
     ({'imu': ROOT / 'config/cusp.yaml'}, 'cusp.yaml has top.'),
     ({'seeds': 0}, 'seeds = 0: must be'), ({'seeds': [-1]}, 'must be'),
-    ({'seeds': [0.5]}, 'must be'), ({'workers': 0}, 'workers = 0: must be from 1'),
+    ({'seeds': [0.5]}, 'must be'), ({'seeds': 2.5}, 'seeds = 2.5: must be'),
+    ({'seeds': np.int64(-3)}, 'must be'), ({'workers': 0}, 'workers = 0: must be from 1'),
     ({'workers': 2, 'restart': False}, 'workers = 2: must be from 1')])
 def test_wrong_arguments_are_refused(options, says):
     with pytest.raises(ValueError, match=re.escape(says)):
         examine(Vqf, **options)
+
+
+def test_the_noise_is_compared_with_the_same_motion_though_the_filter_fails_with_a_seed(
+        monkeypatch):
+    record, failing = scenarios.record, []
+
+    class Failing(Vqf):
+        def update(self, gyroscope, *readings):
+            if failing and np.array_equal(gyroscope, failing[0]):
+                raise ValueError('these readings')
+            return super().update(gyroscope, *readings)
+
+    def recorded(scenario, imu, seed):
+        run = record(scenario, imu, seed)
+        if scenario is scenarios.SLOW and seed == 0 and not failing:
+            failing.append(run.gyroscope[2000])
+        return run
+
+    monkeypatch.setattr(scenarios, 'record', recorded)
+    report = examine(Failing, seeds=[0, 1], isolated=False)
+    assert report.faults == ['invalid_output']
+    assert report.measures['noise_gain'] == pytest.approx(
+        examine(Vqf, seeds=[1], isolated=False).measures['noise_gain'], rel=1e-12)
 
 
 def test_only_level_imu_and_seeds_may_be_given_without_their_names():
@@ -633,6 +658,27 @@ def test_an_odd_log_is_refused_by_what_is_odd_in_it(tmp_path, odd, says):
     file.finish()
     with pytest.raises(ValueError, match=says):
         examine_log(path, '/estimate')
+
+
+@pytest.mark.parametrize(('others', 'truth', 'says'), [
+    ({}, None, 'has no other topic ground_truth/imu, ground_truth/odom, pose with attitudes'),
+    ({'/turtle1/pose': 'turtlesim/msg/Pose'}, None, 'has no other topic ground_truth/imu'),
+    ({'/pose': 'geometry_msgs/msg/PoseStamped'}, None, '/pose has 0 messages: must have 100'),
+    ({}, 'ekf/pose', 'the truth of /ekf/pose cannot be ekf/pose: must be another topic')])
+def test_a_topic_is_not_its_own_truth(tmp_path, others, truth, says):
+    path, template = tmp_path / 'run.mcap', messages.pose_stamped('world')
+    with open(path, 'wb') as stream:
+        writer = Writer(stream)
+        writer.start('ros2', 'another program')
+        for name, kind in {**others, '/ekf/pose': 'geometry_msgs/msg/PoseStamped'}.items():
+            channel = writer.register_channel(
+                name, 'cdr', writer.register_schema(kind, 'ros2msg', b''))
+        for stamp_ns in range(10 ** 9, 2 * 10 ** 9, 10 ** 7):
+            writer.add_message(
+                channel, stamp_ns, template.encode_one(stamp_ns, (0.0, 0.0, 0.0, 1.0)), stamp_ns)
+        writer.finish()
+    with pytest.raises(ValueError, match=says):
+        examine_log(path, '/ekf/pose', truth)
 
 
 def test_the_command_judges_a_log(beside, log, tmp_path, capsys):

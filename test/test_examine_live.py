@@ -83,6 +83,13 @@ def test_a_name_that_is_none_of_a_topic_is_told(topic, capfd):
         'digits, _ and /\n')
 
 
+@pytest.mark.parametrize(('command', 'why'), [
+    ("a 'b", 'No closing quotation'), (' ', 'must be such as python my_node.py')])
+def test_what_is_no_command_is_told(command, why, capfd):
+    assert main(['--node', command, '--topic', 'imu/data']) == 2
+    assert capfd.readouterr().err == f'examine: {command!r} is no command: {why}\n'
+
+
 def test_another_source_of_samples_is_told(running, capfd):
     from spinning_top_sim.exam.live import NodeExam
 

@@ -114,7 +114,8 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
         raise ValueError(f'{"imu" if isinstance(imu, Mapping) else imu} has {", ".join(others)}: '
                          'must have parameters imu.* and mag.* only')
     numbers = list(SEEDS[level] if seeds is None else
-                   range(seeds) if isinstance(seeds, int) else seeds)
+                   range(seeds) if isinstance(seeds, int | np.integer) else
+                   seeds if isinstance(seeds, Iterable) else ())
     if not numbers or not all(isinstance(seed, int | np.integer) and seed >= 0
                               for seed in numbers):
         raise ValueError(f'seeds = {seeds!r}: must be a positive number, or integers >= 0')
@@ -281,31 +282,35 @@ class _Exam:
 
     def _noisy_runs(self) -> list[Outcome]:
         """Return the outcomes on the slow motion, a misreading that explains them undone."""
-        runs = [(scenarios.SLOW, seed) for seed in self._seeds]
-        said = self._try(runs)
-        self.outcomes += said.values()
+        said = self._runs_of_seeds()
+        self.outcomes += said
         if not said:
             return []
-        first = next(iter(said))
 
         def again(hypothesis: Hypothesis) -> Outcome:
-            return self._run(*runs[first], hypothesis.given).last()
+            return self._run(scenarios.SLOW, self._seeds[0], hypothesis.given).last()
 
-        settled = said[first].last()
+        settled = said[0].last()
         late = diagnosis.stamp_fault(settled, self._absolute)[1] is not None
         try:
             found = diagnosis.explain(settled, self._absolute, None if late else again)
         except InvalidOutputError:      # of a filter that cannot take other readings
             found = diagnosis.explain(settled, self._absolute, None)
         if found is None:
-            return list(said.values())
+            return said
         self.faults += [Fault(name, found.text) for name in found.faults]
         # So that it hides nothing else.
         self._conditions.correction = found
         if found.given is None:
             return [replace(outcome, estimates=found.read(outcome.estimates))
-                    for outcome in said.values()]
-        return list(self._try([runs[number] for number in said]).values())
+                    for outcome in said]
+        return self._runs_of_seeds()
+
+    def _runs_of_seeds(self) -> list[Outcome]:
+        """Return the outcomes on the slow motion; seeds with which the filter fails are left."""
+        done = self._try([(scenarios.SLOW, seed) for seed in self._seeds])
+        self._seeds = [self._seeds[number] for number in done]
+        return list(done.values())
 
     def _judge_integration(self) -> None:
         """Compare sampling rates on the fast motion, without what could correct the heading."""

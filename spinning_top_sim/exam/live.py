@@ -42,9 +42,9 @@ IMU_TOPIC, FIELD_TOPIC = 'imu/data_raw', 'imu/mag'
 PATIENCE_S = 20.0               # for a node to start, and for an answer
 FIRST_PATIENCE_S, UNANSWERED = 1.0, 5       # some nodes do not answer their first samples
 START_NS = NANOSECONDS          # in ROS a stamp of 0 is "no time"
-# A second exam of a node that runs must not begin before the first one has ended: stamps of the
-# first sample go by so many times as fast as the machine's clock, faster than any exam.  They
-# begin anew before the seconds of a stamp overflow, after 460 days.
+# A node that runs must never see time go back, not even from one exam to the next.  So the stamp
+# of an exam's first sample is the machine's time multiplied by FASTEST: no exam is fed faster than
+# that.  The stamps begin anew after 460 days, before their seconds overflow.
 FASTEST, LAST_NS = 50, 2 * 10 ** 9 * NANOSECONDS
 NAME, FRAME = 'examine', 'imu_link'
 
@@ -70,7 +70,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
     topic : sensor_msgs/Imu with the attitudes that it publishes, each with the stamp of its sample
     command : of the node, which reads `imu/data_raw` and `imu/mag`; None: it runs already
 
-    Raises ValueError for a topic that ROS does not allow.
+    Raises ValueError for a topic that ROS does not allow, and for a command without words.
     """
 
     def __init__(self, topic: str, command: str | None = None) -> None:
@@ -79,7 +79,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         except ValueError:          # its text has the place in rcl's source
             raise ValueError(f'{topic!r} is no name of a topic: must be such as imu/data, with '
                              'letters, digits, _ and /') from None
-        self._command = None if command is None else shlex.split(command)
+        self._command = None if command is None else _words(command)
         self._topic = topic
         self._context = Context()
         rclpy.init(context=self._context)
@@ -219,3 +219,14 @@ class NodeFilter:
         self.covariance = None if matrix[0, 0] == NO_ORIENTATION else matrix
         q = message.orientation
         return np.array((q.x, q.y, q.z, q.w))
+
+
+def _words(command: str) -> list[str]:
+    """Return the words of a command line.  Raises ValueError for none, or an open quotation."""
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise ValueError(f'{command!r} is no command: {error}') from None
+    if not words:
+        raise ValueError(f'{command!r} is no command: must be such as python my_node.py')
+    return words

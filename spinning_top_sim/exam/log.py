@@ -81,8 +81,11 @@ def examine_log(path: Path, topic: str, truth: str | None = None,
     """
     heading = north is not None
     with LogReader(path) as reader:
-        said = _read(reader, _topic(reader, topic))
-        true_topic = (_topic(reader, truth) if truth else _first_truth(reader))
+        examined = _topic(reader, topic)
+        said = _read(reader, examined)
+        true_topic = _topic(reader, truth) if truth else _first_truth(reader, examined)
+        if true_topic.name == examined.name:
+            raise ValueError(f'the truth of {topic} cannot be {truth}: must be another topic')
         true = _read(reader, true_topic)
         values = _parameters(reader)
     wrong = no_attitudes(true.quaternions)
@@ -141,12 +144,14 @@ def _topic(reader: LogReader, name: str) -> LogTopic:
                      f'{", ".join(topic.name for topic in reader.topics) or "none"}')
 
 
-def _first_truth(reader: LogReader) -> LogTopic:
+def _first_truth(reader: LogReader, examined: LogTopic) -> LogTopic:
     for name in TRUTHS:
         for topic in reader.topics:
-            if f'/{topic.name}'.endswith(f'/{name}'):
+            if (f'/{topic.name}'.endswith(f'/{name}') and topic.type_name in LAYOUTS
+                    and topic.name != examined.name):
                 return topic
-    raise ValueError(f'{reader.path} has no topic {", ".join(TRUTHS)}: name one by --truth')
+    raise ValueError(f'{reader.path} has no other topic {", ".join(TRUTHS)} with attitudes: name '
+                     'one by --truth')
 
 
 def _parameters(reader: LogReader) -> dict[str, Any]:

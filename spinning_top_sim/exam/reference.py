@@ -170,14 +170,13 @@ def from_two_vectors(up: Reals, magnetometer: Reals | None) -> Reals:
     x /= np.linalg.norm(x)
     rows: NDArray[np.float64] = np.stack((x, np.cross(z, x), z))
     # Shepperd's method, by the largest of the four.
-    trace = np.array((*(2.0 * np.diag(rows)), 0.0)) - np.trace(rows)
-    trace[3] = np.trace(rows)
-    k = int(np.argmax(trace))
+    squares = np.append(2.0 * np.diag(rows) - np.trace(rows), np.trace(rows))   # 4 q^2 - 1
+    k = int(np.argmax(squares))
     odd = np.array((rows[2, 1] - rows[1, 2], rows[0, 2] - rows[2, 0], rows[1, 0] - rows[0, 1]))
     if k == 3:
-        q = np.array((*odd, 1.0 + trace[3]))
+        q = np.array((*odd, 1.0 + squares[3]))
     else:
         q = np.array((*(rows[k] + rows[:, k]), odd[k]))
-        q[k] = 1.0 + trace[k]
+        q[k] = 1.0 + squares[k]
     unit: Reals = q / np.linalg.norm(q)
     return unit

@@ -25,12 +25,12 @@ Reals = NDArray[np.float64]
 
 # East, north, up [T]: the strength and dip of mid-latitudes.
 FIELD = (0.0, 20e-6, -43e-6)
-# Noise densities of config/imu/bmi088.yaml, without its turn-on bias: a calibrated device.  The
-# magnetometer has a noise of 0.2 uT in 100 samples a second.
+# Noise densities of a BMI088, without its turn-on bias: a calibrated device.  That of the
+# accelerometer is the mean of its axes.  The magnetometer has 0.2 uT in 100 samples a second.
 CALIBRATED: Mapping[str, Any] = {
     'imu.gyroscope_noise_density': 1.72779e-4, 'imu.accelerometer_noise_density': 1.21360e-3,
     'mag.noise_density': 2e-8}
-# What an IMU without noise has of its parameters.
+# The parameters of an IMU that a scenario without noise keeps.
 OF_PLACE = ('imu.lever_arm', 'imu.rpy', 'mag.field')
 GRAVITY = 9.80665
 
@@ -74,7 +74,7 @@ PIVOT = replace(LEVER_ARM, name='pivot', values={
 # sign, no estimate of a bias can hide them.
 FAST = Scenario('fast', {'spin.l3': 1.6, 'spin.lz': 1.7816, 'initial.theta': 0.5236},
                 duration=8.0, reversals=(2.0, 4.0, 6.0), noisy=False)
-# Small waves through the upward vertical, and a top that falls from it.
+# Small waves through the upward vertical.
 POLE = Scenario('pole', {'spin.l3': 1.6, 'spin.lz': 1.6, 'initial.theta': 0.0,
                          'initial.theta_dot': 2.0})
 SATURATION = replace(WAVES, name='saturation', values={
