@@ -274,6 +274,22 @@ def test_beside_dates_a_time_of_0_is_none(tmp_path):
         assert [message.data for message in reader.messages()] == [b'a', b'b']
 
 
+def test_beside_dates_in_one_chunk_a_time_of_0_is_none(tmp_path):
+    path = tmp_path / 'a.mcap'
+    for has_summary in (True, False):
+        file = create_file(path, TOPICS, {}, compression='none')
+        for stamp in (0, 0, 10 ** 18 + 5, 10 ** 18):
+            file.append(0, stamp, b'')
+        file.write_chunk()
+        file.finish()
+        if not has_summary:
+            path.write_bytes(path.read_bytes()[:-50])
+        with LogReader(path) as reader:
+            assert reader.span == (10 ** 18, 10 ** 18 + 5)
+            assert reader.left_out == 0
+        path.unlink()
+
+
 # Damage
 
 @pytest.mark.parametrize('place', range(4))

@@ -13,9 +13,11 @@ pytest.importorskip('rclpy')
 
 from helpers.node_harness import PATIENCE_S, wait_for
 from helpers.node_logs import events_in, log_of
+from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes.pacing import FairLock
 from spinning_top_sim.nodes.recording_session import RecordingSession
+from spinning_top_sim.nodes.simulator import Simulator
 from spinning_top_sim.recording import provenance, writer
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
@@ -203,6 +205,25 @@ def test_a_disk_that_is_too_slow_is_told_with_what_may_be_lost(tmp_path, monkeyp
     disk_is_back.set()
     log, _ = recorded.stop()
     assert len(log['/ns/pose']) == 101
+
+
+def test_a_recording_that_fails_at_its_end_says_why(tmp_path, monkeypatch):
+    recorded = Recorded(tmp_path)
+    recorded.start()
+    recorded.simulation.advance(SECOND)
+
+    def full(_):
+        raise OSError('no room')
+
+    monkeypatch.setattr(os, 'fsync', full)
+    with pytest.raises(RecordingError, match=r'stopped early: .*no room'):
+        Simulator._record(SimpleNamespace(_session=recorded.session), SetBool.Request(data=False))
+    monkeypatch.undo()
+    assert 'no room' in recorded.session.error
+    assert recorded.session.numbers() == {'recorder': 'failed'}
+    recorded.start()
+    assert recorded.session.error is None
+    recorded.stop()
 
 
 def test_a_recording_that_fails_is_closed_and_says_why(tmp_path):

@@ -898,6 +898,8 @@ def test_an_output_that_cannot_be_made_is_named(tmp_path, log):
     code, _, err = run(path, '-o', path / 'whole.mcap')
     assert code == FAILED
     assert 'Not a directory' in err
+    assert run(path, '-o', '/proc/whole.mcap')[2] == (
+        'recover: cannot write /proc/whole.mcap: no files can be made in /proc\n')
 
 
 @pytest.mark.parametrize(('content', 'reason'), [

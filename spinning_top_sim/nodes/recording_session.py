@@ -99,8 +99,8 @@ class RecordingSession:
                 self._feed(None)
                 self.error = error
             summary = recorder.close()
-        text = (f'{summary.path}: {sum(summary.counts.values())} messages, '
-                f'{summary.bytes / 1e6:.1f} MB')
+            self.error = error or summary.error
+        text = f'{summary.path}: {summary.messages} messages, {summary.bytes / 1e6:.1f} MB'
         return f'{text}; stopped early: {summary.error}' if summary.error else text
 
     def check(self) -> str | None:

@@ -16,7 +16,7 @@ class Loss:
     start_ns: int | None = None     # the earliest log time of its messages
     end_ns: int | None = None       # the latest
     messages: int | None = None     # how many it held
-    refused: bool = False           # larger than what is read into memory, else perhaps right
+    refused: bool = False           # not read, as it is larger than `max_bytes`; may be right
 
     def __str__(self) -> str:
         text = f'{self.what} at byte {self.offset} ({self.bytes} bytes): {self.reason}'

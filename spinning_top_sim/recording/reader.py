@@ -174,7 +174,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         """What is wrong with the file; scans all of it at the first use."""
         return self._survey[1]
 
-    @property
+    @functools.cached_property
     def span(self) -> tuple[int, int]:
         """
         The earliest and the latest log time [ns]; both 0 without messages.
@@ -182,11 +182,20 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         Beside dates, a time of 0 does not count: it says that there was no clock yet.
         """
         spans, _ = self._index
-        dated = [span for span in spans if span.end_ns]
-        if min((span.start_ns for span in dated), default=0) > _FIRST_DATE:
-            spans = dated
-        return (min((span.start_ns for span in spans), default=0),
-                max((span.end_ns for span in spans), default=0))
+        begin_ns = min((span.start_ns for span in spans), default=0)
+        if begin_ns == 0:
+            first_ns = min((span.start_ns or self._first_after_0(span) for span in spans
+                            if span.end_ns), default=0)
+            begin_ns = first_ns if first_ns > _FIRST_DATE else 0
+        return begin_ns, max((span.end_ns for span in spans), default=0)
+
+    def _first_after_0(self, span: _Span) -> int:
+        """Return the earliest log time but 0 in a span, or 0 if that is no date."""
+        if span.end_ns > _FIRST_DATE:
+            with contextlib.suppress(DamagedError):
+                return min((time for numbers in self._open(span).entries.values()
+                            for time in numbers[::2] if time), default=0)
+        return 0
 
     def messages(self, topics: Iterable[str] | None = None, start: int | None = None,
                  end: int | None = None) -> Iterator[LogMessage]:
@@ -301,13 +310,18 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     def _read(self, span: _Span) -> ChunkContents:
         """Return the messages of a span; none if it is damaged."""
         with contextlib.suppress(DamagedError):
-            if self.source.read(span.offset, 1) == bytes([Opcode.MESSAGE]):
-                return records.break_up(self.source.read(span.offset, span.end - span.offset))
-            chunk = self.source.record(span.offset, span.end, Chunk)
-            if chunk is not None:
-                return records.open_chunk(chunk, self.source.max_bytes)
+            return self._open(span)
         self.left_out += 1
         return ChunkContents(b'')
+
+    def _open(self, span: _Span) -> ChunkContents:
+        """Return the messages of a span.  Raises DamagedError."""
+        if self.source.read(span.offset, 1) == bytes([Opcode.MESSAGE]):
+            return records.break_up(self.source.read(span.offset, span.end - span.offset))
+        chunk = self.source.record(span.offset, span.end, Chunk)
+        if chunk is None:
+            raise DamagedError('no chunk')
+        return records.open_chunk(chunk, self.source.max_bytes)
 
 
 def _scan_all(scanner: Scanner) -> _Index:

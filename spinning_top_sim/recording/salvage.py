@@ -55,8 +55,9 @@ def recover(reader: LogReader, output: str | os.PathLike[str],
     except FileExistsError:
         raise LogError(f'{output} exists, and nothing is overwritten') from None
     except FileNotFoundError as error:
-        raise LogError(
-            f'cannot write {output}: there is no directory {output.parent}') from error
+        # A directory such as /proc is there, and takes no files.
+        reason = 'no files can be made in' if output.parent.is_dir() else 'there is no directory'
+        raise LogError(f'cannot write {output}: {reason} {output.parent}') from error
     except OSError as error:
         raise LogError(f'cannot write {output}: {error.strerror or error}') from error
 
