@@ -500,6 +500,17 @@ def test_the_begin_and_the_end_of_a_step_belong_to_it():
         end.tobytes())
 
 
+def test_late_instants_that_one_double_stands_for_are_all_reached():
+    """Else whoever asks for one of them goes on asking."""
+    motion, late = looping_motion(), 10 ** 17
+    step = motion._kept[-1]
+    motion._kept = [step._replace(t0=late / SECOND - 1.0, t1=late / SECOND)]
+    motion._integrator.step = lambda: step._replace(t0=late / SECOND, t1=late / SECOND + 1.0)
+    for ns in range(late - 20, late + 20):
+        assert motion.reach(ns)
+        assert motion.reached_ns >= ns
+
+
 # ------------------------------------------------------------------------- unwrapped phases
 
 @pytest.mark.parametrize(('rtol', 'bound'), [(1e-3, 0.5), (1e-5, 1e-2), (1e-9, 1e-4)])

@@ -147,7 +147,8 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
     ValueError
         Naming the argument, its value and what is allowed.
     IntegrationError
-        Where the 'euler' equations cannot go on, or after 1e7 steps.
+        Where the 'euler' equations cannot go on, a step collapses, or the last time is more than
+        1e7 steps of the present size away.
     """
     try:
         given = np.asarray(t)

@@ -54,7 +54,7 @@ class SteppedMotion(ABC):
 
     def reach(self, ns: int, max_steps: int | None = None) -> bool:
         taken = 0
-        while self._kept[-1].t1 < ns / NANOSECONDS:
+        while self.reached_ns < ns:
             if taken == max_steps:
                 return False
             self._kept.append(self._integrator.step())

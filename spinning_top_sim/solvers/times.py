@@ -52,6 +52,8 @@ class Times:
         if count.ndim != 1 or (count.size and count.dtype.kind not in 'iu'):
             raise ValueError(f'times_ns has shape {count.shape} and type {count.dtype}: must be '
                              '(n,) integer nanoseconds')
+        if count.dtype.kind == 'u' and count.size and int(count.max()) >= 2 ** 63:
+            raise ValueError(f'times_ns = {int(count.max())}: must be within int64')
         return cls(count.astype(np.int64))
 
     @classmethod
