@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from spinning_top_sim.nodes import throttle
-from spinning_top_sim.nodes.tick_loop import State
+from spinning_top_sim.nodes.tick_loop import LoopState
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING, all_streams
 
@@ -31,7 +31,8 @@ AFTER_TOPICS = """| `{throttled}` | nav_msgs/msg/Odometry | at most {rate:g} | y
 - `pose`: attitude q(world ← body) in `world_frame`; the position is the pivot, (0, 0, 0).
 - `joint_states`: {joints}: φ, θ, ψ [rad], unwrapped, and their rates [rad/s].
 - `imu/data_raw` (REP-145): angular velocity [rad/s] and specific force [m/s²] in `imu.frame_id`, +g
-  upwards at rest; `orientation_covariance[0]` = −1, because it has no orientation.
+  upwards at rest; `orientation_covariance[0]` = −1, because it has no orientation. With
+  `increments.enabled`, or `imu.sampling` = mean, `imu.rate` must be at least {slowest:g}.
 - `imu/data`: the same with the orientation of the IMU in the world. There is one IMU, which takes a
   sample every 1/`imu.rate`: at other rates a reading has the white noise of the newest sample.
   [sensor.md](sensor.md) has the errors of all sensors.
@@ -100,7 +101,8 @@ def page() -> str:
 
     lines.append(AFTER_TOPICS.format(
         throttled=throttle.TOPICS['ground_truth/odom'], rate=throttle.RATE,
-        states=listed(state.name.lower() for state in State), joints=listed(JOINTS),
+        slowest=parameters.LOWEST_RATE_OF_INTERVALS,
+        states=listed(state.name.lower() for state in LoopState), joints=listed(JOINTS),
         invariants=listed(INVARIANTS), timing=listed(TIMING)))
     for parameter in parameters.TABLE:
         default = parameter.default

@@ -207,6 +207,8 @@ def test_a_clock_that_has_not_begun_or_has_stopped_is_waited_for_aloud(
     with SimNode(tmp_path, {'use_sim_time': True, 'status_period': 0.2}) as node:
         assert waits()
         assert node.err.count('waiting for /clock') == 1
+        refused = peer.set_together(node, spin__l3=2.0)     # it would send t = 0 to nobody
+        assert not refused.successful and 'waiting for /clock' in refused.reason
         pose = peer.listen(node.topic('pose'), PoseStamped)
         clock.drive('the motion', lambda: len(pose.raw) > 50 and '/clock goes on' in node.err)
         clock.drive('no warning', lambda: diagnostics.statuses(node)[-1].level == b'\x00')

@@ -391,6 +391,23 @@ def test_a_world_is_loaded_with_all_of_its_parameters(top, as_what, paused):
     assert top.simulation.segment.start == parameters.start_state(expected)
 
 
+def test_a_world_that_does_not_go_with_the_present_parameters_is_not_the_current_one(top):
+    text = '/**: {ros__parameters: {top.mass: 2.0, imu.rate: 0.5}}'
+    top.done('LoadWorld', **load(top, text=text))
+    assert top.done('GetCurrentWorld').world.world_resource.resource_string == text
+    for name, value in (('imu.rate', 100.0), ('increments.enabled', True)):
+        assert top.node.set_parameters([Parameter(name, value=value)])[0].successful
+    top.done('ResetSimulation', scope=0)
+    assert top.done('GetCurrentWorld').world.world_resource.resource_string != text
+
+
+def test_a_world_in_another_encoding_is_named(top, tmp_path):
+    path = tmp_path / 'latin.yaml'
+    path.write_bytes(b'# \xe9t\xe9\n')
+    code, text = top.refused('LoadWorld', **load(top, str(path)))
+    assert code == BAD_FORMAT and f'{path}: must be in UTF-8' in text
+
+
 def test_the_current_world_is_known_by_its_start(top):
     assert top.done('GetCurrentWorld').world.name == 'cusp', 'the default'
     assert top.node.set_parameters([Parameter('top.mass', value=2.25)])[0].successful

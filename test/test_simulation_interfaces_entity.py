@@ -295,7 +295,8 @@ def test_bad_bounds_are_refused(top):
             (bounds(top, 'SPHERE', (0.0, 0.0, 0.0)), FAILED, 'must be two finite points'),
             (bounds(top, 'BOX', *3 * [(0.0, 0.0, 0.0)]), FAILED, 'must be two finite points'),
             (bounds(top, 'BOX', (math.nan, 0.0, 0.0), (1.0, 0.0, 0.0)), FAILED, 'finite'),
-            (bounds(top, 'SPHERE', (0.0, 0.0, 0.0), (-1.0, 0.0, 0.0)), FAILED, 'radius')):
+            (bounds(top, 'SPHERE', (0.0, 0.0, 0.0), (-1.0, 0.0, 0.0)), FAILED,
+             'bounds.points[1].x = -1.0 m: the radius')):
         found, reason = top.refused('GetEntities', filters=top.messages.EntityFilters(
             bounds=given))
         assert (found, text in reason) == (code, True), (found, reason)

@@ -7,6 +7,7 @@ import pytest
 
 from spinning_top_sim.nodes import tick_loop
 from spinning_top_sim.nodes.tick_loop import TickLoop
+from spinning_top_sim.physics.top import State
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.pipeline import Simulation
@@ -44,7 +45,7 @@ class Run:
         self.loop = TickLoop(
             self.simulation, self.values, SimpleNamespace(
                 has_room=room, write_command=lambda *_: self.told.append('command'),
-                write_event=lambda event, sent_ns, **_: self.told.append((event, sent_ns))),
+                write_event=lambda event, sent_ns=None, **_: self.told.append((event, sent_ns))),
             update_subscribers=lambda: self.told.append('subscribers'),
             tell=lambda text, _: self.told.append(text), source=self.clock, steady=self.clock)
 
@@ -234,7 +235,7 @@ def test_the_duration_ends_with_its_last_sample():
     run.ticks(100)
     assert run.loop.now_ns == 72_300_000
     assert run.stamps == grid(72_300_000)
-    assert run.loop.state is tick_loop.State.ENDED
+    assert run.loop.state is tick_loop.LoopState.ENDED
 
 
 def test_what_is_too_late_is_recorded_but_not_published():
@@ -361,12 +362,23 @@ def test_a_command_comes_after_what_is_due():
     assert run.loop.commands == run.told.count('command') == 1
 
 
+@pytest.mark.parametrize('change', [
+    lambda loop: loop.command(2.0, 1.0),
+    lambda loop: loop.set_state(lambda _: State(theta=0.5, l3=1.6, lz=1.3))])
+def test_a_change_before_the_first_tick_sends_the_samples_of_t_0(change):
+    run = Run(start_paused=True).record()
+    run.loop._update_subscribers = run.publish
+    run.loop.start()
+    change(run.loop)
+    assert (run.stamps, len(run.published)) == ([0], 1)
+
+
 def test_steps_end_with_the_duration():
     run = started(start_paused=True, duration=0.75)
     run.loop.step(1, 0.5)
-    assert run.loop.state is tick_loop.State.PAUSED
+    assert run.loop.state is tick_loop.LoopState.PAUSED
     run.loop.step(1, 0.5)
-    assert run.loop.state is tick_loop.State.ENDED
+    assert run.loop.state is tick_loop.LoopState.ENDED
     assert run.loop.now_ns == max(run.stamps) - run.simulation.epoch_ns == 750_000_000
 
 
@@ -385,14 +397,14 @@ def test_a_pause_asked_for_during_a_failure_holds_after_the_reset():
     run.loop.fail('for a test')
     run.loop.resume()
     run.loop.start()
-    assert run.loop.state is tick_loop.State.FAILED
+    assert run.loop.state is tick_loop.LoopState.FAILED
     run.loop.pause()
-    assert run.loop.state is tick_loop.State.FAILED and run.loop.failure == 'for a test'
+    assert run.loop.state is tick_loop.LoopState.FAILED and run.loop.failure == 'for a test'
     run.loop.reset(run.values, 0)
-    assert run.loop.state is tick_loop.State.PAUSED
+    assert run.loop.state is tick_loop.LoopState.PAUSED
     assert run.loop.failure is None
     run.loop.resume()
-    assert run.loop.state is tick_loop.State.RUNNING
+    assert run.loop.state is tick_loop.LoopState.RUNNING
 
 
 def test_nothing_leads_on_from_the_end():
@@ -400,6 +412,6 @@ def test_nothing_leads_on_from_the_end():
     for act in (run.loop.start, run.loop.pause, run.loop.resume,
                 lambda: run.loop.fail('for a test'), lambda: run.loop.reset(run.values, 0)):
         act()
-        assert run.loop.state is tick_loop.State.ENDED
+        assert run.loop.state is tick_loop.LoopState.ENDED
     stamps = list(run.stamps)
     assert run.ticks(5).stamps == stamps

@@ -42,6 +42,7 @@ def test_a_throttle_lets_few_messages_through_and_the_last_one(monkeypatch, peri
     one.flush(at_once=True)
     one.flush(at_once=True)
     assert sent[-1] == number
+    assert stream.sent == len(sent)
     assert len(set(sent)) == len(sent)
 
 

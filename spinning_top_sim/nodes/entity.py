@@ -126,7 +126,7 @@ def _overlaps(bounds: Message, top: Top, present: Callable[[], States]) -> bool:
     rotation = rotation_matrix(np.concatenate(present().rows_quaternion))
     if bounds.type == bounds.TYPE_BOX:
         return box.overlaps_box(rotation, Box(points.min(axis=0), points.max(axis=0)))
-    radius = points[1, 0]
+    radius = float(points[1, 0])
     if radius < 0.0:
         raise ValueError(f'bounds.points[1].x = {radius!r} m: the radius must be >= 0')
     return box.overlaps_sphere(rotation, points[0], radius)

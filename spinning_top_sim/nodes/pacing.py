@@ -19,7 +19,11 @@ BATCH_BYTES, BATCH_MESSAGES, BATCHES = 256_000, 512, 16     # read ahead
 
 
 class SimulatedClock:
-    """Maps a source clock [ns] to simulated time [ns]: `scale` times as fast, with pauses."""
+    """
+    Maps a source clock [ns] to simulated time [ns]: `scale` times as fast, with pauses.
+
+    Calls from several threads need a lock around them.
+    """
 
     def __init__(self, source: Callable[[], int], scale: float) -> None:
         self._source, self._scale = source, scale
@@ -42,7 +46,7 @@ class SimulatedClock:
 
     def when(self, simulated_ns: int) -> int | None:
         """Return the source's time of a simulated time [ns]; None while the clock stands."""
-        begin = self._from_source       # read once: other threads may stop the clock
+        begin = self._from_source
         return None if begin is None else (
             begin + round((simulated_ns - self._from_simulated) / self._scale))
 

@@ -249,7 +249,7 @@ def qos_profile(recorded: Mapping[str, Any]) -> QoSProfile:
         timed = isinstance(value, Mapping)
         number = value['sec'] * NANOSECONDS + value['nsec'] if timed else value
         if number < 0:
-            raise ValueError(f'{key} = {number}')
+            raise ValueError(f'{key} = {number}: must be >= 0')
         policies[key] = Duration(nanoseconds=min(number, 2 ** 63 - 1)) if timed else number
     policies['depth'] = min(policies['depth'], 2 ** 31 - 1) or DEFAULT_QOS['depth']
     return QoSProfile(**policies)

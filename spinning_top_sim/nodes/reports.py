@@ -15,7 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from std_msgs.msg import Header
 
 from spinning_top_sim.nodes.recording_session import RecordingSession
-from spinning_top_sim.nodes.tick_loop import State, TickLoop
+from spinning_top_sim.nodes.tick_loop import LoopState, TickLoop
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import Simulation
 
@@ -104,7 +104,7 @@ class MotionReport:
         flag = (' FAILED' if loop.failure else ' waiting for /clock' if self.waits_for_clock
                 else ' paused' if loop.paused else '')
         # The speed of an interval in which the motion ran all the time, as it still does.
-        runs = self._interruptions[0] == loop.interruptions and loop.state is State.RUNNING
+        runs = self._interruptions[0] == loop.interruptions and loop.state is LoopState.RUNNING
         # The most important first: a terminal shows as many as fit.
         return ' | '.join(filter(None, (
             f't {loop.now_ns / NANOSECONDS:9.2f} s{flag}', self._regime, f'theta {theta:6.2f} deg',

@@ -18,7 +18,7 @@ from spinning_top_sim.nodes.simulation_standard import (
     RefusedError,
     service_name,
 )
-from spinning_top_sim.nodes.tick_loop import State, TickLoop
+from spinning_top_sim.nodes.tick_loop import LoopState, TickLoop
 from spinning_top_sim.nodes.worlds import World
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -83,14 +83,14 @@ class SimulationHandlers:
     def _state(self) -> int:
         """Return the constant of SimulationState; the caller has the lock."""
         loop, states = self._loop, self._states
-        if self._quits or loop.state is State.ENDED:
+        if self._quits or loop.state is LoopState.ENDED:
             return states.STATE_QUITTING
-        if loop.state is State.WAITING:
+        if loop.state is LoopState.WAITING:
             return states.STATE_STOPPED
-        if loop.state is State.RUNNING:
+        if loop.state is LoopState.RUNNING:
             return states.STATE_PLAYING
         # A motion that has failed is paused, too.
-        is_at_start = (loop.state is State.PAUSED and self._simulation.now_ns < 0
+        is_at_start = (loop.state is LoopState.PAUSED and self._simulation.now_ns < 0
                        and loop.interruptions != self._pause_at_start)
         return states.STATE_STOPPED if is_at_start else states.STATE_PAUSED
 
@@ -218,7 +218,7 @@ class SimulationHandlers:
         def step() -> None:
             loop = self._loop
             if self._quits or loop.interruptions != interruptions:
-                why = ('`duration` ends before the steps do' if loop.state is State.ENDED else
+                why = ('`duration` ends before the steps do' if loop.state is LoopState.ENDED else
                        loop.failure or 'the simulation was reset, or its state set')
                 raise RuntimeError(f'interrupted after {done} of {steps} steps: {why}')
             self._step(1)

@@ -30,11 +30,11 @@ from spinning_top_sim.nodes.pacing import DeadlineThread, FairLock
 from spinning_top_sim.nodes.recording_session import RecordingSession, Topic
 from spinning_top_sim.nodes.ros_parameters import SPIN
 from spinning_top_sim.nodes.throttle import TOPICS, Throttle
-from spinning_top_sim.nodes.tick_loop import State, TickLoop, next_epoch
+from spinning_top_sim.nodes.tick_loop import LoopState, TickLoop, next_epoch
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.pipeline import PoleError, Simulation
 from spinning_top_sim.streams.stream import Stream
 
 
@@ -197,7 +197,7 @@ class Simulator(Node):
         if open_log is not None:
             try:
                 self._log.info(open_log())
-            except RecordingError as error:
+            except RecordingError as error:     # nobody has asked for it, and gets an answer
                 self._session.error = str(error)
                 self._log.error(f'not recording: {error}')
 
@@ -226,9 +226,9 @@ class Simulator(Node):
     def _tick(self) -> bool:
         with self._lock:
             wants_idle = self._loop.tick()
-            if self._loop.state is not State.RUNNING:
-                self._outputs.flush(at_once=self._loop.state is State.ENDED)
-        if self._loop.state is State.ENDED and not self.finished.done():
+            if self._loop.state is not LoopState.RUNNING:
+                self._outputs.flush(at_once=self._loop.state is LoopState.ENDED)
+        if self._loop.state is LoopState.ENDED and not self.finished.done():
             wait_for_all_acked(self._outputs.by_topic.values(), 1.0)
             self.finished.set_result(None)
         return wants_idle
@@ -280,10 +280,6 @@ class Simulator(Node):
         successful, reason = self._outcome(self._change, changes)
         if ros_parameters.is_command(changes) and not successful:
             self._loop.rejected_commands += 1
-        if 'both together' in reason:
-            reason += (f', as by: ros2 topic pub --once {self.resolve_topic_name("~/commands")} '
-                       "std_msgs/msg/Float64MultiArray '{data: [L3, Lz]}', or by the service "
-                       f'{self.get_fully_qualified_name()}/set_parameters_atomically')
         return SetParametersResult(successful=successful, reason=reason)
 
     def _change(self, changes: dict[str, Any]) -> None:
@@ -291,7 +287,8 @@ class Simulator(Node):
         rest = sorted(changes.keys() - SPIN)
         with self._lock:
             if ros_parameters.is_command(changes):
-                self._loop.command(values['spin.l3'], values['spin.lz'])
+                self.check_started()
+                self._command(values['spin.l3'], values['spin.lz'])
             if rest:
                 changed = {name: values[name] for name in rest}
                 self._session.write_event('parameters', **changed)
@@ -304,6 +301,15 @@ class Simulator(Node):
             if names:
                 self._log.info(f'{", ".join(names)}: {effect.value}')
         self._values, self._start_spin = values, start_spin
+
+    def _command(self, l3: float, lz: float) -> None:
+        try:
+            self._loop.command(l3, lz)
+        except PoleError as error:
+            raise ValueError(
+                f'{error}, as by: ros2 topic pub --once {self.resolve_topic_name("~/commands")} '
+                "std_msgs/msg/Float64MultiArray '{data: [L3, Lz]}', or by the service "
+                f'{self.get_fully_qualified_name()}/set_parameters_atomically') from error
 
     def _open_outputs(self, values: Mapping[str, Any]) -> None:
         """Have the publishers and the status line that these parameters ask for."""
@@ -397,7 +403,10 @@ class Simulator(Node):
 
     def _record(self, request: SetBool.Request) -> str:
         if not request.data:
-            return self._session.stop() or 'not recording'
+            summary = self._session.stop()
+            if summary and self._session.error:
+                raise RecordingError(summary)
+            return summary or 'not recording'
         self.check_started()
         return self._session.start(self.start_values)()
 

@@ -26,6 +26,7 @@ class Throttle:
         self.publisher = publisher
         self._due = 0.0                         # on the monotonic clock: when one may go out
         self._withheld: bytes | None = None     # the newest message, if it has not gone out
+        self._uncounted = False                 # it is not among the stream's messages sent
 
     def sink(self, stream: Stream, publish_all: Publish | None) -> Publish | None:
         """
@@ -44,9 +45,8 @@ class Throttle:
             self._publish_all(message)
         now = time.monotonic()
         if now < self._due:
-            self._withheld = message
-            if self._publish_all is None:
-                self._stream.sent -= 1          # who calls this counts it
+            self._withheld, self._uncounted = message, self._publish_all is None
+            self._stream.sent -= self._uncounted        # who calls this counts it
             return
         self._send(message, now)
 
@@ -61,4 +61,5 @@ class Throttle:
         if self._withheld is not None:
             now = time.monotonic()
             if at_once or now >= self._due:
+                self._stream.sent += self._uncounted
                 self._send(self._withheld, now)

@@ -9,8 +9,8 @@ from typing import Any
 
 from spinning_top_sim.nodes.pacing import SimulatedClock
 from spinning_top_sim.nodes.recording_session import RecordingSession
-from spinning_top_sim.physics import top
 from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.top import State
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import Simulation
@@ -41,13 +41,14 @@ def next_epoch(date_ns: int) -> int:
     return -(-date_ns // EPOCH_GRID_NS) * EPOCH_GRID_NS
 
 
-class State(Enum):
+class LoopState(Enum):
     """
     What a `TickLoop` does; simulated time runs in RUNNING only.
 
-        WAITING --start--> RUNNING --duration--> ENDED, which is final
-                           RUNNING --pause--> PAUSED --resume--> RUNNING
-        any state --fail--> FAILED --reset--> RUNNING
+        WAITING --start--> RUNNING --pause--> PAUSED --resume--> RUNNING
+        RUNNING, or PAUSED by a step --duration--> ENDED, which is final
+        any other --fail--> FAILED
+        any other --reset--> RUNNING
 
     `start` and `reset` lead to PAUSED if a pause is asked for.
     """
@@ -79,7 +80,7 @@ class TickLoop:
                  steady: Callable[[], int] = time.monotonic_ns) -> None:
         self.late_ticks = self.skipped_ticks = self.slipped_ns = 0      # since the start
         self.commands = self.rejected_commands = 0
-        self.state = State.WAITING
+        self.state = LoopState.WAITING
         self.paused: bool = values['start_paused']      # asked for; a failure does not change it
         self.failure: str | None = None         # why the motion stands still until `reset`
         self.interruptions = 0                  # changes of the state, and resets
@@ -104,15 +105,15 @@ class TickLoop:
 
     def start(self) -> None:
         """Let simulated time run from 0 on, unless the motion is paused or has failed."""
-        if self.state is State.WAITING:
-            self._enter(State.PAUSED if self.paused else State.RUNNING)
+        if self.state is LoopState.WAITING:
+            self._enter(LoopState.PAUSED if self.paused else LoopState.RUNNING)
 
-    def _enter(self, state: State) -> None:
+    def _enter(self, state: LoopState) -> None:
         """Change the state; time runs, or stands, from where all samples are sent."""
-        if self.state not in {state, State.ENDED}:
+        if self.state not in {state, LoopState.ENDED}:
             self.state = state
             self.interruptions += 1
-        self._clock.set(self.now_ns, running=self.state is State.RUNNING)
+        self._clock.set(self.now_ns, running=self.state is LoopState.RUNNING)
         self._pace_ticks()
 
     def _pace_ticks(self) -> None:
@@ -131,7 +132,7 @@ class TickLoop:
         if (self._simulation.now_ns <= due_ns < self._fast_until_ns and steady_ns <= late_from_ns
                 and self._simulation.send_ready(due_ns)):
             return self._block_unfinished
-        if self.state is not State.RUNNING:
+        if self.state is not LoopState.RUNNING:
             return False
         if steady_ns > late_from_ns:
             self.late_ticks += 1
@@ -142,7 +143,7 @@ class TickLoop:
             self._subscribers_due_ns = steady_ns + SUBSCRIBERS_PERIOD_NS
         due_ns = self._advance()
         if self._simulation.now_ns >= self._duration_ns:
-            self._enter(State.ENDED)
+            self._enter(LoopState.ENDED)
             return False
         return self._plan_fast_ticks() and self._simulation.now_ns >= due_ns
 
@@ -157,7 +158,7 @@ class TickLoop:
         """Set until when ticks are fast; return whether `idle` has a block to compute."""
         simulation = self._simulation
         block_due_ns = -1 if self._block_unfinished else simulation.ready_ns - self._ahead_ns
-        if self.state is State.RUNNING:
+        if self.state is LoopState.RUNNING:
             self._fast_until_ns = min(
                 simulation.now_ns + int(SUBSCRIBERS_PERIOD_NS * self._time_scale),
                 self._duration_ns, NEVER_NS if self._block_unfinished else block_due_ns)
@@ -168,13 +169,13 @@ class TickLoop:
         simulation, has_room = self._simulation, self._recording.has_room
         due_ns = self._clock.now()
         target_ns = min(due_ns, self._duration_ns)
-        if self.state is not State.RUNNING:
+        if self.state is not LoopState.RUNNING:
             return target_ns
         if due_ns < simulation.now_ns:          # as where a log is played in a loop
             back_s = (simulation.now_ns - due_ns) / self._time_scale / NANOSECONDS
             self._tell(f'/clock stepped back by {back_s:g} s: the motion and its stamps go on '
                        'from where they are', False)
-            self._enter(State.RUNNING)
+            self._enter(LoopState.RUNNING)
             return simulation.now_ns
         publish_from_ns = target_ns - int(LATEST_NS * self._time_scale)
         if simulation.epoch_ns + target_ns > LAST_LIVE_STAMP_NS:
@@ -190,21 +191,21 @@ class TickLoop:
         lag_ns = target_ns - simulation.now_ns
         if not arrived and lag_ns > LONGEST_LAG_NS * self._time_scale:
             self.slipped_ns += lag_ns
-            self._enter(State.RUNNING)
+            self._enter(LoopState.RUNNING)
         return target_ns
 
     def pause(self) -> None:
         """Send what is due, then hold the motion; does nothing when paused already."""
         self._advance()
         self.paused = True
-        if self.state is State.RUNNING:
-            self._enter(State.PAUSED)
+        if self.state is LoopState.RUNNING:
+            self._enter(LoopState.PAUSED)
 
     def resume(self) -> None:
         """Let simulated time run on from where it was held, without catching up."""
         self.paused = False
-        if self.state is State.PAUSED:
-            self._enter(State.RUNNING)
+        if self.state is LoopState.PAUSED:
+            self._enter(LoopState.RUNNING)
 
     def step(self, count: int, dt: float) -> None:
         """
@@ -234,7 +235,7 @@ class TickLoop:
             self._simulation.advance(min(target_ns, last_ns), give_way=give_way)
         except IntegrationError as error:
             self.fail(str(error))
-        self._enter(State.ENDED if self.now_ns >= self._duration_ns else self.state)
+        self._enter(LoopState.ENDED if self.now_ns >= self._duration_ns else self.state)
         if self.failure:
             raise RuntimeError(self.failure)
         if self.now_ns == last_ns:
@@ -245,26 +246,31 @@ class TickLoop:
 
     def command(self, l3: float, lz: float) -> None:
         """Send what is due, then let L3 and Lz jump [kg m^2/s], or raise ValueError."""
-        self._advance()
+        self._send_before_change()
         if self.failure:
             raise ValueError(f'l3 = {l3!r}, lz = {lz!r}: the motion stands still: {self.failure}')
         self._simulation.command(l3, lz)
         self._recording.write_command(l3, lz)
         self.commands += 1
 
-    def set_state(self, change: Callable[[States], top.State]) -> None:
+    def set_state(self, change: Callable[[States], State]) -> None:
         """
         Send what is due, then let the top be in another state, or raise ValueError.
 
         change : takes the present state (n = 1), and returns the new one
         """
-        self._advance()
+        self._send_before_change()
         if self.failure:
             raise ValueError(f'the motion stands still: {self.failure}')
         state = change(self._simulation.state())
         self._simulation.set_state(state)
         self._recording.write_event('state', **asdict(state))
         self.commands += 1
+
+    def _send_before_change(self) -> None:
+        if self._simulation.now_ns < 0:         # the change sends the samples of t = 0
+            self._update_subscribers()
+        self._advance()
 
     def reset(self, values: Mapping[str, Any], date_ns: int, paused: bool | None = None) -> None:
         """
@@ -282,13 +288,13 @@ class TickLoop:
             self.paused = paused
         self.interruptions += 1
         self.set_pace(values)           # a change that failed midway may not have set it
-        self._enter(State.PAUSED if self.paused else State.RUNNING)
+        self._enter(LoopState.PAUSED if self.paused else LoopState.RUNNING)
         self._recording.write_event('reset', sent_ns, epoch_ns=epoch_ns, parameters=values)
 
     def fail(self, reason: str) -> None:
         """Hold the motion until `reset`."""
         self.failure = reason
-        self._enter(State.FAILED)
+        self._enter(LoopState.FAILED)
         self._tell(f'{reason}; the motion stands still until ~/reset', True)
 
     def set_pace(self, values: Mapping[str, Any]) -> None:

@@ -92,7 +92,11 @@ class World:
         if path.stat().st_size > LARGEST_FILE:
             raise FormatError(f'{uri}: {path.stat().st_size} bytes; must be at most '
                               f'{LARGEST_FILE}')
-        return cls.parse(path.read_text(encoding='utf-8'), str(path.absolute()))
+        try:
+            text = path.read_text(encoding='utf-8')
+        except UnicodeDecodeError as error:
+            raise FormatError(f'{uri}: must be in UTF-8: {error}') from error
+        return cls.parse(text, str(path.absolute()))
 
     def values(self, present: Mapping[str, Any]) -> dict[str, Any]:
         """Return the present parameters with those of the world.  Raises ValueError."""
@@ -102,7 +106,11 @@ class World:
 
     def is_that_of(self, values: Mapping[str, Any]) -> bool:
         """Return whether a motion with these parameters starts as this world does."""
-        return all(values[name] == value for name, value in self.values(values).items())
+        try:
+            wanted = self.values(values)
+        except ValueError:      # its parameters do not go with those outside of a world
+            return False
+        return all(values[name] == value for name, value in wanted.items())
 
     @property
     def description(self) -> str:

@@ -61,7 +61,6 @@ class Parameter:
         return '; '.join(filter(None, (
             self.text + (f' [{self.unit}]' if self.unit else ''),
             self.allowed if range_too and (self.choices or self._bounds()) else '',
-            'unset: L3 cos(theta0), the cusp' if self.default is None else '',
             self.effect.value)))
 
     def _bounds(self) -> str:
@@ -189,8 +188,8 @@ TABLE: tuple[Parameter, ...] = (
     # These two without a range: the motion decides what is too fast.
     _at_once('spin.l3', 1.6, 'Angular momentum along the axis; a change is a command',
               'kg m^2/s'),
-    _at_once('spin.lz', None, 'Angular momentum along the vertical; a change is a command',
-              'kg m^2/s'),
+    _at_once('spin.lz', None, 'Angular momentum along the vertical; a change is a command; unset: '
+             'L3 cos(initial.theta), the cusp', 'kg m^2/s'),
     _at_reset('solver.method', 'rk45', 'Dormand-Prince steps or the closed form', choices=METHODS),
     _at_reset('solver.equations', 'transport', "rk45: regular form, or the paper's to the letter",
               choices=EQUATIONS),
@@ -256,8 +255,8 @@ TABLE: tuple[Parameter, ...] = (
     _at_start('record.enabled', False, 'Record from the start'),
     _at_recording('record.uri', '', 'File or folder of a recording; empty: '
                   'spinning_top_<date>_<time>.mcap here'),
-    _at_recording('record.streams', ('all',), 'Which streams to record, by name; all: each '
-                  'enabled one'),
+    _at_recording('record.streams', ('all',), 'Which streams to record, by the names before '
+                  '.enabled; all: each enabled one'),
     _at_recording('record.max_loss', 0.5, 'At most this much is lost by a power cut', 's', 0.01,
                   60.0),
     _at_recording('record.compression', 'zstd', 'Compression of the chunks',

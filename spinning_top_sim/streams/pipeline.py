@@ -49,6 +49,10 @@ Log = Callable[[Sequence[int], int, Sequence[bytes], int], object]
 TakeRows = Callable[[Stream, NDArray[np.int64], NDArray[np.uint8]], object]
 
 
+class PoleError(ValueError):
+    """A command that is impossible with the axis at a pole, where Lz must be L3 or -L3."""
+
+
 class Simulation:
     """
     One top in motion.
@@ -280,7 +284,7 @@ class Simulation:
         """
         Let L3 and Lz jump now [kg m^2/s]: an impulsive torque.  Angles and theta' stay.
 
-        Raises ValueError naming what is off; then the motion goes on unchanged.
+        Raises ValueError naming what is off, at a pole PoleError; the motion goes on unchanged.
         """
         for name, value in (('l3', l3), ('lz', lz)):
             if not math.isfinite(value):
@@ -290,7 +294,7 @@ class Simulation:
         theta = float(now.theta[0])
         pole = pole_momentum(abs(theta), l3)
         if pole is not None and lz != pole:
-            raise ValueError(
+            raise PoleError(
                 f'lz = {lz!r} kg m^2/s with l3 = {l3!r}: the axis is at a pole (theta = '
                 f'{theta!r} rad), where lz must equal {pole!r}; command both together')
         start = ContinuedState(theta=theta, theta_dot=float(now.theta_dot[0]),

@@ -27,6 +27,9 @@ Show a top in the browser: the one that a sim_node simulates, or those of logs.
   view run.mcap                         without ROS
   view rk45.mcap exact.mcap             side by side, or one over the other
   view run.mcap --html page.html        a file that opens without this program
+
+exit code: 0 ended, also by a signal; 1 a log cannot be read, or a file written;
+2 cannot be started, or wrong arguments; 130 interrupted before
 """
 LOOPBACK = '127.0.0.1'
 LAST_PORT = 65535
