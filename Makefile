@@ -9,7 +9,7 @@ SCENE ?= cusp
 LOGS ?= logs
 ARGS ?=
 TESTS ?= test
-WORKERS ?= 4
+WORKERS ?= 6
 
 # The extra of setup.py with the wheels of this ROS; an environment has one ROS only.
 ROS_SUFFIX := $(if $(filter-out jazzy,$(ROS)),-$(ROS))

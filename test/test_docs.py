@@ -20,7 +20,7 @@ PAGES = {str(path.relative_to(ROOT)): path.read_text(encoding='utf-8')
 NOT_RUN = {
     'installs packages from the network': 4,
     'the tests have a domain of their own': 1,
-    'needs the command line tools of a ROS installation': 8,
+    'needs the command line tools of a ROS installation': 9,
     'runs until Ctrl-C, after it has installed packages': 5,
     'takes minutes or hours': 3,
     'serves a page until Ctrl-C; test_view_browser.py opens one': 1,

@@ -17,7 +17,7 @@ parameter, in files or not, the last one on the command line holds.
   ros2 run spinning_top_sim sim_node --ros-args --params-file looping.yaml
   ros2 run spinning_top_sim sim_node --ros-args -p spin.l3:=2.0
 
-exit code: 0 ended, also by a signal; 2 cannot be started; 130 interrupted before
+exit code: 0 ended, also by a signal; 2 cannot start; 130 interrupted before
 
 ~ is /spinning_top.  Subscribes to:
   ~/commands (std_msgs/Float64MultiArray: [L3, Lz] in kg m^2/s)
