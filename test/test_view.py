@@ -179,6 +179,45 @@ def test_a_live_track_names_the_motion_from_its_samples(start, words):
     assert isinstance(motion, Motion)
 
 
+def test_means_of_the_rates_are_drawn_as_the_rates(tmp_path):
+    pytest.importorskip('viser')
+    from spinning_top_sim.view.log import read_logs
+    rows = []
+    for sampling in ('instant', 'mean'):
+        path = tmp_path / f'{sampling}.mcap'
+        assert simulate.main(['--duration', '1', '-o', str(path), '--quiet', '-p',
+                              f'imu.sampling:={sampling}', '-p', 'imu.rpy:=[0.3, 0.0, 1.0]']) == 0
+        rows.append(read_logs([path])[0].track.columns['ground_truth/imu'].rows)
+    assert rows[0].shape == rows[1].shape == (201, 10)
+    assert (rows[0][:, :4] == rows[1][:, :4]).all()
+    assert rows[1][1:, 4:7] == pytest.approx((rows[0][1:, 4:7] + rows[0][:-1, 4:7]) / 2, abs=2e-3)
+
+
+def test_each_of_two_logs_has_its_own_time(page, tmp_path):
+    from spinning_top_sim.view.log import Player, read_logs
+    paths = tmp_path / 'a.mcap', tmp_path / 'b.mcap'
+    for path, epoch in zip(paths, ('1', '1000'), strict=True):
+        assert simulate.main(['--duration', '1', '-o', str(path), '--epoch', epoch]) == 0
+    Player(page, read_logs(paths)).draw_next(0.5)
+    assert page._words.content.count('- t = 0.500 s, stamp ') == 2
+
+
+def test_a_truncated_log_that_cannot_be_followed_is_told_as_both(log, tmp_path, monkeypatch):
+    pytest.importorskip('viser')
+    from spinning_top_sim.tools import recorded_run
+    from spinning_top_sim.view.log import read_logs
+
+    def odd(*_):
+        raise recorded_run.DepartureError('nowhere')
+
+    monkeypatch.setattr(recorded_run, 'rerun', odd)
+    torn = tmp_path / 'torn.mcap'
+    torn.write_bytes(log.read_bytes()[:-60_000])
+    (shown,) = read_logs([torn])
+    assert shown.note == ('torn.mcap: it is truncated: shown as far as it goes; the run cannot be '
+                          'followed: DepartureError: nowhere')
+
+
 def test_two_logs_of_one_time_lie_on_each_other(log, tmp_path):
     pytest.importorskip('viser')
     from spinning_top_sim.view.log import read_logs
@@ -251,6 +290,17 @@ def test_a_player_follows_its_buttons_and_the_slider(log, estimate, page):
     player._switch()
     player.draw_next(0.5)
     assert (player._slider.value, player._button.label) == (pytest.approx(0.5), 'Pause')
+
+
+@pytest.mark.skipif(not socket.has_ipv6, reason='no IPv6')
+def test_the_server_may_be_on_ipv6():
+    pytest.importorskip('viser')
+    from spinning_top_sim.view.server import _free_port
+    try:
+        socket.create_server(('::1', 0), family=socket.AF_INET6).close()
+    except OSError:
+        pytest.skip('no ::1')
+    assert _free_port('::1', None) >= 8080
 
 
 def test_the_server_is_on_loopback_and_takes_the_next_free_port():

@@ -9,17 +9,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import SimNode, wait_for
 from helpers.node_logs import stamp_of
 from helpers.simulations import record
 from nav_msgs.msg import Odometry
+from rclpy.parameter import Parameter
 
 from spinning_top_sim.nodes import throttle
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.view.track import Track
 
 VIEW = ('-m', 'spinning_top_sim.view.command', '--no-browser', '--port', '0')
 PERIODS = {'/pose': 5_000_000, '/ground_truth/odom': 10_000_000}
@@ -115,10 +118,10 @@ def live():
 
 
 def test_the_page_goes_on_where_the_clock_of_a_new_run_is_earlier(live):
-    from spinning_top_sim.view.track import Track
     values = parameters.checked({'spin.lz': 1.4})
     live._stale, live._track = False, Track('', values)
     live._page.set_tracks([live._track])
+    live._listen_as_needed()
     for epoch_ns in (100 * NANOSECONDS, 5 * NANOSECONDS):
         run = Simulation(values, epoch_ns)
         taken = record(run, 'ground_truth/odom')
@@ -132,6 +135,62 @@ def test_the_page_goes_on_where_the_clock_of_a_new_run_is_earlier(live):
     live._inbox.append(('ground_truth/odom', taken[-2][2]))
     live._draw_once()
     assert live._track.span == (epoch_ns, epoch_ns + NANOSECONDS // 2)
+
+
+def answers_with(live, monkeypatch, given):
+    """Let a sim_node answer with these parameters instead of the defaults; it is started."""
+    def ask(_, request):
+        values = parameters.checked(given)
+        spin = {'spin.l3': 1.6, 'spin.lz': 1.4}
+        return SimpleNamespace(values=[
+            Parameter(name, value=list(value) if isinstance(value, tuple) else value
+                      ).get_parameter_value()
+            for name in request.names for value in [spin.get(name, values[name])]])
+
+    monkeypatch.setattr(live, '_ask', ask)
+
+
+def diagnostics_at(live, epoch_ns):
+    live._on_diagnostics(DiagnosticArray(status=[DiagnosticStatus(
+        name='spinning_top', values=[KeyValue(key=key, value=value) for key, value in {
+            'state': 'running', 'recorder': 'off', 'simulated time [s]': '1', 'energy drift': '0',
+            'real-time factor': '1', 'orientation error [rad]': '0',
+            'stamp of t = 0 [ns]': str(epoch_ns)}.items()])]))
+
+
+def test_the_page_shows_another_top_when_its_motion_begins(live, monkeypatch):
+    given = {}
+    answers_with(live, monkeypatch, given)
+    live._read_parameters()
+    diagnostics_at(live, NANOSECONDS)
+    assert live._track.top.mass == parameters.checked({})['top.mass']
+    given |= {'top.mass': 4.0, 'pose.rate': 50.0}       # the mass waits for a reset
+    live._read_parameters()
+    diagnostics_at(live, NANOSECONDS)
+    assert live._track.top.mass == parameters.checked({})['top.mass']
+    assert live._track.values['pose.rate'] == 50.0
+    assert not live._stale
+    diagnostics_at(live, 2 * NANOSECONDS)
+    assert live._stale
+    live._read_parameters()
+    assert live._track.top.mass == 4.0
+
+
+def test_the_page_goes_on_with_the_topics_that_come(live):
+    values = parameters.checked({'spin.lz': 1.4})
+    live._stale, live._track = False, Track('', values)
+    live._page.set_tracks([live._track])
+    run = Simulation(values, NANOSECONDS)
+    taken = record(run, 'ground_truth/odom', 'pose', 'joint_states')
+    for number, enabled in enumerate((True, False, True)):
+        live._track.values = {**values, 'ground_truth_odom.enabled': enabled}
+        live._listen_as_needed()
+        run.advance((number + 1) * NANOSECONDS)
+        live._inbox.extend((topic, data) for topic, _, data in taken if topic in live._listeners)
+        taken.clear()
+        live._draw_once()
+        assert live._track.span[1] == (number + 2) * NANOSECONDS
+        assert live._page._tops[0].drawn[0] == (number + 2) * NANOSECONDS
 
 
 def test_a_scene_brings_its_start_and_leaves_the_sensor_alone(live, monkeypatch):

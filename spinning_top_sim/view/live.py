@@ -39,6 +39,7 @@ from spinning_top_sim.view.track import (
     LATEST_NS,
     ORIENTATION_ERROR,
     WIDTHS,
+    Columns,
     Track,
 )
 
@@ -49,6 +50,8 @@ ANSWER_S = 5.0                  # a service that takes longer does not answer
 SILENT_S = 5.0                  # /diagnostics come every second
 RESTART_NS = NANOSECONDS        # stamps that go back by more are those of another run
 KEPT_NS = 2 * max(WINDOW_NS, model.TRACE_NS)
+OF_THE_START = [parameter.name for parameter in parameters.TABLE
+                if parameter.effect is parameters.Effect.RESET]
 KIND_OF = {'pose': PoseStamped, 'joint_states': JointState, 'ground_truth/odom': Odometry,
            'ground_truth/imu': Imu}
 
@@ -83,6 +86,8 @@ class LiveView(Node):
                 ('record', SetBool), ('step', Trigger), ('reset', Trigger))}
         self._track: Track | None = None
         self._stale = True                      # the parameters have to be read again
+        # Whether those of the start are those of the motion: until a reset they may be later.
+        self._motion_is_new = True
         self._origin_ns: int | None = None      # stamp of t = 0; unknown in the first second
         self._errors: tuple[float, float] | None = None         # not drawn yet
         self._heard_at = math.inf       # when /diagnostics came last, on the monotonic clock
@@ -132,9 +137,15 @@ class LiveView(Node):
                 self._heard_at = time.monotonic()
                 numbers = {pair.key: pair.value for pair in status.values}
                 self._controls.tell_status(status.message, numbers)
-                self._origin_ns = int(numbers['stamp of t = 0 [ns]'])
+                origin_ns = int(numbers['stamp of t = 0 [ns]'])
+                if self._origin_ns not in (None, origin_ns):
+                    self._expect_new_motion()
+                self._origin_ns = origin_ns
                 self._errors = float(numbers['energy drift']), float(
                     numbers['orientation error [rad]'])
+
+    def _expect_new_motion(self) -> None:
+        self._motion_is_new = self._stale = True
 
     def _is_heard(self) -> bool:
         """Whether there is still a sim_node, as far as that is known."""
@@ -179,7 +190,12 @@ class LiveView(Node):
             if newest is not None and stamps_ns[-1] < newest[0] - RESTART_NS:
                 # The sim_node was started again; its t = 0 is not known yet.
                 track, self._origin_ns = self._begin_track(track.values), None
+                self._expect_new_motion()
             track.add(topic, stamps_ns, messages)
+        for topic, width in WIDTHS.items():         # else old samples would stay the best ones
+            if topic != '~/invariants' and topic not in self._listeners and len(
+                    track.columns[topic].stamps_ns):
+                track.columns[topic] = Columns(width)
         if track.span is None:
             return
         newest_ns = track.span[1]
@@ -197,21 +213,24 @@ class LiveView(Node):
     def _read_parameters(self) -> None:
         """Read the parameters of the sim_node, and begin a new track if it is another top."""
         self._stale = False
+        motion_is_new, self._motion_is_new = self._motion_is_new, False
         names = [name for name in parameters.BY_NAME if name not in SPIN]
         try:
             answer = self._ask('get_parameters', GetParameters.Request(names=[*names, *SPIN]))
         except RefusedError:
-            self._stale = True
+            self._stale, self._motion_is_new = True, motion_is_new
             return
         shown = list(map(parameter_value_to_python, answer.values))
         # The present spin need not be one to start with.
         values = {**parameters.checked(dict(zip(names, shown, strict=False))),
                   **dict(zip(SPIN, shown[-len(SPIN):], strict=True))}
+        self._controls.show_values(values)
+        if self._track is not None and not motion_is_new:
+            values |= {name: self._track.values[name] for name in OF_THE_START}
         if self._track is None or _drawn(values) != _drawn(self._track.values):
             self._begin_track(values)
         else:
             self._track.values = values
-        self._controls.show_values(values)
 
     def _begin_track(self, values: Mapping[str, Any]) -> Track:
         """Show what comes from now on instead of what has come."""
@@ -243,6 +262,8 @@ class LiveView(Node):
         answer = self._ask(name, request)
         if not answer.success:
             raise RefusedError(answer.message)
+        if name == 'reset':
+            self._expect_new_motion()
         return f'{name.removeprefix("set_")}: {answer.message}'
 
     def set_parameters_together(self, values: Mapping[str, Any]) -> str:

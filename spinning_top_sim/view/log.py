@@ -54,13 +54,13 @@ def read_log(path: Path, name: str, others: Mapping[str, Any]) -> Log:
     origin_ns: int | None = None
     commands_ns: list[int] = []
     with LogReader(path) as reader:
-        note = '' if reader.whole else f'{path.name} is truncated: shown as far as it goes'
+        note = '' if reader.whole else 'it is truncated: shown as far as it goes'
         try:
             run = recorded_run.read_run_description(reader)
         except recorded_run.ForeignLogError as error:
             track = _read_foreign(reader, name, others, str(error))
         else:
-            track = Track(name, run.values_at_recording)
+            track = Track(name, run.values_in_effect)
             _read_samples(reader, track, run.topics)
             origin_ns = run.epoch_ns
             try:
@@ -73,10 +73,12 @@ def read_log(path: Path, name: str, others: Mapping[str, Any]) -> Log:
                     if event.name == 'command':
                         commands_ns.append(simulation.epoch_ns + at_ns)
             except (recorded_run.DepartureError, *recorded_run.ODD) as error:
-                note = f'{path.name}: the run cannot be followed: {recorded_run.reason_of(error)}'
+                note = '; '.join(filter(None, (
+                    note, f'the run cannot be followed: {recorded_run.reason_of(error)}')))
     if track.span is None:
         raise LogError(f'{path}: no attitude of a top in it')
-    return Log(track, track.span[0] if origin_ns is None else origin_ns, commands_ns, note)
+    return Log(track, track.span[0] if origin_ns is None else origin_ns, commands_ns,
+               f'{path.name}: {note}' if note else '')
 
 
 def _read_samples(reader: LogReader, track: Track, topics: Mapping[str, str]) -> None:
@@ -116,7 +118,7 @@ def read_logs(paths: Sequence[Path]) -> list[Log]:
     others: Mapping[str, Any] = parameters.checked({})
     for path in paths:
         with LogReader(path) as reader, contextlib.suppress(recorded_run.ForeignLogError):
-            others = recorded_run.read_run_description(reader).values_at_recording
+            others = recorded_run.read_run_description(reader).values_in_effect
     return [read_log(path, name, others) for path, name in zip(paths, names, strict=True)]
 
 

@@ -238,6 +238,7 @@ class Page:
         """Say which motion this is, and the numbers of the sample that is drawn."""
         lines = []
         for top, stamp_ns in zip(self._tops, stamps_ns, strict=True):
+            shift_ns = stamp_ns - stamps_ns[0]          # of its t = 0 from that of the first
             if top.drawn is None:
                 lines.append(f'{top.track.name} *{NO_SAMPLES}*')
                 continue
@@ -250,7 +251,7 @@ class Page:
             title = ' '.join(filter(None, (top.track.name, regime)))
             lines += [
                 f'**{title}**' if title else '', *(f'- {number}' for number in numbers),
-                f'- t = {(top.drawn[0] - origin_ns) / NANOSECONDS:.3f} s, stamp '
+                f'- t = {(top.drawn[0] - shift_ns - origin_ns) / NANOSECONDS:.3f} s, stamp '
                 f'{seconds}.{nanoseconds:09d}',
                 f'- q = {x:.6f}, {y:.6f}, {z:.6f}, {w:.6f}', '']
         if len(self._tops) == 2 and all(top.drawn for top in self._tops):

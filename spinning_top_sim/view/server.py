@@ -46,7 +46,8 @@ def _free_port(host: str, port: int | None, first: int = 8080) -> int:
     """Return the port, by default the first free one.  Raises OSError if it cannot be used."""
     for number in (range(first, first + PORTS) if port is None else (port,)):
         try:
-            with socket.create_server((host, number)) as server:
+            family = socket.AF_INET6 if ':' in host else socket.AF_INET
+            with socket.create_server((host, number), family=family) as server:
                 return int(server.getsockname()[1])
         except OSError as error:
             if error.errno != errno.EADDRINUSE or number == port:

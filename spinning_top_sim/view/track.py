@@ -142,8 +142,10 @@ class Track:
         if topic == 'ground_truth/imu':
             if len(rows) < len(stamps):         # an attitude of zeros
                 return
-            _, force = self._imu.in_body(tuple(fields[0].T), tuple(fields[2].T))
-            rows = np.column_stack((rows, *force))
+            # With imu.sampling = mean, rates and force are means: near enough to be drawn.
+            (_, rates), (_, force) = (self._imu.in_body(tuple(fields[0].T), tuple(field.T))
+                                      for field in fields[1:3])
+            rows = np.column_stack((rows[:, :4], *rates, *force))
         self.columns[topic].append(found.stamps_ns, rows)
 
     def forget(self, before_ns: int) -> None:
