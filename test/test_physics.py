@@ -402,6 +402,12 @@ def test_a_description_shows_ranges_with_as_many_digits_as_tell_their_ends_apart
     assert f'precession 0 rad/s ({text}), spin' in str(motion)
 
 
+@pytest.mark.parametrize('theta', [0.2, 2.1])
+def test_the_swing_of_a_pendulum_that_turns_over_ends_at_the_poles(theta):
+    top = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
+    assert swing(top, State(theta=theta, theta_dot=20.0, l3=0.0, lz=0.0)) == (-1.0, 1.0)
+
+
 def test_the_swing_is_that_of_the_samples_of_a_nutation():
     """Of random tops on both sides of the horizontal, and through the poles."""
     compared = 0

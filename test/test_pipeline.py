@@ -369,6 +369,20 @@ def test_late_samples_are_not_published_but_counted():
     assert pose.skipped == 899
 
 
+def test_a_recording_that_begins_while_late_samples_are_left_out_has_them():
+    simulation = simulate()
+    published = publish(simulation, 'pose')
+    simulation.advance(0)
+    assert not simulation.advance(50 * SECOND, publish_from_ns=49 * SECOND, give_way=lambda: True)
+    begun_ns, pose = simulation.now_ns, stream(simulation, 'pose')
+    assert begun_ns < 45 * SECOND and pose.skipped == 4899
+    recorded = record(simulation, 'pose')
+    simulation.advance(50 * SECOND, publish_from_ns=49 * SECOND)
+    assert times(recorded, 'pose') == [
+        t_ns for t_ns in range(0, 50 * SECOND + 1, PERIOD_NS) if t_ns > begun_ns]
+    assert (pose.sent, pose.skipped) == (len(published), 4899) == (102, 4899)
+
+
 @pytest.mark.parametrize('ahead', [False, True])
 def test_late_samples_are_recorded_all_the_same(ahead):
     simulation = simulate()

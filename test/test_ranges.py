@@ -119,7 +119,7 @@ def test_stamps_end_with_their_seconds_and_not_before(method, ahead):
     simulation = near_the_end(solver__method=method)
     taken, published = record(simulation, 'pose'), []
     stream(simulation, 'pose').publish = published.append
-    with pytest.raises(IntegrationError, match=r'must be from 0 to 2147483648 s, in January 2038'):
+    with pytest.raises(IntegrationError, match='< 2147483648 s, in January 2038'):
         for tick in range(300):
             if not simulation.send_ready(5 * tick * MILLISECOND):
                 simulation.advance(5 * tick * MILLISECOND)
@@ -136,12 +136,12 @@ def test_a_run_offline_whose_stamps_would_end_is_refused_before(tmp_path, capsys
     with pytest.raises(IntegrationError, match='2038'):
         simulation.advance_in_blocks(2 * SECOND, lambda *block: None)
     for epoch_ns in (LAST_STAMP_NS - 5, -1, 2 ** 70):
-        with pytest.raises(ValueError, match='must be from 0 to 2147483648 s'):
+        with pytest.raises(ValueError, match='must be >= 0 and < 2147483648 s'):
             Simulation(parameters.checked({'duration': 1.0}), epoch_ns)
     for epoch in ('2147483647.5', '-3', '1e300', 'nan'):
         log = tmp_path / 'run.mcap'
         assert main(['-o', str(log), '--duration', '1', '--quiet', '--epoch', epoch]) == 2
-        assert 'must be from 0 to 2147483648 s' in capsys.readouterr().err
+        assert 'must be >= 0 and < 2147483648 s' in capsys.readouterr().err
         assert not log.exists()
 
 

@@ -97,8 +97,11 @@ def _lowest(height: Reals) -> float:
 
 
 def _check(motion: Motion) -> None:
-    if len(motion.t) < 2 or not (np.diff(motion.t) > 0.0).all():
-        raise ValueError(f't has {len(motion.t)} times: a picture must have 2 at least, ascending')
+    if len(motion.t) < 2:
+        raise ValueError(f't has {len(motion.t)} times: a picture must have 2 at least')
+    for k in np.flatnonzero(~(np.diff(motion.t) > 0.0)).tolist():
+        raise ValueError(f't[{k + 1}] = {float(motion.t[k + 1])!r} s: must be later than t[{k}] = '
+                         f'{float(motion.t[k])!r} s')
 
 
 def plot(motion: Motion) -> Figure:

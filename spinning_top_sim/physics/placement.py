@@ -13,7 +13,8 @@ from spinning_top_sim.physics.top import Shape, State, Top
 
 Reals = NDArray[np.float64]
 # An axis nearer to a vertical than this [rad] counts as vertical.  The rounding of Lz changes the
-# angular velocity of a tilted axis by some 1e-16 L3/(lambda1 theta): here as much as the tilt.
+# angular velocity of a tilted axis by some 1e-16 L3/(lambda1 theta), relative to L3/lambda1 here
+# as much as the tilt that is left out.
 POLE = 1.5e-8
 
 

@@ -93,7 +93,7 @@ def swing(top: Top, state: State) -> tuple[float, float]:
         other = min(max(min(ahead, key=abs, default=0.0), down), up) if f1 else 0.0
         low, high = min(0.0, other), max(0.0, other)
     u0 = math.cos(state.theta)
-    return u0 + low, u0 + high
+    return max(u0 + low, -1.0), min(u0 + high, 1.0)
 
 
 def axis_rests(top: Top, state: State) -> bool:

@@ -25,7 +25,7 @@ class States:
     """
     States of a top at n times.
 
-    A pose costs no angle, and an angle no angular velocity.  A value depends on its own time only,
+    Who asks for the attitude does not pay for Euler angles.  A value depends on its own time only,
     never on the other times.  A solver has a subclass with the columns that raise
     NotImplementedError here; all others follow.
 

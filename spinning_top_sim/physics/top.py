@@ -57,7 +57,8 @@ class Top:
             raise ValueError(f'mass = {self.mass!r} kg: must be >= 0')
         if not math.isfinite(self.gravity_torque):
             raise ValueError(
-                f'mass * gravity * com_distance = {self.gravity_torque!r} N m: must be finite')
+                f'mass = {self.mass!r} kg, gravity = {self.gravity!r} m/s^2, com_distance = '
+                f'{self.com_distance!r} m: their product must be finite')
 
     @property
     def gravity_torque(self) -> float:

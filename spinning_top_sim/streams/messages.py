@@ -74,8 +74,8 @@ def odometry(frame_id: str, child_frame_id: str, *, moves: bool = False) -> Temp
     """
     nav_msgs/Odometry, exact.
 
-    Fields: orientation, body rates; if the point `moves`, its position comes before the
-    one, and its velocity in the child frame before the other.
+    Fields: orientation, body rates; if the point `moves`: position, orientation, velocity in the
+    child frame, body rates.
     """
     writer = CdrWriter()
     writer.header(frame_id)

@@ -37,7 +37,8 @@ from spinning_top_sim.streams.segment import SHORTEST_RUN_NS, Segment
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import all_streams
 
-# Steps that the first nanosecond may take; of a block offline: interpolants stay in the cache.
+# Steps that the first nanosecond of a motion may take, and steps at a time offline, so that their
+# interpolants stay in the cache.
 FIRST_STEPS, OFFLINE_STEPS = 500, 2000
 # Turns a second whose phases doubles hold for the shortest run.
 MOST_RATE = MOST_TURNS / SHORTEST_RUN_NS * NANOSECONDS
@@ -330,9 +331,14 @@ def _segment(top: Top, start: State, start_ns: int, values: Mapping[str, Any]) -
             raise ValueError(f'the energy would be {segment.energy!r} J')
         if not segment.reach(start_ns + 1, FIRST_STEPS):
             raise ValueError(f'it turns too fast: over {FIRST_STEPS} steps a nanosecond')
-        if (solver.ns_limit < SHORTEST_RUN_NS
-                or abs(start.l3) / top.lambda3 > math.tau * MOST_RATE):
-            raise ValueError(f'it turns too fast: at most {MOST_RATE:.2g} turns a second')
+        spin = abs(start.l3) / top.lambda3 / math.tau
+        if spin > MOST_RATE:
+            raise ValueError(f'it turns too fast: {spin:.3g} times a second, must be at most '
+                             f'{MOST_RATE:.2g}')
+        if solver.ns_limit < SHORTEST_RUN_NS:
+            raise ValueError(f'it turns too fast: its phases are known for '
+                             f'{solver.ns_limit / NANOSECONDS:.3g} s, must be for '
+                             f'{SHORTEST_RUN_NS / NANOSECONDS:g} s')
     except (ArithmeticError, RuntimeError, ValueError) as error:
         raise ValueError(f'no motion from theta = {start.theta!r} rad, theta_dot = '
                          f'{start.theta_dot!r} rad/s with l3 = {start.l3!r}, lz = {start.lz!r} '

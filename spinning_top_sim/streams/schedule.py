@@ -26,8 +26,8 @@ STEPS_IN_A_PIECE, MOST_PIECES = 4, 64
 NEVER_NS = 2 ** 63 - 1
 # Seconds of a stamp are an int32: they end in January 2038.
 LAST_STAMP_NS = 2 ** 31 * NANOSECONDS - 1
-# Offline, a block becomes a chunk of a log.  Twice as many bytes take no less time, and are
-# compressed worse (28 MB of 546 000 messages become 36 MB).
+# Offline, a block becomes a chunk of a log.  With twice as many bytes, a log of 546 000 messages
+# has 36 MB instead of 28 MB, in no less time.
 OFFLINE_BYTES = 1 << 20
 # A longer block would show no progress, and an interrupted run would lose it.
 LONGEST_OFFLINE_NS = 100 * NANOSECONDS
@@ -36,8 +36,8 @@ LONGEST_OFFLINE_NS = 100 * NANOSECONDS
 def check_stamp(stamp_ns: int, error: type[Exception] = IntegrationError) -> None:
     """Raise an error for a stamp [ns] that no message can hold."""
     if not 0 <= stamp_ns <= LAST_STAMP_NS:
-        raise error(f'the stamp {stamp_ns / NANOSECONDS:.12g} s: must be from 0 to '
-                    f'{LAST_STAMP_NS / NANOSECONDS:.0f} s, in January 2038')
+        raise error(f'the stamp {stamp_ns / NANOSECONDS:.12g} s: must be >= 0 and < {2 ** 31} s, '
+                    'in January 2038')
 
 
 def _weakly(method: Callable[[], None]) -> Callable[[], None]:

@@ -56,6 +56,9 @@ class Stream:
 
     def begin(self, now_ns: int) -> None:
         """Prepare for samples after the simulated time `now_ns`: it will be recorded."""
+        # What is too late to be published is not too late for a log.
+        until_ns, self._skipped_until_ns = self._skipped_until_ns, 0
+        self.skipped -= len(self.times(now_ns, until_ns - 1))
 
     @property
     def at_once(self) -> tuple[str, ...]:

@@ -219,12 +219,13 @@ class ImuIncrements(ImuRaw):
     parameter, rate_parameter = 'increments', 'imu.rate'
 
     def begin(self, now_ns: int) -> None:
+        super().begin(now_ns)
         self._imu.use_intervals(now_ns)
 
     def apply(self, changes: Mapping[str, Any], now_ns: int) -> None:
         super().apply(changes, now_ns)
         if changes.get('increments.enabled'):
-            self.begin(now_ns)
+            self._imu.use_intervals(now_ns)
 
     def _measured(self, states: States, times: range) -> tuple[Quaternion, Vector]:
         exact = self._imu.increments(times)
