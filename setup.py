@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Build and install with pip or colcon; the only file with version ranges."""
+"""Build and install with pip or colcon; has the version ranges of the package and its tests."""
 
 from glob import glob
 

@@ -69,7 +69,7 @@ def _nodes(context: LaunchContext) -> list:
     except (LogError, ForeignLogError, OSError) as error:
         # replay_node reports a log that cannot be played.
         return [*actions, LogInfo(msg=f'neither TF nor RViz: {error}')]
-    namespace, values = _namespace(run.topics), run.values_at_recording
+    namespace, values = _namespace(run.topics), run.values_in_effect
     if on['tf'] and 'joint_states' in run.topics:
         actions += launch_helpers.state_publisher(
             SHARE, values, namespace, run.topics['joint_states'], clocked)

@@ -19,7 +19,7 @@ from launch_ros.actions import Node
 from spinning_top_sim.nodes import launch_helpers
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.journal import resolve_topic
-from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
+from spinning_top_sim.tools.scene_file import is_of_ros, parse_assignment, read_scene
 
 SHARE = Path(get_package_share_directory('spinning_top_sim'))
 SCENES = sorted(path.stem for path in (SHARE / 'config').glob('*.yaml'))
@@ -75,6 +75,10 @@ def _nodes(context: LaunchContext) -> list:
     files = [_scene_file(given['scene']), *filter(None, [given['params_file']])]
     scene, *second = map(read_scene, files)
     asked = dict(map(parse_assignment, shlex.split(given['set'])))
+    of_ros = {name: asked.pop(name) for name in list(asked) if is_of_ros(name)}
+    if 'use_sim_time' in of_ros:
+        raise ValueError(f'set = {given["set"]!r}: use_sim_time is an argument of its own, '
+                         'use_sim_time:=true')
     for values in second:
         asked = {**values, **asked}
     values = parameters.checked({**scene, **asked})
@@ -96,7 +100,7 @@ def _nodes(context: LaunchContext) -> list:
                 on_exit=Shutdown(reason='it has ended'), parameters=[*map(str, files), {
                     **{name: list(value) if isinstance(value, tuple) else value
                        for name, value in asked.items()},
-                    'use_sim_time': on['use_sim_time']}],
+                    **of_ros, 'use_sim_time': on['use_sim_time']}],
                 ros_arguments=[word for name in asked for word in (
                     '-p', f'{name}:={json.dumps(values[name])}')])
     actions = [node]

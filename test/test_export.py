@@ -2,6 +2,7 @@
 """Exports, read as their formats are documented, beside what the log has."""
 
 import csv
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -152,6 +153,16 @@ def test_what_cannot_be_exported_is_told_before_anything_is_computed(
     assert not log.exists()
     assert not (tmp_path / 'a').exists()
     assert (tmp_path / 'there').read_text() == 'precious'
+
+
+def test_parameters_that_wait_for_a_reset_are_not_in_effect(folder):
+    with LogReader(folder / 'run.mcap') as log:
+        run = read_run_description(log)
+    later = replace(run, values_at_recording={
+        **run.values_at_recording, 'imu.gyroscope_noise_density': 0.5, 'imu.rpy': (0.0, 0.0, 0.0),
+        'imu.rate': 50.0})
+    assert later.values_in_effect == {**run.values_at_start, 'imu.rate': 50.0}
+    assert run.values_in_effect == run.values_at_recording
 
 
 @pytest.mark.parametrize('text', ['tum', 'tum:', 'kitti:a', 'a.tum'])

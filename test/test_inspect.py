@@ -821,6 +821,34 @@ def test_the_path_that_is_drawn_has_cusps(tmp_path, method):
         assert height[at] > 0.99999 * np.max(height)
 
 
+@pytest.mark.parametrize('duration', [3.0, 0.025])
+def test_in_every_frame_the_tip_is_where_the_axis_is(tmp_path, monkeypatch, duration):
+    pytest.importorskip('matplotlib')
+    from spinning_top_sim.tools import plots
+    ends = []
+    monkeypatch.setattr(plots, 'draw_tip', lambda _, tip, height: ends.append(height[-1]))
+    found = surveyed(log_of(tmp_path / 'run.mcap', '--duration', duration))
+    motion, data = found.shown
+    plots.animate(found, motion, data, tmp_path / 'top.gif')
+    frames = max(2, int(data.time[-1] * plots.FRAMES_PER_S))
+    each = np.arange(frames) / (plots.FRAMES_PER_S * data.period)
+    expected = np.interp(each, np.arange(len(data.height)), data.height)
+    assert ends[-frames:] == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_page_is_drawn_where_the_first_readings_are_missing(tmp_path, capsys):
+    pytest.importorskip('matplotlib')
+    path = log_of(tmp_path / 'run.mcap', '--duration', 60, '-p', 'imu.rate:=1000.0')
+    with LogReader(path) as reader:
+        *others, middle = [span for span in reader._index[0] if span.start_ns < 30 * 10 ** 9]
+    content = bytearray(path.read_bytes())
+    for span in (*others, middle):
+        content[span.offset + 100] ^= 1
+    path.write_bytes(content)
+    assert told(capsys, path, '--plot', tmp_path / 'page.png')[0] == 1
+    assert (tmp_path / 'page.png').stat().st_size > 10_000
+
+
 def test_pictures_are_drawn(stepped, tmp_path, capsys):
     pytest.importorskip('matplotlib')
     image = pytest.importorskip('PIL.Image')

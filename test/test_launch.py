@@ -177,6 +177,13 @@ def test_what_is_set_replaces_what_files_say(installed, tmp_path):
     assert 'xyz="0.1 0.0 0.2"' in tf['robot_description'].args[0]
 
 
+def test_parameters_of_ros_are_passed_on(installed):
+    name = 'qos_overrides./pose.publisher.depth'
+    sim = started('sim', set=f'{name}:=3 seed:=7').nodes['spinning_top_sim/sim_node']
+    assert sim.parameters[-1][name] == 3
+    assert sim.parameters[-1]['seed'] == 7
+
+
 def test_a_path_is_a_scene_too(installed, tmp_path):
     path = tmp_path / 'mine.yaml'
     path.write_text('/**: {ros__parameters: {top.mass: 0.0}}')
@@ -190,7 +197,8 @@ def test_a_path_is_a_scene_too(installed, tmp_path):
 @pytest.mark.parametrize(('given', 'said'), [
     ({'scene': 'nope'}, "scene = 'nope'.*one of cusp"), ({'set': 'spin.l3'}, 'NAME:=VALUE'),
     ({'set': 'top.mass:=-1'}, r'top\.mass = -1'), ({'set': 'body_frame:=world'}, 'world_frame'),
-    ({'params_file': 'none.yaml'}, r'none\.yaml')])
+    ({'params_file': 'none.yaml'}, r'none\.yaml'),
+    ({'set': 'use_sim_time:=true'}, 'use_sim_time is an argument of its own')])
 def test_bad_arguments_of_sim_are_named(installed, given, said):
     with pytest.raises((ValueError, OSError), match=said):
         started('sim', **given)

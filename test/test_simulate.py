@@ -199,6 +199,7 @@ def events_of(log):
     (['--duration', '1', '--epoch', 'nan'], '--epoch nan'),
     (['--duration', '1', '--epoch=-3'], '--epoch -3'),
     (['--duration', '10', '--epoch', '2147483640'], '2038'),
+    (['--duration', '1', '--epoch', '2147483648'], '--epoch 2147483648.0: must be >= 0 and < 2'),
     (['--duration', '1e300'], 'must be'), (['--duration', '3e9'], 'must be'),
     (['--duration', '1', '--command', '1:2'], '--command 1:2'),
     (['--duration', '1', '--command=-1:2:2'], '--command -1:2:2'),
@@ -243,6 +244,19 @@ def test_a_command_that_the_state_refuses_ends_the_run_there(
         assert np.loadtxt(path, delimiter=',', skiprows=1)[-1, 0] == 0.5
     else:
         assert table.read_table(path)['t'].to_pylist()[-1] == 0.5
+
+
+@pytest.mark.parametrize('rate', [100.0, 2000.0])
+def test_a_table_holds_the_rows_up_to_where_the_equations_end(tmp_path, capsys, rate):
+    """The paper's equations end at the pole, which the wheel that stands upright falls through."""
+    given = ['--quiet', '--duration', '5', '-p', 'solver.equations:=euler', '-p', 'spin.lz:=1.6',
+             '-p', f'pose.rate:={rate}']
+    assert [main(['-o', str(tmp_path / name), *given]) for name in ('a.mcap', 'a.csv')] == [1, 1]
+    assert capsys.readouterr().err.count('a step leapt over a pole') == 2
+    log, _ = read(tmp_path / 'a.mcap')
+    times = np.loadtxt(tmp_path / 'a.csv', delimiter=',', skiprows=1)[:, 0]
+    assert np.round(times * 1e9).tolist() == sorted(log['/pose'])
+    assert len(times) > 20
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [

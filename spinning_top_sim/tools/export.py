@@ -94,7 +94,7 @@ def check(exports: Sequence[Export], topics: Collection[str], values: Mapping[st
 
 def write(reader: LogReader, run: RunDescription, exports: Sequence[Export]) -> Iterator[str]:
     """Write the files; yield a line about each.  Raises as `check` does, and OSError."""
-    check(exports, run.topics, run.values_at_recording)
+    check(exports, run.topics, run.values_in_effect)
     for kind, path in exports:
         lines = KINDS[kind][1](reader, run)
         first = next(lines, '')         # what is refused leaves no file
@@ -140,7 +140,7 @@ def _csv(stamps_ns: NDArray[np.int64], *columns: Reals) -> Iterator[str]:
 
 
 def _kalibr(_: LogReader, run: RunDescription) -> Iterator[str]:
-    values = run.values_at_recording
+    values = run.values_in_effect
     content = {'rostopic': run.topics[RAW], 'update_rate': values['imu.rate'],
                **{name.removeprefix('imu.'): values[name] for name in KALIBR_NEEDS}}
     force, rates, sensitivity = (values[f'imu.{name}'] for name in (
@@ -159,7 +159,7 @@ def _matrix(rows: Sequence[float]) -> list[list[float]]:
 def _blocks(reader: LogReader, run: RunDescription, topic: str,
             ) -> Iterator[tuple[NDArray[np.int64], tuple[Reals, ...]]]:
     """Yield stamps (n,) [ns] and fields of the messages of a stream, in blocks."""
-    template = next(stream.template for stream in all_streams(run.values_at_recording)
+    template = next(stream.template for stream in all_streams(run.values_in_effect)
                     if stream.topic == topic)
     messages = reader.messages(topics=[run.topics[topic]])
     while block := list(itertools.islice(messages, BLOCK)):

@@ -137,9 +137,10 @@ def _precession_panel(axes: Axes, data: Attitudes, mean: float | None) -> None:
 def animate(found: Survey, _motion: Motion, data: Attitudes, path: Path) -> str:
     """Draw the turning top as a GIF: axis, disc with a mark, trace; else as `draw_page`."""
     frames = max(2, int(min(LONGEST_S, float(data.time[-1])) * FRAMES_PER_S))
-    at = np.arange(frames) / (FRAMES_PER_S * data.period)
+    # As numbers of samples; the last frame of few samples may lie behind the last one.
+    at = np.minimum(np.arange(frames) / (FRAMES_PER_S * data.period), len(data.stamps_ns) - 1)
     spin = np.interp(at, np.arange(len(data.psi)), data.psi)
-    trace = np.linspace(0.0, at[-1], frames * FINER)
+    trace = np.interp(np.arange((frames - 1) * FINER + 1) / FINER, np.arange(frames), at)
     tip, height = interpolate(data.tip, trace), interpolate(data.height, trace)
     lowest = -0.9 if np.min(height) > -0.2 else -1.25
     figure = Figure(figsize=(3.6, 3.6), dpi=90)

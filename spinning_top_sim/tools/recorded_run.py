@@ -99,6 +99,13 @@ class RunDescription:
     broken: Sequence[tuple[int, str]]     # stamp [ns] of each damaged entry, and the reason
     log_bytes: int                        # size of the log
 
+    @property
+    def values_in_effect(self) -> dict[str, Any]:
+        """The parameters of the first sample: a change that waits for a reset is not in it."""
+        return {parameter.name: (
+            self.values_at_start if parameter.effect is parameters.Effect.RESET
+            else self.values_at_recording)[parameter.name] for parameter in parameters.TABLE}
+
 
 def read_run_description(reader: LogReader) -> RunDescription:
     """Return the run of a log.  Raises ForeignLogError where the metadata do not have it."""

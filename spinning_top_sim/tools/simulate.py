@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import Top
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.provenance import provenance
@@ -29,7 +30,7 @@ from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.pipeline import MOST_RATE, Simulation
+from spinning_top_sim.streams.pipeline import MOST_RATE, OFFLINE_STEPS, Simulation
 from spinning_top_sim.streams.schedule import offline_block_ns, offline_targets
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools import cli, export
@@ -83,8 +84,8 @@ def _run(arguments: argparse.Namespace) -> int:
     if file_format not in FORMATS:
         raise ValueError(f'{output}: the name must end in .{", .".join(FORMATS)}, or --format be '
                          'given')
-    if not 0.0 <= arguments.epoch <= 2.0 ** 31:
-        raise ValueError(f'--epoch {arguments.epoch!r}: must be from 0 to {2 ** 31} s')
+    if not 0.0 <= arguments.epoch < 2.0 ** 31:
+        raise ValueError(f'--epoch {arguments.epoch!r}: must be >= 0 and < {2 ** 31} s')
     if arguments.export and file_format != 'mcap':
         raise ValueError(f'--export: needs a log, and {output} is {file_format}')
     values = _parameters(arguments)
@@ -254,18 +255,31 @@ def _rows(simulation: Simulation, period_ns: int, stops: Sequence[Stop],
     """Yield blocks (columns, n) of the table.  A command changes the rows after its time."""
     next_ns = 0
     for target_ns, momenta in offline_targets(0, stops, ROWS_AT_ONCE * period_ns):
-        times = range(next_ns, target_ns + 1, period_ns)
-        if times:
-            states = simulation.segment.states(times)
-            yield np.stack(np.broadcast_arrays(
-                np.array(times) / NANOSECONDS, states.theta, states.theta_dot, states.phi,
-                states.phi_dot, states.psi, states.psi_dot, *states.quaternion.T,
-                *states.angular_velocity.T, states.energy, states.l3, states.lz))
-            next_ns = times[-1] + period_ns
+        segment, arrived, failure = simulation.segment, False, None
+        while not arrived:
+            try:
+                arrived = segment.reach(target_ns, OFFLINE_STEPS)
+            except IntegrationError as error:
+                failure = error
+            times = range(next_ns, min(target_ns, segment.reached_ns) + 1, period_ns)
+            if times:
+                yield _table(times, segment.states(times))
+                next_ns = times[-1] + period_ns
+            if failure is not None:
+                raise failure
+            segment.release(next_ns)
         simulation.advance(target_ns)
         if momenta is not None:
             _command(simulation, *momenta)
         show(target_ns / NANOSECONDS)
+
+
+def _table(times: range, states: States) -> NDArray[np.float64]:
+    """Return the rows (columns, n) of these times [ns]."""
+    return np.stack(np.broadcast_arrays(
+        np.array(times) / NANOSECONDS, states.theta, states.theta_dot, states.phi, states.phi_dot,
+        states.psi, states.psi_dot, *states.quaternion.T, *states.angular_velocity.T,
+        states.energy, states.l3, states.lz))
 
 
 def _write_csv(path: Path, blocks: Iterable[NDArray[np.float64]]) -> None:

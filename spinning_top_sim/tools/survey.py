@@ -235,9 +235,10 @@ def _analyse(found: Survey, motion: Motion, topic: str, samples: list[LogMessage
     stamps_ns = _stamps(fitting)
     fields = stream.template.decode(b''.join(sample.data for sample in fitting))
     if stream.topic in IMU_TOPICS:
-        time = (stamps_ns - found.motions[0].begin_ns) / NANOSECONDS
+        time = (stamps_ns - max(found.motions[0].begin_ns, found.damage.start_ns)) / NANOSECONDS
         readings = np.column_stack((time, *fields[1:]))[time <= found.shown_s]
-        found.readings.setdefault(topic, []).append(readings)
+        if len(readings):
+            found.readings.setdefault(topic, []).append(readings)
     data = analysis.attitudes_of(stream.topic, motion.imu, stamps_ns, fields)
     if data is None:
         return

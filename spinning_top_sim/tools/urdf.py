@@ -29,7 +29,7 @@ def arguments(values: Mapping[str, Any]) -> dict[str, str]:
                                 ('body_frame', body, between), ('imu.frame_id', imu, between)):
         if value in others:
             raise ValueError(f'{name} = {value!r}: must be another name than those of the '
-                             'other frames of the robot description')
+                             f'other frames of the robot description, {", ".join(others)}')
     if imu == body and any((*values['imu.lever_arm'], *values['imu.rpy'])):
         raise ValueError(f'imu.frame_id = {imu!r}: must not be the body_frame where '
                          'imu.lever_arm or imu.rpy is not zero')
