@@ -22,6 +22,7 @@ from spinning_top_sim.recording import provenance, writer
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.tools import inspect
 
 EPOCH_NS = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000
@@ -205,6 +206,26 @@ def test_a_disk_that_is_too_slow_is_told_with_what_may_be_lost(tmp_path, monkeyp
     disk_is_back.set()
     log, _ = recorded.stop()
     assert len(log['/ns/pose']) == 101
+
+
+@pytest.mark.parametrize(('before', 'change'), [
+    ({}, {'increments.enabled': True}),
+    ({'imu.sampling': 'mean'}, {'imu.rate': 300.0}),
+    ({'increments.enabled': True, 'imu.rate': 2.0}, {'imu.rate': 125.0})])
+@pytest.mark.parametrize('begin_ns', [1_003_000_000, 1_007_500_000, 1_300_000_000])
+def test_a_log_that_begins_within_an_interval_of_the_imu_verifies(
+        tmp_path, capsys, before, change, begin_ns):
+    recorded = Recorded(tmp_path / 'one.mcap', **before)
+    simulation = recorded.simulation
+    simulation.advance(1_003_000_000)
+    simulation.apply(change)
+    recorded.values |= change
+    simulation.advance(begin_ns)
+    recorded.start()
+    simulation.advance(2 * SECOND)
+    recorded.session.stop()
+    assert inspect.main([str(tmp_path / 'one.mcap'), '--verify']) == 0
+    assert 'verify: identical' in capsys.readouterr().out
 
 
 def test_a_recording_that_fails_at_its_end_says_why(tmp_path, monkeypatch):

@@ -65,7 +65,9 @@ class RecordingSession:
                    'values_at_recording': values}
             self._journal_index = len(streams)
             self._feed(lambda *messages: self._pending.append(messages), streams)
-            self.write_event('start')
+            interval_ns = simulation.open_interval
+            details: dict[str, Any] = {'interval_ns': interval_ns} if interval_ns else {}
+            self.write_event('start', **details)
         return lambda: self._open(streams, topics, run)
 
     def _open(self, streams: Sequence[Stream], topics: Sequence[Topic],

@@ -61,6 +61,13 @@ class Imu:
                 self._intervals.follow(self._segment)
         return self._intervals
 
+    def open_interval(self, now_ns: int) -> tuple[int, int] | None:
+        """Return `Intervals.change` if the interval after `now_ns` depends on it, else None."""
+        intervals = self._intervals
+        if intervals is None or now_ns >= intervals.change[0] + self._period_ns:
+            return None
+        return intervals.change if any(intervals.change) else None
+
     def follow(self, segment: 'Segment') -> None:
         """Go on with another motion."""
         self._segment = segment

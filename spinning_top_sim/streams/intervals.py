@@ -62,6 +62,16 @@ class Intervals:
             self.length_ns = length_ns
             self._keep_steps()
 
+    @property
+    def change(self) -> tuple[int, int]:
+        """When the present rate began, and where the first interval after that begins [ns]."""
+        return self._since_ns, self._first_begin_ns
+
+    @change.setter
+    def change(self, times_ns: tuple[int, int]) -> None:
+        self._since_ns, self._first_begin_ns = times_ns
+        self._keep_steps()
+
     def _keep_steps(self) -> None:
         self._segments[-1].kept_ns = (
             min(self.length_ns, LONGEST_NS) + self._since_ns - self._first_begin_ns)

@@ -32,10 +32,11 @@ from spinning_top_sim.solvers.exact import MOST_TURNS
 from spinning_top_sim.solvers.propagator import propagate
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.schedule import Instant, Schedule, check_stamp
 from spinning_top_sim.streams.segment import SHORTEST_RUN_NS, Segment
 from spinning_top_sim.streams.stream import Stream
-from spinning_top_sim.streams.topics import all_streams
+from spinning_top_sim.streams.topics import ImuStream, all_streams
 
 # Steps that the first nanosecond of a motion may take, and steps at a time offline, so that their
 # interpolants stay in the cache.
@@ -113,6 +114,19 @@ class Simulation:
         self._schedule.follow(segment)
         for stream in self.streams:
             stream.follow(segment)
+
+    @property
+    def open_interval(self) -> tuple[int, int] | None:
+        """What the next mean or increment of the IMU begins with; None if that is its period."""
+        return self._imu.open_interval(self.now_ns)
+
+    @open_interval.setter
+    def open_interval(self, times_ns: tuple[int, int]) -> None:
+        self._imu.use_intervals(0).change = times_ns
+
+    @property
+    def _imu(self) -> Imu:
+        return next(stream.imu for stream in self.streams if isinstance(stream, ImuStream))
 
     @property
     def epoch_ns(self) -> int:

@@ -62,11 +62,11 @@ class Stream:
 
     @property
     def at_once(self) -> tuple[str, ...]:
-        """Names of the parameters that `apply` takes over; a run is replayed by them."""
+        """Names of the parameters that change its samples at once: a run is replayed by them."""
         return (self.rate_parameter,)
 
     def apply(self, changes: Mapping[str, Any], now_ns: int) -> None:
-        """Take over values of parameters in `at_once`, from the simulated time `now_ns` on."""
+        """Take over values of parameters from the simulated time `now_ns` on."""
         rate = changes.get(self.rate_parameter)
         if rate is not None and period_ns(rate) != self.period_ns:
             self.period_ns = period_ns(rate)

@@ -69,7 +69,7 @@ class ImuStream(Stream):
     has_orientation, is_noisy = True, False
 
     def __init__(self, values: Mapping[str, Any], imu: Imu) -> None:
-        self._frame_id, self._imu = values['imu.frame_id'], imu
+        self._frame_id, self.imu = values['imu.frame_id'], imu
         self._sensor = imu.sensor(period_ns(values['imu.rate']))
         super().__init__(values, self._template())
 
@@ -81,13 +81,13 @@ class ImuStream(Stream):
         super().apply(changes, now_ns)
         if 'imu.rate' in changes:
             # A density says how much noise a sample has at a rate.
-            self._sensor = self._imu.sensor(period_ns(changes['imu.rate']))
-            self._imu.set_period(period_ns(changes['imu.rate']), now_ns)
+            self._sensor = self.imu.sensor(period_ns(changes['imu.rate']))
+            self.imu.set_period(period_ns(changes['imu.rate']), now_ns)
             self.template = self._template()
             self.on_change()
 
     def follow(self, segment: Segment) -> None:
-        self._imu.follow(segment)
+        self.imu.follow(segment)
 
     def _template(self) -> Template:
         sensor = self._sensor
@@ -121,7 +121,7 @@ class ImuRaw(ImuStream):
         return np.repeat(rows, self._timing.copies(t_ns, self.period_ns), axis=0)
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
-        return (IDENTITY, *self._sensor.read(self._imu.sampled(states, times), times))
+        return (IDENTITY, *self._sensor.read(self.imu.sampled(states, times), times))
 
 
 class ImuData(ImuRaw):
@@ -131,7 +131,7 @@ class ImuData(ImuRaw):
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         _, *readings = super().fields(states, times)
-        return (self._sensor.orientation(self._imu.orientation(states), times), *readings)
+        return (self._sensor.orientation(self.imu.orientation(states), times), *readings)
 
 
 class ImuBias(ImuStream):
@@ -179,12 +179,12 @@ class Mag(Stream):
     parameter, topic, type_name = 'mag', 'imu/mag', 'sensor_msgs/msg/MagneticField'
 
     def __init__(self, values: Mapping[str, Any], imu: Imu) -> None:
-        self._imu, self._sensor = imu, lru_cache(2)(partial(_magnetometer, values))
+        self.imu, self._sensor = imu, lru_cache(2)(partial(_magnetometer, values))
         super().__init__(values, messages.magnetic_field(values['imu.frame_id']))
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
         sensor = self._sensor(self.period_ns)
-        exact = sensor.true(self._imu.orientation(states))
+        exact = sensor.true(self.imu.orientation(states))
         return sensor.read(exact, times), messages.diagonal(*3 * (sensor.variance,))
 
 
@@ -194,7 +194,7 @@ class GroundTruthMag(Mag):
     topic = 'ground_truth/mag'
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
-        exact = self._sensor(self.period_ns).true(self._imu.orientation(states))
+        exact = self._sensor(self.period_ns).true(self.imu.orientation(states))
         return exact, messages.EXACT
 
 
@@ -210,7 +210,7 @@ class GroundTruthImu(ImuStream):
     parameter, topic = 'ground_truth_imu', 'ground_truth/imu'
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
-        return (self._imu.orientation(states), *self._imu.sampled(states, times))
+        return (self.imu.orientation(states), *self.imu.sampled(states, times))
 
 
 class ImuIncrements(ImuRaw):
@@ -220,19 +220,19 @@ class ImuIncrements(ImuRaw):
 
     def begin(self, now_ns: int) -> None:
         super().begin(now_ns)
-        self._imu.use_intervals(now_ns)
+        self.imu.use_intervals(now_ns)
 
     def apply(self, changes: Mapping[str, Any], now_ns: int) -> None:
         super().apply(changes, now_ns)
         if changes.get('increments.enabled'):
-            self._imu.use_intervals(now_ns)
+            self.imu.use_intervals(now_ns)
 
     def _measured(self, states: States, times: range) -> tuple[Quaternion, Vector]:
-        exact = self._imu.increments(times)
+        exact = self.imu.increments(times)
         if self._sensor.is_perfect:
             return exact
-        return self._sensor.disturb(exact, self._imu.means(states, times), times,
-                                    self._imu.lengths(times))
+        return self._sensor.disturb(exact, self.imu.means(states, times), times,
+                                    self.imu.lengths(times))
 
 
 class ImuDq(ImuIncrements):
@@ -266,13 +266,13 @@ class GroundTruthImuOdometry(Stream):
                                    'nav_msgs/msg/Odometry')
 
     def __init__(self, values: Mapping[str, Any], imu: Imu) -> None:
-        self._imu = imu
+        self.imu = imu
         super().__init__(values, messages.odometry(
             values['world_frame'], values['imu.frame_id'], moves=True))
 
     def fields(self, states: States, times: range) -> Sequence[Field]:
-        position, velocity = self._imu.motion(states)
-        return position, self._imu.orientation(states), velocity, self._imu.true(states)[0]
+        position, velocity = self.imu.motion(states)
+        return position, self.imu.orientation(states), velocity, self.imu.true(states)[0]
 
 
 class Invariants(Stream):

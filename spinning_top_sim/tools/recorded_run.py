@@ -22,6 +22,7 @@ from spinning_top_sim.recording.writer import METADATA_NAME
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.cdr import ENCAPSULATION
+from spinning_top_sim.streams.intervals import LONGEST_NS
 from spinning_top_sim.streams.pipeline import Simulation, TakeRows
 from spinning_top_sim.streams.schedule import offline_block_ns, offline_targets
 from spinning_top_sim.streams.stream import Stream
@@ -194,9 +195,15 @@ def _event(stamp_ns: int, data: bytes) -> Event:
     elif name == 'reset':
         details = {'epoch_ns': operator.index(details['epoch_ns']),
                    'parameters': parameters.checked(details['parameters'])}
-    elif name != 'start':
+    elif name == 'start':
+        since_ns, begin_ns = map(operator.index, details.get('interval_ns', (0, 0)))
+        if not 0 <= begin_ns <= since_ns <= max(sent_ns, 0) or (
+                since_ns - begin_ns > LONGEST_NS):
+            raise ValueError(f'interval_ns = {[since_ns, begin_ns]}')
+        details = {'interval_ns': (since_ns, begin_ns)} if since_ns else {}
+    else:
         raise ValueError(f'event {name!r} is unknown')
-    return Event(name, stamp_ns, t_ns, sent_ns, {} if name == 'start' else details)
+    return Event(name, stamp_ns, t_ns, sent_ns, details)
 
 
 def rerun(run: RunDescription, end_ns: int,
@@ -233,6 +240,9 @@ def _rerun(run: RunDescription, end_ns: int,
     # 1. Before the recording: the motion and its commands, no samples.  The rates are already
     # those of the recording: the first of its samples may be a mean over a time before it.
     simulation.apply(run.values_at_recording)
+    for event in run.events:
+        if 'interval_ns' in event.details:
+            simulation.open_interval = event.details['interval_ns']
     for event in run.history:
         reach(event.t_ns)
         _apply(simulation, event)
