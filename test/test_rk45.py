@@ -28,7 +28,7 @@ from spinning_top_sim.solvers.equations import EulerEquations, TransportEquation
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.propagator import propagate
 from spinning_top_sim.solvers.rk45 import STEPS_TOGETHER
-from spinning_top_sim.solvers.unwrap import PhaseUnwrapper
+from spinning_top_sim.solvers.unwrap import PhaseUnwrapper, turns_to_follow
 from spinning_top_sim.streams import parameters
 
 NODES = tuple(map(Fraction, ['0', '1/5', '3/10', '4/5', '8/9', '1', '1']))
@@ -512,6 +512,18 @@ def test_late_instants_that_one_double_stands_for_are_all_reached():
 
 
 # ------------------------------------------------------------------------- unwrapped phases
+
+@pytest.mark.parametrize(('momentum', 'low'), [
+    (2.0, -0.5 * math.pi), (0.5, -0.5 * math.pi), (0.0, -math.pi), (-0.5, -1.5 * math.pi),
+    (-2.0, -1.5 * math.pi)])
+def test_a_phase_follows_the_one_before_it_in_its_sense(momentum, low):
+    phase, before = np.linspace(-20.0, 20.0, 4001), 0.3
+    turns = turns_to_follow(phase, before, momentum)
+    assert (turns == np.rint(turns)).all()
+    ahead = phase + math.tau * turns - before
+    assert low - 1e-12 <= ahead.min() < low + 0.02
+    assert low + math.tau - 0.02 < ahead.max() <= low + math.tau + 1e-12
+
 
 @pytest.mark.parametrize(('rtol', 'bound'), [(1e-3, 0.5), (1e-5, 1e-2), (1e-9, 1e-4)])
 @pytest.mark.parametrize(('l3', 'lz'), [
