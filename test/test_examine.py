@@ -6,10 +6,11 @@ import json
 import math
 import os
 import re
+import struct
 import sys
 import time
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from xml.etree import ElementTree
 
 import numpy as np
@@ -19,7 +20,7 @@ from helpers.reference import ROOT
 from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam import examine, isolation, measures, scenarios, trial
+from spinning_top_sim.exam import examine, examiner, isolation, measures, scenarios, trial
 from spinning_top_sim.exam.adapters import FILTERS, Vqf
 from spinning_top_sim.exam.command import main
 from spinning_top_sim.exam.diagnosis import FAULTS
@@ -529,6 +530,49 @@ def test_the_noise_is_compared_with_the_same_motion_though_the_filter_fails_with
         examine(Vqf, seeds=[1], isolated=False).measures['noise_gain'], rel=1e-12)
 
 
+def test_the_gain_of_the_noise_is_without_the_lever_arm_that_the_imu_has():
+    gains = [examine(FAULTY['lever_arm'], seeds=1, isolated=False, imu={
+        **scenarios.CALIBRATED, 'imu.lever_arm': arm}).measures['noise_gain']
+        for arm in ((0.0, 0.0, 0.0), (0.1, 0.0, 0.0))]
+    assert gains[1] == pytest.approx(gains[0], rel=0.5)
+
+
+def test_a_run_that_fails_at_once_does_not_move_a_filter_that_goes_on(monkeypatch):
+    class NeedsField(Vqf):
+        def update(self, gyroscope, accelerometer, magnetometer, dt):
+            if magnetometer is None:
+                raise ValueError('no field')
+            return super().update(gyroscope, accelerometer, magnetometer, dt)
+
+    turning, begins = scenarios.turning, []
+    monkeypatch.setattr(scenarios, 'turning', lambda imu, first, *rest: (
+        begins.append(first), turning(imu, first, *rest))[1])
+    conditions = examiner._OneFilter(cache(NeedsField), trial.feed, scenarios.CALIBRATED)
+    pivot, fast = (scenarios.record(replace(scenario, duration=2.0, reversals=()),
+                                    scenarios.CALIBRATED, 0)
+                   for scenario in (scenarios.PIVOT, scenarios.FAST))
+    conditions.follow(pivot)
+    with pytest.raises(InvalidOutputError):
+        conditions.follow(fast, magnetometer=False)
+    conditions.follow(fast)
+    assert (begins[-1] == pivot.truth[-1]).all()
+
+
+def test_a_filter_that_fails_with_every_seed_once_a_misreading_is_undone_is_reported():
+    class Ends(MISREADINGS['gyroscope_units'].func):
+        count = 0
+
+        def update(self, *readings):
+            type(self).count += 1
+            if self.count > 34_000:
+                raise RuntimeError('it has ended')
+            return super().update(*readings)
+
+    report = examine(lambda: Ends(partial(Vqf, magnetic=False), rates=math.pi / 180.0), seeds=1,
+                     restart=False)
+    assert report.faults == ['gyroscope_units', 'invalid_output']
+
+
 def test_only_level_imu_and_seeds_may_be_given_without_their_names():
     with pytest.raises(TypeError, match='takes from 1 to 4 positional arguments but 5 were given'):
         examine(Vqf, 'quick', None, 1, 2)       # workers?
@@ -574,7 +618,7 @@ def beside(log, tmp_path_factory):
             store.types['geometry_msgs/msg/Point'](1.0, 2.0, 3.0), q)
         if type_name == 'geometry_msgs/msg/PoseStamped':
             return store.types[type_name](header, pose)
-        matrix = np.diag([9.0] * 3 + [variance] * 3).ravel()
+        matrix = np.diag([-1.0, 9.0, 9.0] + [variance] * 3).ravel()     # position unknown
         pose = store.types['geometry_msgs/msg/PoseWithCovariance'](pose, matrix)
         if type_name.endswith('PoseWithCovarianceStamped'):
             return store.types[type_name](header, pose)
@@ -633,6 +677,37 @@ def test_attitudes_of_every_type_are_read(beside, type_name):
 def test_faults_of_attitudes_in_a_log_are_named(beside, name, said, options):
     report = examine_log(beside(said, **options), '/estimate', north='true')
     assert report.faults == [name], report
+
+
+@pytest.mark.parametrize('truth', [None, '/imu/data', 'ground_truth/odom'])
+def test_the_truth_may_be_of_the_sensor_or_of_the_body(log, truth):
+    """The IMU is turned on the body."""
+    report = examine_log(log, '/ground_truth/imu', truth or '/imu/data', north='true')
+    assert report.passed and report.measures['tilt_rms_deg'] < 1e-6
+
+
+def test_a_delay_in_a_log_is_in_steps_of_the_filter(tmp_path):
+    """Attitudes at 1 kHz, 3 ms late, beside a truth of 200 Hz."""
+    path = tmp_path / 'run.mcap'
+    assert simulate(['--quiet', '-o', str(path), '--duration', '20',
+                     '-p', 'imu_data.enabled:=true', '-p', 'imu_data.rate:=1000.0',
+                     '-p', 'ground_truth_imu.rate:=200.0',
+                     '--params', str(ROOT / 'config/wavy.yaml')]) == 0
+    late = tmp_path / 'late.mcap'
+    file = create_file(late, [RecordedTopic(name, 'sensor_msgs/msg/Imu') for name in (
+        '/ground_truth/imu', '/late')], {}, compression='none')
+    with LogReader(path) as reader:
+        for message in reader.messages(['/ground_truth/imu']):
+            file.append(0, message.log_time, message.data)
+        for message in reader.messages(['/imu/data']):
+            stamp_ns = message.log_time + 3_000_000
+            stamp = struct.pack('<iI', *divmod(stamp_ns, 10 ** 9))
+            file.append(1, stamp_ns, message.data[:4] + stamp + message.data[12:])
+    file.write_chunk()
+    file.finish()
+    report = examine_log(late, '/late', north='true')
+    assert report.faults == ['stamp_offset']
+    assert report.measures['stamp_offset_s'] == pytest.approx(0.003, rel=0.02)
 
 
 @pytest.mark.parametrize(('odd', 'says'), [

@@ -191,8 +191,9 @@ class _OneFilter(_Conditions):
     def follow(self, run: Run, given: Input | None = None, magnetometer: bool = True) -> Outcome:
         """Feed the filter."""
         lead = scenarios.turning(self.imu, self.attitude, run.truth[0], TURN_S)
-        self.attitude = run.truth[-1]
-        return super().follow(run.after(lead), given, magnetometer).since(len(lead.t))
+        outcome = super().follow(run.after(lead), given, magnetometer).since(len(lead.t))
+        self.attitude = run.truth[-1]       # a filter that fails does so with its first step
+        return outcome
 
 
 class _Exam:
@@ -355,7 +356,9 @@ class _Exam:
             effect, math.hypot(*scenarios.LEVER_ARM.values['imu.lever_arm'])))
         density = self._imu.get('imu.accelerometer_noise_density', 0.0)
         if density:
-            tilt = rms(measures.errors_of(noisy.last().estimates, pivot.estimates).tilt)
+            quiet = pivot if not any(self._imu.get('imu.lever_arm', ())) else self._run(
+                replace(scenarios.SLOW, noisy=False), seed).last()
+            tilt = rms(measures.errors_of(noisy.last().estimates, quiet.estimates).tilt)
             sample = density * math.sqrt(scenarios.SLOW.rate) / scenarios.GRAVITY
             self.measures['noise_gain'] = tilt / (math.sqrt(2.0) * sample)
 
@@ -381,7 +384,7 @@ class _OneFilterExam(_Exam):
     def sit(self, extra: Sequence[Scenario]) -> None:
         """Do all the runs."""
         super().sit(extra)
-        if self.outcomes:
+        if self._seeds and self.outcomes:
             self._guard(self._tilt)
 
     def _ask_for_field(self) -> None:

@@ -34,9 +34,9 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.attitudes import LAYOUTS, decode
 from spinning_top_sim.tools.recorded_run import ODD, reason_of
 
-# Of the sensor, and of the body; the first that the log has is the truth.
+# The first that the log has is the truth: of the sensor as each Imu is, and of the body.
 TRUTHS = ('ground_truth/imu', 'ground_truth/odom', 'pose')
-OF_SENSOR = 'ground_truth/imu'
+ODOMETRY_OF_SENSOR = 'ground_truth/imu_odom'
 NORTHS = TRUE, MAGNETIC = 'true', 'magnetic'
 LONGEST_GAP_S = 0.1             # of the truth, for attitudes between two of its samples
 FEWEST = 100                    # attitudes that say something
@@ -94,7 +94,8 @@ def examine_log(path: Path, topic: str, truth: str | None = None,
                          f'{true.quaternions[wrong[0]].tolist()} at '
                          f'{true.stamps_ns[wrong[0]] * 1e-9:.9f} s: its norm must be 1')
     turns = Rotation.from_quat(true.quaternions)
-    if not true_topic.name.endswith(OF_SENSOR):
+    if not (true_topic.type_name == 'sensor_msgs/msg/Imu'
+            or true_topic.name.endswith(ODOMETRY_OF_SENSOR)):
         turns = turns * Rotation.from_euler('xyz', values.get('imu.rpy', (0.0, 0.0, 0.0)))
     if north == MAGNETIC:
         if 'mag.field' not in values:
@@ -213,7 +214,7 @@ def _beside(name: str, said: Attitudes, true: Attitudes) -> Outcome:
     rates = np.stack([np.interp(t, middle, column) for column in step.T], axis=1)
     covariances = said.covariances[chosen]
     known = np.flatnonzero(np.all(np.isfinite(covariances), axis=(1, 2)))
-    t = t - t[0]
-    return Outcome(Truth(name, t, np.diff(t, prepend=t[0] - (t[1] - t[0])), truth.as_quat(),
-                         rates), said.quaternions[chosen], Known(known, covariances[known]),
-                   UNKNOWN)
+    # Of the filter: it may be faster than the truth.
+    dt = np.full(len(t), float(np.median(np.diff(said.stamps_ns))) * 1e-9)
+    return Outcome(Truth(name, t - t[0], dt, truth.as_quat(), rates), said.quaternions[chosen],
+                   Known(known, covariances[known]), UNKNOWN)
