@@ -163,6 +163,7 @@ def test_curves_are_the_published_numbers(shown):
     (State(theta=0.5, l3=1.6, lz=1.6 * math.cos(0.5)), 'cusps'),
     (State(theta=0.5, l3=1.6, lz=1.3), 'loops'),
     (State(theta=0.0, l3=2.0, lz=2.0), 'sleeping'),
+    (State(theta=0.0, theta_dot=2.0, l3=1.6, lz=1.6), 'through the top'),
     (State(theta=1.0, theta_dot=0.5, l3=0.0, lz=0.0), 'planar pendulum, swinging')])
 def test_a_live_track_names_the_motion_from_its_samples(start, words):
     values = parameters.checked({})
@@ -191,6 +192,23 @@ def test_means_of_the_rates_are_drawn_as_the_rates(tmp_path):
     assert rows[0].shape == rows[1].shape == (201, 10)
     assert (rows[0][:, :4] == rows[1][:, :4]).all()
     assert rows[1][1:, 4:7] == pytest.approx((rows[0][1:, 4:7] + rows[0][:-1, 4:7]) / 2, abs=2e-3)
+
+
+def test_a_log_that_begins_later_shows_nothing_before(page, tmp_path):
+    from spinning_top_sim.view.log import Player, read_logs
+    from spinning_top_sim.view.page import PLOT_EVERY
+    paths = tmp_path / 'a.mcap', tmp_path / 'b.mcap'
+    for path, epoch in zip(paths, ('1', '2'), strict=True):
+        assert simulate.main(['--duration', '2', '-o', str(path), '--epoch', epoch]) == 0
+    player = Player(page, read_logs(paths))
+    player.draw_next(2.5)
+    assert all(top.drawn and top._root.visible for top in page._tops)
+    player._slider.value = 0.2
+    for _ in range(PLOT_EVERY):
+        player.draw_next(0.0)
+    assert page._tops[0].drawn and not page._tops[1].drawn and not page._tops[1]._root.visible
+    assert 'no samples yet' in page._words.content
+    assert 'angle between' not in page._words.content
 
 
 def test_each_of_two_logs_has_its_own_time(page, tmp_path):
@@ -244,15 +262,19 @@ def test_a_log_without_attitudes_is_refused(tmp_path):
 
 @pytest.fixture
 def estimate(log, tmp_path):
-    """Return a log of another program beside `log`: the same attitudes, in disorder."""
+    """Return a log of another program: the attitudes of `log`, in disorder, of norm 1.5."""
     path = tmp_path / 'estimate.mcap'
-    file = create_file(path, [RecordedTopic('/estimate', 'geometry_msgs/msg/PoseStamped')], {},
+    file = create_file(path, [RecordedTopic('/imu/data_raw', 'sensor_msgs/msg/Imu'),
+                              RecordedTopic('/estimate', 'geometry_msgs/msg/PoseStamped')], {},
                        compression='zstd')
     with LogReader(log) as reader:
         poses = list(reader.messages(['/pose']))
+        for reading in reader.messages(['/imu/data_raw']):      # without orientation
+            file.append(0, reading.log_time, reading.data)
     for pose in [*poses[100:], *poses[:100]]:
-        file.append(0, pose.log_time, pose.data)
-    file.append(0, poses[-1].log_time, bytes(len(poses[-1].data)))      # no attitude
+        q = np.frombuffer(pose.data[-32:])
+        file.append(1, pose.log_time, pose.data[:-32] + (1.5 * q).tobytes())
+    file.append(1, poses[-1].log_time, bytes(len(poses[-1].data)))      # no attitude
     file.write_chunk()
     file.finish()
     return path

@@ -64,7 +64,8 @@ def decode(data: bytes, type_name: str) -> Attitude:
     if layout.covariance:
         size = layout.covariance
         matrix = np.frombuffer(data, f'{order}f8', size * size, at + 32).reshape(size, size)
-        if matrix[0, 0] == NO_ORIENTATION:
+        # Of a pose the first variance is that of the position.
+        if size == 3 and matrix[0, 0] == NO_ORIENTATION:
             raise ValueError('it has no orientation')
         # 0 is unknown (sensor_msgs), and our own streams say so of what is exact.
         if np.max(np.abs(matrix[-3:, -3:])) > EXACT_VARIANCE:

@@ -96,19 +96,23 @@ def _read_samples(reader: LogReader, track: Track, topics: Mapping[str, str]) ->
 def _read_foreign(reader: LogReader, name: str, values: Mapping[str, Any],
                   reason: str) -> Track:
     """Read the first topic of a log that has an attitude."""
-    topic = next((topic for topic in reader.topics if topic.type_name in LAYOUTS), None)
-    if topic is None:
+    topics = [topic for topic in reader.topics if topic.type_name in LAYOUTS]
+    if not topics:
         raise LogError(f'{reader.path}: no topic with an attitude ({", ".join(LAYOUTS)}); '
                        f'{reason}')
-    track, stamps_ns, rows = Track(name, values), [], []
-    for message in reader.messages(topics=[topic.name]):
-        with contextlib.suppress(ValueError):
-            attitude = decode(message.data, topic.type_name)
-            if 0.5 < math.hypot(*attitude.quaternion) < 2.0:
-                stamps_ns.append(attitude.stamp_ns)
-                rows.append(attitude.quaternion)
-    if rows:
-        track.columns['pose'].append(np.array(stamps_ns), np.array(rows))
+    track = Track(name, values)
+    for topic in topics:
+        stamps_ns, rows = [], []
+        for message in reader.messages(topics=[topic.name]):
+            with contextlib.suppress(ValueError):
+                attitude = decode(message.data, topic.type_name)
+                norm = math.hypot(*attitude.quaternion)
+                if 0.5 < norm < 2.0:
+                    stamps_ns.append(attitude.stamp_ns)
+                    rows.append(attitude.quaternion / norm)
+        if rows:
+            track.columns['pose'].append(np.array(stamps_ns), np.array(rows))
+            break
     return track
 
 

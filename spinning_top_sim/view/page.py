@@ -86,10 +86,11 @@ class DrawnTop:
 
     def draw(self, stamp_ns: int) -> None:
         """Draw the newest samples up to a stamp."""
-        sample = self.track.attitudes.at(stamp_ns)
+        self.drawn = sample = self.track.attitudes.at(stamp_ns)
+        self._root.visible = sample is not None
         if sample is None:
+            self._shown = None
             return
-        self.drawn = sample
         # While the motion is paused, too, a part may be switched on.
         shown = sample[0], self._trace.visible, [arrow.visible for arrow in self._arrows]
         if shown == self._shown:

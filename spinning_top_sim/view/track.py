@@ -209,7 +209,11 @@ def state_of(top: Top, row: Rows) -> tuple[tuple[float, float, float], State]:
     start_lz = next((pole for pole in (start_l3, -start_l3) if abs(start_lz - pole) < dust),
                     start_lz)
     sine, theta = math.hypot(up_1, up_2), 2.0 * math.atan2(math.sqrt(sin2), math.sqrt(cos2))
-    theta_dot = (up_2 * one - up_1 * two) / sine if sine >= SNAP else 0.0
+    if sine >= SNAP:
+        theta_dot = (up_2 * one - up_1 * two) / sine
+    else:       # there, whatever turns the axis is nutation
+        across = math.hypot(one, two)
+        theta_dot = across if top.lambda1 * across > dust else 0.0
     if sine < SNAP:
         theta, start_lz = (0.0, start_l3) if theta < 1.0 else (math.pi, -start_l3)
     return (energy, l3, lz), State(theta=theta, theta_dot=theta_dot, l3=start_l3, lz=start_lz)
