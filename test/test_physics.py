@@ -402,6 +402,13 @@ def test_a_description_shows_ranges_with_as_many_digits_as_tell_their_ends_apart
     assert f'precession 0 rad/s ({text}), spin' in str(motion)
 
 
+def test_an_animation_ends_with_the_last_sample():
+    pytest.importorskip('matplotlib')
+    top = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
+    motion = solve(top, State(theta=0.5, l3=1.6, lz=1.3), np.linspace(0.1, 0.3, 5))
+    assert len(list(motion.animate().new_frame_seq())) == 5
+
+
 @pytest.mark.parametrize('theta', [0.2, 2.1])
 def test_the_swing_of_a_pendulum_that_turns_over_ends_at_the_poles(theta):
     top = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)

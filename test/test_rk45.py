@@ -353,7 +353,8 @@ def test_bad_settings_are_refused_by_name_and_value(arguments, message):
     ([0.0, math.nan], r't\[1\] = nan'), ([math.inf], r't\[0\] = inf'), ([[1.0]], 'shape'),
     (1.0, 'shape'), (['soon'], 'soon'), (np.array([1], 'm8[s]'), 'timedelta64.*numbers, in s'),
     (np.array(['2026-01-01'], 'M8[ns]'), 'datetime64.*numbers, in s'),
-    (np.array([1.0 + 0.0j]), 'numbers, in s')])
+    (np.array([1.0 + 0.0j]), 'numbers, in s'), ([10 ** 400], 'numbers, in s'),
+    ([10 ** 5000], 'numbers, in s')])
 def test_bad_times_are_refused(t, message):
     top, start, _ = cusp_scene()
     with pytest.raises(ValueError, match=message):

@@ -147,8 +147,8 @@ def animate(motion: Motion, fps: float, speed: float) -> FuncAnimation:
         if not 0.0 < value < np.inf:
             raise ValueError(f'{name} = {value!r}: must be a number > 0')
     times = motion.t
-    count = int((times[-1] - times[0]) * fps / speed) + 1
     # Each frame shows a sample: the newest one, but for rounding.
+    count = int((times[-1] - times[0]) * fps / speed + 1e-6) + 1
     shown = np.searchsorted(times, times[0] + (np.arange(count) + 1e-6) * speed / fps, 'right') - 1
     x, y, z = motion.rows_axis
     tip, lowest = x + 1j * y, _lowest(z)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.regimes import axis_rests
 from spinning_top_sim.physics.states import States
-from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.nutation import MOST
 from spinning_top_sim.solvers.rk45 import EulerMotion, TransportMotion
@@ -155,8 +155,8 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
         if given.dtype.kind in 'cmM':           # complex, timedelta64, datetime64
             raise TypeError(f'{given.dtype} is no number of seconds')
         times = given.astype(np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f't = {t!r}: must be (n,) numbers, in s') from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f't = {shown(t)}: must be (n,) numbers, in s') from error
     if times.ndim != 1:
         raise ValueError(f't has shape {times.shape}: must be (n,)')
     for at in np.flatnonzero(~np.isfinite(times))[:1]:
