@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.tools import ensemble_part, ensemble_spec
-from spinning_top_sim.tools.ensemble import main
+from spinning_top_sim.tools.ensemble import _manifest, _write_manifest, main
 from spinning_top_sim.tools.ensemble_part import (
     EnsembleError,
     compute_part,
@@ -389,6 +389,42 @@ def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(tmp_pat
         assert set(one['spin.lz'].to_pylist()) == {None if run < 2 else 1.4}
         samples_of_mag = len(one) - one['imu/mag.magnetic_field.x'].null_count
         assert samples_of_mag == [0, 6][run % 2]
+
+
+def test_runs_without_a_sample_have_no_rows(tmp_path):
+    grades = [str(ROOT / f'config/imu/{name}.yaml') for name in ('bmi088', 'icm_20948')]
+    specification = ensemble_spec.parse({
+        'runs': 2, 'runs_per_part': 1, 'duration': 0.05, 'params': [{'record.streams': ['mag']}],
+        'sample': {'params': {'values': grades}}}, 'test')
+    for name in ('progress', 'data'):
+        (tmp_path / name).mkdir()
+    for part in range(2):
+        record = compute_part(specification, part, str(tmp_path), ensemble_part.versions())
+        assert (len(record['files']), record['failed']) == (1, {})
+    assert [len(table(specification, run)) for run in range(2)] == [0, 6]
+    assert len(parquet.read_table(tmp_path / 'data')) == 6
+
+
+def test_a_grid_in_another_order_is_another_one(tmp_path):
+    sample = {'initial.theta': {'values': [0.3, 0.6]}, 'spin.l3': {'values': [1.5, 1.7]}}
+    one, other = (ensemble_spec.parse({'runs': 4, 'duration': 1.0, 'sample': dict(order)}, 'test')
+                  for order in (sample.items(), reversed(sample.items())))
+    manifest = _manifest(tmp_path, one, resume=False)
+    _write_manifest(tmp_path, manifest)
+    assert _manifest(tmp_path, one, resume=True) == manifest
+    with pytest.raises(ValueError, match='has another specification: sample'):
+        _manifest(tmp_path, other, resume=True)
+
+
+def test_an_ensemble_that_stopped_with_its_first_manifest_is_resumed(tmp_path):
+    specification = ensemble_spec.parse({'runs': 4, 'duration': 1.0}, 'test')
+    (tmp_path / 'manifest.json.new').write_text('{"for')
+    for resume in (True, False):
+        assert not _manifest(tmp_path, specification, resume=resume)['complete']
+
+
+def test_the_versions_are_those_that_are_in_the_logs():
+    assert {'rclpy', 'numpy', 'mcap', 'zstandard', 'lz4'} <= set(ensemble_part.versions())
 
 
 def test_streams_that_are_named_have_the_same_columns_in_all_runs():

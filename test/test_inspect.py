@@ -12,6 +12,7 @@ import re
 import struct
 import subprocess
 import sys
+import tracemalloc
 from types import SimpleNamespace
 
 import numpy as np
@@ -25,7 +26,7 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.pipeline import Simulation
 from spinning_top_sim.tools import analysis, cli, inspect, recover, simulate
-from spinning_top_sim.tools.recorded_run import read_run_description
+from spinning_top_sim.tools.recorded_run import read_run_description, verify
 from spinning_top_sim.tools.survey import Series, survey
 
 RUN_S = 20
@@ -683,6 +684,9 @@ def test_an_odd_entry_of_the_journal_is_told(stepped, tmp_path, capsys, event):
     assert code == 1
     assert 'journal, entry at 3.003100000 s: ' in out or 'cannot be followed beyond' in out
     assert 'motion 4' in out
+    _, content = as_json(capsys, path)
+    assert any('entry at 3.003100000 s: ' in note or 'cannot be followed' in note
+               for note in content['notes'])
 
 
 def test_a_run_that_no_log_of_its_size_holds_is_not_computed(stepped, tmp_path, capsys):
@@ -834,6 +838,34 @@ def test_in_every_frame_the_tip_is_where_the_axis_is(tmp_path, monkeypatch, dura
     each = np.arange(frames) / (plots.FRAMES_PER_S * data.period)
     expected = np.interp(each, np.arange(len(data.height)), data.height)
     assert ends[-frames:] == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_curve_of_a_slow_motion_has_no_more_points_than_can_be_seen():
+    pytest.importorskip('matplotlib')
+    from spinning_top_sim.tools.plots import smooth_tip
+    rows = np.tile(np.array([[0.0], [0.6], [0.0], [0.8]]), 100_000)
+    time, tip, height = smooth_tip(analysis.Attitudes(np.arange(100_000) * 10_000_000, rows))
+    assert len(time) == len(tip) == len(height) <= 20_001
+    assert time[-1] == pytest.approx(999.99)
+
+
+def test_what_is_missing_takes_no_memory(tmp_path):
+    path = log_of(tmp_path / 'run.mcap', '--duration', 60, '-p', 'solver.method:=exact')
+    counts = {}
+    with LogReader(path) as reader:
+        for message in reader.messages():
+            counts[message.topic] = counts.get(message.topic, 0) + 1
+    thin = rewritten(path, tmp_path / 'thin.mcap', lambda topic, number, data: (
+        data if number in (0, counts[topic] - 1) or 'spinning_top/' in topic else None))
+    with LogReader(thin) as reader:
+        run = read_run_description(reader)
+        tracemalloc.start()
+        verdict = verify(reader, run, reader.span[1], lambda _: None)
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    assert verdict.missing == sum(
+        count - 2 for topic, count in counts.items() if 'spinning_top/' not in topic)
+    assert peak < 30e6
 
 
 def test_a_page_is_drawn_where_the_first_readings_are_missing(tmp_path, capsys):

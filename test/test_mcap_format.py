@@ -274,6 +274,18 @@ def test_beside_dates_a_time_of_0_is_none(tmp_path):
         assert [message.data for message in reader.messages()] == [b'a', b'b']
 
 
+def test_a_summary_that_is_too_large_to_be_parsed_is_no_damage(tmp_path):
+    path = tmp_path / 'a.mcap'
+    file = create_file(path, TOPICS, {}, compression='none')
+    for stamp in range(1, 201):
+        file.append(0, stamp, b'')
+        file.write_chunk()
+    file.finish()
+    with LogReader(path, max_bytes=10_000) as reader:
+        assert reader.whole and reader.damage.lines() == []
+        assert [message.log_time for message in reader.messages()] == list(range(1, 201))
+
+
 def test_beside_dates_in_one_chunk_a_time_of_0_is_none(tmp_path):
     path = tmp_path / 'a.mcap'
     for has_summary in (True, False):

@@ -888,6 +888,25 @@ def test_a_full_disk_leaves_nothing_behind(monkeypatch, tmp_path, log):
     assert [item.name for item in tmp_path.iterdir()] == ['run.mcap']
 
 
+@pytest.mark.parametrize('whole', [True, False])
+def test_a_log_behind_the_end_of_another_is_told(tmp_path, log, whole):
+    path = tmp_path / 'both.mcap'
+    path.write_bytes(log.content + (log.content if whole else log.content[:-100]))
+    code, out, _ = run(path, '-o', tmp_path / 'first.mcap')
+    assert code == SOME_LOST
+    assert 'another log at byte' in out and 'behind the end of this one' in out
+
+
+def test_a_path_without_a_name_is_told(tmp_path, log, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path('run.mcap').write_bytes(log.content)
+    assert run('run.mcap', '-o', '.') == (
+        FAILED, '', 'recover: . exists, and nothing is overwritten\n')
+    for path in ('.', '/'):
+        code, _, err = run(path)
+        assert code == FAILED and 'recover: ' in err and err.count('\n') == 1
+
+
 def test_an_output_that_cannot_be_made_is_named(tmp_path, log):
     path = tmp_path / 'run.mcap'
     path.write_bytes(log.content)

@@ -18,7 +18,8 @@ from rosbags.highlevel import AnyReader
 from spinning_top_sim import solve
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.pipeline import Simulation
-from spinning_top_sim.tools import cli
+from spinning_top_sim.streams.stream import Stream
+from spinning_top_sim.tools import cli, inspect
 from spinning_top_sim.tools.simulate import main
 
 EVERYTHING = ['-p', 'imu_data.enabled:=true', '-p', 'clock.enabled:=true',
@@ -372,6 +373,24 @@ def test_an_interrupted_run_is_a_shorter_log(tmp_path, capsys, monkeypatch, meth
     assert capsys.readouterr().err == 'simulate: interrupted\n'
     found, _ = read(tmp_path / 'run.mcap')
     assert list(found['/pose']) == list(range(0, calls[1] + 1, 10_000_000))
+
+
+def test_a_run_that_is_interrupted_within_a_block_has_all_streams_up_to_one_time(
+        tmp_path, monkeypatch):
+    path, encode, calls = tmp_path / 'run.mcap', Stream.encode, []
+
+    def interrupted(self, *arguments):
+        calls.append(self)
+        if len(calls) == 12:
+            raise KeyboardInterrupt
+        return encode(self, *arguments)
+
+    monkeypatch.setattr(Stream, 'encode', interrupted)
+    assert main(['-o', str(path), '--duration', '20', '--quiet']) == 130
+    monkeypatch.undo()
+    assert inspect.main([str(path), '--verify']) == 0
+    log, _ = read(path)
+    assert len(log['/pose']) > 100
 
 
 def test_no_streams_are_a_log_of_events(tmp_path):

@@ -45,7 +45,7 @@ def recover(reader: LogReader, output: str | os.PathLike[str],
     Raises LogError, also if a file that was not closed holds no whole message.
     """
     output = Path(output)
-    draft = output.with_name(f'.recover-{secrets.token_hex(8)}.tmp')
+    draft = output.parent / f'.recover-{secrets.token_hex(8)}.tmp'
     try:
         if os.path.lexists(output):
             raise FileExistsError

@@ -350,6 +350,8 @@ class Scanner:
                 end.data_section_crc not in (0, self.source.crc(0, offset))):
             self._losses.append(Loss(0, 0, 'something besides the messages',
                                      'the checksum of the data section is wrong'))
+        if end is not None and not self._limit_is_summary:
+            self._look_behind(offset + _DATA_END_SIZE)
         if self._summary.problem:
             self._defects.append(self._summary.problem)
         if self._summary.closed and end is None:
@@ -358,6 +360,16 @@ class Scanner:
         if statistics is not None and not self._losses and not self._counts.unknown and (
                 statistics.message_count > self._counts.found.total()):
             self._losses.append(Loss(0, 0, 'messages', 'the statistics count more than there are'))
+
+
+    def _look_behind(self, offset: int) -> None:
+        """Tell of another log behind the end of this one; a summary has no chunks."""
+        while (offset := self._finder.find(offset)) < self._limit:
+            if self.source.read(offset, 1)[0] == Opcode.CHUNK:
+                self._losses.append(Loss(offset, self._limit - offset, 'another log',
+                                         'it stands behind the end of this one'))
+                return
+            offset += 1
 
 
 class _MessageCounts:

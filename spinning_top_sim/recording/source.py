@@ -39,6 +39,7 @@ _NAME_OFFSETS: dict[int, int] = {
 _LOOK_BYTES = 64                # of the content, enough for a chunk's fields before its data
 _MAX_NAME = 1 << 12
 _MAX_EXTRA = 1 << 10
+LARGEST_SUMMARY = 1 << 25       # that is parsed [bytes]
 _MAX_EFFORT = 4                 # bytes of candidates read, as a multiple of the file's size
 
 
@@ -284,9 +285,10 @@ def read_summary(source: McapSource) -> Summary:
     try:
         if not MAGIC_SIZE <= start <= footer_offset:
             raise DamagedError('the footer does not lead to it')
-        records.check_size(size, source.max_bytes)
         if footer.summary_crc not in (0, source.crc(start, magic_offset - 4)):
             raise DamagedError('its checksum is wrong')
+        if size > min(LARGEST_SUMMARY, source.max_bytes):       # a scan finds the same
+            return Summary(start, closed=True)
         return _read_section(source, start, footer_offset)
     except DamagedError as damage:
         return Summary(source.size, closed=True, problem=f'the summary is not used: {damage}')

@@ -61,6 +61,7 @@ from spinning_top_sim.tools.ensemble_spec import Specification
 from spinning_top_sim.tools.recorded_run import ODD, reason_of
 
 MANIFEST = 'manifest.json'
+NEW_MANIFEST = f'{MANIFEST}.new'        # while it is written
 # What a manifest has besides its format.
 ENTRIES = {'complete': bool, 'versions': dict, 'specification': dict, 'files': dict,
            'failed': dict}
@@ -206,7 +207,12 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
 def _difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
     """Return in words which entries differ."""
     return ', '.join(f'{name} = {old.get(name)!r}, not {new.get(name)!r}'
-                     for name in {**old, **new} if old.get(name) != new.get(name))
+                     for name in {**old, **new} if not _same(old.get(name), new.get(name)))
+
+
+def _same(one: object, other: object) -> bool:
+    """Whether two entries are the same, in the same order: that of the samples is of the grid."""
+    return json.dumps(one) == json.dumps(other)
 
 
 def _manifest(folder: Path, specification: Specification, *, resume: bool) -> dict[str, Any]:
@@ -221,11 +227,12 @@ def _manifest(folder: Path, specification: Specification, *, resume: bool) -> di
     if resume and (folder / MANIFEST).exists():
         old = _read_manifest(folder)
         for what in ('specification', 'versions'):
-            if old[what] != manifest[what]:
+            if not _same(old[what], manifest[what]):
                 raise ValueError(f'--resume: {folder} has another {what}: '
                                  f'{_difference(old[what], manifest[what])}')
         manifest = old
-    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    elif folder.exists() and (not folder.is_dir() or any(
+            entry.name != NEW_MANIFEST for entry in folder.iterdir())):
         raise ValueError(f'{folder} exists and ' + (
             f'has no {MANIFEST}: it is no ensemble to resume' if resume else
             'is not overwritten: --resume goes on with it'))
@@ -234,7 +241,7 @@ def _manifest(folder: Path, specification: Specification, *, resume: bool) -> di
 
 def _write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     """Write the manifest at once, so that it is never there in part."""
-    written = folder / f'{MANIFEST}.new'
+    written = folder / NEW_MANIFEST
     with open(written, 'w', encoding='utf-8') as file:
         json.dump(manifest, file, indent=1)
         file.flush()

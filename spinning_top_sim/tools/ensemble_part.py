@@ -54,7 +54,8 @@ class EnsembleError(Exception):
 def versions() -> dict[str, str]:
     """Return what decides the last bit, and the bytes of the files."""
     return {'python': platform.python_version(), 'machine': platform.machine(),
-            **{name: version(name) for name in ('spinning_top_sim', 'numpy', 'pyarrow', 'mcap')}}
+            **{name: version(name) for name in (
+                'spinning_top_sim', 'numpy', 'pyarrow', 'mcap', 'rclpy', 'zstandard', 'lz4')}}
 
 
 def samples(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Samples]:
@@ -241,7 +242,7 @@ def _write_parquet(specification: Specification, part: int, folder: Path,
                 if writer is None:
                     writer = stack.enter_context(_parquet_writer(
                         specification, folder / f'part-{part:06d}.parquet', group.schema))
-                writer.write_table(group, row_group_size=len(group))
+                writer.write_table(group, row_group_size=max(len(group), 1))
 
 
 def _write_logs(specification: Specification, part: int, folder: Path,

@@ -27,7 +27,7 @@ from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import cli, export
-from spinning_top_sim.tools.recorded_run import Verdict, verify
+from spinning_top_sim.tools.recorded_run import RunDescription, Verdict, verify
 from spinning_top_sim.tools.survey import Motion, Survey, survey
 
 MOST_MOTIONS = 12           # shown one by one in the text
@@ -133,7 +133,7 @@ def _as_json(found: Survey, verdict: Verdict | None) -> object:
         'duration': (damage.end_ns - damage.start_ns) / NANOSECONDS,
         'topics': {name: asdict(topic) for name, topic in found.topics.items()},
         'ours': run is not None, 'why_not_ours': found.foreign_reason or None,
-        'notes': found.notes,
+        'notes': [*_broken_entries(run), *found.notes],
         'run': run and {
             'parameters': run.values_at_start, 'seed': run.values_at_start['seed'],
             'epoch_ns': run.epoch_ns, 'begun_ns': run.begun_ns, **run.surroundings},
@@ -158,6 +158,11 @@ def _as_json(found: Survey, verdict: Verdict | None) -> object:
     return json.loads(json.dumps(content), parse_constant=lambda name: None)
 
 
+def _broken_entries(run: RunDescription | None) -> list[str]:
+    return [f'journal, entry at {seconds(stamp_ns)}: {reason}'
+            for stamp_ns, reason in (run.broken if run else ())]
+
+
 def _as_text(found: Survey, verdict: Verdict | None) -> Iterator[str]:
     """Yield the findings as lines of text."""
     damage, run = found.damage, found.run
@@ -180,8 +185,7 @@ def _as_text(found: Survey, verdict: Verdict | None) -> Iterator[str]:
            f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
            f'{counts["parameters"]} changes of parameters'
            + (f', {counts["state"]} states set' if counts['state'] else ''))
-    for stamp_ns, reason in run.broken:
-        yield f'journal, entry at {seconds(stamp_ns)}: {reason}'
+    yield from _broken_entries(run)
     yield from found.notes
     for number, motion in enumerate(found.motions[:MOST_MOTIONS], start=1):
         yield from _motion(number, motion, damage.start_ns)

@@ -31,6 +31,7 @@ from spinning_top_sim.tools.survey import Motion, Survey
 STYLE = {**pictures.STYLE, 'axes.prop_cycle': cycler(color=COLOURS), 'legend.fontsize': 8,
          'legend.frameon': False}
 FINER = 10                  # points drawn for each sample
+MOST_DRAWN = 20_000         # points of a curve
 PAGE_NUTATIONS, PAGE_S = 8, 5.0      # on the page; seconds where theta rests
 MOST_MARKS = 30             # motions whose begin is marked
 FRAMES_PER_S, LONGEST_S = 20, 10.0
@@ -39,7 +40,7 @@ FRAMES_PER_S, LONGEST_S = 20, 10.0
 def smooth_tip(data: Attitudes) -> tuple[Reals, Complexes, Reals]:
     """Return time [s], tip (x + iy) and height of the axis, with points between the samples."""
     last = len(data.stamps_ns) - 1
-    at = np.linspace(0.0, last, last * FINER + 1)
+    at = np.linspace(0.0, last, min(last * FINER, MOST_DRAWN) + 1)
     return at * data.period, interpolate(data.tip, at), interpolate(data.height, at)
 
 

@@ -363,10 +363,17 @@ def verify(reader: LogReader, run: RunDescription, end_ns: int,
             verdict.stopped = str(error)
         yield math.inf
 
+    def miss(before_ns: float) -> None:
+        """Count what the log, which is read in the order of time, does not have before a time."""
+        for key in [key for key in computed if key[0] < before_ns]:
+            verdict.missing += len(computed.pop(key))
+            verdict.note(Difference(*key, 'message', 'no such message', 'there'))
+
     progress, before_ns = computing(), -math.inf
     for message in reader.messages(topics=verdict.compared):
         while message.log_time >= before_ns:
             before_ns = next(progress)
+            miss(message.log_time)
         key = message.log_time, message.topic
         if key in computed:
             stream, expected = computed[key].popleft()
@@ -380,10 +387,8 @@ def verify(reader: LogReader, run: RunDescription, end_ns: int,
             verdict.unexpected += 1
             verdict.note(Difference(*key, 'message', 'there', 'no such message'))
     for _ in progress:
-        pass
-    for key, left in computed.items():
-        verdict.missing += len(left)
-        verdict.note(Difference(*key, 'message', 'no such message', 'there'))
+        miss(math.inf)
+    miss(math.inf)
     return verdict
 
 

@@ -48,7 +48,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     log: Path = arguments.log
-    output: Path = arguments.output or log.with_name(f'{log.stem}_recovered.mcap')
+    output: Path = arguments.output or log.parent / f'{log.stem}_recovered.mcap'
     with LogReader(log) as reader, cli.progress(
             'recovered', reader.size, 'bytes', quiet=reader.size < PROGRESS_BYTES) as show:
         recovered = recover(reader, output, lambda done, total: show(done))

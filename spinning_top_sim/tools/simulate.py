@@ -188,7 +188,7 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
             try:
                 simulation.advance_in_blocks(target_ns, writer.take)
             finally:                # also what was computed before the motion could not go on
-                writer.write_blocks()
+                writer.write_blocks(epoch_ns + simulation.now_ns)
             if momenta is not None:
                 _command(simulation, *momenta)
                 t_ns, (l3, lz) = simulation.history[-1][0], momenta
@@ -231,9 +231,14 @@ class _LogWriter:
         """Take a block of samples, which `write_blocks` writes."""
         self._blocks.append((self._streams.index(stream), stamps_ns, rows.copy()))
 
-    def write_blocks(self) -> None:
-        """Begin to write a chunk of the blocks.  Raises OSError of the chunk before."""
-        blocks, self._blocks = self._blocks, []
+    def write_blocks(self, until_ns: int) -> None:
+        """
+        Begin to write a chunk of the blocks up to a stamp.  Raises OSError of the chunk before.
+
+        A later one is of an interrupted computation, of which other streams have no block.
+        """
+        blocks = [block for block in self._blocks if block[1][0] <= until_ns]
+        self._blocks = []
         if blocks:
             chunk = self.file.chunk_of_rows(blocks)
             self._chunk.result()
