@@ -3,6 +3,7 @@
 
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -172,3 +173,28 @@ def test_a_shorter_period_ends_a_long_sleep(monkeypatch):
     thread.run()
     assert BEGIN + 1.0 < seen[0] < BEGIN + 1.0 + 2 * thread.LONGEST_SLEEP
     assert [later - seen[0] for later in seen] == pytest.approx([0.0, PERIOD, 2 * PERIOD])
+
+
+@pytest.mark.parametrize('change', [
+    lambda player: player.set_rate(1.0), lambda player: (player.pause(True), player.pause(False))])
+def test_a_playback_that_cannot_keep_up_goes_on_from_what_is_sent(monkeypatch, change):
+    now_ns, sent = 0, []
+
+    def wait(seconds):
+        nonlocal now_ns
+        now_ns += round(seconds * 1e9)
+
+    monkeypatch.setattr(pacing.time, 'monotonic_ns', lambda: now_ns)
+    player = pacing.Playback(0)
+    player._changed = SimpleNamespace(wait=wait, clear=lambda: None, set=lambda: None)
+    player.set_rate(1e9)
+
+    def messages():
+        nonlocal now_ns
+        yield 0, lambda _: sent.append(now_ns), b''
+        now_ns += 1000                  # a second of the log
+        change(player)
+        yield 2_000_000_000, lambda _: sent.append(now_ns), b''
+
+    player.run(messages())
+    assert sent[1] - sent[0] >= (2_000_000_000 if player._clock._scale == 1.0 else 1002)

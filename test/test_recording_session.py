@@ -247,6 +247,19 @@ def test_a_recording_that_fails_at_its_end_says_why(tmp_path, monkeypatch):
     recorded.stop()
 
 
+def test_a_recording_that_has_failed_gives_way_to_the_next(tmp_path):
+    recorded, told = Recorded(tmp_path), []
+    recorded.start()
+    recorded.session._recorder.error = 'the disk is gone'
+    node = SimpleNamespace(
+        _session=recorded.session, check_started=lambda: None, start_values=recorded.values,
+        _log=SimpleNamespace(error=told.append))
+    node._check_recording = lambda: Simulator._check_recording(node)
+    assert Simulator._record(node, SetBool.Request(data=True)).startswith('recording to ')
+    assert told == ['recording stopped: the disk is gone; the simulation goes on']
+    recorded.stop()
+
+
 def test_a_recording_that_fails_is_closed_and_says_why(tmp_path):
     recorded = Recorded(tmp_path / 'one.mcap')
     recorded.start()

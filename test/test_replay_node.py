@@ -38,7 +38,8 @@ from spinning_top_sim.nodes.pacing import ROUND_GAP_NS, Playback, ReadAhead, rou
 from spinning_top_sim.nodes.replayer import message_class
 from spinning_top_sim.recording import writer
 from spinning_top_sim.recording.rosbag2 import RecordedTopic, find_definition, offered_qos_yaml
-from spinning_top_sim.recording.writer import McapRecorder
+from spinning_top_sim.recording.writer import McapRecorder, create_file
+from spinning_top_sim.streams.messages import string
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 EPOCH_NS = 1_700_000_000_123_456_789
@@ -609,7 +610,14 @@ def test_what_cannot_be_played_is_one_line_and_exit_code_2(tmp_path, strangers_l
     text = tmp_path / 'text.mcap'
     text.write_text('no log')
     path, _ = strangers_log
+    late = tmp_path / 'late.mcap'
+    file = create_file(late, [RecordedTopic('/chatter', 'std_msgs/msg/String')], {},
+                       compression='none')
+    file.append(0, 2 ** 63, string('late'))
+    file.write_chunk()
+    file.finish()
     for options, says in (
+            ((late, '--clock'), '--clock: the log has times after January 2038'),
             ((tmp_path / 'missing.mcap',), 'No such file'),
             ((tmp_path,), 'no regular file'),
             ((text,), 'no MCAP'),

@@ -288,3 +288,15 @@ def test_a_run_that_ends_is_freed_without_a_search_for_cycles():
         on_change()             # of a schedule that is no more
     finally:
         gc.enable()
+
+
+def test_lost_samples_move_no_target():
+    """The first sample of a block that is unfinished may be lost."""
+    simulation = simulate({'imu.drop_rate': 0.9})
+    published = publish(simulation, 'imu/data_raw')
+    simulation.advance(0)
+    for tick in range(1, 200):
+        simulation.prepare(5 * tick * MILLISECOND, budget_ns=0)
+        simulation.advance(5 * tick * MILLISECOND)
+        assert simulation.now_ns == 5 * tick * MILLISECOND
+    assert published

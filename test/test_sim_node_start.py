@@ -10,7 +10,7 @@ pytest.importorskip('rclpy')
 
 from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import DrivenClock, SimNode, wait_for
-from helpers.node_logs import QUIET, TRACEBACK, assert_clean_end, the_log
+from helpers.node_logs import QUIET, TRACEBACK, assert_clean_end, stamp_of, the_log
 from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
@@ -193,6 +193,29 @@ def test_what_is_said_at_the_start_is_on_rosout_and_at_the_end_what_to_do_next(p
     assert '\x1b' not in node.out and '\r' not in node.out
 
 
+def test_times_that_no_stamp_can_have_are_not_followed(peer, tmp_path):
+    clock = DrivenClock(peer, 1_000_000_000_000)
+    with SimNode(tmp_path, {**QUIET, 'use_sim_time': True}) as node:
+        pose = peer.listen(node.topic('pose'), PoseStamped)
+        # It would follow itself.
+        assert 'follows another /clock' in peer.set_together(node, clock__enabled=True).reason
+
+        def warned():       # -1 is no time to rclpy
+            for seconds in (-1, 2 ** 31 - 1):
+                clock.publish(seconds)
+            return 'stamps cannot be later than 2038' in node.err
+
+        wait_for('a warning', warned)
+        clock.publish(-1)
+        clock.drive('the motion', lambda: len(pose.raw) > 50)
+        clock.publish(-1)
+        clock.drive('more', lambda: len(pose.raw) > 100)
+        assert_clean_end(node, node.end())
+        peer.stop_listening(pose)
+    assert TRACEBACK not in node.err
+    clock.stop()
+
+
 def test_a_clock_that_has_not_begun_or_has_stopped_is_waited_for_aloud(
         peer, diagnostics, tmp_path):
     clock = DrivenClock(peer, 1_000_000_000_000)
@@ -210,7 +233,13 @@ def test_a_clock_that_has_not_begun_or_has_stopped_is_waited_for_aloud(
         refused = peer.set_together(node, spin__l3=2.0)     # it would send t = 0 to nobody
         assert not refused.successful and 'waiting for /clock' in refused.reason
         pose = peer.listen(node.topic('pose'), PoseStamped)
-        clock.drive('the motion', lambda: len(pose.raw) > 50 and '/clock goes on' in node.err)
+        clock.now_ns += 3_000_000           # not on the grid of the stamps
+
+        def is_ahead():
+            assert all(stamp_of(data) <= clock.now_ns for data in pose.raw[-1:])
+            return len(pose.raw) > 50 and '/clock goes on' in node.err
+
+        clock.drive('the motion', is_ahead)
         clock.drive('no warning', lambda: diagnostics.statuses(node)[-1].level == b'\x00')
         assert waits()
         assert node.err.count('waiting for /clock') == 2

@@ -401,6 +401,33 @@ def test_a_world_that_does_not_go_with_the_present_parameters_is_not_the_current
     assert top.done('GetCurrentWorld').world.world_resource.resource_string != text
 
 
+def refusal_of(top, name, value):
+    (result,) = top.node.set_parameters([Parameter(name, value=value)])
+    assert not result.successful
+    return result.reason
+
+
+def test_means_that_are_taken_keep_the_imu_at_a_hertz(top):
+    assert all(result.successful for result in top.node.set_parameters([
+        Parameter('imu.sampling', value='mean')]))
+    top.done('ResetSimulation', scope=0)
+    assert top.node.set_parameters([Parameter('imu.sampling', value='instant')])[0].successful
+    assert 'imu.rate = 0.5: must be >= 1 while means' in refusal_of(top, 'imu.rate', 0.5)
+    top.done('ResetSimulation', scope=0)
+    assert top.node.set_parameters([Parameter('imu.rate', value=0.5)])[0].successful
+
+
+def test_increments_that_are_recorded_keep_the_imu_at_a_hertz(top):
+    assert top.node.set_parameters([Parameter('increments.enabled', value=True)])[0].successful
+    top.node._session.start(top.node.values)()
+    assert top.node.set_parameters([Parameter('increments.enabled', value=False)])[0].successful
+    assert 'must be >= 1 while' in refusal_of(top, 'imu.rate', 0.5)
+    text = '/**: {ros__parameters: {top.mass: 2.0, imu.rate: 0.5}}'
+    assert 'imu.rate = 0.5: must be >= 1' in top.refused('LoadWorld', **load(top, text=text))[1]
+    top.node._session.stop()
+    assert top.node.set_parameters([Parameter('imu.rate', value=0.5)])[0].successful
+
+
 def test_a_world_in_another_encoding_is_named(top, tmp_path):
     path = tmp_path / 'latin.yaml'
     path.write_bytes(b'# \xe9t\xe9\n')

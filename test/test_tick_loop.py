@@ -286,6 +286,28 @@ def test_a_tick_gives_way_when_its_time_is_up(monkeypatch):
     assert len(run.stamps) > first
 
 
+def test_after_a_slip_live_samples_go_on(monkeypatch):
+    monkeypatch.setattr(tick_loop, 'TICK_BUDGET_NS', 500_000)
+    run = Run().publish()
+    run.loop.start()
+    run.ticks(3)
+    run.clock.step_ns = 100_000
+    run.tick(1000 * SECOND)
+    assert run.loop.slipped_ns > 0
+    run.clock.step_ns, count = 0, len(run.published)
+    run.ticks(100)
+    assert len(run.published) >= count + 40
+    assert run.pose.skipped < 1000          # of 100 000
+
+
+def test_seldom_ticks_publish_all_samples():
+    run = Run(tick_rate=0.01).publish()
+    run.loop.start()
+    while run.clock.now_ns < BEGIN_NS + 3 * SECOND:
+        run.tick(round(run.loop.grid[1] * SECOND))
+    assert (len(run.published), run.pose.skipped) == (301, 0)
+
+
 def test_a_time_scale_holds_from_its_moment_on():
     run = started().ticks(4)
     assert run.loop.grid == (BEGIN_NS / 1e9, 0.005)

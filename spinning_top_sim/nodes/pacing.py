@@ -223,13 +223,18 @@ class Playback:
         """Pause, or go on without catching up; once paused, no message is sent any more."""
         with self._lock:
             self.paused = paused
-            self._clock.set(self._clock.now(), not paused)
+            self._go_on_from_sent(not paused)
         self._changed.set()
 
     def set_rate(self, rate: float) -> None:
         with self._lock:
+            self._go_on_from_sent(self._clock.when(0) is not None)
             self._clock.set_scale(rate)
         self._changed.set()
+
+    def _go_on_from_sent(self, running: bool) -> None:
+        # The clock is ahead of what is sent where that cannot keep up.
+        self._clock.set(min(self._clock.now(), self._sent_until), running)
 
     def stop(self) -> None:
         with self._lock:

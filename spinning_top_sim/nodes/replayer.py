@@ -33,7 +33,7 @@ from spinning_top_sim.nodes.executable import one_line, wait_for_all_acked
 from spinning_top_sim.recording.errors import DefinitionNotFoundError
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, find_definition
-from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 
 
 class Replayer(Node):
@@ -60,10 +60,14 @@ class Replayer(Node):
             additional_constraints=f'must be {pacing.RATES}', dynamic_typing=True))
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         if options.clock:
+            if self._end_ns > LAST_STAMP_NS:
+                raise ValueError('--clock: the log has times after January 2038, which a stamp '
+                                 'cannot be')
             clock = self.create_publisher(ClockMessage, '/clock', 10)
             self._senders.add(clock)
             self.create_timer(1.0 / max(options.clock, pacing.SLOWEST), lambda: clock.publish(
-                ClockMessage(clock=Time(nanoseconds=self._playback.now()).to_msg())), clock=steady)
+                ClockMessage(clock=Time(nanoseconds=min(
+                    self._playback.now(), LAST_STAMP_NS)).to_msg())), clock=steady)
         self.create_timer(1.0, self._show_status, clock=steady)
         self.create_service(SetBool, '~/set_pause', self._on_pause)
         self._stopping = threading.Event()

@@ -19,8 +19,10 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
 from rclpy.task import Future
 from rclpy.timer import Timer
+from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
@@ -30,12 +32,21 @@ from spinning_top_sim.nodes.pacing import DeadlineThread, FairLock
 from spinning_top_sim.nodes.recording_session import RecordingSession, Topic
 from spinning_top_sim.nodes.ros_parameters import SPIN
 from spinning_top_sim.nodes.throttle import TOPICS, Throttle
-from spinning_top_sim.nodes.tick_loop import LoopState, TickLoop, next_epoch
+from spinning_top_sim.nodes.tick_loop import (
+    EPOCH_GRID_NS,
+    LAST_LIVE_STAMP_NS,
+    TOO_LATE,
+    LoopState,
+    TickLoop,
+    next_epoch,
+)
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.pipeline import PoleError, Simulation
 from spinning_top_sim.streams.stream import Stream
+
+LAST_ANSWERS_S = 0.2            # what answers still take when the node ends
 
 
 class StreamPublishers:
@@ -135,6 +146,7 @@ class Simulator(Node):
                                 ('step', Trigger, self._step), ('reset', Trigger, self._reset),
                                 ('record', SetBool, self._record)):
             self.create_service(kind, f'~/{name}', functools.partial(self._serve, act))
+        self._steps_action: object = None
         if values['simulation_interfaces'] and importlib.util.find_spec('simulation_interfaces'):
             from spinning_top_sim.nodes import simulation_services  # noqa: PLC0415
             self._steps_action = simulation_services.offer(
@@ -172,6 +184,15 @@ class Simulator(Node):
     def _date_ns(self) -> int:
         return self._date.now().nanoseconds
 
+    def create_subscription(self, msg_type: Any, topic: str, callback: Callable[[Any], Any],
+                            *arguments: Any, **options: Any) -> Subscription:
+        """Subscribe as any node does; of /clock, leave out times before 0: rclpy raises there."""
+        def take(message: ClockMessage) -> None:
+            if message.clock.sec >= 0:
+                callback(message)
+        return super().create_subscription(
+            msg_type, topic, take if msg_type is ClockMessage else callback, *arguments, **options)
+
     def start(self) -> None:
         """Let time run: simulated t = 0 is the next point of the stamps' grid."""
         # Threads let go of the interpreter this soon when a tick is due; the default is 5 ms.
@@ -183,10 +204,13 @@ class Simulator(Node):
         """Start the motion, unless the /clock that is followed says nothing yet."""
         if self._date_ns() == 0:
             return
+        if self._follows and self._date_ns() > LAST_LIVE_STAMP_NS:
+            self._log.warning(f'/clock: {TOO_LATE}', once=True)
+            return
         self.destroy_timer(self._begin_timer)
         if self._values['max_error'] > 0.0:
             _ = self._simulation.segment.exact    # its modules take a while to import
-        now_ns = self._date_ns()
+        now_ns = self._first_date_ns()
         self._simulation.epoch_ns = next_epoch(now_ns)
         if not self._follows:
             time.sleep((self._simulation.epoch_ns - now_ns) / NANOSECONDS)
@@ -200,6 +224,15 @@ class Simulator(Node):
             except RecordingError as error:     # nobody has asked for it, and gets an answer
                 self._session.error = str(error)
                 self._log.error(f'not recording: {error}')
+
+    def _first_date_ns(self) -> int:
+        """
+        Return the date of a t = 0 that begins now [ns].
+
+        No stamp is later than the /clock that is followed; a stamp of 0 is "no time".
+        """
+        date_ns = self._date_ns()
+        return (max(date_ns // EPOCH_GRID_NS, 1) * EPOCH_GRID_NS if self._follows else date_ns)
 
     def _watch_clock(self) -> None:
         """Warn when the followed /clock stands for 2 s or has not begun; say when it goes on."""
@@ -230,6 +263,8 @@ class Simulator(Node):
                 self._outputs.flush(at_once=self._loop.state is LoopState.ENDED)
         if self._loop.state is LoopState.ENDED and not self.finished.done():
             wait_for_all_acked(self._outputs.by_topic.values(), 1.0)
+            if self._steps_action is not None:      # a goal ends with the motion, and is told
+                time.sleep(LAST_ANSWERS_S)
             self.finished.set_result(None)
         return wants_idle
 
@@ -284,6 +319,7 @@ class Simulator(Node):
 
     def _change(self, changes: dict[str, Any]) -> None:
         values, start_spin = ros_parameters.changed(self._values, changes, self._start_spin)
+        self._check_surroundings(values, restarted=False)
         rest = sorted(changes.keys() - SPIN)
         with self._lock:
             if ros_parameters.is_command(changes):
@@ -301,6 +337,16 @@ class Simulator(Node):
             if names:
                 self._log.info(f'{", ".join(names)}: {effect.value}')
         self._values, self._start_spin = values, start_spin
+
+    def _check_surroundings(self, values: Mapping[str, Any], *, restarted: bool) -> None:
+        """Raise ValueError for parameters that do not go with what is in use already."""
+        if self._follows and journal.is_enabled('clock', values):
+            raise ValueError('clock.enabled, publish_clock: must be false while this node follows '
+                             'another /clock (use_sim_time)')
+        lowest = self._simulation.lowest_imu_rate(restarted=restarted)
+        if values['imu.rate'] < lowest:
+            raise ValueError(f'imu.rate = {values["imu.rate"]!r}: must be >= {lowest:g} while '
+                             'means or increments are taken, published or recorded')
 
     def _command(self, l3: float, lz: float) -> None:
         try:
@@ -366,8 +412,9 @@ class Simulator(Node):
         """
         with self._lock:
             self.check_started()
-            self._loop.reset(self.start_values if values is None else values, self._date_ns(),
-                             paused)
+            start = self.start_values if values is None else values
+            self._check_surroundings(start, restarted=True)
+            self._loop.reset(start, self._first_date_ns(), paused)
             if values is not None:
                 self._open_outputs(values)
                 self._start_spin = {name: values[name] for name in SPIN}
@@ -399,7 +446,7 @@ class Simulator(Node):
     def finish(self) -> None:
         """End the process, once the response that is under way has been sent."""
         self._finish_timer = self._steady_timer(
-            0.2, lambda: self.finished.done() or self.finished.set_result(None))
+            LAST_ANSWERS_S, lambda: self.finished.done() or self.finished.set_result(None))
 
     def _record(self, request: SetBool.Request) -> str:
         if not request.data:
@@ -408,14 +455,18 @@ class Simulator(Node):
                 raise RecordingError(summary)
             return summary or 'not recording'
         self.check_started()
+        self._check_recording()
         return self._session.start(self.start_values)()
+
+    def _check_recording(self) -> None:
+        reason = self._session.check()
+        if reason:
+            self._log.error(f'recording stopped: {reason}; the simulation goes on')
 
     def _publish_diagnostics(self) -> None:
         """Look at /clock, the recording and other nodes, and publish /diagnostics."""
         self._watch_clock()
-        reason = self._session.check()
-        if reason:
-            self._log.error(f'recording stopped: {reason}; the simulation goes on')
+        self._check_recording()
         if self._session.warning:
             self._log.warning(f'recording: {self._session.warning}', throttle_duration_sec=10.0)
         if next(self._diagnostics_count) % 10 == 1:       # a look every 10 s

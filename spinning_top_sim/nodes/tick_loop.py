@@ -113,6 +113,7 @@ class TickLoop:
         if self.state not in {state, LoopState.ENDED}:
             self.state = state
             self.interruptions += 1
+        self._simulation.readmit()
         self._clock.set(self.now_ns, running=self.state is LoopState.RUNNING)
         self._pace_ticks()
 
@@ -301,7 +302,8 @@ class TickLoop:
         """Take over tick_rate, time_scale and duration."""
         self._time_scale = values['time_scale']
         self._duration_ns = round(values['duration'] * NANOSECONDS) or NEVER_NS
-        self._tick_period_ns = NANOSECONDS / values['tick_rate']
+        # With fewer ticks, some of what is due would be too late to be published.
+        self._tick_period_ns = min(NANOSECONDS / values['tick_rate'], LATEST_NS / 2)
         self._late_after_ns = round(1.5 * self._tick_period_ns)
         self._ahead_ns = round(self._time_scale * max(
             1.5 * self._tick_period_ns, min(TICKS_AHEAD * self._tick_period_ns, AHEAD_NS)))

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 ENCAPSULATION = b'\x00\x01\x00\x00'
 NANOSECONDS = 1_000_000_000
+# Seconds of a stamp are an int32: they end in January 2038.
+LAST_STAMP_NS = 2 ** 31 * NANOSECONDS - 1
 
 # The numbers of a field in n messages: an array (n, count), or `count` columns or numbers.
 Field = NDArray[np.float64] | Sequence[NDArray[np.float64] | float]

@@ -199,7 +199,8 @@ TABLE: tuple[Parameter, ...] = (
               'from the exact solution; 0 = do not look', 'rad', 0.0, 1e6),
     _at_start('pacing', 'timer', 'Without effect, and accepted for older files: a thread with '
               'absolute deadlines makes the ticks', choices=('timer', 'thread')),
-    _at_once('tick_rate', 200.0, 'How often due samples are sent', 'Hz', 1e-2, HIGHEST_RATE),
+    _at_once('tick_rate', 200.0, 'How often due samples are sent; 4 Hz at least', 'Hz', 1e-2,
+             HIGHEST_RATE),
     _at_once('time_scale', 1.0, 'Simulated over real time', '', 1e-6, 1e6),
     _at_start('start_paused', False, 'Wait for ~/set_pause or ~/step'),
     _at_start('publish_clock', False, 'Publish /clock (the same as clock.enabled)'),

@@ -36,7 +36,7 @@ from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.schedule import Instant, Schedule, check_stamp
 from spinning_top_sim.streams.segment import SHORTEST_RUN_NS, Segment
 from spinning_top_sim.streams.stream import Stream
-from spinning_top_sim.streams.topics import ImuStream, all_streams
+from spinning_top_sim.streams.topics import ImuIncrements, ImuStream, all_streams
 
 # Steps that the first nanosecond of a motion may take, and steps at a time offline, so that their
 # interpolants stay in the cache.
@@ -210,8 +210,9 @@ class Simulation:
             if moved and give_way():
                 return False
             moved = True
-            if not ready:       # to compute does not move the time that is due next
+            if not ready:
                 schedule.compute(self.now_ns, target_ns)
+                due_ns = schedule.next_due(self.now_ns)     # later, if the first ones are lost
             if ready and due_ns <= target_ns:
                 self._send(ready.popleft(), due_ns >= publish_from_ns)
             else:               # the steps do not reach a sample yet, or none is due
@@ -244,6 +245,21 @@ class Simulation:
     def prepare(self, until_ns: int, budget_ns: int | None = None) -> bool:
         """Compute ahead what is due up to `until_ns`; see `Schedule.prepare`."""
         return self._schedule.prepare(self.now_ns, until_ns, budget_ns)
+
+    def readmit(self) -> None:
+        """Let samples after `now_ns` be due again: the clock has changed, they are not late."""
+        for stream in self.streams:
+            stream.readmit(self.now_ns)
+
+    def lowest_imu_rate(self, *, restarted: bool) -> float:
+        """
+        Return the lowest `imu.rate` [Hz] with which means and increments in use can go on.
+
+        restarted : after `restart`, which may end the means
+        """
+        uses = (self._imu.takes_means and not restarted) or any(
+            isinstance(stream, ImuIncrements) and stream.has_sinks for stream in self.streams)
+        return parameters.LOWEST_RATE_OF_INTERVALS if uses else 0.0
 
     def _send(self, instant: Instant, publishes: bool = True) -> None:
         """Hand out the samples of an instant; count those that are too late to be published."""

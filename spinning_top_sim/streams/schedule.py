@@ -10,7 +10,7 @@ from functools import cache
 from typing import TypeVar
 
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 from spinning_top_sim.streams.segment import Segment
 from spinning_top_sim.streams.stream import Stream
 
@@ -24,8 +24,6 @@ LONGEST_BLOCK_NS = 300_000_000
 # Integration steps between two looks at the time, and how many such pieces make a block.
 STEPS_IN_A_PIECE, MOST_PIECES = 4, 64
 NEVER_NS = 2 ** 63 - 1
-# Seconds of a stamp are an int32: they end in January 2038.
-LAST_STAMP_NS = 2 ** 31 * NANOSECONDS - 1
 # Offline, a block becomes a chunk of a log.  With twice as many bytes, a log of 546 000 messages
 # has 36 MB instead of 28 MB, in no less time.
 OFFLINE_BYTES = 1 << 20

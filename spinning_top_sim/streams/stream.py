@@ -56,9 +56,7 @@ class Stream:
 
     def begin(self, now_ns: int) -> None:
         """Prepare for samples after the simulated time `now_ns`: it will be recorded."""
-        # What is too late to be published is not too late for a log.
-        until_ns, self._skipped_until_ns = self._skipped_until_ns, 0
-        self.skipped -= len(self.times(now_ns, until_ns - 1))
+        self.readmit(now_ns)        # what is too late to be published is not too late for a log
 
     @property
     def at_once(self) -> tuple[str, ...]:
@@ -91,6 +89,14 @@ class Stream:
         if count:
             self.skipped += count
             self._skipped_until_ns = before_ns
+            self.on_change()
+
+    def readmit(self, now_ns: int) -> None:
+        """Leave out no more samples after `now_ns` than are skipped from now on."""
+        until_ns, self._skipped_until_ns = self._skipped_until_ns, 0
+        count = len(self.times(now_ns, until_ns - 1))
+        if count:
+            self.skipped -= count
             self.on_change()
 
     def sent_ns(self, times: range) -> NDArray[np.int64]:

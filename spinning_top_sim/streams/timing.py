@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.streams import noise
-from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.schedule import LAST_STAMP_NS
+from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 
 Integers = NDArray[np.int64]
 # Of the period: jitter is cut there, so that no stamp is before that of an earlier sample.

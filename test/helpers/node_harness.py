@@ -37,7 +37,6 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
-from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
@@ -369,10 +368,15 @@ class DrivenClock:
         self._peer, self.now_ns = peer, now_ns
         self._publisher = peer.node.create_publisher(Clock, '/clock', 10)
 
+    def publish(self, seconds, nanoseconds=0):
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = seconds, nanoseconds
+        self._publisher.publish(message)
+
     def drive(self, what, until):
         def goes_on():
             self.now_ns += 5_000_000
-            self._publisher.publish(Clock(clock=Time(nanoseconds=self.now_ns).to_msg()))
+            self.publish(*divmod(self.now_ns, 10 ** 9))
             return until()
         wait_for(what, goes_on)
 
