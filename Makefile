@@ -164,6 +164,7 @@ COMPARISONS := heavy_top exact_cost gauge stability work_precision allan increme
     attitude_filter ensemble exam view
 offline_options := --hour
 offline_scaling_options := --long
+soak_options := --minutes 30
 benchmark performance: export OMP_NUM_THREADS ?= 1
 benchmark performance: export OPENBLAS_NUM_THREADS ?= 1
 benchmark performance:

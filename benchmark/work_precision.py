@@ -222,13 +222,14 @@ def _section(case: Case, duration: int, rate: int, rows: list[Row]) -> str:
 
 # Okabe & Ito's palette, which the colour-blind can tell apart; a colour is a family.
 COLOURS = {'ours': '#D55E00', 'SciPy': '#0072B2', 'heyoka': '#009E73', 'diffrax': '#CC79A7',
-           'MuJoCo': '#666666'}
+           'numbalsoda': '#56B4E9', 'MuJoCo': '#666666'}
 EXACT = '#000000'
 STYLES = {'exact, any times': ('P', '-'), 'exact, grid': ('X', '-'),
           'rk45 transport': ('o', '-'), 'rk45 euler': ('o', ':'),
           'SciPy RK45': ('s', '-'), 'SciPy DOP853': ('^', '-'), 'SciPy LSODA': ('v', '-'),
           'heyoka Euler': ('D', ':'), 'heyoka quadratic': ('D', '-'),
-          'diffrax Dopri8 quadratic': ('h', '-'), 'MuJoCo RK4': ('<', '-'),
+          'diffrax Dopri8 quadratic': ('h', '-'), 'numbalsoda LSODA quadratic': ('v', ':'),
+          'numbalsoda DOP853 quadratic': ('^', ':'), 'MuJoCo RK4': ('<', '-'),
           'MuJoCo implicit': ('>', ':')}
 
 
