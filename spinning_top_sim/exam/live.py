@@ -55,8 +55,30 @@ def examine_node(topic: str, command: str | None = None, level: str = 'quick',
     """
     Examine a ROS node.
 
-    topic, command : see `NodeExam`
-    level, imu, seeds : see `examine`, which this does and raises
+    Parameters
+    ----------
+    topic : str
+        Of its attitudes, sensor_msgs/Imu, each with the stamp of its sample.
+    command : str, optional
+        Starts the node for each run, without a shell; without it the node runs already.
+    level : {'quick', 'full'}, optional
+        As of `examine`.
+    imu : mapping, str or Path, optional
+        As of `examine`.
+    seeds : int or iterable of int, optional
+        As of `examine`.
+
+    Returns
+    -------
+    Report
+        Faults with their evidence, and measures.
+
+    Raises
+    ------
+    ValueError
+        For a topic or command that is none, and as `examine` does.
+    NodeError
+        If the node is not there, or others publish on its topics.
     """
     with NodeExam(topic, command) as node:
         return examine(node.make_filter, level, imu, seeds, subject=command or topic,
