@@ -9,7 +9,7 @@ import string
 import numpy as np
 import yaml
 from helpers.examples import examples
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
@@ -144,6 +144,9 @@ SPECIFICATIONS = st.one_of(st.fixed_dictionaries(
 
 @examples(300)
 @given(SPECIFICATIONS)
+@example({'runs': 1, 'duration': 1.0, 'format': 1 << 15_000})
+@example({'runs': 1, 'duration': 1.0, 'streams': [1 << 15_000]})
+@example({1 << 15_000: 1})
 def test_any_specification_gives_its_runs_or_is_refused_by_its_source(content):
     try:
         specification = ensemble_spec.parse(content, 'spec.yaml')

@@ -171,7 +171,8 @@ def break_up(plain: bytes | bytearray) -> ChunkContents:
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             declared_bytes += length
             check_declared(declared_bytes)
-            record, _ = parse(bytes(plain[offset:end]))
+            record, extra = parse(bytes(plain[offset:end]))
+            contents.right &= not extra         # mcap's reader does not skip what it does not know
             assert isinstance(record, Schema | Channel)
             contents.declared.append(record)
         offset = end

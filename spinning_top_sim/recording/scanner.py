@@ -215,7 +215,7 @@ class Scanner:
     def _open_chunk(self, offset: int, chunk: Chunk) -> ChunkContents:
         contents = records.open_chunk(chunk, self.source.max_bytes)
         declared = [self._declare(offset, record) for record in contents.declared]
-        contents.right = declared == contents.declared and all(
+        contents.right &= declared == contents.declared and all(
             self._summary.knows(record.id) for record in declared if isinstance(record, Channel))
         if contents.entries and time_span(contents.entries) != (
                 chunk.message_start_time, chunk.message_end_time):

@@ -169,7 +169,8 @@ def parse(content: object, source: str, folder: Path = Path()) -> Specification:
     names = Specification.__dataclass_fields__
     for name in content:
         if name not in names:
-            raise ValueError(f'{source}: {name}: there is no such entry; there are '
+            raise ValueError(f'{source}: {name if isinstance(name, str) else shown(name)}: there '
+                             'is no such entry; there are '
                              f'{", ".join(names)}')
     given = dict(content)
     for name in ('runs', 'duration'):
@@ -184,7 +185,7 @@ def parse(content: object, source: str, folder: Path = Path()) -> Specification:
     if not duration > 0.0:
         raise ValueError(f'{source}: duration = {duration!r}: must be a number > 0')
     if given.setdefault('format', FORMATS[0]) not in FORMATS:
-        raise ValueError(f'{source}: format = {given["format"]!r}: must be one of '
+        raise ValueError(f'{source}: format = {shown(given["format"])}: must be one of '
                          f'{", ".join(FORMATS)}')
     given['params'] = [_set_of(one, f'{source}: params', folder)
                        for one in _list(given.get('params', []), f'{source}: params')]
@@ -230,7 +231,7 @@ def _streams(given: object, file_format: str, source: str) -> list[str]:
     allowed = [name for name in STREAMS if file_format != 'parquet' or name not in WITHOUT_COLUMNS]
     for name in names:
         if name not in allowed:
-            raise ValueError(f'{source}: streams: {name!r}: must be some of '
+            raise ValueError(f'{source}: streams: {shown(name)}: must be some of '
                              f'{", ".join(allowed)} with format: {file_format}')
     return names
 

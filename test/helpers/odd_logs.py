@@ -94,7 +94,7 @@ def _odd_entry(rng, data):
     entry = json.loads(data[8:-1])
     kind = rng.random()
     if kind < 0.1:
-        return data[:rng.randrange(len(data))]
+        return data[:rng.randrange(max(len(data), 1))]
     if kind < 0.2:
         return messages.string(rng.choice(TEXTS))
     if kind < 0.45:
@@ -120,7 +120,7 @@ def _odd_entry(rng, data):
 def _odd_sample(rng, data):
     """Return a sample with another size, or with odd bytes at its end."""
     if rng.random() < 0.3:
-        return data[:rng.randrange(len(data))]
+        return data[:rng.randrange(max(len(data), 1))]
     count = rng.randint(1, 8) * 8
     return data[:-count] + rng.choice((b'\0' * count, b'\xff' * count, b'\xff\xef' * (count // 2),
                                        rng.randbytes(count)))
