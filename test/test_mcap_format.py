@@ -140,7 +140,7 @@ def test_extra_fields_and_unknown_kinds_are_read_and_kept(tmp_path):
 
 
 def test_extra_fields_inside_of_a_chunk_are_ignored_and_not_copied(tmp_path):
-    """mcap's own reader does not skip them there."""
+    """The reader of mcap itself does not skip them there."""
     path = tmp_path / 'a.mcap'
     plain = padded(SCHEMA, b'more') + padded(CHANNEL, b'more') + message(5, b'1')
     path.write_bytes(closed(HEADER, chunk_of(plain)))

@@ -19,7 +19,6 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.subscription import Subscription
 from rclpy.task import Future
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
@@ -106,6 +105,14 @@ class StreamPublishers:
                          for name, type_name in journal.TOPICS]
 
 
+def _with_dates(take: Callable[[ClockMessage], object]) -> Callable[[ClockMessage], None]:
+    """Return what takes /clock but for times before 0, for which rclpy raises an error."""
+    def take_dates(message: ClockMessage) -> None:
+        if message.clock.sec >= 0:
+            take(message)
+    return take_dates
+
+
 class Simulator(Node):
     """
     The node.  Raises ValueError for a bad parameter.
@@ -124,6 +131,9 @@ class Simulator(Node):
         self._values = {**values, 'spin.lz': simulation.lz}
         self.add_pre_set_parameters_callback(ros_parameters.with_doubles)
         self.add_on_set_parameters_callback(self._on_set_parameters)
+        for subscription in self.subscriptions:
+            if subscription.msg_type is ClockMessage:
+                subscription.callback = _with_dates(subscription.callback)
         # Another node's /clock is followed, but not one that this node publishes.
         self._follows = (self.get_parameter('use_sim_time').value
                          and not journal.is_enabled('clock', values))
@@ -183,15 +193,6 @@ class Simulator(Node):
 
     def _date_ns(self) -> int:
         return self._date.now().nanoseconds
-
-    def create_subscription(self, msg_type: Any, topic: str, callback: Callable[[Any], Any],
-                            *arguments: Any, **options: Any) -> Subscription:
-        """Subscribe as any node does; of /clock, leave out times before 0: rclpy raises there."""
-        def take(message: ClockMessage) -> None:
-            if message.clock.sec >= 0:
-                callback(message)
-        return super().create_subscription(
-            msg_type, topic, take if msg_type is ClockMessage else callback, *arguments, **options)
 
     def start(self) -> None:
         """Let time run: simulated t = 0 is the next point of the stamps' grid."""
