@@ -62,14 +62,16 @@ help:
 	@echo 'make stress  kill 200 recording nodes (KILLS=...), try 30 times the random'
 	@echo '             inputs of the tests (EXAMPLES=...), then random logs, parameters,'
 	@echo '             commands, service calls, disk faults and the statistics of the'
-	@echo '             sensors (each SECONDS=300), then 40 000 random tops (STRESS=...)'
-	@echo '             with both solvers; an hour or two'
+	@echo '             sensors (each SECONDS=180), 10 exams of nodes beside other work'
+	@echo '             (EXAMS=...), and 20 000 random tops (STRESS=...) with both solvers;'
+	@echo '             an hour'
 	@echo 'make performance'
 	@echo '             measure node, start-up, a long run, solvers and simulate, and write'
 	@echo '             docs/performance.md; an hour, in .venv-benchmark'
 	@echo 'make benchmark'
 	@echo '             the same, and compare accuracy, stability and cost with other'
-	@echo '             programs, attitude filters and the noise of the IMU; two hours'
+	@echo '             programs, attitude filters and the noise of the IMU; one hour'
+	@echo '             and a half'
 	@echo 'make performance-check'
 	@echo '             compare the cost with that of the last tag (REF=...); minutes'
 	@echo 'make docs    write the interface page, the plain URDF and the pictures, and'
@@ -144,10 +146,11 @@ mutation: $(VENV)/.deps-mutation dependencies
 	'$(VENV)/bin/mutmut' run --max-children $(WORKERS) $(MUTANTS)
 	'$(VENV)/bin/mutmut' results
 
-STRESS ?= 40000
+STRESS ?= 20000
 KILLS ?= 200
 EXAMPLES ?= 30
-SECONDS ?= 300
+EXAMS ?= 10
+SECONDS ?= 180
 stress: dependencies
 	@seed=$$(od -An -N4 -tu4 /dev/urandom | tr -d ' '); \
 	.ci/timed "KILLS=$(KILLS) '$(VENV)/bin/pytest' -q test/test_kill.py" \
@@ -155,7 +158,7 @@ stress: dependencies
 	        $(addprefix test/test_,properties.py properties_logs.py ranges.py extremes.py)" \
 	    $(foreach part,logs nodes services disk sensor, \
 	        "'$(VENV)/bin/python' test/stress $(part) --seconds $(SECONDS)") \
-	    "'$(VENV)/bin/python' test/stress exam --count 20" \
+	    "'$(VENV)/bin/python' test/stress exam --count $(EXAMS)" \
 	    "'$(VENV)/bin/python' test/stress tops --count $(STRESS)"
 
 # The programs to compare with need hundreds of megabytes, so they have their own environment.

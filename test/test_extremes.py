@@ -85,7 +85,7 @@ def without_end(values):
             if name not in ('duration', 'start_paused')}
 
 
-@examples(4)
+@examples(2)
 @given(st.randoms(), st.booleans())
 def test_whatever_is_set_and_commanded_a_reset_to_the_default_revives(rng, allowed):
     run = run_of(without_end(parameter_set(rng, allowed))) or run_of({})
