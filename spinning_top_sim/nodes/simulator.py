@@ -233,7 +233,7 @@ class Simulator(Node):
         No stamp is later than the /clock that is followed; a stamp of 0 is "no time".
         """
         date_ns = self._date_ns()
-        return (max(date_ns // EPOCH_GRID_NS, 1) * EPOCH_GRID_NS if self._follows else date_ns)
+        return max(date_ns // EPOCH_GRID_NS, 1) * EPOCH_GRID_NS if self._follows else date_ns
 
     def _watch_clock(self) -> None:
         """Warn when the followed /clock stands for 2 s or has not begun; say when it goes on."""

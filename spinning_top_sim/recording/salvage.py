@@ -13,7 +13,7 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, Chunk, Header, Metadata, Schema
 
 from spinning_top_sim.recording.damage import Damage
-from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.recording.errors import LogError, no_place_in
 from spinning_top_sim.recording.mcap_writer import McapWriter, record_bytes, sync_directory
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.records import ChunkContents
@@ -55,9 +55,7 @@ def recover(reader: LogReader, output: str | os.PathLike[str],
     except FileExistsError:
         raise LogError(f'{output} exists, and nothing is overwritten') from None
     except FileNotFoundError as error:
-        # A directory such as /proc is there, and takes no files.
-        reason = 'no files can be made in' if output.parent.is_dir() else 'there is no directory'
-        raise LogError(f'cannot write {output}: {reason} {output.parent}') from error
+        raise LogError(f'cannot write {output}: {no_place_in(output.parent)}') from error
     except OSError as error:
         raise LogError(f'cannot write {output}: {error.strerror or error}') from error
 

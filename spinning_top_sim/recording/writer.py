@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from spinning_top_sim.recording.errors import RecordingError
+from spinning_top_sim.recording.errors import RecordingError, no_place_in
 from spinning_top_sim.recording.provenance import version
 from spinning_top_sim.recording.rosbag2 import RecordedTopic, find_definition, offered_qos_yaml
 
@@ -290,9 +290,7 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
         raise RecordingError(f'cannot record to {path}: it exists, and a recording '
                              'overwrites nothing') from error
     except FileNotFoundError as error:
-        # A directory such as /proc is there, and takes no files.
-        reason = 'no files can be made in' if path.parent.is_dir() else 'there is no directory'
-        raise RecordingError(f'cannot record to {path}: {reason} {path.parent}') from error
+        raise RecordingError(f'cannot record to {path}: {no_place_in(path.parent)}') from error
     except (OSError, ValueError) as error:
         raise RecordingError(f'cannot record to {path}: {_reason(error)}') from error
     return file

@@ -214,7 +214,6 @@ def state_of(top: Top, row: Rows) -> tuple[tuple[float, float, float], State]:
     else:       # there, whatever turns the axis is nutation
         across = math.hypot(one, two)
         theta_dot = across if top.lambda1 * across > dust else 0.0
-    if sine < SNAP:
         theta, start_lz = (0.0, start_l3) if theta < 1.0 else (math.pi, -start_l3)
     return (energy, l3, lz), State(theta=theta, theta_dot=theta_dot, l3=start_l3, lz=start_lz)
 
