@@ -40,6 +40,7 @@ from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.mcap_writer import McapWriter, record_bytes
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic, find_definition
+from spinning_top_sim.recording.salvage import recover
 from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.tools.recover import main
 
@@ -782,6 +783,76 @@ def test_a_damaged_attachment_is_left_out(tmp_path):
         assert not list(make_reader(file).iter_attachments())
 
 
+def test_what_an_attachment_may_have(tmp_path):
+    path = tmp_path / 'a.mcap'
+    messages = write_stranger(path, {})
+    content = path.read_bytes()
+    (start, end), = [(start, end) for opcode, start, end in records_of(content)
+                     if opcode == Opcode.ATTACHMENT]
+    data_end = next(start for opcode, start, _ in records_of(content) if opcode == Opcode.DATA_END)
+    attachment = content[start:end]
+    for number, (changed, reason) in enumerate([
+            (attachment[:-4] + bytes(4), None),                         # without a checksum
+            (longer(attachment, 2) + b'12', None),                      # fields of later versions
+            (longer(attachment, 2), 'its length is not that of its content'),
+            (longer(attachment, -2), 'its length is not that of its content'),
+            (attachment[:-4] + b'1234', 'its checksum is wrong')]):
+        damaged, output = tmp_path / f'{number}.mcap', tmp_path / f'whole_{number}.mcap'
+        damaged.write_bytes(content[:start] + changed + content[end:data_end])
+        code, out, _ = run(damaged, '-o', output)
+        assert code == (ALL_KEPT if reason is None else SOME_LOST), (number, out)
+        assert (changed in output.read_bytes()) == (reason is None), number
+        if reason is not None:
+            assert f'attachment at byte {start} ' in out and reason in out, (number, out)
+        assert seen_by_mcap(output) == messages, number
+
+
+def test_an_attachment_before_the_tear_is_kept(tmp_path):
+    path, output = tmp_path / 'a.mcap', tmp_path / 'whole.mcap'
+    write_stranger(path, {})
+    content = path.read_bytes()
+    (start, end), = [(start, end) for opcode, start, end in records_of(content)
+                     if opcode == Opcode.ATTACHMENT]
+    path.write_bytes(content[:end + 3])
+    assert run(path, '-o', output)[0] == SOME_LOST
+    assert content[start:end] in output.read_bytes()
+
+
+def longer(record: bytes, number: int) -> bytes:
+    """Return a record whose length is a number of bytes more than it has."""
+    (length,) = struct.unpack_from('<Q', record, 1)
+    return record[:1] + struct.pack('<Q', length + number) + record[9:]
+
+
+@pytest.mark.parametrize('number', [-2, -1, 1, 2, 8])
+def test_a_message_of_another_length_is_not_believed(tmp_path, number):
+    path, output = tmp_path / 'a.mcap', tmp_path / 'whole.mcap'
+    messages = write_stranger(path, STRANGERS['unchunked'], count=20)
+    content = path.read_bytes()
+    places = [(start, end) for opcode, start, end in records_of(content)
+              if opcode == Opcode.MESSAGE]
+    data_end = next(start for opcode, start, _ in records_of(content) if opcode == Opcode.DATA_END)
+    start, end = places[6]
+    path.write_bytes(content[:start] + longer(content[start:end], number) + content[end:data_end])
+    code, out, _ = run(path, '-o', output)
+    assert code == SOME_LOST
+    assert f'message at byte {start} ' in out
+    # Without chunks and summary nothing proves where another message begins.
+    assert seen_by_us(output) == seen_by_mcap(output) == messages[:6]
+
+
+def test_a_recovery_tells_what_it_has_written(tmp_path, log):
+    path, output, told = tmp_path / 'run.mcap', tmp_path / 'whole.mcap', []
+    path.write_bytes(log.content)
+    with LogReader(path) as reader:
+        done = recover(reader, output, lambda *progress: told.append(progress))
+    size = len(log.content)
+    assert (done.path, done.bytes, done.messages, done.chunks) == (
+        output, output.stat().st_size, len(log.messages), len(log.chunks))
+    assert told == sorted(told) and told[-1] == (size, size)
+    assert {total for _, total in told} == {size} and len(told) > len(log.chunks)
+
+
 # Hostile
 
 def test_memory_does_not_grow_with_the_file(tmp_path):
@@ -895,6 +966,10 @@ def test_a_log_behind_the_end_of_another_is_told(tmp_path, log, whole):
     code, out, _ = run(path, '-o', tmp_path / 'first.mcap')
     assert code == SOME_LOST
     assert 'another log at byte' in out and 'behind the end of this one' in out
+    with LogReader(path) as reader:
+        (loss,) = reader.damage.losses
+    assert loss.offset == len(log.content) + log.chunks[0][1]
+    assert loss.offset + loss.bytes == path.stat().st_size
 
 
 def test_a_path_without_a_name_is_told(tmp_path, log, monkeypatch):
