@@ -253,6 +253,7 @@ def test_a_torn_chunk_tells_its_time(tmp_path, log):
         (loss,) = reader.damage.losses
     first = 2 * MESSAGES_PER_CHUNK
     assert (loss.what, loss.offset, loss.bytes) == ('chunk', start, end - 5 - start)
+    assert loss.reason == 'the file ends within it'
     assert (loss.start_ns, loss.end_ns) == (
         log.messages[first][1], log.messages[first + MESSAGES_PER_CHUNK - 1][1])
     code, out, _ = run(torn)
@@ -463,19 +464,34 @@ def test_a_wild_length_that_seems_to_lead_to_a_record_takes_no_other_chunk(tmp_p
     assert [data for _, _, data in seen_by_us(path)] == [decoy, b'third']
 
 
-def test_whole_indexes_tell_what_a_damaged_last_chunk_held(tmp_path, log):
+def test_the_summary_tells_what_was_a_chunk_and_when(tmp_path, log):
+    broken = tmp_path / 'broken.mcap'
+    _, start, end = log.chunks[1]
+    broken.write_bytes(flipped(log.content, start, 0))      # the kind of the record
+    first, last = MESSAGES_PER_CHUNK, 2 * MESSAGES_PER_CHUNK - 1
+    with LogReader(broken) as reader:
+        loss = reader.damage.losses[0]
+    assert (loss.what, loss.offset) == ('chunk', start)
+    assert (loss.start_ns, loss.end_ns) == (log.messages[first][1], log.messages[last][1])
+
+
+@pytest.mark.parametrize('lost', [1, 2])
+def test_whole_indexes_tell_what_damaged_last_chunks_held(tmp_path, log, lost):
     """No later message shows a gap, and a truncated file has no statistics."""
     data_end = next(start for opcode, start, _ in log.records if opcode == Opcode.DATA_END)
     bag = next(start for opcode, start, _ in log.records
                if opcode == Opcode.METADATA and start > log.chunks[-1][1])
     assert bag < data_end
     broken = tmp_path / 'broken.mcap'
-    broken.write_bytes(flipped(log.content[:bag], log.chunks[-1][2] - 8, 3))
+    content = log.content[:bag]
+    for _, _, end in log.chunks[-lost:]:
+        content = flipped(content, end - 8, 3)
+    broken.write_bytes(content)
     with LogReader(broken) as reader:
         damage = reader.damage
-    assert damage.missing == {'/top/point': 8, '/top/number': 4}
+    assert damage.missing == {'/top/point': 8 * lost, '/top/number': 4 * lost}
     assert not damage.missing_exactly
-    assert damage.losses[0].messages == MESSAGES_PER_CHUNK
+    assert [loss.messages for loss in damage.losses] == [MESSAGES_PER_CHUNK] * lost
 
 
 @pytest.mark.parametrize('inserted', [b'', b'12'])
