@@ -78,9 +78,10 @@ def write_section(name: str, head: str, description: str, *texts: str) -> None:
 
 
 def _commit() -> str:
-    """Return the commit, marked if any file except the generated pages has changed."""
+    """Return the commit, marked if any file except those that benchmarks write has changed."""
     commit = _git('describe', '--always')
-    changed = _git('status', '--porcelain', '--untracked-files=no', '--', '.', ':!docs')
+    changed = _git('status', '--porcelain', '--untracked-files=no', '--', '.', ':!docs',
+                   ':!README.md')
     return (commit + ('-dirty' if changed else '')) or 'unknown'
 
 
