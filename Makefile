@@ -154,7 +154,8 @@ SECONDS ?= 180
 stress: dependencies
 	@seed=$$(od -An -N4 -tu4 /dev/urandom | tr -d ' '); \
 	.ci/timed "KILLS=$(KILLS) '$(VENV)/bin/pytest' -q test/test_kill.py" \
-	    "EXAMPLES=$(EXAMPLES) '$(VENV)/bin/pytest' -q -n $(WORKERS) --hypothesis-seed=$$seed \
+	    "EXAMPLES=$(EXAMPLES) '$(VENV)/bin/pytest' -q -n $(WORKERS) --max-worker-restart=0 \
+	        --hypothesis-seed=$$seed \
 	        $(addprefix test/test_,properties.py properties_logs.py ranges.py extremes.py)" \
 	    $(foreach part,logs nodes services disk sensor, \
 	        "'$(VENV)/bin/python' test/stress $(part) --seconds $(SECONDS)") \

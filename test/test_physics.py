@@ -19,6 +19,7 @@ from spinning_top_sim.physics.regimes import (
     regime,
     swing,
 )
+from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.pipeline import Simulation
@@ -52,6 +53,13 @@ def test_at_a_pole_only_one_lz_is_possible(theta, lz, allowed):
     with pytest.raises(ValueError, match=rf'lz = {lz} .*{allowed}'):
         State(**{**STATE, 'theta': theta, 'lz': lz})
     assert State(**{**STATE, 'theta': theta, 'lz': allowed}).lz == allowed
+
+
+@pytest.mark.parametrize(('start', 'expected'), [
+    (-2.0, (0.5, 0.0, -0.5)), (0.0, (-1.0, -2.0, -3.0)),
+    (5e-324, (-1.7976931348623157e308,) * 3)])
+def test_a_drift_is_relative_absolute_where_the_constant_is_0_and_finite(start, expected):
+    assert tuple(relative_drift(np.array([-1.0, -2.0, -3.0]), start)) == expected
 
 
 def test_negative_distances_and_gravity_are_legal():

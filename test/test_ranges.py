@@ -200,6 +200,19 @@ def test_every_combination_that_the_ranges_allow_runs_or_is_refused(rng):
     event(short_life(rng))
 
 
+def test_the_drift_of_a_tiny_constant_is_finite():
+    simulation = Simulation(parameters.checked({}), 0)
+    simulation.advance(SECOND)
+    simulation.command(5e-324, 50.0)
+    simulation.advance(3 * SECOND)
+    assert abs(simulation.state().l3[0]) > 1e-15    # more than 1.8e308 times the command
+    invariants = stream(simulation, '~/invariants')
+    now = range(3 * SECOND, 3 * SECOND + 1)
+    ((values,),) = invariants.template.decode(
+        invariants.encode(simulation.segment.states(now), 0, now).tobytes())
+    assert np.isfinite(values).all()
+
+
 def test_most_combinations_run():
     found = [short_life(random.Random(seed)) for seed in range(30)]
     assert found.count('ran') >= 15 and 'refused' in found

@@ -19,6 +19,17 @@ if TYPE_CHECKING:
 
 Point = tuple[float, float, float]
 NO_PICTURES = "pictures need matplotlib: pip install 'spinning_top_sim[plot]' ({})"
+_LARGEST = np.finfo(float).max
+
+
+def relative_drift(values: NDArray[np.float64], start: float) -> Column:
+    """
+    Return by how much values of a constant differ from it, relative to it, absolute where it is 0.
+
+    A ratio that exceeds the range of doubles becomes the largest double.
+    """
+    with np.errstate(over='ignore'):
+        return np.clip((values - start) / (abs(start) or 1.0), -_LARGEST, _LARGEST)
 
 
 class States:

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.regimes import Description
-from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.states import States, relative_drift
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.exact import MOST_TURNS
@@ -159,8 +159,7 @@ class Simulation:
     @property
     def energy_drift(self) -> float:
         """The energy's relative drift since the segment began, absolute where it was 0."""
-        start = self.segment.energy
-        return (float(self.state().energy[0]) - start) / (abs(start) or 1.0)
+        return float(relative_drift(self.state().energy, self.segment.energy)[0])
 
     @property
     def orientation_error(self) -> float:

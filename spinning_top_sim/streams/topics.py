@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Quaternion, Vector
-from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.states import States, relative_drift
 from spinning_top_sim.physics.top import Shape
 from spinning_top_sim.streams import messages, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
@@ -286,8 +286,7 @@ class Invariants(Stream):
     def fields(self, states: States, times: range) -> Sequence[Field]:
         segment = self._segment
         now = (states.energy, states.l3, states.lz)
-        drifts = [(values - start) / (abs(start) or 1.0) for values, start in zip(
-            now, (segment.energy, segment.l3, segment.lz), strict=True)]
+        drifts = map(relative_drift, now, (segment.energy, segment.l3, segment.lz))
         return ((*now, *drifts, states.norm_error, segment.orientation_error(states, times)),)
 
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import angle_between
 from spinning_top_sim.physics.regimes import Description
+from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.reader import LogMessage, LogReader
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -249,7 +250,7 @@ def _analyse(found: Survey, motion: Motion, topic: str, samples: list[LogMessage
         drifts = found.drifts.setdefault(topic, {key: Series() for key in ('energy', 'l3', 'lz')})
         for series, value, start in zip(
                 drifts.values(), values, (segment.energy, segment.l3, segment.lz), strict=True):
-            series.add(data.stamps_ns, (value - start) / (abs(start) or 1.0))
+            series.add(data.stamps_ns, relative_drift(value, start))
     if motion.exact is not None and (exact := segment.exact) is not None:
         times_ns = np.clip(data.stamps_ns - motion.origin_ns, -exact.ns_limit, exact.ns_limit)
         truth = exact.states(times_ns).rows_quaternion
