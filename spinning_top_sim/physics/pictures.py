@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.regimes import swing
-from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.physics.top import State, Top
 
 Reals = NDArray[np.float64]
@@ -110,6 +109,7 @@ def plot(motion: Motion) -> Figure:
     _check(motion)
     x, y, z = motion.rows_axis
     bounds = sorted(float(np.arccos(u)) for u in swing(motion.top, motion.start))
+    energy = motion.energy
     with rc_context(STYLE):
         figure = Figure(figsize=(10.0, 7.0), layout='constrained')
         panels = figure.subplot_mosaic(
@@ -134,7 +134,7 @@ def plot(motion: Motion) -> Figure:
         panels['rate'].plot(motion.t, motion.phi_dot, color=COLOURS[1])
         panels['rate'].axhline(0.0, color=FAINT, linewidth=0.8, zorder=0)
         panels['rate'].set(ylabel="precession φ' [rad/s]", xlabel='t [s]')
-        panels['drift'].plot(motion.t, relative_drift(motion.energy, float(motion.energy[0])),
+        panels['drift'].plot(motion.t, (energy - energy[0]) / (abs(energy[0]) or 1.0),
                              color=COLOURS[2])
         panels['drift'].set(ylabel='energy drift', xlabel='t [s]')
     return figure
