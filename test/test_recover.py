@@ -126,6 +126,12 @@ def records_of(content: bytes) -> list[tuple[int, int, int]]:
     return found
 
 
+def place_of(content: bytes, wanted: int) -> tuple[int, int]:
+    """Return start and end of the only record of a kind."""
+    (place,) = [(start, end) for opcode, start, end in records_of(content) if opcode == wanted]
+    return place
+
+
 def run(*argv) -> tuple[int, str, str]:
     """Run the command in this process; return exit code, output and errors."""
     out, err = io.StringIO(), io.StringIO()
@@ -789,7 +795,7 @@ def test_a_damaged_attachment_is_left_out(tmp_path):
     path, output = tmp_path / 'a.mcap', tmp_path / 'whole.mcap'
     messages = write_stranger(path, {})
     content = path.read_bytes()
-    (start,) = [start for opcode, start, _ in records_of(content) if opcode == Opcode.ATTACHMENT]
+    start, _ = place_of(content, Opcode.ATTACHMENT)
     path.write_bytes(flipped(content, start + 500, 0))
     code, out, _ = run(path, '-o', output)
     assert code == SOME_LOST
@@ -803,9 +809,8 @@ def test_what_an_attachment_may_have(tmp_path):
     path = tmp_path / 'a.mcap'
     messages = write_stranger(path, {})
     content = path.read_bytes()
-    (start, end), = [(start, end) for opcode, start, end in records_of(content)
-                     if opcode == Opcode.ATTACHMENT]
-    data_end = next(start for opcode, start, _ in records_of(content) if opcode == Opcode.DATA_END)
+    start, end = place_of(content, Opcode.ATTACHMENT)
+    data_end, _ = place_of(content, Opcode.DATA_END)
     attachment = content[start:end]
     for number, (changed, reason) in enumerate([
             (attachment[:-4] + bytes(4), None),                         # without a checksum
@@ -827,8 +832,7 @@ def test_an_attachment_before_the_tear_is_kept(tmp_path):
     path, output = tmp_path / 'a.mcap', tmp_path / 'whole.mcap'
     write_stranger(path, {})
     content = path.read_bytes()
-    (start, end), = [(start, end) for opcode, start, end in records_of(content)
-                     if opcode == Opcode.ATTACHMENT]
+    start, end = place_of(content, Opcode.ATTACHMENT)
     path.write_bytes(content[:end + 3])
     assert run(path, '-o', output)[0] == SOME_LOST
     assert content[start:end] in output.read_bytes()
@@ -847,7 +851,7 @@ def test_a_message_of_another_length_is_not_believed(tmp_path, number):
     content = path.read_bytes()
     places = [(start, end) for opcode, start, end in records_of(content)
               if opcode == Opcode.MESSAGE]
-    data_end = next(start for opcode, start, _ in records_of(content) if opcode == Opcode.DATA_END)
+    data_end, _ = place_of(content, Opcode.DATA_END)
     start, end = places[6]
     path.write_bytes(content[:start] + longer(content[start:end], number) + content[end:data_end])
     code, out, _ = run(path, '-o', output)

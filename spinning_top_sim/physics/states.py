@@ -24,9 +24,10 @@ _LARGEST = np.finfo(float).max
 
 def relative_drift(values: NDArray[np.float64], start: float) -> Column:
     """
-    Return by how much values of a constant differ from it, relative to it, absolute where it is 0.
+    Return how far a constant of the motion has drifted from its value at the start.
 
-    A ratio that exceeds the range of doubles becomes the largest double.
+    The drift is relative to that value, or absolute if that is 0.  A ratio that exceeds the range
+    of doubles becomes the largest double, with its sign.
     """
     with np.errstate(over='ignore'):
         return np.clip((values - start) / (abs(start) or 1.0), -_LARGEST, _LARGEST)
