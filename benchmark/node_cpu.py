@@ -45,6 +45,8 @@ KINDS = {
     'straightforward': None, 'straightforward, EventsExecutor': None, 'floor, thread': None,
 }
 STRAIGHT, EVENTS, FLOOR = 'straightforward', 'straightforward, EventsExecutor', 'floor, thread'
+PAIRS = (('sim_node, 200 ticks, recording', EVENTS), ('sim_node, recording', FLOOR),
+         ('sim_node', FLOOR))
 
 
 @dataclass
@@ -219,17 +221,17 @@ def idle(rounds: int, seconds: float) -> str:
         [pair_row(together({'all': node(True), 'none': node(False)}, rounds, seconds))])
 
 
-def beside_the_floor(rounds: int, seconds: float) -> str:
-    """Return the table of `sim_node` with one tick per sample and of the floor, at 1 kHz."""
+def in_pairs(rounds: int, seconds: float) -> str:
+    """Return the table of `sim_node` and another node that run at once, at 1 kHz."""
     with tempfile.TemporaryDirectory() as name:
         def node(kind: str) -> Callable[[str], list[str]]:
             return lambda namespace: program(kind, 1000, namespace, Path(name))
 
         return table(
-            ('node', 'node [%]', 'floor [%]', 'ratio', 'smallest', 'largest'),
-            [(kind, *pair_row(together({kind: node(kind), FLOOR: node(FLOOR)}, rounds, seconds,
-                                       subscribers=1)))
-             for kind in ('sim_node, recording', 'sim_node')])
+            ('node', 'other', 'node [%]', 'other [%]', 'ratio', 'smallest', 'largest'),
+            [(kind, other, *pair_row(together({kind: node(kind), other: node(other)}, rounds,
+                                              seconds, subscribers=1)))
+             for kind, other in PAIRS])
 
 
 def mean_rate(one: Result) -> float:
@@ -326,8 +328,8 @@ def main() -> None:
     at_first = load()
     unheard = idle(arguments.pair_rounds, 2.0 * arguments.seconds)
     print(unheard, flush=True)
-    floor = beside_the_floor(arguments.pair_rounds, 2.0 * arguments.seconds)
-    print(floor, flush=True)
+    pairs = in_pairs(arguments.pair_rounds, 2.0 * arguments.seconds)
+    print(pairs, flush=True)
     found = measured(arguments)
     text = '\n'.join((
         f'Load average at the start {at_first:.1f}, at the end {load():.1f} (including the '
@@ -336,9 +338,9 @@ def main() -> None:
         '## Ratios of processor time\n', ratio_table(found),
         '## Ratios of processor time per received sample\n',
         ratio_table(found, per_sample=True),
-        '## Compared with the floor\n',
-        'Processor time at 1 kHz with one subscriber each; both nodes of a pair run at once, '
-        f'{arguments.pair_rounds} rounds.\n', floor,
+        '## In pairs\n',
+        'Processor time at 1 kHz with one subscriber each.  Both nodes of a pair run at once, so '
+        f'that they meet the same load of the machine; {arguments.pair_rounds} rounds.\n', pairs,
         '## Streams without subscribers\n',
         'Processor time at 1000 ticks per second, default rates, no subscriber; both nodes of a '
         f'pair run at once, {arguments.pair_rounds} rounds.\n', unheard,

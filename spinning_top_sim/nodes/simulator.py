@@ -222,7 +222,7 @@ class Simulator(Node):
         if open_log is not None:
             try:
                 self._log.info(open_log())
-            except RecordingError as error:     # nobody has asked for it, and gets an answer
+            except RecordingError as error:     # no service call that could tell of it
                 self._session.error = str(error)
                 self._log.error(f'not recording: {error}')
 

@@ -361,7 +361,6 @@ class Scanner:
                 statistics.message_count > self._counts.found.total()):
             self._losses.append(Loss(0, 0, 'messages', 'the statistics count more than there are'))
 
-
     def _look_behind(self, offset: int) -> None:
         """Tell of another log behind the end of this one; a summary has no chunks."""
         while (offset := self._finder.find(offset)) < self._limit:
