@@ -64,14 +64,14 @@ help:
 	@echo '             commands, service calls, disk faults and the statistics of the'
 	@echo '             sensors (each SECONDS=180), 10 exams of nodes beside other work'
 	@echo '             (EXAMS=...), and 20 000 random tops (STRESS=...) with both solvers;'
-	@echo '             an hour'
+	@echo '             more than an hour'
 	@echo 'make performance'
 	@echo '             measure node, start-up, a long run, solvers and simulate, and write'
 	@echo '             docs/performance.md; an hour, in .venv-benchmark'
 	@echo 'make benchmark'
 	@echo '             the same, and compare accuracy, stability and cost with other'
-	@echo '             programs, attitude filters and the noise of the IMU; less than'
-	@echo '             two hours'
+	@echo '             programs, attitude filters and the noise of the IMU; two hours'
+	@echo '             and a quarter'
 	@echo 'make performance-check'
 	@echo '             compare the cost with that of the last tag (REF=...); minutes'
 	@echo 'make docs    write the interface page, the plain URDF and the pictures, and'
@@ -163,7 +163,7 @@ stress: dependencies
 	    "'$(VENV)/bin/python' test/stress tops --count $(STRESS)"
 
 # The programs to compare with need hundreds of megabytes, so they have their own environment.
-# The last two take an hour and measure no time: others may use the machine by then.
+# The last two take more than an hour, and compare no times: others may use the machine by then.
 PERFORMANCE := node_cpu wake_up startup solvers offline offline_scaling log_compression
 COMPARISONS := heavy_top exact_cost gauge stability work_precision allan increments \
     attitude_filter ensemble view exam
