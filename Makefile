@@ -163,7 +163,7 @@ stress: dependencies
 	    "'$(VENV)/bin/python' test/stress tops --count $(STRESS)"
 
 # The programs to compare with need hundreds of megabytes, so they have their own environment.
-# The last two take more than an hour, and compare no times: others may use the machine by then.
+# The exam and the soak come last: they take more than an hour, and the tables of times do not wait.
 PERFORMANCE := node_cpu wake_up startup solvers offline offline_scaling log_compression
 COMPARISONS := heavy_top exact_cost gauge stability work_precision allan increments \
     attitude_filter ensemble view exam

@@ -222,7 +222,7 @@ class Simulator(Node):
         if open_log is not None:
             try:
                 self._log.info(open_log())
-            except RecordingError as error:     # no service call that could tell of it
+            except RecordingError as error:     # no service call waits for an answer
                 self._session.error = str(error)
                 self._log.error(f'not recording: {error}')
 
