@@ -17,13 +17,14 @@ from std_msgs.msg import Header
 from spinning_top_sim.nodes.recording_session import RecordingSession
 from spinning_top_sim.nodes.tick_loop import LoopState, TickLoop
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.live import LiveSimulation
 
 
 class MotionReport:
     """Describes a running simulation; the caller holds the simulation's lock."""
 
-    def __init__(self, simulation: Simulation, loop: TickLoop, session: RecordingSession) -> None:
+    def __init__(self, simulation: LiveSimulation, loop: TickLoop,
+                 session: RecordingSession) -> None:
         self._simulation, self._loop, self._session = simulation, loop, session
         self._speed = math.nan                  # simulated over real time, at the last reading
         self._read_at, self._read_ns = time.monotonic(), 0
@@ -74,7 +75,7 @@ class MotionReport:
         return self._loop.slipped_ns > 0 or self._total('skipped') > 0
 
     def _total(self, count: str) -> int:
-        return sum(getattr(stream, count) for stream in self._simulation.streams)
+        return sum(getattr(output, count) for output in self._simulation.outputs)
 
     def _measure_speed(self, now_ns: int) -> float:
         """Return simulated over real time since the reading before, or since a reset."""

@@ -22,7 +22,7 @@ from spinning_top_sim.nodes.tick_loop import LoopState, TickLoop
 from spinning_top_sim.nodes.worlds import World
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.simulation import Simulation
 
 
 class SimulationHandlers:

@@ -12,7 +12,7 @@ from spinning_top_sim.nodes.pacing import FairLock
 from spinning_top_sim.nodes.simulation_handlers import SimulationHandlers
 from spinning_top_sim.nodes.simulation_standard import ACTION, SERVICES, service_name
 from spinning_top_sim.nodes.tick_loop import TickLoop
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.simulation import Simulation
 
 PACKAGE = 'simulation_interfaces'
 

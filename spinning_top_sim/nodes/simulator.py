@@ -33,7 +33,6 @@ from spinning_top_sim.nodes.ros_parameters import SPIN
 from spinning_top_sim.nodes.throttle import TOPICS, Throttle
 from spinning_top_sim.nodes.tick_loop import (
     EPOCH_GRID_NS,
-    LAST_LIVE_STAMP_NS,
     TOO_LATE,
     LoopState,
     TickLoop,
@@ -41,8 +40,9 @@ from spinning_top_sim.nodes.tick_loop import (
 )
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.pipeline import PoleError, Simulation
+from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
+from spinning_top_sim.streams.live import LiveSimulation, Output
+from spinning_top_sim.streams.simulation import PoleError
 from spinning_top_sim.streams.stream import Stream
 
 LAST_ANSWERS_S = 0.2            # what answers still take when the node ends
@@ -61,9 +61,10 @@ class StreamPublishers:
             message_class, topic, QoSProfile(depth=10),
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
-    def open(self, streams: Sequence[Stream], values: Mapping[str, Any]) -> None:
+    def open(self, outputs: Sequence[Output], values: Mapping[str, Any]) -> None:
         """Create the publishers of enabled streams; destroy those of others."""
-        for stream in streams:
+        for output in outputs:
+            stream = output.stream
             enabled = journal.is_enabled(stream.parameter, values)
             there = stream.topic in self.by_topic
             if enabled and not there:
@@ -74,19 +75,19 @@ class StreamPublishers:
                     self._throttles[stream.topic] = Throttle(
                         self.create(message_class, TOPICS[stream.topic]))
             elif there and not enabled:
-                stream.publish = None
+                output.publish = None
                 self._node.destroy_publisher(self.by_topic.pop(stream.topic))
                 if stream.topic in TOPICS:
                     self._node.destroy_publisher(self._throttles.pop(stream.topic).publisher)
 
-    def update_subscribers(self, streams: Sequence[Stream]) -> None:
-        """Let a stream publish if anybody subscribes to it; without that, it computes nothing."""
-        for stream in streams:
-            publisher = self.by_topic.get(stream.topic)
+    def update_subscribers(self, outputs: Sequence[Output]) -> None:
+        """Let an output publish if anybody subscribes to its topic; else it computes nothing."""
+        for output in outputs:
+            publisher = self.by_topic.get(output.stream.topic)
             if publisher is not None:
                 sink = publisher.publish if publisher.get_subscription_count() else None
-                throttle = self._throttles.get(stream.topic)
-                stream.publish = throttle.sink(stream, sink) if throttle else sink
+                throttle = self._throttles.get(output.stream.topic)
+                output.publish = throttle.sink(output, sink) if throttle else sink
 
     def flush(self, at_once: bool) -> None:
         """Publish what is withheld, as soon as its rate allows or at once."""
@@ -125,7 +126,7 @@ class Simulator(Node):
         self.finished: Future = Future()        # completes after `duration`
         self._terminal = reports.Terminal()
         values = ros_parameters.declare(self, argv)
-        simulation = self._simulation = Simulation(values)
+        simulation = self._simulation = LiveSimulation(values)
         # For `~/reset`.  An unset spin.lz stays unset: a reset computes it from initial.theta.
         self._start_spin = {name: values[name] for name in SPIN}
         self._values = {**values, 'spin.lz': simulation.lz}
@@ -145,11 +146,11 @@ class Simulator(Node):
         self._loop = TickLoop(
             simulation, values, self._session,
             tell=lambda text, bad: self._log.error(text) if bad else self._log.warning(text),
-            update_subscribers=lambda: self._outputs.update_subscribers(simulation.streams),
+            update_subscribers=lambda: self._outputs.update_subscribers(simulation.outputs),
             source=self._date_ns if self._follows else time.monotonic_ns)
         self._pacer = DeadlineThread(self._tick, self._idle, lambda: self._loop.grid, self.fail)
         self._report = reports.MotionReport(simulation, self._loop, self._session)
-        self._outputs.open(simulation.streams, values)
+        self._outputs.open(simulation.outputs, values)
         self._diagnostics = self._outputs.create(DiagnosticArray, '/diagnostics')
         self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
         for name, kind, act in (('set_pause', SetBool, self._set_pause),
@@ -205,7 +206,7 @@ class Simulator(Node):
         """Start the motion, unless the /clock that is followed says nothing yet."""
         if self._date_ns() == 0:
             return
-        if self._follows and self._date_ns() > LAST_LIVE_STAMP_NS:
+        if self._follows and self._date_ns() > LAST_STAMP_NS - EPOCH_GRID_NS:
             self._log.warning(f'/clock: {TOO_LATE}', once=True)
             return
         self.destroy_timer(self._begin_timer)
@@ -360,7 +361,7 @@ class Simulator(Node):
 
     def _open_outputs(self, values: Mapping[str, Any]) -> None:
         """Have the publishers and the status line that these parameters ask for."""
-        self._outputs.open(self._simulation.streams, values)
+        self._outputs.open(self._simulation.outputs, values)
         if values['status_period'] != self._values['status_period']:
             self._set_status_period(values['status_period'])
 

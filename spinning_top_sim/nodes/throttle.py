@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from rclpy.publisher import Publisher
 
-from spinning_top_sim.streams.stream import Stream
+from spinning_top_sim.streams.live import Output
 
 Publish = Callable[[bytes], object]
 
@@ -28,13 +28,13 @@ class Throttle:
         self._withheld: bytes | None = None     # the newest message, if it has not gone out
         self._uncounted = False                 # it is not among the stream's messages sent
 
-    def sink(self, stream: Stream, publish_all: Publish | None) -> Publish | None:
+    def sink(self, output: Output, publish_all: Publish | None) -> Publish | None:
         """
         Return what takes the samples of a stream; None without subscribers.
 
         publish_all : takes those that are for subscribers of the stream's own topic, or None
         """
-        self._stream, self._publish_all = stream, publish_all
+        self._output, self._publish_all = output, publish_all
         if self.publisher.get_subscription_count():
             return self._publish
         self._withheld = None
@@ -46,7 +46,7 @@ class Throttle:
         now = time.monotonic()
         if now < self._due:
             self._withheld, self._uncounted = message, self._publish_all is None
-            self._stream.sent -= self._uncounted        # who calls this counts it
+            self._output.sent -= self._uncounted        # who calls this counts it
             return
         self._send(message, now)
 
@@ -61,5 +61,5 @@ class Throttle:
         if self._withheld is not None:
             now = time.monotonic()
             if at_once or now >= self._due:
-                self._stream.sent += self._uncounted
+                self._output.sent += self._uncounted
                 self._send(self._withheld, now)

@@ -12,9 +12,9 @@ from spinning_top_sim.nodes.recording_session import RecordingSession
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.pipeline import Simulation
-from spinning_top_sim.streams.schedule import NEVER_NS
+from spinning_top_sim.streams.blocks import NEVER_NS
+from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
+from spinning_top_sim.streams.live import LiveSimulation
 
 # The stamp of t = 0 is a multiple of this, so that grids meet across streams and runs.
 EPOCH_GRID_NS = 10_000_000
@@ -29,14 +29,12 @@ STEP_BUDGET_NS = 2_000_000_000
 LATEST_NS = 500_000_000         # samples later than this are recorded, but not published any more
 # A simulation further behind than this lets its clock slip: its real-time factor falls below 1.
 LONGEST_LAG_NS = 1_000_000_000
-# A day before the seconds of a stamp, an int32, end: no look-ahead goes that far.
-LAST_LIVE_STAMP_NS = (2 ** 31 - 86_400) * NANOSECONDS
-TOO_LATE = 'stamps cannot be later than 2038-01-18: the stamps of ROS messages end'
+TOO_LATE = 'the seconds of a ROS stamp, an int32, end in January 2038'
 
 
 def next_epoch(date_ns: int) -> int:
     """Return the first stamp from this date on [ns] that t = 0 may have.  Raises ValueError."""
-    if date_ns > LAST_LIVE_STAMP_NS:
+    if date_ns > LAST_STAMP_NS - EPOCH_GRID_NS:
         raise ValueError(TOO_LATE)
     return -(-date_ns // EPOCH_GRID_NS) * EPOCH_GRID_NS
 
@@ -66,14 +64,14 @@ class TickLoop:
 
     What is sent does not depend on when ticks come: each sends all samples that are due.
 
-    update_subscribers : sets `publish` of each stream that has subscribers
+    update_subscribers : sets `publish` of each output that has subscribers
     tell : takes a text for the log, and whether the motion has failed
     source : returns the time that simulated time follows [ns]
     steady : returns steady time [ns]; decides which ticks are late and how long one may work
     grid : steady time of a tick, just after samples are due, and the time between ticks [s]
     """
 
-    def __init__(self, simulation: Simulation, values: Mapping[str, Any],
+    def __init__(self, simulation: LiveSimulation, values: Mapping[str, Any],
                  recording: RecordingSession, *, tell: Callable[[str, bool], object],
                  update_subscribers: Callable[[], object],
                  source: Callable[[], int] = time.monotonic_ns,
@@ -113,57 +111,41 @@ class TickLoop:
         if self.state not in {state, LoopState.ENDED}:
             self.state = state
             self.interruptions += 1
-        self._simulation.readmit()
         self._clock.set(self.now_ns, running=self.state is LoopState.RUNNING)
         self._pace_ticks()
 
     def _pace_ticks(self) -> None:
-        """Set when ticks come; the next one is a slow one, and not late."""
+        """Set when ticks come; the next one is not late."""
         origin_ns = self._clock.when(0) if self._is_steady else None
         self.grid = (origin_ns or 0) / NANOSECONDS, self._tick_period_ns / NANOSECONDS
         self._late_from_ns = NEVER_NS           # on the steady clock: a tick from then on is late
-        self._fast_until_ns = -1                # ticks before this simulated time are fast
 
     def tick(self) -> bool:
         """Send what is due; return whether `idle` has something to do before the next tick."""
-        steady_ns, due_ns, late_from_ns = self._steady(), self._clock.now(), self._late_from_ns
-        self._late_from_ns = steady_ns + self._late_after_ns
-        # A fast tick only sends computed samples.  It touches little memory, as the processor's
-        # caches hold little of it after a sleep.
-        if (self._simulation.now_ns <= due_ns < self._fast_until_ns and steady_ns <= late_from_ns
-                and self._simulation.send_ready(due_ns)):
-            return self._block_unfinished
         if self.state is not LoopState.RUNNING:
             return False
-        if steady_ns > late_from_ns:
+        steady_ns = self._steady()
+        if steady_ns > self._late_from_ns:
             self.late_ticks += 1
-            since_last_ns = steady_ns - (late_from_ns - self._late_after_ns)
+            since_last_ns = steady_ns - (self._late_from_ns - self._late_after_ns)
             self.skipped_ticks += round(since_last_ns / self._tick_period_ns) - 1
+        self._late_from_ns = steady_ns + self._late_after_ns
         if steady_ns >= self._subscribers_due_ns:
             self._update_subscribers()
             self._subscribers_due_ns = steady_ns + SUBSCRIBERS_PERIOD_NS
         due_ns = self._advance()
-        if self._simulation.now_ns >= self._duration_ns:
+        now_ns = self._simulation.now_ns
+        if now_ns >= self._duration_ns:
             self._enter(LoopState.ENDED)
             return False
-        return self._plan_fast_ticks() and self._simulation.now_ns >= due_ns
+        return now_ns >= due_ns and (
+            self._block_unfinished or self._simulation.computed_ns < now_ns + self._ahead_ns)
 
     def idle(self) -> None:
         """Compute some of the samples that are due next, until about the next tick."""
         simulation = self._simulation
         self._block_unfinished = not simulation.prepare(
             simulation.now_ns + self._ahead_ns, int(BUSY_SHARE * self._tick_period_ns))
-        self._plan_fast_ticks()
-
-    def _plan_fast_ticks(self) -> bool:
-        """Set until when ticks are fast; return whether `idle` has a block to compute."""
-        simulation = self._simulation
-        block_due_ns = -1 if self._block_unfinished else simulation.ready_ns - self._ahead_ns
-        if self.state is LoopState.RUNNING:
-            self._fast_until_ns = min(
-                simulation.now_ns + int(SUBSCRIBERS_PERIOD_NS * self._time_scale),
-                self._duration_ns, NEVER_NS if self._block_unfinished else block_due_ns)
-        return simulation.now_ns >= block_due_ns
 
     def _advance(self) -> int:
         """Send what is due, or what one tick has time for; return the simulated time due [ns]."""
@@ -178,14 +160,11 @@ class TickLoop:
                        'from where they are', False)
             self._enter(LoopState.RUNNING)
             return simulation.now_ns
-        publish_from_ns = target_ns - int(LATEST_NS * self._time_scale)
-        if simulation.epoch_ns + target_ns > LAST_LIVE_STAMP_NS:
-            self.fail(TOO_LATE)
-            return target_ns
         stop_at_ns = self._steady() + TICK_BUDGET_NS
         try:
             arrived = has_room() and simulation.advance(
-                target_ns, publish_from_ns, lambda: self._steady() > stop_at_ns or not has_room())
+                target_ns, target_ns - self._latest_ns,
+                lambda: self._steady() > stop_at_ns or not has_room())
         except IntegrationError as error:
             self.fail(str(error))
             return target_ns
@@ -224,7 +203,6 @@ class TickLoop:
             raise RuntimeError('running: ~/step works while paused (~/set_pause true)')
         self._update_subscribers()
         target_ns = min(self.now_ns + length_ns, self._duration_ns)
-        last_ns = LAST_LIVE_STAMP_NS - self._simulation.epoch_ns
         stop_at_ns = self._steady() + STEP_BUDGET_NS
 
         def give_way() -> bool:
@@ -233,14 +211,12 @@ class TickLoop:
             return self._steady() > stop_at_ns
 
         try:
-            self._simulation.advance(min(target_ns, last_ns), give_way=give_way)
+            self._simulation.advance(target_ns, give_way=give_way)
         except IntegrationError as error:
             self.fail(str(error))
         self._enter(LoopState.ENDED if self.now_ns >= self._duration_ns else self.state)
         if self.failure:
             raise RuntimeError(self.failure)
-        if self.now_ns == last_ns:
-            raise RuntimeError(TOO_LATE)
         if self.now_ns < target_ns:
             raise RuntimeError(f'{self.time_text}: this takes too long, '
                                f'{(target_ns - self.now_ns) / NANOSECONDS:.9g} s are left')
@@ -307,5 +283,6 @@ class TickLoop:
         self._late_after_ns = round(1.5 * self._tick_period_ns)
         self._ahead_ns = round(self._time_scale * max(
             1.5 * self._tick_period_ns, min(TICKS_AHEAD * self._tick_period_ns, AHEAD_NS)))
+        self._latest_ns = round(self._time_scale * LATEST_NS)
         self._clock.set_scale(self._time_scale)
         self._pace_ticks()

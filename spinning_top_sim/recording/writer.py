@@ -36,9 +36,8 @@ QUEUE_BYTES = 32_000_000            # of a full queue; a burst that began with r
 
 _ENTRY_BYTES = 128  # what a queued message costs besides its data, about
 
-# Messages of one stamp: the topic of each, an index of the recorder's `topics`; log time [ns]; CDR
-# of each; size of all [bytes].
-Messages = tuple[Sequence[int], int, Sequence[bytes], int]
+# A message: its topic, an index of the recorder's `topics`; log time [ns]; CDR.
+Entry = tuple[int, int, bytes]
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,7 @@ class McapRecorder:
         self._min_free_bytes = min_free_bytes
 
         # Appending to a deque and taking from its other end need no lock between threads.
-        self._queue: deque[Messages] = deque()
+        self._queue: deque[tuple[Sequence[Entry], int]] = deque()     # entries, and their bytes
         self._bytes_in = self._bytes_out = 0    # of the queue, ever
         self._offered = 0              # messages handed over, ever
         self._accepting = True
@@ -135,20 +134,20 @@ class McapRecorder:
 
     def write(self, topic_index: int, log_time_ns: int, data: bytes) -> None:
         """Hand over one message; see `write_all`."""
-        self.write_all((topic_index,), log_time_ns, (data,), len(data))
+        self.write_all([(topic_index, log_time_ns, data)])
 
-    def write_all(self, topic_indices: Sequence[int], log_time_ns: int,
-                  messages: Sequence[bytes], size: int) -> None:
+    def write_all(self, entries: Sequence[Entry]) -> None:
         """
-        Hand over `Messages`, from one thread at a time; they keep their order.
+        Hand over messages, from one thread at a time; they keep their order.
 
         Never waits for the disk, never raises for its sake.  After the recording stopped the
         messages are only counted, as lost.
         """
-        self._offered += len(messages)
+        self._offered += len(entries)
         if self._accepting:
-            self._queue.append((topic_indices, log_time_ns, messages, size))
-            self._bytes_in += size + _ENTRY_BYTES * len(messages)
+            size = sum(len(data) for _, _, data in entries) + _ENTRY_BYTES * len(entries)
+            self._queue.append((entries, size))
+            self._bytes_in += size
             if self._bytes_in - self._bytes_out >= QUEUE_BYTES // 2 and not self._wake.is_set():
                 self._wake.set()
 
@@ -243,10 +242,10 @@ class McapRecorder:
     def _write_queued(self) -> None:
         """Take what is in the queue now and put it into chunks."""
         for _ in range(len(self._queue)):
-            topic_indices, log_time_ns, messages, size = self._queue.popleft()
-            for topic_index, data in zip(topic_indices, messages, strict=True):
+            entries, size = self._queue.popleft()
+            for topic_index, log_time_ns, data in entries:
                 self._file.append(topic_index, log_time_ns, data)
-            self._bytes_out += size + _ENTRY_BYTES * len(messages)
+            self._bytes_out += size
         if self.room:
             self._taken.set()
 

@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
+from spinning_top_sim.physics.integrals import Increments
 from spinning_top_sim.physics.states import States
+from spinning_top_sim.streams.intervals import Intervals
 from spinning_top_sim.streams.parameters import IDENTITY
-from spinning_top_sim.streams.stream import period_ns
+from spinning_top_sim.streams.stream import Samples, period_ns
 
 if TYPE_CHECKING:
-    from spinning_top_sim.streams.intervals import Intervals
     from spinning_top_sim.streams.noise import SensorNoise
-    from spinning_top_sim.streams.segment import Segment
 
 # Six columns: three axes of the gyroscope, three of the accelerometer.
 Rows = NDArray[np.float64]
@@ -34,9 +34,11 @@ NO_ERRORS = np.zeros((6, 1))
 
 class Imu:
     """
-    One IMU, at `imu.lever_arm` [m] and `imu.rpy` [rad]; what it adds is of its `sensor`.
+    The kinematics of an ideal IMU at `imu.lever_arm` [m] and `imu.rpy` [rad] on the body.
 
+    sensor : returns the `Sensor` for a sample period [ns]; it adds the errors
     takes_means : whether a sample is the mean over the interval before it, by `imu.sampling`
+    intervals : the intervals between its samples
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
@@ -45,40 +47,15 @@ class Imu:
         self._mounting = _quaternion(*values['imu.rpy'])
         self.sensor: Callable[[int], Sensor] = lru_cache(4)(partial(Sensor, values))
         self.takes_means = values['imu.sampling'] == 'mean'
-        self._period_ns = period_ns(values['imu.rate'])
-        self._segment: Segment | None = None
-        self._intervals: Intervals | None = None
-        if self.takes_means or values['increments.enabled']:
-            self.use_intervals(0)
+        self.intervals = Intervals(period_ns(values['imu.rate']))
 
-    def use_intervals(self, now_ns: int) -> 'Intervals':
-        """Return the intervals between samples; what they need is kept from the first use on."""
-        if self._intervals is None:
-            from spinning_top_sim.streams.intervals import Intervals  # noqa: PLC0415 - where needed
-
-            self._intervals = Intervals(self._lever_arm, self._period_ns, now_ns)
-            if self._segment is not None:
-                self._intervals.follow(self._segment)
-        return self._intervals
-
-    def open_interval(self, now_ns: int) -> tuple[int, int] | None:
-        """Return `Intervals.change` if the interval after `now_ns` depends on it, else None."""
-        intervals = self._intervals
-        if intervals is None or now_ns >= intervals.change[0] + self._period_ns:
-            return None
-        return intervals.change if any(intervals.change) else None
-
-    def follow(self, segment: 'Segment') -> None:
-        """Go on with another motion."""
-        self._segment = segment
-        if self._intervals is not None:
-            self._intervals.follow(segment)
-
-    def set_period(self, period_ns: int, now_ns: int) -> None:
-        """Let it take a sample every `period_ns` after the simulated time `now_ns`."""
-        self._period_ns = period_ns
-        if self._intervals is not None:
-            self._intervals.set_length(period_ns, now_ns)
+    def set_rate(self, rate: float, now_ns: int) -> bool:
+        """Take samples at this rate [Hz] after `now_ns`; return whether that is a change."""
+        length_ns = period_ns(rate)
+        if length_ns == self.intervals.length_ns:
+            return False
+        self.intervals = self.intervals.changed(length_ns, now_ns)
+        return True
 
     def orientation(self, states: States) -> Quaternion:
         """Return q(world <- IMU): columns x, y, z, w."""
@@ -97,12 +74,12 @@ class Imu:
         return (self._from_body(states.rows_angular_velocity),
                 self._from_body(states.specific_force(self._lever_arm)))
 
-    def means(self, states: States, times: range) -> tuple[Vector, Vector]:
-        """Return the means of `true` over the intervals that end at these times [ns]."""
-        increments = self.use_intervals(times.start).increments(times)
-        seconds = self.lengths(times)
+    def means(self, samples: Samples) -> tuple[Vector, Vector]:
+        """Return the means of `true` over the intervals that end with these samples."""
+        increments, seconds = samples.once(self._body_increments), self.lengths(samples)
         # Over no time the mean is the value.
         divisor = np.where(seconds > 0.0, seconds, 1.0)
+        states = samples.states
         w1, w2, w3, f1, f2, f3 = (
             np.where(seconds > 0.0, integral / divisor, value) for integral, value in zip(
                 (*increments.angles, *increments.forces),
@@ -110,22 +87,25 @@ class Imu:
                 strict=True))
         return self._from_body((w1, w2, w3)), self._from_body((f1, f2, f3))
 
-    def sampled(self, states: States, times: range) -> tuple[Vector, Vector]:
-        """Return what a perfect sensor reads at these times [ns], by `imu.sampling`."""
-        return self.means(states, times) if self.takes_means else self.true(states)
+    def sampled(self, samples: Samples) -> tuple[Vector, Vector]:
+        """Return what a perfect sensor reads, by `imu.sampling`."""
+        return samples.once(self.means) if self.takes_means else self.true(samples.states)
 
-    def lengths(self, times: range) -> Column:
-        """Return the lengths (n,) [s] of these intervals."""
-        return self.use_intervals(times.start).lengths(times)
+    def lengths(self, samples: Samples) -> Column:
+        """Return the lengths (n,) [s] of the intervals that end with these samples."""
+        return self.intervals.lengths(samples.times)
 
-    def increments(self, times: range) -> tuple[Quaternion, Vector]:
-        """Return rotation and velocity increment [m/s] over these intervals; see `Intervals`."""
-        increments = self.use_intervals(times.start).increments(times)
+    def increments(self, samples: Samples) -> tuple[Quaternion, Vector]:
+        """Return rotation and velocity increment [m/s] over these intervals."""
+        increments = samples.once(self._body_increments)
         x, y, z, w = increments.rotation
         v1, v2, v3 = increments.velocity
         if self._is_rotated:
             x, y, z = attitude.in_body(self._mounting, (x, y, z))
         return (x, y, z, w), self._from_body((v1, v2, v3))
+
+    def _body_increments(self, samples: Samples) -> Increments:
+        return self.intervals.increments(samples.path, samples.times, self._lever_arm)
 
     def motion(self, states: States) -> tuple[Vector, Vector]:
         """Return position in the world [m], and velocity in the IMU's frame [m/s]."""

@@ -1,25 +1,56 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every stream has: a topic, a message type, a rate, sinks, and how states become bytes."""
+"""What every stream has: a topic, a message type, a grid of times, and how states become bytes."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
-from spinning_top_sim.streams.segment import Segment
+from spinning_top_sim.streams.path import Path
+
+Result = TypeVar('Result')
+
+
+class Samples:
+    """
+    The motion at the times of a block; the streams of one rate share it.
+
+    path : the motion
+    times : of the samples, within the present segment [ns]
+    """
+
+    def __init__(self, path: Path, times: range) -> None:
+        self.path, self.times = path, times
+        self._results: dict[Callable[..., Any], Any] = {}
+
+    @cached_property
+    def t_ns(self) -> NDArray[np.int64]:
+        """The times (n,) [ns]."""
+        return np.arange(self.times.start, self.times.stop, self.times.step)
+
+    @cached_property
+    def states(self) -> States:
+        """The states at these times."""
+        return self.path.present.states(self.times)
+
+    def once(self, compute: Callable[['Samples'], Result]) -> Result:
+        """Return `compute(self)`, which is called for the first of the streams that ask for it."""
+        if compute not in self._results:
+            self._results[compute] = compute(self)
+        result: Result = self._results[compute]
+        return result
 
 
 class Stream:
     """
-    One topic: samples at t = k * period, k = 0, 1, 2.., whoever listens and however ticks fall.
+    One topic, with samples at t = k * period_ns for k = 0, 1, 2, ...
 
     parameter : prefix of its parameters
-    log_index : its number in the log that records it, None for no log; see `Simulation.log_to`
-    sent, skipped : counts of samples published, and of those that came too late for that
-    on_change : called when its sinks, its rate or the numbers in its samples change
+    rate_parameter : name of the parameter that is its rate
     """
 
     parameter: str
@@ -28,87 +59,50 @@ class Stream:
 
     def __init__(self, values: Mapping[str, Any], template: Template) -> None:
         self.template = template
-        self._publish: Callable[[bytes], object] | None = None
-        self.log_index: int | None = None
-        self.on_change: Callable[[], None] = lambda: None
-        self.sent = self.skipped = 0
-        self._skipped_until_ns = 0
         self.period_ns = period_ns(values[self.rate_parameter])
 
     @property
     def rate_parameter(self) -> str:
-        """Name of the parameter that is its rate."""
         return f'{self.parameter}.rate'
 
     @property
-    def publish(self) -> Callable[[bytes], object] | None:
-        """What a sample is handed to in time; None while there are no subscribers."""
-        return self._publish
-
-    @publish.setter
-    def publish(self, sink: Callable[[bytes], object] | None) -> None:
-        if sink != self._publish:
-            self._publish = sink
-            self.on_change()
-
-    def follow(self, segment: Segment) -> None:
-        """Begin with the samples of a motion, or of the one after a command."""
-
-    def begin(self, now_ns: int) -> None:
-        """Prepare for samples after the simulated time `now_ns`: it will be recorded."""
-        self.readmit(now_ns)        # what is too late to be published is not too late for a log
+    def size(self) -> int:
+        """Size of a message [bytes]."""
+        return len(self.template)
 
     @property
     def at_once(self) -> tuple[str, ...]:
-        """Names of the parameters that change its samples at once: a run is replayed by them."""
+        """Names of the parameters whose changes `apply` takes over."""
         return (self.rate_parameter,)
 
-    def apply(self, changes: Mapping[str, Any], now_ns: int) -> None:
-        """Take over values of parameters from the simulated time `now_ns` on."""
-        rate = changes.get(self.rate_parameter)
-        if rate is not None and period_ns(rate) != self.period_ns:
-            self.period_ns = period_ns(rate)
-            self.on_change()
-
-    @property
-    def has_sinks(self) -> bool:
-        """Whether it has subscribers or is recorded: else nothing is computed."""
-        return self._publish is not None or self.log_index is not None
-
-    def first_after(self, t_ns: int) -> int:
-        """Return the time of the first sample later than `t_ns` that is not skipped [ns]."""
-        return (max(t_ns, self._skipped_until_ns - 1) // self.period_ns + 1) * self.period_ns
+    def apply(self, changes: Mapping[str, Any]) -> None:
+        """Take over new values of parameters."""
+        if self.rate_parameter in changes:
+            self.period_ns = period_ns(changes[self.rate_parameter])
 
     def times(self, after_ns: int, until_ns: int) -> range:
         """Return the times of the samples after `after_ns` and up to `until_ns` [ns]."""
-        return range(self.first_after(after_ns), until_ns + 1, self.period_ns)
+        return range((after_ns // self.period_ns + 1) * self.period_ns, until_ns + 1,
+                     self.period_ns)
 
-    def skip(self, after_ns: int, before_ns: int) -> None:
-        """Leave out and count the samples after `after_ns` and before `before_ns` [ns]."""
-        count = len(self.times(after_ns, before_ns - 1))
-        if count:
-            self.skipped += count
-            self._skipped_until_ns = before_ns
-            self.on_change()
+    def encode(self, samples: Samples, epoch_ns: int,
+               ) -> tuple[NDArray[np.int64], NDArray[Any]]:
+        """
+        Return the messages of samples.
 
-    def readmit(self, now_ns: int) -> None:
-        """Leave out no more samples after `now_ns` than are skipped from now on."""
-        until_ns, self._skipped_until_ns = self._skipped_until_ns, 0
-        count = len(self.times(now_ns, until_ns - 1))
-        if count:
-            self.skipped -= count
-            self.on_change()
+        epoch_ns : stamp of t = 0 [ns]
 
-    def sent_ns(self, times: range) -> NDArray[np.int64]:
-        """Return the times of the messages of these samples: some may be lost, some repeated."""
-        return np.arange(times.start, times.stop, times.step)
+        Returns
+        -------
+        t_ns : (n,)
+            Time of each message [ns]; a sample may have none, or two.
+        rows : (n, size)
+            The messages, valid until the next call.
+        """
+        rows = self.template.encode(epoch_ns + samples.t_ns, *self.fields(samples))
+        return samples.t_ns, rows
 
-    def encode(self, states: States, epoch_ns: int, times: range) -> NDArray[np.uint8]:
-        """Return messages, at `sent_ns`, of states at times [ns]; see `Template.encode`."""
-        stamps_ns = np.arange(epoch_ns + times.start, epoch_ns + times.stop, times.step)
-        return self.template.encode(stamps_ns, *self.fields(states, times))
-
-    def fields(self, states: States, times: range) -> Sequence[Field]:
+    def fields(self, samples: Samples) -> Sequence[Field]:
         """Return the numbers that go into the fields of `template`."""
         raise NotImplementedError
 

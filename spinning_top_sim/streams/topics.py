@@ -2,7 +2,6 @@
 """The streams.  What a new one needs is said in docs/architecture.md."""
 
 import math
-from collections import deque
 from collections.abc import Mapping, Sequence
 from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Any
@@ -11,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Quaternion, Vector
-from spinning_top_sim.physics.states import States, relative_drift
+from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.physics.top import Shape
 from spinning_top_sim.streams import messages, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
 from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.segment import Segment
-from spinning_top_sim.streams.stream import Stream, period_ns
+from spinning_top_sim.streams.stream import Samples, Stream, period_ns
 
 if TYPE_CHECKING:
     from spinning_top_sim.streams.magnetometer import Magnetometer
@@ -38,8 +36,8 @@ class Pose(Stream):
 
     parameter, topic, type_name = 'pose', 'pose', 'geometry_msgs/msg/PoseStamped'
 
-    def fields(self, states: States, times: range) -> Sequence[Field]:
-        return (states.rows_quaternion,)
+    def fields(self, samples: Samples) -> Sequence[Field]:
+        return (samples.states.rows_quaternion,)
 
 
 class JointStates(Stream):
@@ -47,7 +45,8 @@ class JointStates(Stream):
 
     parameter, topic, type_name = 'joint_states', 'joint_states', 'sensor_msgs/msg/JointState'
 
-    def fields(self, states: States, times: range) -> Sequence[Field]:
+    def fields(self, samples: Samples) -> Sequence[Field]:
+        states = samples.states
         return ((states.phi, states.theta, states.psi),
                 (states.phi_dot, states.theta_dot, states.psi_dot))
 
@@ -58,8 +57,8 @@ class GroundTruthOdometry(Stream):
     parameter, topic, type_name = ('ground_truth_odom', 'ground_truth/odom',
                                    'nav_msgs/msg/Odometry')
 
-    def fields(self, states: States, times: range) -> Sequence[Field]:
-        return states.rows_quaternion, states.rows_angular_velocity
+    def fields(self, samples: Samples) -> Sequence[Field]:
+        return samples.states.rows_quaternion, samples.states.rows_angular_velocity
 
 
 class ImuStream(Stream):
@@ -77,17 +76,12 @@ class ImuStream(Stream):
     def at_once(self) -> tuple[str, ...]:
         return (*super().at_once, 'imu.rate')
 
-    def apply(self, changes: Mapping[str, Any], now_ns: int) -> None:
-        super().apply(changes, now_ns)
+    def apply(self, changes: Mapping[str, Any]) -> None:
+        super().apply(changes)
         if 'imu.rate' in changes:
-            # A density says how much noise a sample has at a rate.
+            # The noise of a sample follows from its density and the rate.
             self._sensor = self.imu.sensor(period_ns(changes['imu.rate']))
-            self.imu.set_period(period_ns(changes['imu.rate']), now_ns)
             self.template = self._template()
-            self.on_change()
-
-    def follow(self, segment: Segment) -> None:
-        self.imu.follow(segment)
 
     def _template(self) -> Template:
         sensor = self._sensor
@@ -108,20 +102,18 @@ class ImuRaw(ImuStream):
         super().__init__(values, imu)
         self._timing = _timing(values) if any(map(values.get, TIMING_FAULTS)) else None
 
-    def sent_ns(self, times: range) -> NDArray[np.int64]:
-        t_ns = super().sent_ns(times)
-        return np.repeat(t_ns, self._timing.copies(t_ns, self.period_ns)) if self._timing else t_ns
-
-    def encode(self, states: States, epoch_ns: int, times: range) -> NDArray[np.uint8]:
+    def encode(self, samples: Samples, epoch_ns: int,
+               ) -> tuple[NDArray[np.int64], NDArray[Any]]:
         if self._timing is None:
-            return super().encode(states, epoch_ns, times)
-        t_ns = super().sent_ns(times)
-        rows = self.template.encode(self._timing.stamps_ns(epoch_ns, t_ns, self.period_ns),
-                                    *self.fields(states, times))
-        return np.repeat(rows, self._timing.copies(t_ns, self.period_ns), axis=0)
+            return super().encode(samples, epoch_ns)
+        t_ns, timing = samples.t_ns, self._timing
+        rows = self.template.encode(timing.stamps_ns(epoch_ns, t_ns, self.period_ns),
+                                    *self.fields(samples))
+        copies = timing.copies(t_ns, self.period_ns)
+        return np.repeat(t_ns, copies), np.repeat(rows, copies, axis=0)
 
-    def fields(self, states: States, times: range) -> Sequence[Field]:
-        return (IDENTITY, *self._sensor.read(self.imu.sampled(states, times), times))
+    def fields(self, samples: Samples) -> Sequence[Field]:
+        return (IDENTITY, *self._sensor.read(self.imu.sampled(samples), samples.times))
 
 
 class ImuData(ImuRaw):
@@ -129,9 +121,10 @@ class ImuData(ImuRaw):
 
     parameter, topic, has_orientation = 'imu_data', 'imu/data', True
 
-    def fields(self, states: States, times: range) -> Sequence[Field]:
-        _, *readings = super().fields(states, times)
-        return (self._sensor.orientation(self.imu.orientation(states), times), *readings)
+    def fields(self, samples: Samples) -> Sequence[Field]:
+        _, *readings = super().fields(samples)
+        exact = self.imu.orientation(samples.states)
+        return (self._sensor.orientation(exact, samples.times), *readings)
 
 
 class ImuBias(ImuStream):
@@ -139,8 +132,8 @@ class ImuBias(ImuStream):
 
     parameter, topic, has_orientation = 'imu', 'ground_truth/imu_bias', False
 
-    def fields(self, states: States, times: range) -> Sequence[Field]:
-        return (IDENTITY, *self._sensor.bias(times))
+    def fields(self, samples: Samples) -> Sequence[Field]:
+        return (IDENTITY, *self._sensor.bias(samples.times))
 
 
 class ImuTiming(Stream):
@@ -158,13 +151,15 @@ class ImuTiming(Stream):
     def _timing(self) -> 'Timing':
         return _timing(self._values)
 
-    def encode(self, states: States, epoch_ns: int, times: range) -> NDArray[np.uint8]:
-        t_ns = self.sent_ns(times)
+    def encode(self, samples: Samples, epoch_ns: int,
+               ) -> tuple[NDArray[np.int64], NDArray[Any]]:
+        t_ns = samples.t_ns
         true_ns = epoch_ns + t_ns
         stamps_ns = self._timing.stamps_ns(epoch_ns, t_ns, self.period_ns)
         columns = (*np.divmod(stamps_ns, NANOSECONDS), *np.divmod(true_ns, NANOSECONDS),
                    self._timing.copies(t_ns, self.period_ns))
-        return self.template.encode(true_ns, [column.astype(np.float64) for column in columns])
+        return t_ns, self.template.encode(
+            true_ns, [column.astype(np.float64) for column in columns])
 
 
 def _timing(values: Mapping[str, Any]) -> 'Timing':
@@ -182,10 +177,10 @@ class Mag(Stream):
         self.imu, self._sensor = imu, lru_cache(2)(partial(_magnetometer, values))
         super().__init__(values, messages.magnetic_field(values['imu.frame_id']))
 
-    def fields(self, states: States, times: range) -> Sequence[Field]:
+    def fields(self, samples: Samples) -> Sequence[Field]:
         sensor = self._sensor(self.period_ns)
-        exact = sensor.true(self.imu.orientation(states))
-        return sensor.read(exact, times), messages.diagonal(*3 * (sensor.variance,))
+        exact = sensor.true(self.imu.orientation(samples.states))
+        return sensor.read(exact, samples.times), messages.diagonal(*3 * (sensor.variance,))
 
 
 class GroundTruthMag(Mag):
@@ -193,8 +188,8 @@ class GroundTruthMag(Mag):
 
     topic = 'ground_truth/mag'
 
-    def fields(self, states: States, times: range) -> Sequence[Field]:
-        exact = self._sensor(self.period_ns).true(self.imu.orientation(states))
+    def fields(self, samples: Samples) -> Sequence[Field]:
+        exact = self._sensor(self.period_ns).true(self.imu.orientation(samples.states))
         return exact, messages.EXACT
 
 
@@ -209,8 +204,8 @@ class GroundTruthImu(ImuStream):
 
     parameter, topic = 'ground_truth_imu', 'ground_truth/imu'
 
-    def fields(self, states: States, times: range) -> Sequence[Field]:
-        return (self.imu.orientation(states), *self.imu.sampled(states, times))
+    def fields(self, samples: Samples) -> Sequence[Field]:
+        return (self.imu.orientation(samples.states), *self.imu.sampled(samples))
 
 
 class ImuIncrements(ImuRaw):
@@ -218,21 +213,12 @@ class ImuIncrements(ImuRaw):
 
     parameter, rate_parameter = 'increments', 'imu.rate'
 
-    def begin(self, now_ns: int) -> None:
-        super().begin(now_ns)
-        self.imu.use_intervals(now_ns)
-
-    def apply(self, changes: Mapping[str, Any], now_ns: int) -> None:
-        super().apply(changes, now_ns)
-        if changes.get('increments.enabled'):
-            self.imu.use_intervals(now_ns)
-
-    def _measured(self, states: States, times: range) -> tuple[Quaternion, Vector]:
-        exact = self.imu.increments(times)
+    def _measured(self, samples: Samples) -> tuple[Quaternion, Vector]:
+        exact = self.imu.increments(samples)
         if self._sensor.is_perfect:
             return exact
-        return self._sensor.disturb(exact, self.imu.means(states, times), times,
-                                    self.imu.lengths(times))
+        return self._sensor.disturb(exact, samples.once(self.imu.means), samples.times,
+                                    self.imu.lengths(samples))
 
 
 class ImuDq(ImuIncrements):
@@ -243,8 +229,8 @@ class ImuDq(ImuIncrements):
     def _template(self) -> Template:
         return messages.stamped(self._frame_id, 4)
 
-    def fields(self, states: States, times: range) -> Sequence[Field]:
-        return (self._measured(states, times)[0],)
+    def fields(self, samples: Samples) -> Sequence[Field]:
+        return (self._measured(samples)[0],)
 
 
 class ImuDv(ImuIncrements):
@@ -255,8 +241,8 @@ class ImuDv(ImuIncrements):
     def _template(self) -> Template:
         return messages.stamped(self._frame_id, 3)
 
-    def fields(self, states: States, times: range) -> Sequence[Field]:
-        return (self._measured(states, times)[1],)
+    def fields(self, samples: Samples) -> Sequence[Field]:
+        return (self._measured(samples)[1],)
 
 
 class GroundTruthImuOdometry(Stream):
@@ -270,7 +256,8 @@ class GroundTruthImuOdometry(Stream):
         super().__init__(values, messages.odometry(
             values['world_frame'], values['imu.frame_id'], moves=True))
 
-    def fields(self, states: States, times: range) -> Sequence[Field]:
+    def fields(self, samples: Samples) -> Sequence[Field]:
+        states = samples.states
         position, velocity = self.imu.motion(states)
         return position, self.imu.orientation(states), velocity, self.imu.true(states)[0]
 
@@ -280,14 +267,12 @@ class Invariants(Stream):
 
     parameter, topic, type_name = 'invariants', '~/invariants', 'std_msgs/msg/Float64MultiArray'
 
-    def follow(self, segment: Segment) -> None:
-        self._segment = segment
-
-    def fields(self, states: States, times: range) -> Sequence[Field]:
-        segment = self._segment
+    def fields(self, samples: Samples) -> Sequence[Field]:
+        segment, states = samples.path.present, samples.states
         now = (states.energy, states.l3, states.lz)
         drifts = map(relative_drift, now, (segment.energy, segment.l3, segment.lz))
-        return ((*now, *drifts, states.norm_error, segment.orientation_error(states, times)),)
+        error = segment.orientation_error(states, samples.times)
+        return ((*now, *drifts, states.norm_error, error),)
 
 
 class Clock(Stream):
@@ -295,7 +280,7 @@ class Clock(Stream):
 
     parameter, topic, type_name = 'clock', '/clock', 'rosgraph_msgs/msg/Clock'
 
-    def fields(self, states: States, times: range) -> Sequence[Field]:
+    def fields(self, samples: Samples) -> Sequence[Field]:
         return ()
 
 
@@ -316,7 +301,6 @@ class Markers(Stream):
         self._length_ns = round(values['markers.trace_length'] * NANOSECONDS)
         self._count = min(values['markers.trace_points'], self._length_ns)
         self._spacing_ns = max(1, self._length_ns // max(self._count, 1))
-        self._segments: deque[Segment] = deque()
         # Slightly outside, to be seen.
         rim, side = 1.01 * shape.radius, 1.01 * math.copysign(0.5 * shape.height, shape.tip)
         far, near = shape.centre + side, shape.centre - side
@@ -328,42 +312,27 @@ class Markers(Stream):
             values['world_frame'], (2.0 * shape.radius, 2.0 * shape.radius, shape.height), lines,
             0.02 * abs(shape.tip), self._count + 1 if self._count else 0))
 
-    def follow(self, segment: Segment) -> None:
-        """Begin a new segment; forget those that the trace does not reach any more."""
-        self._segments.append(segment)
-        oldest_ns = segment.start_ns - self._length_ns
-        while len(self._segments) > 1 and self._segments[1].start_ns < oldest_ns:
-            self._segments.popleft()
-
-    def fields(self, states: States, times: range) -> Sequence[Field]:
+    def fields(self, samples: Samples) -> Sequence[Field]:
+        states = samples.states
         centre = tuple(self._shape.centre * part for part in states.rows_axis)
         body = (centre, states.rows_quaternion, states.rows_quaternion)
-        return (*body, self._traces(states, times)) if self._count else body
+        return (*body, self._traces(samples)) if self._count else body
 
-    def _traces(self, states: States, times: range) -> NDArray[np.float64]:
-        """Return the points of the traces (n, 3 (count + 1)) that end at these times."""
+    def _traces(self, samples: Samples) -> NDArray[np.float64]:
+        """Return the points of the traces (n, 3 (count + 1)) that end with these samples."""
         count = self._count
-        newest = (np.arange(times.start, times.stop, times.step) - 1) // self._spacing_ns
+        newest = (samples.t_ns - 1) // self._spacing_ns
         # A trace shares points with the one before it; there they are computed once.
         fresh = np.minimum(np.diff(newest, prepend=newest[0] - count), count)
         ends = np.cumsum(fresh)
         grid = np.repeat(newest + 1 - ends, fresh) + np.arange(ends[-1])
-        points = self._past_axis(np.maximum(grid * self._spacing_ns, 0))
-        traces = np.empty((len(times), count + 1, 3))
+        points = samples.path.exact_axis(np.maximum(grid * self._spacing_ns, 0))
+        traces = np.empty((len(newest), count + 1, 3))
         for row, end in zip(traces, ends.tolist(), strict=True):
             row[:-1] = points[end - count:end]
-        traces[:, -1] = np.stack(states.rows_axis, axis=-1)
+        traces[:, -1] = np.stack(samples.states.rows_axis, axis=-1)
         traces *= self._shape.tip
-        return traces.reshape(len(times), -1)
-
-    def _past_axis(self, times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the axis in the world at ascending times of the last `trace_length`, (n, 3)."""
-        begins = [segment.start_ns for segment in self._segments]
-        # A segment ends with the command that begins the next one, that instant included.
-        ends = np.searchsorted(times_ns, begins[1:], 'right')
-        return np.concatenate([
-            np.stack(segment.exact_axis(times), axis=-1) for segment, times in zip(
-                self._segments, np.split(times_ns, ends), strict=True) if len(times)])
+        return traces.reshape(len(newest), -1)
 
 
 def all_streams(values: Mapping[str, Any]) -> list[Stream]:

@@ -23,8 +23,7 @@ from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.provenance import version
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.pipeline import Simulation
-from spinning_top_sim.streams.stream import Stream
+from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING
 from spinning_top_sim.tools.ensemble_spec import WITHOUT_COLUMNS, Specification
 from spinning_top_sim.tools.recorded_run import ODD, field_names, reason_of
@@ -73,11 +72,10 @@ def samples(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Samp
     blocks: dict[str, list[tuple[NDArray[np.int64], tuple[NDArray[np.float64], ...]]]] = {
         stream.topic: [(np.empty(0, np.int64), stream.template.decode(b''))] for stream in streams}
 
-    def take(stream: Stream, stamps_ns: NDArray[np.int64], rows: NDArray[np.uint8]) -> None:
-        blocks[stream.topic].append((stamps_ns - EPOCH_NS, stream.template.decode(rows.tobytes())))
-
-    simulation.log_to(None, journal.recorded_streams(streams, values))
-    simulation.advance_in_blocks(round(values['duration'] * NANOSECONDS), take)
+    recorded = journal.recorded_streams(streams, values)
+    for block in simulation.play(recorded, round(values['duration'] * NANOSECONDS)):
+        for stream, t_ns, rows in block.parts:
+            blocks[stream.topic].append((t_ns, stream.template.decode(rows.tobytes())))
     found = {}
     for stream in streams:
         times, fields = zip(*blocks[stream.topic], strict=True)

@@ -27,8 +27,9 @@ from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import cli, export
-from spinning_top_sim.tools.recorded_run import RunDescription, Verdict, verify
+from spinning_top_sim.tools.recorded_run import RunDescription
 from spinning_top_sim.tools.survey import Motion, Survey, survey
+from spinning_top_sim.tools.verify import Verdict, verify
 
 MOST_MOTIONS = 12           # shown one by one in the text
 DEGREES = math.degrees(1.0)

@@ -1,30 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The run of a log: how the log describes it, its computation again, the comparison of both."""
+"""The run of a log: how the log describes it, and its computation again."""
 
 import contextlib
 import json
-import math
 import operator
-import re
-import struct
-from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from typing import Any, NamedTuple
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.top import State
-from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.writer import METADATA_NAME
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
+from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import ENCAPSULATION
-from spinning_top_sim.streams.intervals import LONGEST_NS
-from spinning_top_sim.streams.pipeline import Simulation, TakeRows
-from spinning_top_sim.streams.schedule import offline_block_ns, offline_targets
+from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import all_streams
 
@@ -35,7 +29,6 @@ MOST_TEXT = 300             # of a reason
 # What is computed for a log at most: for a small one, and more for each of its bytes.
 LEAST_STEPS, STEPS_A_BYTE = 200_000, 20
 LEAST_SAMPLES, SAMPLES_A_BYTE = 100_000, 1
-MOST_BLOCKS = 20_000        # of samples between two events
 # Numbers of the events that begin another motion at the present time, in the order of
 # `Simulation.history`.
 FIELDS_OF = {'command': ('l3', 'lz'), 'state': tuple(field.name for field in fields(State))}
@@ -61,6 +54,10 @@ FIELDS = {
 def field_names(stream: Stream) -> Sequence[str] | None:
     """Return the names of the fields of a stream's template, None if they are not in FIELDS."""
     return FIELDS.get(stream.topic) or FIELDS.get(stream.type_name)
+
+
+# Takes messages of a stream: stamps (n,) [ns], and rows (n, size), valid until it returns.
+TakeRows = Callable[[Stream, NDArray[np.int64], NDArray[np.uint8]], object]
 
 
 class ForeignLogError(Exception):
@@ -150,6 +147,9 @@ def read_run_description(reader: LogReader) -> RunDescription:
 
 def _applied_before(epoch_ns: int, t_ns: int, *numbers: float) -> Event:
     """Return an entry of `Simulation.history` as an event.  Raises ValueError for other counts."""
+    if len(numbers) == 1:
+        rate = parameters.BY_NAME['imu.rate'].check(numbers[0])
+        return Event('parameters', epoch_ns + t_ns, t_ns, t_ns, {'imu.rate': rate})
     name = 'command' if len(numbers) == len(FIELDS_OF['command']) else 'state'
     return Event(name, epoch_ns + t_ns, t_ns, t_ns,
                  dict(zip(FIELDS_OF[name], numbers, strict=True)))
@@ -196,11 +196,7 @@ def _event(stamp_ns: int, data: bytes) -> Event:
         details = {'epoch_ns': operator.index(details['epoch_ns']),
                    'parameters': parameters.checked(details['parameters'])}
     elif name == 'start':
-        since_ns, begin_ns = map(operator.index, details.get('interval_ns', (0, 0)))
-        if not 0 <= begin_ns <= since_ns <= max(sent_ns, 0) or (
-                since_ns - begin_ns > LONGEST_NS):
-            raise ValueError(f'interval_ns = {[since_ns, begin_ns]}')
-        details = {'interval_ns': (since_ns, begin_ns)} if since_ns else {}
+        details = {}
     else:
         raise ValueError(f'event {name!r} is unknown')
     return Event(name, stamp_ns, t_ns, sent_ns, details)
@@ -209,73 +205,80 @@ def _event(stamp_ns: int, data: bytes) -> Event:
 def rerun(run: RunDescription, end_ns: int,
           send: TakeRows | None = None) -> Iterator[tuple[Simulation, Event | None]]:
     """
-    Compute the run of a log again; yield it after the start, each event, and each block (None).
+    Compute the run of a log again; yield it at the start, after each event and each block (None).
 
     end_ns : log time of the end [ns]
-    send : takes the samples of the log's streams in blocks; without it only motions are computed
+    send : takes the messages of the log's streams in blocks; without it only motions are computed
 
     Raises DepartureError where there is no motion with these parameters and commands, or where it
     takes far more work than a run that fits into the log.
     """
     try:
-        yield from _rerun(run, end_ns, send)
+        yield from _Rerun(run, send).events(end_ns)
     except ODD as error:
         raise DepartureError(reason_of(error)) from error
 
 
-def _rerun(run: RunDescription, end_ns: int,
-           send: TakeRows | None) -> Iterator[tuple[Simulation, Event | None]]:
-    simulation = Simulation(run.values_at_start, run.epoch_ns)
-    most_steps = LEAST_STEPS + STEPS_A_BYTE * run.log_bytes
-    samples_left = LEAST_SAMPLES + SAMPLES_A_BYTE * run.log_bytes
+class _Rerun:
+    """The computation of a run, within limits that the size of its log sets."""
 
-    def reach(target_ns: int) -> None:
-        with contextlib.suppress(IntegrationError):     # as far as the equations go
-            simulation.advance_in_blocks(target_ns, send or (lambda *_: None),
-                                         lambda: simulation.steps > most_steps)
-        if simulation.steps > most_steps:
-            raise DepartureError(f'over {most_steps} integration steps are too many for a log of '
-                                 f'{run.log_bytes} bytes')
+    def __init__(self, run: RunDescription, send: TakeRows | None) -> None:
+        self._run, self._send = run, send
+        self._most_steps = LEAST_STEPS + STEPS_A_BYTE * run.log_bytes
+        self._samples_left = LEAST_SAMPLES + SAMPLES_A_BYTE * run.log_bytes
+        self._simulation = Simulation(run.values_at_start, run.epoch_ns)
 
-    # 1. Before the recording: the motion and its commands, no samples.  The rates are already
-    # those of the recording: the first of its samples may be a mean over a time before it.
-    simulation.apply(run.values_at_recording)
-    for event in run.events:
-        if 'interval_ns' in event.details:
-            simulation.open_interval = event.details['interval_ns']
-    for event in run.history:
-        reach(event.t_ns)
-        _apply(simulation, event)
-    if send is not None:
-        reach(run.begun_ns)
+    def events(self, end_ns: int) -> Iterator[tuple[Simulation, Event | None]]:
+        simulation, run = self._simulation, self._run
+        # Before the recording: the motion and its commands, no samples.
+        for event in run.history:
+            self._move_to(event.t_ns)
+            _apply(simulation, event)
+        if self._send is not None:
+            self._move_to(run.begun_ns)
+        simulation.skip_to(run.begun_ns)
+        at_once = {name for stream in simulation.streams for name in stream.at_once}
+        simulation.apply({name: run.values_at_recording[name] for name in at_once})
+        yield simulation, Event('start', run.epoch_ns, 0, simulation.now_ns, {})
 
-    # 2. The recording begins, with the streams of this moment.
-    simulation.skip_to(max(run.begun_ns, -1))
-    if send is not None:
-        simulation.log_to(None, [stream for stream in simulation.streams
-                                 if stream.topic in run.topics])
-    yield simulation, Event('start', run.epoch_ns, 0, simulation.now_ns, {})
+        # The journal: samples up to each event that acts on them, and up to the end.
+        for event in run.events:
+            if event.name in ('reset', *FIELDS_OF) or not at_once.isdisjoint(event.details):
+                yield from self._samples_up_to(event.sent_ns, event.name in FIELDS_OF)
+                _apply(simulation, event)
+                yield simulation, event
+        yield from self._samples_up_to(end_ns - simulation.epoch_ns, False)
 
-    # 3. The journal: samples up to each event that acts on them, and up to the end.
-    at_once = {name for stream in simulation.streams for name in stream.at_once}
-    acting = [event for event in run.events if event.name in ('reset', *FIELDS_OF)
-              or not at_once.isdisjoint(event.details)]
-    for item in (*acting, None):
-        now_ns = max(simulation.now_ns, 0)
-        stop_ns = end_ns - simulation.epoch_ns if item is None else item.sent_ns
-        recorded = [stream for stream in simulation.streams if stream.has_sinks]
-        samples_left -= sum(max(stop_ns - now_ns, 0) // stream.period_ns for stream in recorded)
-        if samples_left < 0:
-            raise DepartureError(f'a log of {run.log_bytes} bytes lacks most samples of this run')
-        block_ns = max(offline_block_ns(recorded), (stop_ns - now_ns) // MOST_BLOCKS)
-        for target_ns, arrived in offline_targets(now_ns, [(stop_ns, item)], block_ns):
-            # Without samples states are only needed where a command finds them.
-            if send is not None or (arrived is not None and arrived.name in FIELDS_OF):
-                reach(target_ns)
-            simulation.skip_to(target_ns)
-            if arrived is not None:
-                _apply(simulation, arrived)
-            yield simulation, arrived
+    def _move_to(self, t_ns: int) -> None:
+        for _ in self._blocks(t_ns, ()):
+            pass
+
+    def _samples_up_to(self, t_ns: int, moves: bool) -> Iterator[tuple[Simulation, None]]:
+        """Send the samples up to a time; `moves`: let the motion reach it in any case."""
+        simulation = self._simulation
+        if self._send is not None:
+            streams = [one for one in simulation.streams if one.topic in self._run.topics]
+            self._samples_left -= sum(len(one.times(simulation.now_ns, t_ns)) for one in streams)
+            if self._samples_left < 0:
+                raise DepartureError(f'a log of {self._run.log_bytes} bytes lacks most samples of '
+                                     'this run')
+            for block in self._blocks(t_ns, streams):
+                for stream, sent_ns, rows in block.parts:
+                    self._send(stream, simulation.epoch_ns + sent_ns, rows)
+                yield simulation, None
+        elif moves:
+            self._move_to(t_ns)
+        simulation.skip_to(t_ns)
+
+    def _blocks(self, t_ns: int, streams: Sequence[Stream]) -> Iterator[Block]:
+        """Yield the blocks up to a time, as far as the equations and the limit of steps go."""
+        with contextlib.suppress(IntegrationError):
+            for block in self._simulation.play(streams, t_ns):
+                yield block
+                if self._simulation.steps > self._most_steps:
+                    raise DepartureError(
+                        f'over {self._most_steps} integration steps are too many for a log of '
+                        f'{self._run.log_bytes} bytes')
 
 
 def _apply(simulation: Simulation, event: Event) -> None:
@@ -297,129 +300,3 @@ def _apply(simulation: Simulation, event: Event) -> None:
             simulation.epoch_ns = details['epoch_ns']
     except ODD as error:
         raise DepartureError(f'{event.name} at t = {event.t_ns} ns: {reason_of(error)}') from error
-
-
-class Difference(NamedTuple):
-    """A place where a log and the computation differ."""
-
-    stamp_ns: int                         # log time of the message [ns]
-    topic: str
-    field: str                            # name of the field, or what else is different
-    logged: str                           # its two values
-    computed: str
-    byte: int | None = None               # None where one of them has no such message
-
-
-@dataclass
-class Verdict:
-    """The result of a comparison."""
-
-    compared: dict[str, int]              # messages that both have, by topic
-    different: int = 0                    # how many of these differ
-    missing: int = 0                      # messages that were computed and are not in the log
-    unexpected: int = 0                   # messages that are in the log and were not computed
-    first: Difference | None = None       # the earliest of all these
-    stopped: str = ''                     # why the run could not be computed to its end
-    warnings: list[str] = field(default_factory=list)       # of another version or machine
-
-    @property
-    def identical(self) -> bool:
-        """Whether the messages in the log are those computed."""
-        return not (self.different or self.missing or self.unexpected or self.stopped)
-
-    def note(self, this: Difference) -> None:
-        """Keep a difference if it is the earliest so far."""
-        self.first = min(self.first or this, this, key=operator.attrgetter('stamp_ns'))
-
-
-def verify(reader: LogReader, run: RunDescription, end_ns: int,
-           show: Callable[[int], None]) -> Verdict:
-    """Compute a run again up to a log time, and compare; `show` takes the one reached [ns]."""
-    commands = run.commands_topic
-    verdict = Verdict({topic: 0 for topic in (*run.topics.values(), commands)
-                       if topic is not None}, warnings=_warnings(run))
-    for stamp_ns, reason in run.broken:
-        verdict.different += 1
-        verdict.note(Difference(stamp_ns, run.events_topic or '', 'entry', reason, 'an entry'))
-    # What has not been met in the log, by stamp and topic: several commands may have the same.
-    computed: defaultdict[tuple[int, str], deque[tuple[Stream | None, bytes]]] = defaultdict(deque)
-
-    def take(stream: Stream, stamps_ns: NDArray[np.int64], rows: NDArray[np.uint8]) -> None:
-        for stamp_ns, row in zip(stamps_ns.tolist(), rows, strict=True):
-            computed[stamp_ns, run.topics[stream.topic]].append((stream, row.tobytes()))
-
-    def computing() -> Iterator[float]:
-        """Compute the run; yield the log times before which all is computed, at last infinity."""
-        try:
-            for simulation, event in rerun(run, end_ns, take):
-                if commands is not None and event is not None and event.name == 'command':
-                    computed[event.stamp_ns, commands].append(
-                        (None, journal.command(event.details['l3'], event.details['lz'])))
-                reached_ns = simulation.epoch_ns + simulation.now_ns
-                show(reached_ns)
-                # Not up to it: another command at this very time may follow.
-                yield reached_ns
-        except DepartureError as error:
-            verdict.stopped = str(error)
-        yield math.inf
-
-    def miss(before_ns: float) -> None:
-        """Count what the log, which is read in the order of time, does not have before a time."""
-        for key in [key for key in computed if key[0] < before_ns]:
-            verdict.missing += len(computed.pop(key))
-            verdict.note(Difference(*key, 'message', 'no such message', 'there'))
-
-    progress, before_ns = computing(), -math.inf
-    for message in reader.messages(topics=verdict.compared):
-        while message.log_time >= before_ns:
-            before_ns = next(progress)
-            miss(message.log_time)
-        key = message.log_time, message.topic
-        if key in computed:
-            stream, expected = computed[key].popleft()
-            if not computed[key]:
-                del computed[key]
-            verdict.compared[message.topic] += 1
-            if message.data != expected:
-                verdict.different += 1
-                verdict.note(_difference(key, stream, message.data, expected))
-        else:
-            verdict.unexpected += 1
-            verdict.note(Difference(*key, 'message', 'there', 'no such message'))
-    for _ in progress:
-        miss(math.inf)
-    miss(math.inf)
-    return verdict
-
-
-def _difference(key: tuple[int, str], stream: Stream | None, logged: bytes,
-                computed: bytes) -> Difference:
-    """Return the first difference of two messages."""
-    sizes = len(logged), len(computed)
-    if sizes[0] != sizes[1]:
-        return Difference(*key, 'size', f'{sizes[0]} bytes', f'{sizes[1]} bytes', min(sizes))
-    at = next(at for at in range(sizes[0]) if logged[at] != computed[at])
-    place = None if stream is None else stream.template.field_at(at)
-    if stream is None or place is None:
-        return Difference(*key, f'byte {at}', f'0x{logged[at]:02x}', f'0x{computed[at]:02x}', at)
-    number, element, start = place
-    if number < 0:
-        what, code, text = 'header.stamp', '<iI', '{}.{:09d}'
-    else:
-        names = field_names(stream)
-        what = f'{names[number] if names else f"array {number}"}[{element}]'
-        code, text = '<d', '{!r}'
-    one, two = (text.format(*struct.unpack_from(code, data, start)) for data in (logged, computed))
-    return Difference(*key, what, one, two, at)
-
-
-def _warnings(run: RunDescription) -> list[str]:
-    """Return the differences of this machine from that of the recording."""
-    now, found = provenance.surroundings(), []
-    for what, key, pattern in (('the version of spinning_top_sim', 'version', '.*'),
-                               ('the platform', 'platform', '.*'),
-                               ('numpy', 'libraries', '"numpy": "[^"]*"')):     # only it computes
-        then, here = (''.join(re.findall(pattern, one[key])) for one in (run.surroundings, now))
-        if then != here:
-            found.append(f'{what} was {then}, is {here}')
-    return found

@@ -22,17 +22,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import Top
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.provenance import provenance
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.pipeline import MOST_RATE, OFFLINE_STEPS, Simulation
-from spinning_top_sim.streams.schedule import offline_block_ns, offline_targets
-from spinning_top_sim.streams.stream import Stream
+from spinning_top_sim.streams.blocks import Block
+from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
+from spinning_top_sim.streams.simulation import MOST_RATE, Simulation
+from spinning_top_sim.streams.stream import Samples, Stream, period_ns
 from spinning_top_sim.tools import cli, export
 from spinning_top_sim.tools.scene_file import is_of_ros, parse_assignment, read_scene
 
@@ -43,7 +42,6 @@ UNITS = {
     'psi': 'rad', 'psi_dot': 'rad/s', 'qx': '1', 'qy': '1', 'qz': '1', 'qw': '1',
     'omega_1': 'rad/s', 'omega_2': 'rad/s', 'omega_3': 'rad/s', 'energy': 'J',
     'l3': 'kg m^2/s', 'lz': 'kg m^2/s'}
-ROWS_AT_ONCE = 20_000
 
 # Time [ns], and L3 and Lz commanded there [kg m^2/s], None at the end of the run.
 Stop = tuple[int, tuple[float, float] | None]
@@ -84,12 +82,13 @@ def _run(arguments: argparse.Namespace) -> int:
     if file_format not in FORMATS:
         raise ValueError(f'{output}: the name must end in .{", .".join(FORMATS)}, or --format be '
                          'given')
-    if not 0.0 <= arguments.epoch < 2.0 ** 31:
+    epoch_ns = arguments.epoch * NANOSECONDS
+    if not 0.0 <= epoch_ns <= LAST_STAMP_NS:
         raise ValueError(f'--epoch {arguments.epoch!r}: must be >= 0 and < {2 ** 31} s')
     if arguments.export and file_format != 'mcap':
         raise ValueError(f'--export: needs a log, and {output} is {file_format}')
     values = _parameters(arguments)
-    simulation = Simulation(values, round(arguments.epoch * NANOSECONDS))
+    simulation = Simulation(values, round(epoch_ns))
     export.check(arguments.export, [stream.topic for stream in journal.recorded_streams(
         simulation.streams, values)], values)
     stops = _parse_stops(arguments.command, round(values['duration'] * NANOSECONDS),
@@ -98,10 +97,11 @@ def _run(arguments: argparse.Namespace) -> int:
         if file_format == 'mcap':
             summary = write_log(output, simulation, stops, show, arguments.namespace)
         else:
-            period_ns = max(1, round(NANOSECONDS / values['pose.rate']))
+            table = Table(period_ns(values['pose.rate']))
             write = _write_csv if file_format == 'csv' else _write_parquet
-            write(output, _rows(simulation, period_ns, stops, show))
-            summary = f'{stops[-1][0] // period_ns + 1} rows of {", ".join(UNITS)}'
+            write(output, _rows(simulation, table, stops, show))
+            rows = len(table.times(-1, stops[-1][0]))
+            summary = f'{rows} rows of {", ".join(UNITS)}'
     lines = [f'{output}: {summary}', *_export(output, arguments.export)]
     if not arguments.quiet:
         for line in lines:
@@ -180,22 +180,19 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
     """
     epoch_ns = simulation.epoch_ns
     streams = journal.recorded_streams(simulation.streams, simulation.values)
-    simulation.log_to(None, streams)
     commands_topic, events_topic = len(streams), len(streams) + 1
     with contextlib.closing(_LogWriter(path, simulation, streams, namespace)) as writer:
         writer.write(events_topic, epoch_ns, journal.event('start', 0, -1))
-        for target_ns, momenta in offline_targets(0, stops, offline_block_ns(streams)):
-            try:
-                simulation.advance_in_blocks(target_ns, writer.take)
-            finally:                # also what was computed before the motion could not go on
-                writer.write_blocks(epoch_ns + simulation.now_ns)
+        for stop_ns, momenta in stops:
+            for block in simulation.play(streams, stop_ns):
+                writer.write_block(block)
+                show(simulation.now_ns / NANOSECONDS)
             if momenta is not None:
                 _command(simulation, *momenta)
-                t_ns, (l3, lz) = simulation.history[-1][0], momenta
+                t_ns, (l3, lz) = simulation.now_ns, momenta
                 writer.write(events_topic, epoch_ns + t_ns, journal.event(
-                    'command', t_ns, simulation.now_ns, l3=l3, lz=lz))
+                    'command', t_ns, t_ns, l3=l3, lz=lz))
                 writer.write(commands_topic, epoch_ns + t_ns, journal.command(l3, lz))
-            show(target_ns / NANOSECONDS)
     return f'{sum(writer.file.message_counts.values())} messages, {writer.file.size / 1e6:.1f} MB'
 
 
@@ -203,8 +200,8 @@ class _LogWriter:
     """
     Writes a log in a thread: compression and the file system leave Python to others.
 
-    The blocks of all streams up to one time become one chunk, which is compressed and written
-    while the next blocks are computed.  Everything else waits for it, to keep the order.
+    A block becomes a chunk, which is compressed and written while the next block is computed.
+    Everything else waits for it, to keep the order.
     """
 
     def __init__(self, path: Path, simulation: Simulation, streams: Sequence[Stream],
@@ -217,8 +214,7 @@ class _LogWriter:
                   for name, type_name in types.items()]
         metadata = provenance(values, simulation.epoch_ns, -1, (), values)
         self.file = create_file(path, topics, metadata, compression=values['record.compression'])
-        self._streams = streams
-        self._blocks: list[tuple[int, NDArray[np.int64], NDArray[np.uint8]]] = []
+        self._streams, self._epoch_ns = streams, simulation.epoch_ns
         self._executor = ThreadPoolExecutor(1)
         self._chunk: Future[None] = self._executor.submit(lambda: None)     # none at first
 
@@ -227,20 +223,12 @@ class _LogWriter:
         self._chunk.result()
         self.file.append(topic_index, stamp_ns, data)
 
-    def take(self, stream: Stream, stamps_ns: NDArray[np.int64], rows: NDArray[np.uint8]) -> None:
-        """Take a block of samples, which `write_blocks` writes."""
-        self._blocks.append((self._streams.index(stream), stamps_ns, rows.copy()))
-
-    def write_blocks(self, until_ns: int) -> None:
-        """
-        Begin to write a chunk of the blocks up to a stamp.  Raises OSError of the chunk before.
-
-        A later one is of an interrupted computation, of which other streams have no block.
-        """
-        blocks = [block for block in self._blocks if block[1][0] <= until_ns]
-        self._blocks = []
-        if blocks:
-            chunk = self.file.chunk_of_rows(blocks)
+    def write_block(self, block: Block) -> None:
+        """Begin to write a chunk of a block.  Raises OSError of the chunk before."""
+        if block.parts:
+            chunk = self.file.chunk_of_rows([
+                (self._streams.index(stream), self._epoch_ns + t_ns, rows)
+                for stream, t_ns, rows in block.parts])
             self._chunk.result()
             self.file.write_chunk()         # of the journal's entries, which wait in memory
             self._chunk = self._executor.submit(self.file.write_chunk, chunk)
@@ -255,36 +243,33 @@ class _LogWriter:
             self.file.finish()
 
 
-def _rows(simulation: Simulation, period_ns: int, stops: Sequence[Stop],
+class Table(Stream):
+    """The true states as rows of numbers: a stream whose messages are the rows of a table."""
+
+    size = 8 * len(UNITS)
+
+    def __init__(self, period_ns: int) -> None:
+        self.period_ns = period_ns
+
+    def encode(self, samples: Samples, epoch_ns: int,
+               ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        states = samples.states
+        columns = np.broadcast_arrays(
+            samples.t_ns / NANOSECONDS, states.theta, states.theta_dot, states.phi, states.phi_dot,
+            states.psi, states.psi_dot, *states.quaternion.T, *states.angular_velocity.T,
+            states.energy, states.l3, states.lz)
+        return samples.t_ns, np.stack(columns, axis=-1)
+
+
+def _rows(simulation: Simulation, table: Table, stops: Sequence[Stop],
           show: Callable[[float], object]) -> Iterator[NDArray[np.float64]]:
-    """Yield blocks (columns, n) of the table.  A command changes the rows after its time."""
-    next_ns = 0
-    for target_ns, momenta in offline_targets(0, stops, ROWS_AT_ONCE * period_ns):
-        segment, arrived, failure = simulation.segment, False, None
-        while not arrived:
-            try:
-                arrived = segment.reach(target_ns, OFFLINE_STEPS)
-            except IntegrationError as error:
-                failure = error
-            times = range(next_ns, min(target_ns, segment.reached_ns) + 1, period_ns)
-            if times:
-                yield _table(times, segment.states(times))
-                next_ns = times[-1] + period_ns
-            if failure is not None:
-                raise failure
-            segment.release(next_ns)
-        simulation.advance(target_ns)
+    """Yield blocks (n, columns) of the table.  A command changes the rows after its time."""
+    for stop_ns, momenta in stops:
+        for block in simulation.play([table], stop_ns):
+            yield from (rows for _, _, rows in block.parts)
+            show(simulation.now_ns / NANOSECONDS)
         if momenta is not None:
             _command(simulation, *momenta)
-        show(target_ns / NANOSECONDS)
-
-
-def _table(times: range, states: States) -> NDArray[np.float64]:
-    """Return the rows (columns, n) of these times [ns]."""
-    return np.stack(np.broadcast_arrays(
-        np.array(times) / NANOSECONDS, states.theta, states.theta_dot, states.phi, states.phi_dot,
-        states.psi, states.psi_dot, *states.quaternion.T, *states.angular_velocity.T,
-        states.energy, states.l3, states.lz))
 
 
 def _write_csv(path: Path, blocks: Iterable[NDArray[np.float64]]) -> None:
@@ -292,7 +277,7 @@ def _write_csv(path: Path, blocks: Iterable[NDArray[np.float64]]) -> None:
         file.write(','.join(f'{name} [{unit}]' for name, unit in UNITS.items()) + '\n')
         for rows in blocks:
             # csv.writer looks for what to quote in every number, and takes a third longer.
-            file.writelines(','.join(map(repr, row)) + '\n' for row in rows.T.tolist())
+            file.writelines(','.join(map(repr, row)) + '\n' for row in rows.tolist())
 
 
 def _write_parquet(path: Path, blocks: Iterable[NDArray[np.float64]]) -> None:
@@ -306,7 +291,7 @@ def _write_parquet(path: Path, blocks: Iterable[NDArray[np.float64]]) -> None:
     schema = pa.schema([(name, pa.float64()) for name in UNITS])
     with open(path, 'xb') as file, parquet.ParquetWriter(file, schema) as writer:
         for rows in blocks:
-            writer.write_table(pa.table(list(rows), schema=schema))
+            writer.write_table(pa.table(list(rows.T), schema=schema))
 
 
 if __name__ == '__main__':

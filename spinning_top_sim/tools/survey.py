@@ -26,7 +26,7 @@ from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.reader import LogMessage, LogReader
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.segment import Segment
+from spinning_top_sim.streams.path import Segment
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools import analysis, recorded_run
 from spinning_top_sim.tools.analysis import Attitudes, Measured, Reals

@@ -4,7 +4,7 @@
 import struct
 
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.live import LiveSimulation
 
 SECOND = 1_000_000_000
 MILLISECOND = 1_000_000
@@ -14,33 +14,44 @@ EPOCH_NS = 1_700_000_000 * SECOND
 def simulate(values=None, **more):
     """Return a simulation of these parameters; in keywords `__` stands for a dot."""
     dotted = {name.replace('__', '.'): value for name, value in more.items()}
-    return Simulation(parameters.checked({**(values or {}), **dotted}), EPOCH_NS)
+    return LiveSimulation(parameters.checked({**(values or {}), **dotted}), EPOCH_NS)
 
 
 def stream(simulation, topic):
     return next(stream for stream in simulation.streams if stream.topic == topic)
 
 
+def output(simulation, topic):
+    return next(one for one in simulation.outputs if one.stream.topic == topic)
+
+
 def record(simulation, *topics):
     """Record these streams, all where none is named, from now on: [(topic, t_ns, bytes)]."""
     taken, epoch_ns = [], simulation.epoch_ns
-    recorded = [one.topic for one in simulation.streams if not topics or one.topic in topics]
+    recorded = [one for one in simulation.streams if not topics or one.topic in topics]
 
-    def write(numbers, stamp_ns, messages, size):
-        assert size == sum(map(len, messages))
-        taken.extend((recorded[number], stamp_ns - epoch_ns, bytes(message))
-                     for number, message in zip(numbers, messages, strict=True))
+    def write(entries):
+        taken.extend((recorded[number].topic, stamp_ns - epoch_ns, message)
+                     for number, stamp_ns, message in entries)
 
-    simulation.log_to(write, [stream(simulation, topic) for topic in recorded])
+    simulation.log_to(write, recorded)
     return taken
+
+
+def play(simulation, until_ns, *topics):
+    """Return what the same run sends offline, in the order of blocks: [(topic, t_ns, bytes)]."""
+    streams = [one for one in simulation.streams if not topics or one.topic in topics]
+    return [(one.topic, t_ns, row.tobytes()) for block in simulation.play(streams, until_ns)
+            for one, times_ns, rows in block.parts
+            for t_ns, row in zip(times_ns.tolist(), rows, strict=True)]
 
 
 def publish(simulation, *topics):
     """Subscribe to these streams: [(topic, bytes)]."""
     taken = []
     for topic in topics:
-        stream(simulation, topic).publish = (
-            lambda message, topic=topic: taken.append((topic, bytes(message))))
+        output(simulation, topic).publish = (
+            lambda message, topic=topic: taken.append((topic, message)))
     return taken
 
 
@@ -74,6 +85,6 @@ def states_of(simulation):
 
 
 def messages_of(simulation):
-    """Count the messages that are encoded of each topic."""
-    return {one.topic: Counting(one, 'encode', lambda states, epoch_ns, times: len(times))
+    """Count the samples that are encoded of each topic."""
+    return {one.topic: Counting(one, 'encode', lambda samples, epoch_ns: len(samples.times))
             for one in simulation.streams}

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The one place where samples are computed: the solver steps, states are evaluated and encoded.
+
+A message depends on the parameters, the commands and its own time alone, never on the block that
+it is computed in.
+"""
+
+from collections.abc import Iterator, Sequence
+from functools import cache, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
+from spinning_top_sim.streams.path import Path
+from spinning_top_sim.streams.stream import Samples, Stream
+
+STEPS_IN_A_PIECE = 4
+NEVER_NS = 2 ** 63 - 1
+
+
+class Block(NamedTuple):
+    """
+    The messages of some streams after the block before and up to `until_ns`.
+
+    parts : of each stream that has any: the stream, the times (n,) [ns] of its messages, and the
+        messages as rows (n, size), valid until the next block
+    """
+
+    until_ns: int
+    parts: Sequence[tuple[Stream, NDArray[np.int64], NDArray[Any]]]
+
+
+def blocks(path: Path, streams: Sequence[Stream], epoch_ns: int, after_ns: int, until_ns: int, *,
+           span_ns: int, most_steps: int) -> Iterator[Block | None]:
+    """
+    Yield the messages of these streams after `after_ns` and up to `until_ns`, block by block.
+
+    Yields None between pieces of work of some 0.1 to 0.3 ms, so that the caller can interrupt it.
+
+    span_ns : longest time that a block covers [ns]
+    most_steps : most integration steps of a block; the block ends where they end
+
+    Raises IntegrationError behind the last block that can be computed.
+    """
+    end_ns = min(until_ns, LAST_STAMP_NS - epoch_ns)
+    while after_ns < end_ns:
+        block_end_ns = min(end_ns, after_ns + span_ns)
+        failure = None
+        try:
+            for _ in range(-(-most_steps // STEPS_IN_A_PIECE)):
+                if path.present.reach(block_end_ns, STEPS_IN_A_PIECE):
+                    break
+                yield None
+        except IntegrationError as error:
+            failure = error
+        block_end_ns = min(block_end_ns, path.present.reached_ns)
+        if block_end_ns > after_ns:
+            samples = cache(partial(Samples, path))     # once for all streams of one rate
+            parts = []
+            for stream in streams:
+                times = stream.times(after_ns, block_end_ns)
+                if times:
+                    parts.append((stream, *stream.encode(samples(times), epoch_ns)))
+                    yield None
+            yield Block(block_end_ns, parts)
+            after_ns = block_end_ns
+        if failure is not None:
+            raise failure
+    if end_ns < until_ns:
+        raise IntegrationError(f'the stamp {(epoch_ns + until_ns) / NANOSECONDS:.12g} s: must be '
+                               f'< {2 ** 31} s, in January 2038')

@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run: the parameters, the motion with its commands, and the samples of its streams."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import astuple
+from typing import Any
+
+import numpy as np
+
+from spinning_top_sim.physics.regimes import Description
+from spinning_top_sim.physics.states import States, relative_drift
+from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
+from spinning_top_sim.solvers.exact import MOST_TURNS
+from spinning_top_sim.solvers.propagator import propagate
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.blocks import Block, blocks
+from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
+from spinning_top_sim.streams.imu import Imu
+from spinning_top_sim.streams.intervals import LONGEST_NS
+from spinning_top_sim.streams.path import SHORTEST_RUN_NS, Path, Segment
+from spinning_top_sim.streams.stream import Stream
+from spinning_top_sim.streams.topics import ImuStream, all_streams
+
+# Steps that the first nanosecond of a motion may take, and those of a block offline, so that the
+# interpolants of these stay in the cache.
+FIRST_STEPS, OFFLINE_STEPS = 500, 2000
+# Offline, a block has so many bytes, but covers no more time than this, for the sake of progress;
+# nor are there more blocks than this.
+OFFLINE_BYTES, LONGEST_OFFLINE_NS, MOST_BLOCKS = 1 << 20, 100 * NANOSECONDS, 20_000
+# Turns a second whose phases doubles hold for the shortest run.
+MOST_RATE = MOST_TURNS / SHORTEST_RUN_NS * NANOSECONDS
+
+
+class PoleError(ValueError):
+    """A command that is impossible with the axis at a pole, where Lz must be L3 or -L3."""
+
+
+class Simulation:
+    """
+    One top in motion.  Times are integer nanoseconds since the start.
+
+    values : checked parameters of the run, as it started
+    top : the top that they describe
+    streams : every stream, whether it is switched on or not
+    path : the motion
+    now_ns : every sample up to here is done (-1: not even that of t = 0)
+    history : what was applied since the start: commands as (t_ns, l3, lz), states that were set as
+        t_ns and the fields of `State`, changes of `imu.rate` as (t_ns, rate)
+    version : changes with all that makes samples after `now_ns` other ones
+
+    Raises ValueError where there is no motion from the start state.
+    """
+
+    def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
+        self.version = 0
+        self._steps_before = self._evaluations_before = 0
+        self._epoch_ns = epoch_ns
+        self._load(values)
+
+    def restart(self, values: Mapping[str, Any]) -> None:
+        """
+        Go back to the start state of these parameters; counts of steps and stamps go on.
+
+        Raises ValueError where there is no motion from there; then the present one goes on.
+        """
+        counts = self.steps, self.evaluations
+        self._load(values)
+        self._steps_before, self._evaluations_before = counts
+
+    def _load(self, values: Mapping[str, Any]) -> None:
+        # Whatever may be refused comes first, before anything changes.
+        for stamp_ns in (self._epoch_ns,
+                         self._epoch_ns + round(values['duration'] * NANOSECONDS)):
+            if not 0 <= stamp_ns <= LAST_STAMP_NS:
+                raise ValueError(f'the stamp {stamp_ns / NANOSECONDS:.12g} s: must be >= 0 and '
+                                 f'< {2 ** 31} s, in January 2038')
+        top, start = parameters.top_of(values), parameters.start_state(values)
+        segment = _segment(top, start, 0, values)
+        streams = all_streams(values)
+        self.values, self.top, self.streams = dict(values), top, streams
+        self.history: list[tuple[int, *tuple[float, ...]]] = []
+        self.now_ns = -1
+        # The trace of the markers, and intervals of the IMU, reach back across commands.
+        trace_ns = round(values['markers.trace_length'] * NANOSECONDS)
+        self.path = Path(segment, keep_ns=max(trace_ns, LONGEST_NS),
+                         keep_steps_ns=self.imu.intervals.keep_ns)
+        self.version += 1
+
+    @property
+    def imu(self) -> Imu:
+        """The ideal IMU, which all streams of the IMU share."""
+        return next(stream.imu for stream in self.streams if isinstance(stream, ImuStream))
+
+    @property
+    def segment(self) -> Segment:
+        """The motion since the last command."""
+        return self.path.present
+
+    @property
+    def l3(self) -> float:
+        """L3 as last commanded [kg m^2/s]."""
+        return self.segment.l3
+
+    @property
+    def lz(self) -> float:
+        """Lz as last commanded [kg m^2/s]."""
+        return self.segment.lz
+
+    @property
+    def epoch_ns(self) -> int:
+        """Stamp of t = 0 [ns]."""
+        return self._epoch_ns
+
+    @epoch_ns.setter
+    def epoch_ns(self, epoch_ns: int) -> None:
+        self._epoch_ns = epoch_ns
+        self.version += 1
+
+    @property
+    def steps(self) -> int:
+        """Integration steps taken so far."""
+        return self._steps_before + self.segment.solver.steps
+
+    @property
+    def evaluations(self) -> int:
+        """Evaluations of the right-hand side so far."""
+        return self._evaluations_before + self.segment.solver.evaluations
+
+    def state(self) -> States:
+        """Return the state (n = 1) at `now_ns`, or at the start before the first sample."""
+        return self.segment.states(self._now())
+
+    def _now(self) -> range:
+        now_ns = max(self.now_ns, self.segment.start_ns)
+        return range(now_ns, now_ns + 1)
+
+    @property
+    def energy_drift(self) -> float:
+        """The energy's relative drift since the segment began, absolute where it was 0."""
+        return float(relative_drift(self.state().energy, self.segment.energy)[0])
+
+    @property
+    def orientation_error(self) -> float:
+        """The angle between the present attitude and the exact one [rad]; NaN: not known."""
+        return float(self.segment.orientation_error(self.state(), self._now())[0])
+
+    def describe(self) -> Description | None:
+        """Return the present motion in numbers; None where the closed form cannot hold it."""
+        exact = self.segment.exact
+        return None if exact is None else exact.describe()
+
+    def play(self, streams: Sequence[Stream], until_ns: int) -> Iterator[Block]:
+        """
+        Move on to `until_ns`; yield the messages of these streams on the way, block by block.
+
+        `now_ns` is the end of the block that is yielded.  Raises IntegrationError behind the last
+        block if the motion does not go on.
+        """
+        bytes_per_ns = sum(stream.size / stream.period_ns for stream in streams)
+        span_ns = max(1, int(OFFLINE_BYTES / max(bytes_per_ns,
+                                                 OFFLINE_BYTES / LONGEST_OFFLINE_NS)),
+                      (until_ns - self.now_ns) // MOST_BLOCKS)
+        for block in blocks(self.path, streams, self._epoch_ns, self.now_ns, until_ns,
+                            span_ns=span_ns, most_steps=OFFLINE_STEPS):
+            if block is not None:
+                self.now_ns = block.until_ns
+                yield block
+                self.path.release(self.now_ns)
+
+    def skip_to(self, t_ns: int) -> None:
+        """Take the samples up to this time as done, and those after it as not done."""
+        self.now_ns = t_ns
+
+    def apply(self, changes: Mapping[str, Any]) -> None:
+        """Take over new values of the parameters in `Stream.at_once`, after `now_ns`."""
+        imu, rate = self.imu, changes.get('imu.rate')
+        if rate is not None and imu.set_rate(rate, max(self.now_ns, 0)):
+            self.path.keep_steps_ns = imu.intervals.keep_ns
+            self.history.append((max(self.now_ns, 0), rate))
+        for stream in self.streams:
+            stream.apply(changes)
+        self.version += 1
+
+    def command(self, l3: float, lz: float) -> None:
+        """
+        Let L3 and Lz jump now [kg m^2/s]: an impulsive torque.  Angles and theta' stay.
+
+        Raises ValueError naming what is off, at a pole PoleError; the motion goes on unchanged.
+        """
+        for name, value in (('l3', l3), ('lz', lz)):
+            if not math.isfinite(value):
+                raise ValueError(f'{name} = {value!r} kg m^2/s: must be finite')
+        self._settle()
+        now = self.state()
+        theta = float(now.theta[0])
+        pole = pole_momentum(abs(theta), l3)
+        if pole is not None and lz != pole:
+            raise PoleError(
+                f'lz = {lz!r} kg m^2/s with l3 = {l3!r}: the axis is at a pole (theta = '
+                f'{theta!r} rad), where lz must equal {pole!r}; command both together')
+        self._go_on_from(ContinuedState(
+            theta=theta, theta_dot=float(now.theta_dot[0]), phi=float(now.phi[0]),
+            psi=float(now.psi[0]), l3=l3, lz=lz))
+        self.history.append((self.now_ns, l3, lz))
+
+    def set_state(self, state: State) -> None:
+        """
+        Let the top be in another state from now on; the simulated time goes on.
+
+        Raises ValueError if no motion begins there; then the present one goes on unchanged.
+        """
+        self._settle()
+        self._go_on_from(state)
+        self.history.append((self.now_ns, *astuple(state)))
+
+    def _settle(self) -> None:
+        """Let the solver reach `now_ns`, and be at t = 0 at least."""
+        self.now_ns = max(self.now_ns, 0)
+        while not self.segment.reach(self.now_ns, OFFLINE_STEPS):
+            pass
+
+    def _go_on_from(self, start: State) -> None:
+        segment = _segment(self.top, start, self.now_ns, self.values)
+        self._steps_before, self._evaluations_before = self.steps, self.evaluations
+        self.path.go_on_with(segment)
+        self.version += 1
+
+
+def _segment(top: Top, start: State, start_ns: int, values: Mapping[str, Any]) -> Segment:
+    """Return the motion from a start.  Raises ValueError if its first nanosecond shows none."""
+    try:
+        solver = propagate(top, start, method=values['solver.method'],
+                           equations=values['solver.equations'], rtol=values['solver.rtol'],
+                           atol=values['solver.atol'])
+        with np.errstate(over='ignore', invalid='ignore'):
+            segment = Segment(solver, start, start_ns)
+        if not math.isfinite(segment.energy):
+            raise ValueError(f'the energy would be {segment.energy!r} J')
+        if not segment.reach(start_ns + 1, FIRST_STEPS):
+            raise ValueError(f'it turns too fast: over {FIRST_STEPS} steps a nanosecond')
+        spin = abs(start.l3) / top.lambda3 / math.tau
+        if spin > MOST_RATE:
+            raise ValueError(f'it turns too fast: {spin:.3g} times a second, must be at most '
+                             f'{MOST_RATE:.2g}')
+        if solver.ns_limit < SHORTEST_RUN_NS:
+            raise ValueError(f'it turns too fast: its phases are known for '
+                             f'{solver.ns_limit / NANOSECONDS:.3g} s, must be for '
+                             f'{SHORTEST_RUN_NS / NANOSECONDS:g} s')
+    except (ArithmeticError, RuntimeError, ValueError) as error:
+        raise ValueError(f'no motion from theta = {start.theta!r} rad, theta_dot = '
+                         f'{start.theta_dot!r} rad/s with l3 = {start.l3!r}, lz = {start.lz!r} '
+                         f'kg m^2/s, for {top}: {error}') from error
+    return segment

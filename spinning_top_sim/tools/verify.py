@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The comparison of a log with the computation of its run, byte by byte."""
+
+import math
+import operator
+import re
+import struct
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.recording import provenance
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.streams import journal
+from spinning_top_sim.streams.stream import Stream
+from spinning_top_sim.tools.recorded_run import (
+    DepartureError,
+    RunDescription,
+    field_names,
+    rerun,
+)
+
+
+class Difference(NamedTuple):
+    """A place where a log and the computation differ."""
+
+    stamp_ns: int                         # log time of the message [ns]
+    topic: str
+    field: str                            # name of the field, or what else is different
+    logged: str                           # its two values
+    computed: str
+    byte: int | None = None               # None where one of them has no such message
+
+
+@dataclass
+class Verdict:
+    """The result of a comparison."""
+
+    compared: dict[str, int]              # messages that both have, by topic
+    different: int = 0                    # how many of these differ
+    missing: int = 0                      # messages that were computed and are not in the log
+    unexpected: int = 0                   # messages that are in the log and were not computed
+    first: Difference | None = None       # the earliest of all these
+    stopped: str = ''                     # why the run could not be computed to its end
+    warnings: list[str] = field(default_factory=list)       # of another version or machine
+
+    @property
+    def identical(self) -> bool:
+        """Whether the messages in the log are those computed."""
+        return not (self.different or self.missing or self.unexpected or self.stopped)
+
+    def note(self, this: Difference) -> None:
+        """Keep a difference if it is the earliest so far."""
+        self.first = min(self.first or this, this, key=operator.attrgetter('stamp_ns'))
+
+
+def verify(reader: LogReader, run: RunDescription, end_ns: int,
+           show: Callable[[int], None]) -> Verdict:
+    """Compute a run again up to a log time, and compare; `show` takes the one reached [ns]."""
+    commands = run.commands_topic
+    verdict = Verdict({topic: 0 for topic in (*run.topics.values(), commands)
+                       if topic is not None}, warnings=_warnings(run))
+    for stamp_ns, reason in run.broken:
+        verdict.different += 1
+        verdict.note(Difference(stamp_ns, run.events_topic or '', 'entry', reason, 'an entry'))
+    # What has not been met in the log, by stamp and topic: several commands may have the same.
+    computed: defaultdict[tuple[int, str], deque[tuple[Stream | None, bytes]]] = defaultdict(deque)
+
+    def take(stream: Stream, stamps_ns: NDArray[np.int64], rows: NDArray[np.uint8]) -> None:
+        for stamp_ns, row in zip(stamps_ns.tolist(), rows, strict=True):
+            computed[stamp_ns, run.topics[stream.topic]].append((stream, row.tobytes()))
+
+    def computing() -> Iterator[float]:
+        """Compute the run; yield the log times before which all is computed, at last infinity."""
+        try:
+            for simulation, event in rerun(run, end_ns, take):
+                if commands is not None and event is not None and event.name == 'command':
+                    computed[event.stamp_ns, commands].append(
+                        (None, journal.command(event.details['l3'], event.details['lz'])))
+                reached_ns = simulation.epoch_ns + simulation.now_ns
+                show(reached_ns)
+                # Not up to it: another command at this very time may follow.
+                yield reached_ns
+        except DepartureError as error:
+            verdict.stopped = str(error)
+        yield math.inf
+
+    def miss(before_ns: float) -> None:
+        """Count what the log, which is read in the order of time, does not have before a time."""
+        for key in [key for key in computed if key[0] < before_ns]:
+            verdict.missing += len(computed.pop(key))
+            verdict.note(Difference(*key, 'message', 'no such message', 'there'))
+
+    progress, before_ns = computing(), -math.inf
+    for message in reader.messages(topics=verdict.compared):
+        while message.log_time >= before_ns:
+            before_ns = next(progress)
+            miss(message.log_time)
+        key = message.log_time, message.topic
+        if key in computed:
+            stream, expected = computed[key].popleft()
+            if not computed[key]:
+                del computed[key]
+            verdict.compared[message.topic] += 1
+            if message.data != expected:
+                verdict.different += 1
+                verdict.note(_difference(key, stream, message.data, expected))
+        else:
+            verdict.unexpected += 1
+            verdict.note(Difference(*key, 'message', 'there', 'no such message'))
+    for _ in progress:
+        miss(math.inf)
+    miss(math.inf)
+    return verdict
+
+
+def _difference(key: tuple[int, str], stream: Stream | None, logged: bytes,
+                computed: bytes) -> Difference:
+    """Return the first difference of two messages."""
+    sizes = len(logged), len(computed)
+    if sizes[0] != sizes[1]:
+        return Difference(*key, 'size', f'{sizes[0]} bytes', f'{sizes[1]} bytes', min(sizes))
+    at = next(at for at in range(sizes[0]) if logged[at] != computed[at])
+    place = None if stream is None else stream.template.field_at(at)
+    if stream is None or place is None:
+        return Difference(*key, f'byte {at}', f'0x{logged[at]:02x}', f'0x{computed[at]:02x}', at)
+    number, element, start = place
+    if number < 0:
+        what, code, text = 'header.stamp', '<iI', '{}.{:09d}'
+    else:
+        names = field_names(stream)
+        what = f'{names[number] if names else f"array {number}"}[{element}]'
+        code, text = '<d', '{!r}'
+    one, two = (text.format(*struct.unpack_from(code, data, start)) for data in (logged, computed))
+    return Difference(*key, what, one, two, at)
+
+
+def _warnings(run: RunDescription) -> list[str]:
+    """Return the differences of this machine from that of the recording."""
+    now, found = provenance.surroundings(), []
+    for what, key, pattern in (('the version of spinning_top_sim', 'version', '.*'),
+                               ('the platform', 'platform', '.*'),
+                               ('numpy', 'libraries', '"numpy": "[^"]*"')):     # only it computes
+        then, here = (''.join(re.findall(pattern, one[key])) for one in (run.surroundings, now))
+        if then != here:
+            found.append(f'{what} was {then}, is {here}')
+    return found
