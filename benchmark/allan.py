@@ -22,7 +22,7 @@ import report
 from cases import ROOT
 
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.tools.scene_file import read_scene
 
 RATE = 200.0

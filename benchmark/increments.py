@@ -23,7 +23,7 @@ import yaml
 from cases import ROOT
 
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.simulation import Simulation
 
 LONG = np.longdouble
 RATE = 200

@@ -33,7 +33,7 @@ from spinning_top_sim.recording.chunks import ZSTD_LEVEL
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.simulation import Simulation
 
 STREAMS = ('pose', 'joint_states', 'imu')
 TOPICS = ('pose', 'joint_states', 'imu/data_raw')

@@ -17,7 +17,7 @@ from helpers.reference import ROOT
 from mcap.reader import make_reader
 
 from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.tools import ensemble_part, ensemble_spec
 from spinning_top_sim.tools.ensemble import _manifest, _write_manifest, main
 from spinning_top_sim.tools.ensemble_part import (

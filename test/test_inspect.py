@@ -24,7 +24,7 @@ from mcap.writer import Writer
 from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.tools import analysis, cli, inspect, recover, simulate
 from spinning_top_sim.tools.recorded_run import read_run_description, verify
 from spinning_top_sim.tools.survey import Series, survey

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.tools.simulate import main
 
 HUGE, TINY = 1e300, 1e-300

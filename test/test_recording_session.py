@@ -21,7 +21,7 @@ from spinning_top_sim.nodes.simulator import Simulator
 from spinning_top_sim.recording import provenance, writer
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.tools import inspect
 
 EPOCH_NS = 1_700_000_000_000_000_000

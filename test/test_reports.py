@@ -18,7 +18,7 @@ from spinning_top_sim.nodes import reports
 from spinning_top_sim.nodes.reports import MotionReport
 from spinning_top_sim.nodes.tick_loop import TickLoop
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.simulation import Simulation
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from rosbags.highlevel import AnyReader
 
 from spinning_top_sim import solve
 from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools import cli, inspect
 from spinning_top_sim.tools.simulate import main

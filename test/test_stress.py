@@ -34,7 +34,7 @@ from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.propagator import propagate
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.simulation import Simulation
 
 TOPS = int(os.environ.get('STRESS_TOPS', '250'))
 

@@ -10,7 +10,7 @@ from spinning_top_sim.nodes.tick_loop import TickLoop
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.simulation import Simulation
 
 TICK_NS = 5_000_000             # 200 Hz
 POSE_NS = 10_000_000

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim.physics.top import Shape
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.topics import JOINTS, JointStates, Pose
 from spinning_top_sim.tools import urdf
 

@@ -21,7 +21,7 @@ from spinning_top_sim.nodes import throttle
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.view.track import Track
 
 VIEW = ('-m', 'spinning_top_sim.view.command', '--no-browser', '--port', '0')

@@ -18,7 +18,7 @@ from sensor_msgs.msg import Imu, JointState
 from helpers.node_harness import LIFETIME_S
 from helpers.simulations import record
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.pipeline import Simulation
+from spinning_top_sim.streams.simulation import Simulation
 
 SECOND = 1_000_000_000
 KINDS = {'pose': PoseStamped, 'joint_states': JointState, 'imu/data_raw': Imu,
