@@ -22,10 +22,10 @@ from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.serialization import deserialize_message, serialize_message  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import Imu, JointState, MagneticField  # noqa: E402
+from spinning_top_sim.streams.pipeline import Simulation  # noqa: E402
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String  # noqa: E402
 
 from spinning_top_sim.streams import messages, parameters  # noqa: E402
-from spinning_top_sim.streams.pipeline import Simulation  # noqa: E402
 
 SECOND = 1_000_000_000
 STAMPS = (0, 1, SECOND - 1, SECOND, 1_700_000_000 * SECOND + 123_456_789, -1, -SECOND,

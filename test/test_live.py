@@ -1,0 +1,747 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The simulation without ROS: what is sent depends on the parameters and the commands alone."""
+
+import gc
+import itertools
+import math
+import random
+import sys
+import tracemalloc
+import weakref
+
+import numpy as np
+import pytest
+from helpers.simulations import (
+    EPOCH_NS,
+    MILLISECOND,
+    SECOND,
+    Counting,
+    doubles,
+    messages_of,
+    output,
+    play,
+    publish,
+    record,
+    simulate,
+    states_of,
+    stream,
+    times,
+)
+
+from spinning_top_sim import solve
+from spinning_top_sim.solvers import exact, rk45
+from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.solvers.propagator import Propagator
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams import simulation as simulations
+from spinning_top_sim.streams.live import (
+    LARGEST_BLOCK,
+    LONGEST_BLOCK_NS,
+    MOST_STEPS,
+    SMALLEST_BLOCK,
+)
+
+PERIOD_NS = 10 * MILLISECOND        # of most streams
+METHODS = pytest.mark.parametrize('method', ['rk45', 'exact'])
+# Everything that a sample may depend on: noise, means, intervals, lost and repeated messages.
+EVERYTHING = {
+    'imu.gyroscope_noise_density': 0.001, 'imu.accelerometer_random_walk': 0.01,
+    'imu.lever_arm': (0.1, 0.0, 0.2), 'imu.rpy': (0.1, 0.2, 0.3), 'imu.sampling': 'mean',
+    'imu.drop_rate': 0.1, 'imu.duplicate_rate': 0.1, 'imu.stamp_jitter': 1e-4}
+THROUGH_A_POLE = {'initial.theta': 0.5, 'initial.theta_dot': -3.0, 'spin.l3': 0.2,
+                  'spin.lz': -0.2}
+
+
+# ------------------------------------------------------------------------------ what is sent
+
+@METHODS
+def test_live_and_offline_send_the_same_however_ticks_fall(method):
+    """With commands, a state that is set and changes of rates, and whatever is computed ahead."""
+    changes = [(123_456_789, lambda one: one.command(2.0, 1.5)),
+               (200 * MILLISECOND, lambda one: one.apply({'imu.rate': 333.0, 'pose.rate': 77.0})),
+               (201 * MILLISECOND, lambda one: one.command(-1.0, 0.5)),
+               (500 * MILLISECOND, lambda one: one.set_state(
+                   parameters.start_state(parameters.checked({'initial.theta': 1.0})))),
+               (SECOND, lambda one: None)]
+    offline, live, dice = (*(simulate(EVERYTHING, solver__method=method) for _ in range(2)),
+                           random.Random(3))
+    expected, taken = [], record(live)
+    for t_ns, change in changes:
+        expected += play(offline, t_ns)
+        change(offline)
+        while live.now_ns < t_ns:
+            live.advance(min(live.now_ns + dice.randrange(1, 30 * MILLISECOND), t_ns))
+            live.prepare(live.now_ns + dice.randrange(50 * MILLISECOND),
+                         dice.choice((None, 0, 100_000)))
+        change(live)
+    assert live.history == offline.history and len(live.history) == 4
+    topics = [one.topic for one in live.streams]
+    assert taken == sorted(expected, key=lambda message: (message[1], topics.index(message[0])))
+    assert len(taken) > 2500
+
+
+def test_samples_are_on_the_grid_and_in_order_of_time():
+    simulation = simulate()
+    taken = record(simulation)
+    simulation.advance(2 * SECOND)
+    all_times = [t_ns for _, t_ns, _ in taken]
+    assert all_times == sorted(all_times)
+    for one in simulation.streams:
+        period = round(SECOND / parameters.checked({})[one.rate_parameter])
+        assert times(taken, one.topic) == list(range(0, 2 * SECOND + 1, period))
+
+
+def test_a_log_gets_what_is_due_in_one_call_before_anybody_else():
+    """Also where publishing fails, as when a signal takes the context away."""
+    undisturbed = simulate()
+    expected = record(undisturbed)
+    undisturbed.advance(SECOND)
+    simulation, calls = simulate(), []
+    simulation.log_to(calls.append, simulation.streams)
+
+    def fail(data):
+        if simulation.now_ns >= SECOND // 3:
+            raise RuntimeError('the context is gone')
+
+    output(simulation, 'joint_states').publish = fail
+    with pytest.raises(RuntimeError, match='gone'):
+        for tick in range(1, 11):
+            simulation.advance(tick * SECOND // 10)
+    assert len(calls) == 4
+    taken = [(simulation.streams[number].topic, stamp_ns - EPOCH_NS, message)
+             for number, stamp_ns, message in itertools.chain(*calls)]
+    assert taken == [entry for entry in expected if entry[1] <= 4 * SECOND // 10]
+    assert simulation.now_ns == taken[-1][1]
+    simulation.log_to(calls.append, ())
+    output(simulation, 'joint_states').publish = None
+    simulation.advance(2 * SECOND)
+    assert len(calls) == 4 and not any(one.is_used for one in simulation.outputs)
+
+
+def test_the_energy_of_a_hanging_top_drifts_upwards_where_it_grows():
+    """The drift is over the magnitude of an energy that is below 0."""
+    simulation = simulate(initial__theta=2.8, spin__l3=0.1, spin__lz=-0.05,
+                          solver__equations='euler', solver__rtol=1e-4, solver__atol=1e-4)
+    taken = play(simulation, 20 * SECOND, '~/invariants')
+    energies, drifts = np.array([doubles(data, 8) for _, _, data in taken])[:, [0, 3]].T
+    assert energies[0] < -2.0 and simulation.segment.energy == energies[0]
+    assert abs(drifts[-1]) > 1e-5
+    assert drifts == pytest.approx((energies - energies[0]) / -energies[0], rel=1e-9, abs=1e-15)
+    assert simulation.energy_drift == drifts[-1]
+
+
+# -------------------------------------------------------------------------------- giving way
+
+def test_giving_way_in_a_long_integration_loses_nothing_and_leaves_a_state_to_read():
+    """A wheel so fast that a sample takes thousands of steps; ticks end in their midst."""
+    fast = {'spin.l3': 1e4, 'joint_states.rate': 500.0}
+    expected = play(simulate(fast), 6_000_000, 'joint_states')
+    broken = simulate(fast)
+    taken = record(broken, 'joint_states')
+    start, found, steps = parameters.start_state(broken.values), [], [broken.steps]
+    while not broken.advance(6_000_000, give_way=lambda: True):
+        steps.append(broken.steps)
+        state = broken.state()
+        assert abs(broken.energy_drift) <= 1e-14
+        assert abs(state.l3[0] / 1e4 - 1.0) <= 1e-14
+        found.append((broken.now_ns * 1e-9, state.theta[0], state.phi[0], state.psi[0]))
+    assert broken.steps > 5000 and max(np.diff(steps)) <= MOST_STEPS
+    assert found[-1][0] <= 6e-3 and all(a[0] < b[0] for a, b in itertools.pairwise(found))
+    t, *angles = zip(*found, strict=True)
+    there = solve(broken.top, start, np.array(t))
+    assert np.transpose(angles) == pytest.approx(
+        np.column_stack((there.theta, there.phi, there.psi)), abs=1e-8)
+    assert taken == expected
+
+
+def test_without_listeners_steps_are_forgotten_but_for_an_interval_of_the_imu():
+    simulation = simulate(spin__l3=1e4, imu__rate=1e4)
+    while not simulation.advance(2_000_000, give_way=lambda: True):
+        simulation.state()
+        # Steps are 2 us long; a block has 256 of them.
+        assert simulation.now_ns / SECOND - 7e-4 < simulation.segment.solver._kept[0].t0
+    assert simulation.now_ns == 2_000_000
+
+
+def test_a_command_in_the_midst_of_a_long_integration_is_taken():
+    simulation = simulate(spin__l3=1e4)
+    taken = record(simulation, 'joint_states')
+    assert not simulation.advance(SECOND, give_way=lambda: simulation.steps > 800)
+    simulation.command(1.0, 0.5)
+    assert simulation.now_ns == simulation.history[-1][0] > 0
+    simulation.advance(SECOND)
+    assert times(taken, 'joint_states') == list(range(0, SECOND + 1, PERIOD_NS))
+
+
+# -------------------------------------------------------------------------- nothing for nobody
+
+def test_without_a_sink_nothing_is_encoded_and_the_solver_is_not_sampled():
+    simulation = simulate()
+    encoded, states = messages_of(simulation), states_of(simulation)
+    for tick in range(1, 101):
+        simulation.advance(tick * PERIOD_NS)
+        simulation.prepare((tick + 1) * PERIOD_NS)
+    assert simulation.now_ns == SECOND
+    assert states.count == 0
+    assert {counted.count for counted in encoded.values()} == {0}
+    assert all(one.sent == one.skipped == 0 for one in simulation.outputs)
+
+
+@pytest.mark.parametrize('topic', ['pose', '/clock'])
+def test_a_sample_of_a_stream_with_a_sink_is_encoded_once_for_all_its_sinks(topic):
+    simulation = simulate()
+    encoded, states = messages_of(simulation), states_of(simulation)
+    simulation.advance(SECOND)
+    published, recorded = publish(simulation, topic), record(simulation, topic)
+    simulation.advance(2 * SECOND)
+    assert encoded.pop(topic).count == len(published) == len(recorded) == 100
+    assert all(a is b for (_, a), (_, _, b) in zip(published, recorded, strict=True))
+    assert states.count == (0 if topic == '/clock' else 100)
+    assert all(counted.count == 0 for counted in encoded.values())
+
+
+@METHODS
+def test_streams_of_one_rate_share_the_states(method):
+    simulation = simulate(solver__method=method)
+    taken = record(simulation, 'pose', 'joint_states', 'ground_truth/odom')
+    states = states_of(simulation)
+    simulation.advance(SECOND)
+    assert len(taken) == 3 * 101
+    assert states.count == 101
+
+
+@METHODS
+def test_a_column_that_nobody_needs_is_not_computed(method, monkeypatch):
+    """A pose needs no angle and no rate, joints no body rate, odometry no angle."""
+    computed = set()
+    samples = {'rk45': rk45._TransportStates, 'exact': exact._ExactStates}[method]
+
+    def watch(name):
+        original = getattr(samples, name)
+        compute = original.fget if isinstance(original, property) else original.func
+        monkeypatch.setattr(samples, name, property(
+            lambda self: (computed.add(name), compute(self))[1]))
+
+    watch('angles')
+    watch('transverse_velocity')
+    for topic, needed in (('pose', set()), ('joint_states', {'angles'}),
+                          ('ground_truth/odom', {'transverse_velocity'})):
+        simulation = simulate(solver__method=method)
+        computed.clear()
+        assert len(play(simulation, SECOND, topic)) == 101
+        assert computed == needed, topic
+
+
+def test_equilibria_and_free_motion_take_no_steps():
+    for values in ({'initial.theta': 0.0, 'spin.l3': 3.0}, {'top.gravity': 0.0, 'spin.lz': 0.2}):
+        simulation = simulate(values)
+        assert play(simulation, SECOND, 'pose')
+        assert simulation.steps == simulation.evaluations == 0, values
+
+
+@METHODS
+def test_a_solver_needs_the_members_of_the_protocol_and_no_others(method, monkeypatch):
+    """Nobody asks what kind of solver it is: a foreign one with these members does as well."""
+    members = {name for name in (*vars(Propagator), *Propagator.__annotations__)
+               if not name.startswith('_')}
+
+    class Foreign:
+        def __init__(self, solver):
+            self._solver = solver
+
+        def __getattr__(self, name):
+            assert name in members, name
+            return 10 ** 16 if name == 'ns_limit' and limited else getattr(self._solver, name)
+
+    topics = [one.topic for one in simulate().streams if one.topic != '~/invariants']
+    expected = play(simulate(solver__method=method), SECOND, *topics)
+    propagate = simulations.propagate
+    monkeypatch.setattr(simulations, 'propagate', lambda *args, **more: Foreign(
+        propagate(*args, **more)))
+    limited = False
+    simulation = simulate(solver__method=method)
+    assert play(simulation, SECOND, *topics) == expected
+    assert simulation.orientation_error <= 1e-9 and simulation.describe().name == 'cusps'
+    limited = True
+    with pytest.raises(ValueError, match='turns too fast'):
+        simulate(solver__method=method)
+
+
+@pytest.mark.parametrize('ahead', [False, True])
+def test_ticks_leave_nothing_behind(ahead):
+    """
+    Blocks of memory in use do not become more, whoever listens, however long it runs.
+
+    The interpreter's and numpy's own caches take blocks too, up to some 150 and then no more: how
+    fast depends on what ran before in the process.  What a tick leaves behind, every round shows.
+    """
+    simulation = simulate(solver__method='exact')
+    # One by one, increments take milliseconds.
+    used = [one for one in simulation.outputs if ahead or one.stream.parameter != 'increments']
+    for one in used:
+        one.publish = len
+    simulation.log_to(lambda entries: None, [one.stream for one in used])
+
+    def run(ticks):
+        for _ in range(ticks):
+            simulation.advance(simulation.now_ns + 5 * MILLISECOND)
+            if ahead:
+                simulation.prepare(simulation.now_ns + MILLISECOND)
+        gc.collect()
+        return sys.getallocatedblocks()
+
+    run(200)
+    in_use = [run(64) for _ in range(9)]
+    assert min(np.diff(in_use)) < 8
+
+
+def test_a_tick_allocates_little():
+    """The most that is in use at a time during a tick, over that between two: a few states."""
+    simulation = simulate(imu__rate=1000.0, pose__rate=1000.0, joint_states__rate=1000.0)
+    for topic in ('pose', 'joint_states', 'imu/data_raw'):
+        output(simulation, topic).publish = len
+    for tick in range(1, 101):
+        simulation.advance(tick * MILLISECOND)
+    tracemalloc.start()
+    try:
+        most = 0
+        for tick in range(101, 201):
+            before, _ = tracemalloc.get_traced_memory()
+            tracemalloc.reset_peak()
+            simulation.advance(tick * MILLISECOND)
+            most = max(most, tracemalloc.get_traced_memory()[1] - before)
+    finally:
+        tracemalloc.stop()
+    assert 500 < most < 16_000
+
+
+def test_a_run_that_ends_is_freed_without_a_search_for_cycles():
+    simulation = simulate()
+    publish(simulation, 'pose')
+    simulation.advance(SECOND)
+    simulation.prepare(2 * SECOND, budget_ns=0)
+    segment = weakref.ref(simulation.segment)
+    gc.disable()
+    try:
+        del simulation
+        assert segment() is None
+    finally:
+        gc.enable()
+
+
+# ---------------------------------------------------------------------------- computing ahead
+
+def test_blocks_ahead_begin_small_and_double_until_the_next_command():
+    simulation = simulate(pose__rate=10_000.0)
+    encoded = messages_of(simulation)['pose']
+    publish(simulation, 'pose')
+    simulation.advance(0)
+
+    def sizes(number):
+        found = []
+        for _ in range(number):
+            before = encoded.count
+            assert simulation.prepare(simulation.computed_ns + 1)
+            found.append(encoded.count - before)
+        return found
+
+    growing = [SMALLEST_BLOCK * 2 ** k for k in range(5)]
+    assert growing[-1] == LARGEST_BLOCK
+    assert sizes(7) == [*(size - 1 for size in growing), LARGEST_BLOCK - 1, LARGEST_BLOCK - 1]
+    simulation.command(2.0, 1.5)
+    simulation.advance(0)
+    assert sizes(1) == [SMALLEST_BLOCK - 1]
+
+
+def test_a_block_is_bounded_in_time_and_in_samples():
+    simulation = simulate(pose__rate=1000.0)
+    publish(simulation, '~/invariants')
+    simulation.advance(0)
+    simulation.prepare(1)
+    assert simulation.computed_ns == LONGEST_BLOCK_NS
+    publish(simulation, 'pose')
+    assert not simulation.advance(60 * SECOND, give_way=lambda: True)
+    assert simulation.now_ns == (LARGEST_BLOCK - 1) * MILLISECOND
+
+
+@pytest.mark.parametrize('values', [{}, {'solver__method': 'exact'}])
+def test_a_block_without_time_goes_on_with_the_next_call(values):
+    simulation = simulate(**values)
+    taken = record(simulation, 'pose', 'joint_states')
+    simulation.advance(0)
+    calls = 1
+    while not simulation.prepare(SECOND // 10, budget_ns=0):
+        assert simulation.computed_ns == 0, 'nothing is ready before all is'
+        calls += 1
+    assert 2 < calls < 100
+    assert simulation.prepare(SECOND // 10, budget_ns=0), 'there is nothing left to do'
+    states = states_of(simulation)
+    simulation.advance(SECOND // 10)
+    assert (states.count, len(taken)) == (0, 22)
+
+
+def test_a_tick_that_finds_a_block_under_way_finishes_it():
+    simulation = simulate(pose__rate=1000.0)
+    taken = record(simulation, 'pose')
+    simulation.advance(0)
+    states = states_of(simulation)
+    while states.count == 0:
+        assert not simulation.prepare(MILLISECOND, budget_ns=0)
+    simulation.advance(MILLISECOND)
+    simulation.advance((SMALLEST_BLOCK - 1) * MILLISECOND)
+    assert len(taken) == SMALLEST_BLOCK
+    assert states.count == SMALLEST_BLOCK - 1
+
+
+@METHODS
+def test_ticks_that_find_all_computed_compute_nothing(method):
+    simulation = simulate(pose__rate=1000.0, solver__method=method)
+    taken = record(simulation, 'pose')
+    simulation.advance(0)
+    simulation.prepare(MILLISECOND)
+    states, steps = states_of(simulation), Counting(simulation.segment.solver, 'reach')
+    for tick in range(1, SMALLEST_BLOCK):
+        simulation.advance(tick * MILLISECOND)
+        assert simulation.now_ns == tick * MILLISECOND
+        simulation.prepare((SMALLEST_BLOCK - 1) * MILLISECOND)
+    assert (states.count, steps.calls) == (0, 0)
+    assert len(taken) == SMALLEST_BLOCK
+    simulation.prepare(SMALLEST_BLOCK * MILLISECOND)
+    assert states.count == 2 * SMALLEST_BLOCK - 1
+
+
+def test_each_sample_is_computed_once_and_few_in_vain():
+    simulation = simulate(pose__rate=1000.0, joint_states__rate=500.0)
+    taken = record(simulation, 'pose', 'joint_states')
+    encoded, states = messages_of(simulation), states_of(simulation)
+    for tick in range(1, 1001):
+        simulation.advance(tick * MILLISECOND)
+        simulation.prepare((tick + 1) * MILLISECOND)
+    assert len(taken) == 1001 + 501
+    ahead = simulation.computed_ns // MILLISECOND - 1000
+    assert 0 < ahead <= LARGEST_BLOCK
+    assert encoded['pose'].count == 1001 + ahead
+    assert encoded['joint_states'].count <= 501 + ahead // 2
+    # All streams but those whose samples are the same instants ask for states of their own.
+    assert states.count <= encoded['pose'].count + encoded['joint_states'].count
+    assert states.calls <= 22
+
+
+@pytest.mark.parametrize('change', [
+    'command', 'rate', 'subscriber', 'no subscriber', 'recorder', 'restart', 'epoch', 'late'])
+def test_what_was_computed_ahead_is_dropped_when_it_no_longer_holds(change):
+    def run(ahead):
+        simulation = simulate(pose__rate=1000.0)
+        taken = []
+        pose, raw = output(simulation, 'pose'), output(simulation, 'imu/data_raw')
+        pose.publish = taken.append
+        simulation.advance(5 * MILLISECOND)
+        if ahead:
+            assert simulation.prepare(6 * MILLISECOND)
+            assert simulation.computed_ns == 20 * MILLISECOND
+        if change == 'command':
+            simulation.command(2.0, 1.5)
+        elif change == 'rate':
+            simulation.apply({'pose.rate': 300.0})
+        elif change == 'subscriber':
+            raw.publish = taken.append
+        elif change == 'no subscriber':
+            pose.publish = None
+        elif change == 'recorder':
+            simulation.log_to(taken.extend, [raw.stream, pose.stream])
+        elif change == 'restart':
+            simulation.restart(parameters.checked({'initial.theta': 1.0}))
+        elif change == 'epoch':
+            simulation.epoch_ns += 1
+        else:
+            simulation.advance(15 * MILLISECOND, publish_from_ns=10 * MILLISECOND)
+        if ahead:
+            simulation.prepare(30 * MILLISECOND)
+        for until in (30, 60):
+            simulation.advance(until * MILLISECOND)
+        return [entry if isinstance(entry, tuple) else bytes(entry) for entry in taken], (
+            pose.sent, pose.skipped)
+
+    taken, counts = run(True)
+    expected, expected_counts = run(False)
+    # A batch is recorded before it is published; how many samples it has differs.
+    assert sorted(map(repr, taken)) == sorted(map(repr, expected))
+    assert counts == expected_counts
+
+
+@pytest.mark.parametrize('l3', [1.6, 1e3])
+def test_however_far_is_computed_ahead_the_present_state_can_be_read(l3):
+    """Also where a tick takes many steps, and where the clock stands still meanwhile."""
+    simulation, beside = simulate(spin__l3=l3), simulate(spin__l3=l3)
+    record(simulation, 'pose', '~/invariants')
+    for tick in range(1, 25):
+        now = tick // 4 * MILLISECOND
+        simulation.advance(now)
+        simulation.prepare(now + 8 * MILLISECOND)
+        beside.advance(now)
+        assert simulation.now_ns == beside.now_ns == now
+        assert simulation.state().quaternion.tolist() == beside.state().quaternion.tolist()
+    assert simulation.steps > beside.steps
+
+
+# ----------------------------------------------------------------------- coming and being late
+
+def test_a_subscriber_gets_the_next_samples_of_the_grid_and_no_backlog():
+    simulation = simulate()
+    simulation.advance(SECOND + 3)
+    taken = publish(simulation, 'pose')
+    simulation.advance(2 * SECOND)
+    assert len(taken) == 100
+    output(simulation, 'pose').publish = None
+    simulation.advance(5 * SECOND)
+    again, recorded = publish(simulation, 'pose'), record(simulation, 'pose')
+    simulation.advance(5 * SECOND + PERIOD_NS)
+    assert again == [('pose', data) for _, _, data in recorded]
+    assert times(recorded, 'pose') == [5 * SECOND + PERIOD_NS]
+    assert len(taken) == 100
+
+
+@pytest.mark.parametrize('ahead', [False, True])
+def test_late_samples_are_recorded_and_counted_but_not_published(ahead):
+    simulation = simulate()
+    encoded = messages_of(simulation)
+    published = publish(simulation, 'pose', 'joint_states')
+    recorded = record(simulation, 'pose')
+    simulation.advance(0)
+    if ahead:
+        simulation.prepare(SECOND)
+    assert simulation.advance(10 * SECOND, publish_from_ns=9 * SECOND + 1)
+    assert times(recorded, 'pose') == list(range(0, 10 * SECOND + 1, PERIOD_NS))
+    for topic in ('pose', 'joint_states'):
+        assert [name for name, _ in published].count(topic) == 101
+        assert (output(simulation, topic).sent, output(simulation, topic).skipped) == (101, 900)
+    assert encoded['pose'].count == 1001
+    if not ahead:       # nobody takes the samples that are left out
+        assert encoded['joint_states'].count == 101
+
+
+def test_what_is_late_and_not_yet_left_out_is_published_when_the_clock_slips():
+    simulation = simulate()
+    published = publish(simulation, 'pose')
+    simulation.advance(0)
+    assert not simulation.advance(50 * SECOND, publish_from_ns=49 * SECOND, give_way=lambda: True)
+    begun_ns, pose = simulation.now_ns, output(simulation, 'pose')
+    assert 0 < begun_ns < 45 * SECOND and pose.skipped == begun_ns // PERIOD_NS
+    recorded = record(simulation, 'pose')
+    simulation.advance(50 * SECOND)
+    assert times(recorded, 'pose') == [
+        t_ns for t_ns in range(0, 50 * SECOND + 1, PERIOD_NS) if t_ns > begun_ns]
+    assert len(published) == pose.sent == 1 + len(recorded)
+
+
+def test_skipping_keeps_the_grid_of_any_rate():
+    simulation = simulate(pose__rate=333.0)
+    publish(simulation, 'pose')
+    simulation.advance(SECOND, publish_from_ns=SECOND // 2)
+    pose = output(simulation, 'pose')
+    assert (pose.sent, pose.skipped) == (167, 167)
+    taken = record(simulation, 'pose')
+    simulation.advance(2 * SECOND)
+    period = round(SECOND / 333.0)
+    assert times(taken, 'pose') == [
+        t for t in range(0, 2 * SECOND + 1, period) if t > SECOND]
+
+
+def test_lost_samples_move_no_target():
+    """The first sample of a block that is unfinished may be lost."""
+    simulation = simulate({'imu.drop_rate': 0.9})
+    published = publish(simulation, 'imu/data_raw')
+    simulation.advance(0)
+    for tick in range(1, 200):
+        simulation.prepare(5 * tick * MILLISECOND, budget_ns=0)
+        simulation.advance(5 * tick * MILLISECOND)
+        assert simulation.now_ns == 5 * tick * MILLISECOND
+    assert published
+
+
+# --------------------------------------------------------------------------- rates and commands
+
+@pytest.mark.parametrize(('before', 'after'), [(100.0, 33.0), (1.0, 1000.0), (10000.0, 10.0)])
+def test_a_change_of_rate_goes_on_on_the_new_grid(before, after):
+    simulation = simulate(pose__rate=before)
+    taken = record(simulation, 'pose')
+    changed_at = 123_456_789
+    simulation.advance(changed_at)
+    simulation.apply({'pose.rate': after})
+    simulation.advance(SECOND)
+    old, new = round(SECOND / before), round(SECOND / after)
+    expected = [*range(0, changed_at + 1, old),
+                *(t for t in range(0, SECOND + 1, new) if t > changed_at)]
+    assert times(taken, 'pose') == expected
+
+
+def test_a_change_of_rates_reaches_every_stream():
+    """A run is computed again by the parameters that `Stream.at_once` names."""
+    simulation = simulate()
+    at_once = {name for stream in simulation.streams for name in stream.at_once}
+    assert at_once == {name for name in parameters.BY_NAME if name.endswith('.rate')}
+    assert all(parameters.BY_NAME[name].effect is parameters.Effect.NOW for name in at_once)
+    simulation.advance(SECOND)
+    simulation.apply({**dict.fromkeys(at_once, 50.0), 'tick_rate': 100.0})
+    taken = record(simulation)
+    simulation.advance(2 * SECOND)
+    for one in simulation.streams:
+        assert times(taken, one.topic) == list(range(SECOND + 20 * MILLISECOND, 2 * SECOND + 1,
+                                                     20 * MILLISECOND)), one.topic
+    assert simulation.history == [(SECOND, 50.0)], 'the rate of the IMU'
+
+
+def test_a_command_keeps_the_angles_and_the_nutation_rate_and_sets_the_momenta():
+    simulation = simulate()
+    simulation.advance(777_777_777)
+    before = simulation.state()
+    simulation.command(2.0, -0.5)
+    after = simulation.state()
+    for name in ('theta', 'phi', 'psi'):
+        assert getattr(after, name) == pytest.approx(getattr(before, name), abs=1e-14)
+    assert after.theta_dot == pytest.approx(before.theta_dot, abs=1e-12)   # rtol is 1e-11
+    assert (simulation.l3, simulation.lz) == (2.0, -0.5)
+    assert (after.l3[0], after.lz[0]) == pytest.approx((2.0, -0.5), rel=1e-15)
+    assert simulation.history == [(777_777_777, 2.0, -0.5)]
+
+
+@pytest.mark.parametrize(('l3', 'lz', 'named'), [
+    (math.nan, 0.0, 'l3 = nan'), (0.0, math.inf, 'lz = inf'), (1e300, 1e300, '1e+300'),
+    (1e16, -1e16, '1e+16')])
+def test_a_refused_command_names_the_value_and_changes_nothing(l3, lz, named):
+    expected = play(simulate(), SECOND, 'pose')
+    simulation = simulate()
+    taken = record(simulation, 'pose')
+    simulation.advance(SECOND // 3)
+    momenta = simulation.l3, simulation.lz
+    with pytest.raises(ValueError, match=r'must be finite|no motion from') as refusal:
+        simulation.command(l3, lz)
+    assert named in str(refusal.value)
+    simulation.advance(SECOND)
+    assert taken == expected
+    assert (simulation.l3, simulation.lz) == momenta
+    assert simulation.history == []
+
+
+@pytest.mark.parametrize(('theta', 'sign'), [(0.0, 1.0), (math.pi, -1.0)])
+def test_at_a_pole_only_lz_of_the_pole_is_taken(theta, sign):
+    simulation = simulate(initial__theta=theta, spin__l3=3.0, spin__lz=sign * 3.0)
+    simulation.advance(SECOND)
+    for lz in (-sign * 2.0, 0.0, sign * 2.0000001):
+        with pytest.raises(ValueError, match=r'lz = .*pole'):
+            simulation.command(2.0, lz)
+    simulation.command(2.0, sign * 2.0)
+    assert simulation.lz == sign * 2.0
+
+
+def test_a_reference_stays_that_of_its_own_motion():
+    """It may be set up in another thread, while a command begins the next motion."""
+    simulation = simulate()
+    first = simulation.segment
+    simulation.command(2.0, 1.5)
+    assert first.exact.start.l3 == 1.6
+    assert simulation.segment.exact.start.l3 == 2.0
+    assert simulation.segment.exact is simulation.segment.exact
+
+
+def test_segments_are_forgotten_when_nothing_reaches_back_to_them():
+    """The trace of the markers has 3 s by default."""
+    simulation = simulate(solver__method='exact')
+    for tick in range(1, 101):
+        simulation.advance(tick * SECOND // 10)
+        simulation.command(1.6 + 0.001 * tick, 1.4)
+    kept = [one.start_ns for one in simulation.path._segments]
+    trace_ns = round(simulation.values['markers.trace_length'] * SECOND)
+    assert kept == list(range(10 * SECOND - trace_ns - SECOND // 10, 10 * SECOND + 1,
+                              SECOND // 10))
+
+
+# ----------------------------------------------------------------------------- restart, failure
+
+def test_a_restart_gives_the_same_bytes_again_and_keeps_sinks_and_counts():
+    simulation = simulate()
+    taken, published = record(simulation), publish(simulation, 'pose')
+    simulation.advance(SECOND)
+    first, steps = list(taken), simulation.steps
+    simulation.command(0.5, 0.1)
+    simulation.advance(2 * SECOND)
+    between = simulation.steps
+    simulation.restart(parameters.checked({}))
+    del taken[:]
+    simulation.advance(SECOND)
+    assert taken == first
+    assert simulation.history == []
+    assert simulation.steps == between + steps > between > steps
+    assert output(simulation, 'pose').sent == len(published) == 101 + 100 + 101
+
+
+def test_a_restart_that_is_refused_leaves_the_motion_as_it_was():
+    expected = play(simulate(), SECOND, 'pose')
+    simulation = simulate()
+    taken = record(simulation, 'pose')
+    simulation.advance(SECOND // 2)
+    with pytest.raises(ValueError, match='pole'):
+        simulation.restart({**parameters.checked({}), 'initial.theta': 0.0, 'spin.lz': 0.5})
+    with pytest.raises(ValueError, match=r'1e\+20'):
+        simulation.restart({**parameters.checked({}), 'spin.l3': 1e20, 'spin.lz': 1e20})
+    simulation.advance(SECOND)
+    assert taken == expected
+
+
+@pytest.mark.parametrize('how', ['live', 'ahead', 'offline'])
+def test_the_euler_equations_fail_at_a_pole_at_one_time_and_can_be_restarted(how):
+    simulation = simulate({**THROUGH_A_POLE, 'solver.equations': 'euler'})
+    taken = record(simulation, 'joint_states') if how != 'offline' else []
+
+    def advance():
+        if how == 'offline':
+            for block in simulation.play([stream(simulation, 'joint_states')], 60 * SECOND):
+                taken.extend(('joint_states', t_ns, None) for t_ns in block.parts[0][1].tolist())
+        else:
+            for tick in range(simulation.now_ns // MILLISECOND, 60_000):
+                simulation.advance(tick * MILLISECOND)
+                if how == 'ahead':
+                    simulation.prepare((tick + 1) * MILLISECOND)
+
+    with pytest.raises(IntegrationError, match='leapt over a pole'):
+        advance()
+    assert times(taken, 'joint_states') == list(range(0, len(taken) * PERIOD_NS, PERIOD_NS))
+    reached_ns = simulation.segment.reached_ns
+    assert len(taken) == reached_ns // PERIOD_NS + 1 > 10
+    assert math.isfinite(simulation.state().energy[0])
+    with pytest.raises(IntegrationError):           # it does not go on by itself
+        advance()
+    assert len(taken) == reached_ns // PERIOD_NS + 1
+    simulation.restart(parameters.checked(THROUGH_A_POLE))
+    assert simulation.advance(5 * SECOND)
+
+
+def test_the_euler_equations_cannot_start_at_a_pole():
+    with pytest.raises((ValueError, IntegrationError), match='theta'):
+        simulate(solver__equations='euler', initial__theta=0.0, spin__l3=1.0, spin__lz=1.0)
+
+
+def test_no_sample_is_sent_whose_stamp_ros_cannot_hold():
+    simulation = simulate(solver__method='exact')
+    simulation.epoch_ns = (2 ** 31 - 1) * SECOND
+    taken = record(simulation, 'pose')
+    with pytest.raises(IntegrationError, match=r'must be < 2147483648 s, in January 2038'):
+        simulation.advance(2 * SECOND)
+    assert times(taken, 'pose') == list(range(0, SECOND, PERIOD_NS))
+
+
+def test_a_block_that_fails_leaves_nothing_half_done():
+    def fail(stamps_ns, *fields):
+        raise MemoryError
+
+    simulation = simulate(pose__rate=1000.0, solver__method='exact')
+    taken = record(simulation, 'pose', 'joint_states')
+    simulation.advance(0)
+    pose = stream(simulation, 'pose')
+    original, pose.template.encode = pose.template.encode, fail
+    with pytest.raises(MemoryError):
+        simulation.prepare(10 * MILLISECOND)
+    pose.template.encode = original
+    simulation.advance(20 * MILLISECOND)
+    assert times(taken, 'pose') == [k * MILLISECOND for k in range(21)]
+    assert times(taken, 'joint_states') == [0, 10 * MILLISECOND, 20 * MILLISECOND]
