@@ -54,7 +54,7 @@ def in_memory(values, commands, duration_ns):
     found = {journal.resolve_topic(stream.topic, '/'): {} for stream in streams}
     messages_of = list(found.values())
 
-    def write(entries):
+    def write(entries, size):
         for number, stamp_ns, data in entries:
             messages_of[number][stamp_ns - EPOCH_NS] = data
 

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any
 from spinning_top_sim.nodes.pacing import FairLock
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal
-from spinning_top_sim.streams.live import Entry, LiveSimulation
+from spinning_top_sim.streams.live import Entry, LiveSimulation, Write
 from spinning_top_sim.streams.stream import Stream
 
 # Opening a log imports and loads libraries, so that is done where a log is opened.
 if TYPE_CHECKING:
     from spinning_top_sim.recording.writer import McapRecorder
 
-MOST_PENDING = 50_000       # messages that wait for the file that is being opened
+MOST_PENDING = 20_000       # stamps whose messages wait for the file that is being opened
 
 Topic = tuple[str, str, dict[str, int]]     # full name, type, and offered QoS
 
@@ -40,9 +40,8 @@ class RecordingSession:
         self.path = Path()                  # of the newest one
         self._simulation, self._lock, self._topics = simulation, lock, topics
         self._recorder: McapRecorder | None = None
-        self._pending: list[Entry] = []         # while a log is being opened
-        # Into the recorder, or `_pending`.
-        self._write: Callable[[Sequence[Entry]], object] | None = None
+        self._pending: list[tuple[Sequence[Entry], int]] = []   # while a log is being opened
+        self._write: Write | None = None                        # into the recorder, or `_pending`
         self._journal_index = 0                 # number of the journal's first topic in the log
         self._file_lock = threading.Lock()      # one opens or closes at a time
 
@@ -66,7 +65,7 @@ class RecordingSession:
                    'values_at_recording': values}
             self._journal_index = len(streams)
             self._pending = []
-            self._feed(self._pending.extend, streams)
+            self._feed(lambda *messages: self._pending.append(messages), streams)
             self.write_event('start')
         return lambda: self._open(streams, topics, run)
 
@@ -80,14 +79,14 @@ class RecordingSession:
                     self._feed(None)
                 raise RecordingError(str(error)) from error
             with self._lock:
-                recorder.write_all(self._pending)
+                for messages in self._pending:
+                    recorder.write_all(*messages)
                 self._recorder, self.path, self.error = recorder, recorder.path, None
                 self._feed(recorder.write_all, streams)
                 self._pending = []
         return f'recording to {recorder.path}'
 
-    def _feed(self, write: Callable[[Sequence[Entry]], object] | None,
-              streams: Sequence[Stream] = ()) -> None:
+    def _feed(self, write: Write | None, streams: Sequence[Stream] = ()) -> None:
         """Record these streams, commands and events with `write` from now on."""
         self._write = write
         self._simulation.log_to(write, streams)
@@ -135,7 +134,7 @@ class RecordingSession:
         if self._write is not None:
             index = self._journal_index + [name for name, _ in journal.TOPICS].index(topic)
             stamp_ns = self._simulation.epoch_ns + max(self._simulation.now_ns, 0)
-            self._write([(index, stamp_ns, data)])
+            self._write([(index, stamp_ns, data)], len(data))
 
     def has_room(self) -> bool:
         if self._recorder is not None:

@@ -87,6 +87,7 @@ class TickLoop:
         self._steady, self._is_steady = steady, source is steady
         self._clock = SimulatedClock(source, values['time_scale'])
         self._subscribers_due_ns = 0            # on the steady clock
+        self._stop_at_ns = 0                    # on the steady clock: when a tick gives way
         self._block_unfinished = False          # `idle` goes on with a block of samples
         self.set_pace(values)
 
@@ -149,7 +150,7 @@ class TickLoop:
 
     def _advance(self) -> int:
         """Send what is due, or what one tick has time for; return the simulated time due [ns]."""
-        simulation, has_room = self._simulation, self._recording.has_room
+        simulation = self._simulation
         due_ns = self._clock.now()
         target_ns = min(due_ns, self._duration_ns)
         if self.state is not LoopState.RUNNING:
@@ -160,11 +161,10 @@ class TickLoop:
                        'from where they are', False)
             self._enter(LoopState.RUNNING)
             return simulation.now_ns
-        stop_at_ns = self._steady() + TICK_BUDGET_NS
+        self._stop_at_ns = self._steady() + TICK_BUDGET_NS
         try:
-            arrived = has_room() and simulation.advance(
-                target_ns, target_ns - self._latest_ns,
-                lambda: self._steady() > stop_at_ns or not has_room())
+            arrived = self._recording.has_room() and simulation.advance(
+                target_ns, target_ns - self._latest_ns, self._has_to_give_way)
         except IntegrationError as error:
             self.fail(str(error))
             return target_ns
@@ -173,6 +173,9 @@ class TickLoop:
             self.slipped_ns += lag_ns
             self._enter(LoopState.RUNNING)
         return target_ns
+
+    def _has_to_give_way(self) -> bool:
+        return self._steady() > self._stop_at_ns or not self._recording.has_room()
 
     def pause(self) -> None:
         """Send what is due, then hold the motion; does nothing when paused already."""

@@ -134,18 +134,20 @@ class McapRecorder:
 
     def write(self, topic_index: int, log_time_ns: int, data: bytes) -> None:
         """Hand over one message; see `write_all`."""
-        self.write_all([(topic_index, log_time_ns, data)])
+        self.write_all([(topic_index, log_time_ns, data)], len(data))
 
-    def write_all(self, entries: Sequence[Entry]) -> None:
+    def write_all(self, entries: Sequence[Entry], size: int) -> None:
         """
         Hand over messages, from one thread at a time; they keep their order.
+
+        size : of their data together [bytes]
 
         Never waits for the disk, never raises for its sake.  After the recording stopped the
         messages are only counted, as lost.
         """
         self._offered += len(entries)
         if self._accepting:
-            size = sum(len(data) for _, _, data in entries) + _ENTRY_BYTES * len(entries)
+            size += _ENTRY_BYTES * len(entries)
             self._queue.append((entries, size))
             self._bytes_in += size
             if self._bytes_in - self._bytes_out >= QUEUE_BYTES // 2 and not self._wake.is_set():

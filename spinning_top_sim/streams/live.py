@@ -16,9 +16,9 @@ that changes samples after `now_ns` empties the queue.
 
 import contextlib
 import time
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import chain, repeat
+from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any
 
@@ -37,27 +37,50 @@ LONGEST_BLOCK_NS, MOST_STEPS = 300_000_000, 256
 
 # A message for a log: number of the stream in the log, stamp [ns], CDR.
 Entry = tuple[int, int, bytes]
+# Takes messages of one stamp for a log, and their size together [bytes].
+Write = Callable[[Sequence[Entry], int], object]
+
+
+@dataclass
+class Usage:
+    """How often the use of some outputs has changed."""
+
+    changes: int = 0
 
 
 class Output:
     """
     Where the samples of a stream go.
 
-    publish : takes each message in time; None while there are no subscribers
     log_index : number of the stream in the log, None if it is not recorded
     sent, skipped : samples that were published, and those that were too late for that
     """
 
-    def __init__(self, stream: Stream) -> None:
-        self.stream = stream
-        self.publish: Callable[[bytes], object] | None = None
+    def __init__(self, stream: Stream, usage: Usage) -> None:
+        self.stream, self._usage = stream, usage
+        self._publish: Callable[[bytes], object] | None = None
         self.log_index: int | None = None
         self.sent = self.skipped = 0
 
     @property
+    def publish(self) -> Callable[[bytes], object] | None:
+        """What takes each message in time; None while there are no subscribers."""
+        return self._publish
+
+    @publish.setter
+    def publish(self, publish: Callable[[bytes], object] | None) -> None:
+        if (publish is None) != (self._publish is None):
+            self._usage.changes += 1
+        self._publish = publish
+
+    @property
     def is_used(self) -> bool:
         """Whether anybody takes the samples: else they are not computed."""
-        return self.publish is not None or self.log_index is not None
+        return self._publish is not None or self.log_index is not None
+
+
+# The messages of a time: for the log, their size together, and for subscribers.
+Instant = tuple[list[Entry], int, list[tuple[Output, bytes]]]
 
 
 class LiveSimulation(Simulation):
@@ -72,12 +95,13 @@ class LiveSimulation(Simulation):
 
     def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
         super().__init__(values, epoch_ns)
-        self.outputs = [Output(stream) for stream in self.streams]
+        self._usage = Usage()
+        self.outputs = [Output(stream, self._usage) for stream in self.streams]
         self.computed_ns = -1
-        self._write: Callable[[Sequence[Entry]], object] | None = None
-        self._queue: deque[tuple[int, Output, bytes]] = deque()     # time [ns], message
-        self._used: list[Output] = []               # those whose samples are computed
-        self._version = -1                          # that of the samples in the queue
+        self._write: Write = lambda entries, size: None
+        self._queue: deque[tuple[int, Instant]] = deque()       # by time [ns]
+        self._used: list[Output] = []               # those whose samples are in the queue
+        self._holds_for = -1, -1                    # `version` and `Usage.changes` of the queue
         self._work: Iterator[Block | None] | None = None
         self._block = SMALLEST_BLOCK
 
@@ -85,17 +109,18 @@ class LiveSimulation(Simulation):
         """Return the output of a stream."""
         return next(output for output in self.outputs if output.stream is stream)
 
-    def log_to(self, write: Callable[[Sequence[Entry]], object] | None,
-               streams: Sequence[Stream] = ()) -> None:
+    def log_to(self, write: Write | None, streams: Sequence[Stream] = ()) -> None:
         """
         Record these streams after `now_ns`, and no others.
 
-        write : takes their messages, some at a time
+        write : takes their messages, in the order of time
         streams : the position of a stream is its number in the log
         """
-        self._write = write
+        if write is not None:
+            self._write = write
         for output in self.outputs:
             output.log_index = streams.index(output.stream) if output.stream in streams else None
+        self._usage.changes += 1
 
     def lowest_imu_rate(self, *, restarted: bool) -> float:
         """
@@ -113,19 +138,22 @@ class LiveSimulation(Simulation):
         Send every sample due up to `target_ns`; return whether that was reached.
 
         publish_from_ns : earlier samples are too late to be published; they are recorded
-        give_way : asked between batches of samples and between blocks; True ends the call early.
+        give_way : asked between blocks of samples; True ends the call early.
             Nothing is lost: the next call goes on there.
 
         Raises IntegrationError if the motion does not go on.
         """
         begin_ns = self.now_ns
         self._refresh()
+        queue = self._queue
         try:
             while True:
-                self._send(target_ns, publish_from_ns)
-                self.now_ns = max(self.now_ns, min(target_ns, self.computed_ns))
+                while queue and queue[0][0] <= target_ns:
+                    self._send(*queue.popleft(), publish_from_ns)
                 if self.computed_ns >= target_ns:
+                    self.now_ns = max(self.now_ns, target_ns)
                     return True
+                self.now_ns = max(self.now_ns, self.computed_ns)
                 if self.now_ns > begin_ns and give_way():
                     return False
                 self._compute(target_ns, publish_from_ns)
@@ -156,36 +184,27 @@ class LiveSimulation(Simulation):
         self.advance(max(self.now_ns, 0))
 
     def _refresh(self) -> None:
-        """Empty the queue if its samples do not hold any more, or lack those of an output."""
-        used = [output for output in self.outputs if output.is_used]
-        if self._version != self.version or not set(used) <= set(self._used):
+        """Empty the queue if the motion or the outputs have changed."""
+        holds_for = self.version, self._usage.changes
+        if holds_for != self._holds_for:
+            self._holds_for = holds_for
             for output, stream in zip(self.outputs, self.streams, strict=True):
                 output.stream = stream
-            self._version, self._block = self.version, SMALLEST_BLOCK
-            self._drop()
-        self._used = used
+            self._used = [output for output in self.outputs if output.is_used]
+            self._queue.clear()
+            self._work, self.computed_ns, self._block = None, self.now_ns, SMALLEST_BLOCK
 
-    def _drop(self) -> None:
-        self._queue.clear()
-        self._work, self.computed_ns = None, self.now_ns
-
-    def _send(self, target_ns: int, publish_from_ns: int) -> None:
-        """Record what is computed up to `target_ns`, then publish it."""
-        queue, due = self._queue, []
-        while queue and queue[0][0] <= target_ns:
-            due.append(queue.popleft())
-        if not due:
-            return
-        if self._write is not None:
-            entries = [(output.log_index, self.epoch_ns + t_ns, message)
-                       for t_ns, output, message in due if output.log_index is not None]
-            if entries:
-                self._write(entries)
-        self.now_ns = due[-1][0]
-        for t_ns, output, message in due:
-            if output.publish is not None and t_ns >= publish_from_ns:
-                output.publish(message)
-                output.sent += 1
+    def _send(self, t_ns: int, instant: Instant, publish_from_ns: int) -> None:
+        """Record the messages of a time, then publish them."""
+        entries, size, published = instant
+        if entries:
+            self._write(entries, size)
+        self.now_ns = t_ns
+        if t_ns >= publish_from_ns:
+            for output, message in published:
+                if output.publish is not None:      # it may be gone since the head of `advance`
+                    output.publish(message)
+                    output.sent += 1
 
     def _count_skipped(self, after_ns: int, until_ns: int) -> None:
         for output in self.outputs:
@@ -229,10 +248,19 @@ class LiveSimulation(Simulation):
 
     def _append(self, block: Block) -> None:
         """Put a block into the queue, in the order of time."""
-        parts: list[Iterator[tuple[int, Output, bytes]]] = []
-        for stream, t_ns, rows in block.parts:
-            data, size = rows.tobytes(), stream.size
-            messages = [data[at:at + size] for at in range(0, len(data), size)]
-            parts.append(zip(t_ns.tolist(), repeat(self.output(stream)), messages))
-        self._queue.extend(sorted(chain(*parts), key=itemgetter(0)))
+        instants: defaultdict[int, tuple[list[Entry], list[tuple[Output, bytes]]]] = defaultdict(
+            lambda: ([], []))
+        for stream, times_ns, rows in block.parts:
+            output, data, size = self.output(stream), rows.tobytes(), stream.size
+            log_index = output.log_index
+            for number, t_ns in enumerate(times_ns.tolist()):
+                message = data[number * size:(number + 1) * size]
+                entries, published = instants[t_ns]
+                if log_index is not None:
+                    entries.append((log_index, self.epoch_ns + t_ns, message))
+                if output.publish is not None:
+                    published.append((output, message))
+        self._queue.extend(
+            (t_ns, (entries, sum(len(data) for _, _, data in entries), published))
+            for t_ns, (entries, published) in sorted(instants.items(), key=itemgetter(0)))
         self.computed_ns = block.until_ns
