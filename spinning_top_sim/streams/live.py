@@ -16,10 +16,9 @@ that changes samples after `now_ns` empties the queue.
 
 import contextlib
 import time
-from collections import defaultdict, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from operator import itemgetter
 from typing import Any
 
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
@@ -79,8 +78,15 @@ class Output:
         return self._publish is not None or self.log_index is not None
 
 
-# The messages of a time: for the log, their size together, and for subscribers.
-Instant = tuple[list[Entry], int, list[tuple[Output, bytes]]]
+class Instant:
+    """The messages of one time: for the log, their size together [bytes], and for subscribers."""
+
+    __slots__ = ('entries', 'published', 'size')
+
+    def __init__(self) -> None:
+        self.entries: list[Entry] = []
+        self.size = 0
+        self.published: list[tuple[Output, bytes]] = []
 
 
 class LiveSimulation(Simulation):
@@ -196,12 +202,11 @@ class LiveSimulation(Simulation):
 
     def _send(self, t_ns: int, instant: Instant, publish_from_ns: int) -> None:
         """Record the messages of a time, then publish them."""
-        entries, size, published = instant
-        if entries:
-            self._write(entries, size)
+        if instant.entries:
+            self._write(instant.entries, instant.size)
         self.now_ns = t_ns
         if t_ns >= publish_from_ns:
-            for output, message in published:
+            for output, message in instant.published:
                 if output.publish is not None:      # it may be gone since the head of `advance`
                     output.publish(message)
                     output.sent += 1
@@ -248,19 +253,22 @@ class LiveSimulation(Simulation):
 
     def _append(self, block: Block) -> None:
         """Put a block into the queue, in the order of time."""
-        instants: defaultdict[int, tuple[list[Entry], list[tuple[Output, bytes]]]] = defaultdict(
-            lambda: ([], []))
+        instants: dict[int, Instant] = {}
+        epoch_ns = self.epoch_ns
         for stream, times_ns, rows in block.parts:
             output, data, size = self.output(stream), rows.tobytes(), stream.size
-            log_index = output.log_index
-            for number, t_ns in enumerate(times_ns.tolist()):
-                message = data[number * size:(number + 1) * size]
-                entries, published = instants[t_ns]
+            log_index, is_published = output.log_index, output.publish is not None
+            begin = 0
+            for t_ns in times_ns.tolist():
+                message = data[begin:begin + size]
+                begin += size
+                if t_ns not in instants:
+                    instants[t_ns] = Instant()
+                instant = instants[t_ns]
                 if log_index is not None:
-                    entries.append((log_index, self.epoch_ns + t_ns, message))
-                if output.publish is not None:
-                    published.append((output, message))
-        self._queue.extend(
-            (t_ns, (entries, sum(len(data) for _, _, data in entries), published))
-            for t_ns, (entries, published) in sorted(instants.items(), key=itemgetter(0)))
+                    instant.entries.append((log_index, epoch_ns + t_ns, message))
+                    instant.size += size
+                if is_published:
+                    instant.published.append((output, message))
+        self._queue.extend(sorted(instants.items()))
         self.computed_ns = block.until_ns
