@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Dask: workers on this machine or on a cluster, and the tasks that they are given."""
+"""Workers of Dask, on this machine or a cluster, and the tasks for them."""
 
 import asyncio
 import concurrent.futures
@@ -21,8 +21,8 @@ from spinning_top_sim.tools.ensemble_part import EnsembleError
 Result = TypeVar('Result')
 
 LOOPBACK = '127.0.0.1'
-# Tasks that are submitted at a time, for each thread of the workers: enough that none waits, and
-# memory does not grow with the number of tasks.
+# Tasks that are submitted ahead for each thread of the workers.  A limit keeps the memory of the
+# scheduler independent of the number of tasks.
 TASKS_A_THREAD = 4
 CONNECT_S, FIRST_WORKER_S = 10.0, 60.0
 
@@ -30,20 +30,20 @@ CONNECT_S, FIRST_WORKER_S = 10.0, 60.0
 @contextlib.contextmanager
 def connect(workers: int | None, scheduler: str | None) -> Iterator[distributed.Client]:
     """
-    Yield a client of a cluster at `scheduler`, else of so many processes on this machine.
+    Yield a client of the cluster at the address `scheduler`, else of processes on this machine.
 
-    workers : None for one process a core
+    workers : number of processes on this machine, None for one a core
 
     Raises EnsembleError if the cluster cannot be reached, or has no workers.
     """
     for handler in logging.getLogger('distributed').handlers:
-        handler.setLevel(logging.CRITICAL)          # what matters becomes an error of ours
+        handler.setLevel(logging.CRITICAL)          # errors are raised by the client
     with contextlib.ExitStack() as stack:
         if scheduler is None:
-            # Dask's profile grows with time, and memory grew with the number of runs.
+            # The profile that Dask keeps grows with time.
             stack.enter_context(dask.config.set({'distributed.worker.profile.enabled': False}))
             with _interrupts_blocked():
-                # Neither a dashboard nor a port that other machines reach.
+                # No dashboard, and no port that other machines can reach.
                 address: object = stack.enter_context(distributed.LocalCluster(
                     n_workers=workers or len(os.sched_getaffinity(0)), threads_per_worker=1,
                     host=LOOPBACK, dashboard_address=f'{LOOPBACK}:0',
@@ -62,11 +62,11 @@ def connect(workers: int | None, scheduler: str | None) -> Iterator[distributed.
 @contextlib.contextmanager
 def _interrupts_blocked() -> Iterator[None]:
     """
-    Block SIGINT in the threads and processes that are started meanwhile, for good.
+    Start threads and processes with SIGINT blocked.
 
-    A terminal sends Ctrl-C to the workers too.  This process alone shall react.
+    A terminal sends Ctrl-C to the workers, too, but only this process reacts.
     """
-    resource_tracker.ensure_running()       # when it starts later, it ends the blocking
+    resource_tracker.ensure_running()       # if it started later, it would unblock the signal
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -77,12 +77,12 @@ def _interrupts_blocked() -> Iterator[None]:
 def compute(client: distributed.Client, task: Callable[[int], Result],
             numbers: Iterable[int]) -> Iterator[Result]:
     """
-    Yield the results of task(number) in the order in which they are ready.
+    Yield the results of task(number) in the order of completion.
 
-    A task is computed again elsewhere if its worker is killed.  Raises what a task raises, and
-    EnsembleError if the scheduler is lost or a task takes its workers with it.
+    If a worker is killed, another one computes its task again.  Raises what a task raises, and
+    EnsembleError if the scheduler is lost, or if a task kills several workers.
     """
-    batch = uuid.uuid4().hex        # the cluster may have tasks of other ensembles
+    batch = uuid.uuid4().hex        # a cluster may have the tasks of several ensembles
     waiting, running = iter(numbers), distributed.as_completed(loop=client.loop)
     for done in count():
         if done % TASKS_A_THREAD == 0:              # a cluster may grow
