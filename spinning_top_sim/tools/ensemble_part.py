@@ -93,7 +93,8 @@ class _NumbersOnly(Template):
     def __len__(self) -> int:
         return 8 * sum(self.counts)
 
-    def encode(self, stamps_ns: NDArray[np.int64], *values: Field) -> NDArray[Any]:
+    def encode(self, stamps_ns: NDArray[np.int64],     # type: ignore[override]
+               *values: Field) -> NDArray[np.float64]:
         columns = [column for field in values for column in field]
         rows = np.empty((len(columns), len(stamps_ns)))
         for row, column in zip(rows, columns, strict=True):

@@ -182,13 +182,7 @@ def _parsed(content: object, folder: Path) -> Specification:
         if name not in content:
             raise ValueError(f'{name} is missing')
     given = {'seed': 0, 'runs_per_part': 0, 'format': FORMATS[0], **content}
-    for name, least in (('runs', 1), ('seed', 0), ('runs_per_part', 0)):
-        value = given[name]
-        if type(value) is not int or not least <= value < 2 ** 63:
-            raise ValueError(f'{name} = {shown(value)}: must be an integer >= {least}')
-    duration = given['duration'] = parameters.BY_NAME['duration'].check(given['duration'])
-    if not duration > 0.0:
-        raise ValueError(f'duration = {duration!r}: must be a number > 0')
+    _check_numbers(given)
     if given['format'] not in FORMATS:
         raise ValueError(f'format = {shown(given["format"])}: must be one of {", ".join(FORMATS)}')
     given['params'] = [_parameter_set(one, 'params', folder)
@@ -201,6 +195,16 @@ def _parsed(content: object, folder: Path) -> Specification:
     specification = Specification(**given)
     return specification if specification.runs_per_part else replace(
         specification, runs_per_part=_runs_per_part(specification))
+
+
+def _check_numbers(given: dict[str, Any]) -> None:
+    for name, least in (('runs', 1), ('seed', 0), ('runs_per_part', 0)):
+        value = given[name]
+        if type(value) is not int or not least <= value < 2 ** 63:
+            raise ValueError(f'{name} = {shown(value)}: must be an integer >= {least}')
+    duration = given['duration'] = parameters.BY_NAME['duration'].check(given['duration'])
+    if not duration > 0.0:
+        raise ValueError(f'duration = {duration!r}: must be a number > 0')
 
 
 def _list(value: object, what: str) -> Sequence[Any]:
@@ -234,40 +238,46 @@ def _streams(given: object, file_format: str) -> list[str]:
 
 def _rule(name: object, rule: object, folder: Path) -> dict[str, list[Any]]:
     """Return how a parameter is sampled, checked: {distribution: [a, b]}, or {values: [...]}."""
-    what = f'sample: {name}'
-    if name != PARAMS and not parse_section({name: 0.0}, 'sample'):
-        raise ValueError(f'{what} is of ROS and has no effect')
-    if str(name).endswith('.enabled') or name in ('record.streams', 'publish_clock'):
-        raise ValueError(f'{what} must not be sampled: `streams`, or a set of `params`, says '
-                         'which streams there are')
-    kinds = (*DISTRIBUTIONS, VALUES)
+    what, kinds = f'sample: {name}', (*DISTRIBUTIONS, VALUES)
+    if name != PARAMS:
+        _check_sampled(name)
     if not isinstance(rule, Mapping) or len(rule) != 1:
         raise ValueError(f'{what} = {shown(rule)}: must be one of {", ".join(kinds)} with a list')
     (kind, given), = rule.items()
     if kind not in kinds:
         raise ValueError(f'{what}: there is no distribution {kind}; there are {", ".join(kinds)}')
     items = _list(given, f'{what}: {kind}')
-    if kind == VALUES:
-        if not items:
-            raise ValueError(f'{what}: values = []: must have one value at least')
-        return {kind: [_parameter_set(item, what, folder) if name == PARAMS else
-                       parameters.BY_NAME[str(name)].check(item) for item in items]}
-    if name == PARAMS or not parameters.BY_NAME[str(name)].is_double:
-        raise ValueError(f'{what}: {kind}: must be values, because the parameter is no double')
-    _check_numbers(items, kind, what)
-    for bound in items[:1] if kind == 'normal' else items:
-        parameters.BY_NAME[str(name)].check(bound)
-    return {kind: [float(item) for item in items]}
+    if kind != VALUES:
+        return {kind: _bounds(str(name), kind, items)}
+    if not items:
+        raise ValueError(f'{what}: values = []: must have one value at least')
+    return {kind: [_parameter_set(item, what, folder) if name == PARAMS else
+                   parameters.BY_NAME[str(name)].check(item) for item in items]}
 
 
-def _check_numbers(items: Sequence[Any], kind: str, what: str) -> None:
-    """Raise ValueError unless these are the two numbers of a distribution."""
+def _check_sampled(name: object) -> None:
+    """Raise ValueError for a parameter that cannot be sampled."""
+    if not parse_section({name: 0.0}, 'sample'):
+        raise ValueError(f'sample: {name} is of ROS and has no effect')
+    if str(name).endswith('.enabled') or name in ('record.streams', 'publish_clock'):
+        raise ValueError(f'sample: {name} must not be sampled: `streams`, or a set of `params`, '
+                         'says which streams there are')
+
+
+def _bounds(name: str, kind: str, items: Sequence[Any]) -> list[float]:
+    """Return the two numbers of a distribution, checked."""
+    if name == PARAMS or not parameters.BY_NAME[name].is_double:
+        raise ValueError(f'sample: {name}: {kind}: must be values, because the parameter is no '
+                         'double')
     _, allowed, is_allowed = DISTRIBUTIONS[kind]
     if not (len(items) == 2 and all(
             isinstance(item, int | float) and not isinstance(item, bool)
             and abs(item) <= sys.float_info.max for item in items)
             and is_allowed(*map(float, items))):
-        raise ValueError(f'{what}: {kind} = {shown(items)}: must be {allowed}')
+        raise ValueError(f'sample: {name}: {kind} = {shown(items)}: must be {allowed}')
+    for bound in items[:1] if kind == 'normal' else items:
+        parameters.BY_NAME[name].check(bound)
+    return [float(item) for item in items]
 
 
 def _runs_per_part(specification: Specification) -> int:
