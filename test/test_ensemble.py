@@ -91,7 +91,7 @@ def meanwhile(act):
     thread.join()
 
 
-@pytest.fixture(scope='session')
+@pytest.fixture(scope='module')
 def cluster():
     """Two workers for all ensembles."""
     from spinning_top_sim.tools import ensemble_cluster
@@ -108,7 +108,7 @@ def ensemble(cluster):
 
 
 @pytest.fixture(scope='module')
-def dataset(tmp_path_factory):
+def whole(tmp_path_factory):
     """Return the data of the ensemble, computed without Dask, and its specification."""
     folder = tmp_path_factory.mktemp('ensemble')
     path = written(folder)
@@ -138,18 +138,18 @@ def test_every_stream_has_columns_or_is_left_out():
 
 
 @pytest.mark.parametrize('run', [0, 7])
-def test_a_run_has_the_samples_that_its_log_has(dataset, tmp_path, run):
+def test_a_run_has_the_samples_that_its_log_has(whole, tmp_path, run):
     """Also where the IMU loses samples, and sends some twice."""
-    folder, path = dataset
+    folder, path = whole
     values = ensemble_spec.read(path).values(run)
-    whole = parquet.read_table(folder)
-    rows = whole.filter(whole['run'].to_numpy() == run)
+    every = parquet.read_table(folder)
+    rows = every.filter(every['run'].to_numpy() == run)
     assert values['imu.rate'] == [100.0, 200.0][run % 2]
     assert rows['params'].to_pylist() == len(rows) * [run // 2 % 3]
     assert set(rows['spin.l3'].to_pylist()) == {values['spin.l3']}
     assert set(rows['seed'].to_pylist()) == {values['seed']}
     assert rows['t'].to_pylist() == [k / 200.0 for k in range(401)]
-    assert not [name for name in whole.column_names if 'data_raw.orientation' in name]
+    assert not [name for name in every.column_names if 'data_raw.orientation' in name]
     log = tmp_path / 'run.mcap'
     assert main([str(path), '--row', str(run), '-o', str(log)]) == 0
     templates = {f'/{stream.topic}': stream.template for stream in all_streams(values)}
@@ -162,18 +162,18 @@ def test_a_run_has_the_samples_that_its_log_has(dataset, tmp_path, run):
     lost = 0
     for topic, column, field in (('imu/data_raw', 'linear_acceleration.y', 2),
                                  ('ground_truth/imu', 'orientation.w', 0)):
-        every = rows[f'{topic}.{column}'].to_pylist()
+        values = rows[f'{topic}.{column}'].to_pylist()
         kept = {round(1e9 * (t + 1.0)): value for t, value in zip(
-            rows['t'].to_pylist(), every, strict=True) if value is not None}
+            rows['t'].to_pylist(), values, strict=True) if value is not None}
         assert kept == {stamp_ns: fields[field][0, 'xyzw'.index(column[-1])]
                         for stamp_ns, fields in logged[f'/{topic}'].items()}
-        lost = max(lost, len(every) - len(kept))
+        lost = max(lost, len(values) - len(kept))
     assert lost > 40
 
 
 def test_two_workers_of_which_one_is_killed_make_the_same_dataset(
-        dataset, tmp_path, cluster, ensemble):
-    data, path = dataset
+        whole, tmp_path, cluster, ensemble):
+    data, path = whole
     folder = tmp_path / 'other'
     first, _ = cluster.run(os.getpid).values()
 
@@ -192,9 +192,9 @@ def test_two_workers_of_which_one_is_killed_make_the_same_dataset(
     assert sorted(entry.name for entry in folder.iterdir()) == ['data', 'manifest.json']
 
 
-def test_the_same_command_goes_on_after_an_interruption(dataset, tmp_path, ensemble):
+def test_the_same_command_goes_on_after_an_interruption(whole, tmp_path, ensemble):
     """A part that is there is not computed again; a torn one is."""
-    data, path = dataset
+    data, path = whole
     folder = tmp_path / 'other'
     with process('-P', ROOT / 'scripts/ensemble', path, '-o', folder, '--workers', 1,
                  '--quiet') as running:
@@ -206,16 +206,16 @@ def test_the_same_command_goes_on_after_an_interruption(dataset, tmp_path, ensem
         f'ensemble: {folder} holds what is complete: the same command goes on',
         'ensemble: interrupted']
     assert not json.loads((folder / 'manifest.json').read_text())['complete']
-    torn, *whole = sorted((folder / 'data').iterdir())
-    assert 2 <= len(whole) < RUNS // 2
-    then = [(part.stat().st_ino, part.stat().st_mtime_ns) for part in whole]
+    torn, *kept = sorted((folder / 'data').iterdir())
+    assert 2 <= len(kept) < RUNS // 2
+    then = [(part.stat().st_ino, part.stat().st_mtime_ns) for part in kept]
     torn.write_bytes(torn.read_bytes()[:-1])
     assert ensemble(path, '-o', folder, '--resume') == 0        # as version 1.0 needed it
     assert contents(folder / 'data') == contents(data)
-    assert [(part.stat().st_ino, part.stat().st_mtime_ns) for part in whole] == then
+    assert [(part.stat().st_ino, part.stat().st_mtime_ns) for part in kept] == then
 
 
-def test_a_cluster_whose_scheduler_is_killed(dataset, tmp_path, capsys):
+def test_a_cluster_whose_scheduler_is_killed(whole, tmp_path, capsys):
     folder, place = tmp_path / 'other', tmp_path / 'scheduler.json'
     common = ('--scheduler-file', place, '--host', '127.0.0.1', '--no-dashboard')
     with process('-m', 'dask', 'scheduler', '--port', 0, *common) as scheduler, process(
@@ -230,12 +230,12 @@ def test_a_cluster_whose_scheduler_is_killed(dataset, tmp_path, capsys):
             scheduler.kill()
 
         with meanwhile(kill):
-            assert main([str(dataset[1]), '-o', str(folder), '--scheduler', address]) == 1
+            assert main([str(whole[1]), '-o', str(folder), '--scheduler', address]) == 1
     assert capsys.readouterr().err.splitlines()[-1] == 'ensemble: the scheduler is lost'
 
 
-def test_a_row_alone_is_computed_from_the_manifest(dataset, tmp_path):
-    data, path = dataset
+def test_a_row_alone_is_computed_from_the_manifest(whole, tmp_path):
+    data, path = whole
     from dataclasses import asdict
     (tmp_path / 'manifest.json').write_text(json.dumps({
         'format': 1, 'versions': ensemble_part.versions(),
@@ -414,8 +414,8 @@ def test_a_bad_specification_is_refused_and_makes_nothing(tmp_path, capsys, chan
     assert not (tmp_path / 'out').exists()
 
 
-def test_a_folder_of_something_else_is_refused(dataset, tmp_path, capsys, ensemble):
-    _, path = dataset
+def test_a_folder_of_something_else_is_refused(whole, tmp_path, capsys, ensemble):
+    _, path = whole
     folder = tmp_path / 'runs'
     one = written(tmp_path, runs=1, duration=0.05, sample={
         'initial.theta': {'values': [0.3, 0.6]}, 'spin.l3': {'values': [1.5, 1.7]}})
@@ -446,11 +446,11 @@ def test_a_folder_of_something_else_is_refused(dataset, tmp_path, capsys, ensemb
     '{"format": 2, "versions": 1, "specification": {}}',
     '{"format": 2, "versions": {}, "specification": []}',
     '{"format": 3, "versions": {}, "specification": {}}', '[]', '{"format": 1}', '[' * 100_000])
-def test_what_is_no_manifest_is_refused(dataset, tmp_path, capsys, text):
+def test_what_is_no_manifest_is_refused(whole, tmp_path, capsys, text):
     place = tmp_path / 'manifest.json'
     place.write_text(text)
     for arguments in ([str(tmp_path), '--row', '0', '-o', str(tmp_path / 'one.mcap')],
-                      [str(dataset[1]), '-o', str(tmp_path)]):
+                      [str(whole[1]), '-o', str(tmp_path)]):
         assert main(arguments) == 2
         error = capsys.readouterr().err
         assert error.startswith(f'ensemble: {place} is no manifest') and error.count('\n') == 1

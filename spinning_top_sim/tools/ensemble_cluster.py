@@ -9,7 +9,6 @@ import os
 import signal
 import uuid
 from collections.abc import Callable, Iterable, Iterator
-from itertools import count, islice
 from multiprocessing import resource_tracker
 from typing import TypeVar
 
@@ -21,9 +20,6 @@ from spinning_top_sim.tools.ensemble_part import EnsembleError
 Result = TypeVar('Result')
 
 LOOPBACK = '127.0.0.1'
-# Tasks that are submitted ahead for each thread of the workers.  A limit keeps the memory of the
-# scheduler independent of the number of tasks.
-TASKS_A_THREAD = 4
 CONNECT_S, FIRST_WORKER_S = 10.0, 60.0
 
 
@@ -82,20 +78,16 @@ def compute(client: distributed.Client, task: Callable[[int], Result],
     If a worker is killed, another one computes its task again.  Raises what a task raises, and
     EnsembleError if the scheduler is lost, or if a task kills several workers.
     """
-    batch = uuid.uuid4().hex        # a cluster may have the tasks of several ensembles
-    waiting, running = iter(numbers), distributed.as_completed(loop=client.loop)
-    for done in count():
-        if done % TASKS_A_THREAD == 0:              # a cluster may grow
-            room = TASKS_A_THREAD * max(sum(client.nthreads().values()), 1)
-        for number in islice(waiting, max(room - running.count(), 0)):
-            running.add(client.submit(task, number, key=f'ensemble-{batch}-{number}', pure=False))
-        if running.is_empty():
-            return
-        try:
-            yield next(running).result()
-        except distributed.KilledWorker as error:
-            raise EnsembleError(f'several workers died, all of them with the same task: {error}'
-                                ) from error
-        except (concurrent.futures.CancelledError, asyncio.CancelledError,
-                distributed.comm.CommClosedError) as error:
-            raise EnsembleError('the scheduler is lost') from error
+    # A cluster may have the tasks of several ensembles.
+    results = distributed.as_completed(
+        client.map(task, list(numbers), key=f'ensemble-{uuid.uuid4().hex}', pure=False),
+        loop=client.loop)
+    try:
+        for future in results:
+            yield future.result()
+    except distributed.KilledWorker as error:
+        raise EnsembleError(f'several workers died, all of them with the same task: {error}'
+                            ) from error
+    except (concurrent.futures.CancelledError, asyncio.CancelledError,
+            distributed.comm.CommClosedError) as error:
+        raise EnsembleError('the scheduler is lost') from error

@@ -130,13 +130,18 @@ class Specification:
     def _given(self, chosen: Mapping[str, Any]) -> dict[str, Any]:
         """Return the given parameters of the runs with one of the sets."""
         given: dict[str, Any] = {}
-        for some in (*self.params, chosen):
+        for some in (*self.params, chosen, {'duration': self.duration}):
             given.update(some)
-        given['duration'] = self.duration
         if self.streams:
             given['record.streams'] = self.streams
             given.update((f'{name}.enabled', True) for name in self.streams)
         return given
+
+    @cached_property
+    def alternatives(self) -> Sequence[Mapping[str, Any]]:
+        """The parameters of the runs with each of the sets, without the sampled ones."""
+        defaults = {parameter.name: parameter.default for parameter in parameters.TABLE}
+        return [{**defaults, **self._given(one)} for one in self._sets]
 
     @cached_property
     def kept(self) -> Sequence[str]:
@@ -145,10 +150,8 @@ class Specification:
 
         The table of each run has columns for all of them, so that the files form one table.
         """
-        defaults = {parameter.name: parameter.default for parameter in parameters.TABLE}
-        alternatives = [{**defaults, **self._given(one)} for one in self._sets]
         return [name for name in STREAMS
-                if any(journal.is_recorded(name, values) for values in alternatives)]
+                if any(journal.is_recorded(name, values) for values in self.alternatives)]
 
 
 def read(path: Path) -> Specification:
@@ -282,14 +285,11 @@ def _bounds(name: str, kind: str, items: Sequence[Any]) -> list[float]:
 
 def _runs_per_part(specification: Specification) -> int:
     """Return how many runs are worth a task."""
-    try:
-        values = specification.values(0)
-    except ValueError:          # such a run fails later, alone
-        values = parameters.checked({'duration': specification.duration})
     names = [name for name in specification.kept
              if specification.format != 'parquet' or name not in WITHOUT_COLUMNS]
     if not names:
         raise ValueError(f'no stream is enabled; streams: must name one of {", ".join(STREAMS)}')
+    values = specification.alternatives[0]
     # A stream without a rate of its own has that of the IMU.
     rows = values['duration'] * max(
         values.get(f'{name}.rate', values['imu.rate']) for name in names)
