@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Show what is in a log: topics, gaps, the motions measured from the data beside
-the exact ones, drifts, errors.  Reads damaged logs too.
+Show what is in a log: topics, gaps, drifts, errors, and the motions as measured
+from the data beside the exact ones. Reads damaged logs, too.
 
 exit codes:
   0    no fault was found
@@ -64,7 +64,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _picture(endings: tuple[str, ...], name: str) -> Path:
-    """Return the path of a picture.  Raises ArgumentTypeError for another ending than these."""
+    """Return the path of a picture.  Raises ArgumentTypeError if it has another ending."""
     if Path(name).suffix.lower() not in endings:
         raise argparse.ArgumentTypeError(f'{name}: must end in {" or ".join(endings)}')
     return Path(name)
@@ -103,7 +103,7 @@ def _verified(arguments: argparse.Namespace, reader: LogReader, found: Survey) -
 
 
 def _draw(arguments: argparse.Namespace, found: Survey) -> bool:
-    """Draw the pictures that are asked for; return whether that worked."""
+    """Draw the pictures; return whether there was no error."""
     if arguments.plot is None and arguments.animate is None:
         return True
     try:
