@@ -71,11 +71,11 @@ def samples(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Samp
     simulation = Simulation(values, EPOCH_NS)
     streams = [stream for stream in simulation.streams
                if stream.parameter in names and stream.parameter not in WITHOUT_COLUMNS]
-    blocks: dict[str, list[tuple[NDArray[np.int64], NDArray[Any]]]] = {
+    blocks: dict[str, list[tuple[NDArray[np.int64], NDArray[np.float64]]]] = {
         stream.topic: [] for stream in streams}
 
-    def take(stream: Stream, stamps_ns: NDArray[np.int64], rows: NDArray[Any]) -> None:
-        blocks[stream.topic].append((stamps_ns - EPOCH_NS, rows))
+    def take(stream: Stream, stamps_ns: NDArray[np.int64], rows: NDArray[np.generic]) -> None:
+        blocks[stream.topic].append((stamps_ns - EPOCH_NS, rows.view(np.float64)))
 
     for stream in streams:
         stream.template = _NumbersOnly(stream.template)

@@ -28,7 +28,7 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import cli, export
 from spinning_top_sim.tools.recorded_run import RunDescription, Verdict, verify
-from spinning_top_sim.tools.survey import Motion, Survey, survey
+from spinning_top_sim.tools.survey import MotionReport, Survey, survey
 
 MOST_MOTIONS = 12           # in the text
 DEGREES = math.degrees(1.0)
@@ -232,7 +232,7 @@ def _topics(found: Survey) -> Iterator[str]:
             yield f'{name}: {topic.odd_size} messages do not have the size of this stream'
 
 
-def _motion(number: int, motion: Motion, begin_ns: int) -> Iterator[str]:
+def _motion(number: int, motion: MotionReport, begin_ns: int) -> Iterator[str]:
     exact, measured = motion.exact, motion.measured
     begin, end = (max(at_ns - begin_ns, 0) / NANOSECONDS
                   for at_ns in (motion.begin_ns, motion.end_ns))

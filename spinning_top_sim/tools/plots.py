@@ -30,7 +30,7 @@ from spinning_top_sim.physics.pictures import (
 )
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools.analysis import Attitudes
-from spinning_top_sim.tools.survey import Motion, Survey
+from spinning_top_sim.tools.survey import MotionReport, Survey
 
 STYLE = {**pictures.STYLE, 'axes.prop_cycle': cycler(color=COLOURS), 'legend.fontsize': 8,
          'legend.frameon': False}
@@ -56,7 +56,7 @@ def tip_at(data: Attitudes, at: Column) -> tuple[NDArray[np.complex128], Column]
     return tip, height
 
 
-def draw_page(found: Survey, motion: Motion, data: Attitudes, path: Path) -> str:
+def draw_page(found: Survey, motion: MotionReport, data: Attitudes, path: Path) -> str:
     """Draw a page about a log and the samples of a motion; return in words what it shows."""
     assert motion.measured is not None
     period, mean = motion.measured.nutation_period, motion.measured.mean_precession_rate
@@ -156,7 +156,7 @@ def _reading_panels(found: Survey, data: Attitudes, panels: Sequence[Axes]) -> N
         axes.set(title=f'{label.partition(" [")[0]}, {topic}', xlabel='time [s]', ylabel=label)
 
 
-def animate(found: Survey, _motion: Motion, data: Attitudes, path: Path) -> str:
+def animate(found: Survey, _motion: MotionReport, data: Attitudes, path: Path) -> str:
     """Draw the turning top as a GIF: a disc with a mark, and the trace of the tip."""
     frames = max(2, int(min(LONGEST_S, float(data.time[-1])) * FRAMES_PER_S))
     # Indices of the samples; with few samples the last frame may be later than the last of them.

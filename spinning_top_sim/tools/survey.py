@@ -102,7 +102,7 @@ class Section:
 
 
 @dataclass
-class Motion:
+class MotionReport:
     """A motion of the top, from its cause to the next one."""
 
     cause: str                            # start, command, state or reset
@@ -138,12 +138,12 @@ class Survey:
     topics: dict[str, TopicReport]
     run: RunDescription | None = None     # None for a log that this package did not record
     foreign_reason: str = ''              # why it is None
-    motions: list[Motion] = field(default_factory=list)
+    motions: list[MotionReport] = field(default_factory=list)
     # Drifts of energy, l3 and lz since the begin of the motion by topic, relative if not from 0
     drifts: dict[str, dict[str, Series]] = field(default_factory=dict)
     errors: dict[str, Series] = field(default_factory=dict)     # of attitudes by topic [rad]
     # For pictures: the first motion with samples, and the first of these
-    shown: tuple[Motion, Attitudes] | None = None
+    shown: tuple[MotionReport, Attitudes] | None = None
     # For pictures, by topic: (n, 7) time [s], angular velocity [rad/s], specific force [m/s^2]
     readings: dict[str, list[Rows]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -197,7 +197,7 @@ def _follow_run(found: Survey, run: RunDescription) -> None:
                        if stream.topic in run.topics}
             if event.name != 'parameters':
                 exact = simulation.describe() if len(motions) < MOST_EXACT else None
-                motions.append(Motion(
+                motions.append(MotionReport(
                     event.name, simulation.epoch_ns + simulation.segment.start_ns,
                     simulation.segment, exact, _source(run, streams, exact), streams,
                     Imu(simulation.values)))
@@ -237,7 +237,7 @@ def _stamps(samples: Sequence[LogMessage]) -> Stamps:
     return np.array([min(sample.log_time, LATEST_NS) for sample in samples], np.int64)
 
 
-def _analyse(found: Survey, motion: Motion, topic: str, samples: list[LogMessage]) -> None:
+def _analyse(found: Survey, motion: MotionReport, topic: str, samples: list[LogMessage]) -> None:
     """Compare samples of a stream with their motion."""
     stream, segment = motion.streams[topic], motion.segment
     fitting = [sample for sample in samples if len(sample.data) == len(stream.template)]
@@ -293,7 +293,7 @@ def _count(report: TopicReport, stamps_ns: Stamps, sections: list[Section], topi
                                    int(edges_ns[place + 1]) - period_ns))
 
 
-def _measure(found: Survey, motion: Motion) -> None:
+def _measure(found: Survey, motion: MotionReport) -> None:
     """Measure a motion from the samples of its source."""
     samples, motion.samples = motion.samples, []
     data = analysis.longest_run(samples) if samples else None
