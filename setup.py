@@ -77,7 +77,7 @@ setup(
             'matplotlib>=3.6,<4',
             'mcap-ros2-support>=0.5.5,<0.7',
             'nbclient>=0.8,<0.12',
-            'pyarrow>=14,<30',
+            'pyarrow>=18,<30',
             'pytest>=7.4,<10',
             'playwright>=1.45,<2',      # drives the Chromium of the system, and brings none
             'pytest-xdist>=3.5,<4',     # make test: several workers
@@ -95,7 +95,7 @@ setup(
                      'vqf>=2.1,<3'],
         # Ensembles, and the filters that `examine` knows by name but for gtsam.
         'exam': ['ahrs>=0.4,<0.5', 'distributed>=2024.5,<2028', 'imufusion>=1.3,<2',
-                 'pyarrow>=14,<30', 'vqf>=2.1,<3'],
+                 'pyarrow>=18,<30', 'vqf>=2.1,<3'],
         'docs': ['furo>=2024.8,<2027', 'myst-parser>=4,<7', 'numpydoc>=1.8,<2', 'sphinx>=8.1,<10',
                  'sphinx-mathjax-offline>=0.0.2,<0.1'],
         # Narrow ranges: a new release reports new faults.

@@ -101,7 +101,7 @@ def run(folder: Path, runs: int, workers: int) -> tuple[float, int, int]:
 def alone(folder: Path) -> float:
     """Return the time of a run without Dask [s]."""
     spec = ensemble_spec.parse({**specification(ALONE), 'runs_per_part': ALONE}, 'benchmark')
-    for name in (ensemble_part.DATA, ensemble_part.PROGRESS):
+    for name in (ensemble_part.DATA, ensemble_part.UNFINISHED):
         (folder / 'alone' / name).mkdir(parents=True)
     begin = time.monotonic()
     ensemble_part.compute_part(spec, 0, str(folder / 'alone'), ensemble_part.versions())
@@ -172,8 +172,7 @@ def page(folder: Path, runs: int) -> str:
         'decides. Where it is the\nscheduler, set `runs_per_part` in the specification. The disks '
         'of a cluster are not measured here.\n',
         table(('runs', 'machines', 'runs_per_part', 'computing [h]', 'scheduling [h]',
-               'in all [h]', 'size [TB]', 'files'), costs(a_run, task, size / runs, per_part)),
-        'The manifest has 100 bytes a file, and is in memory as a whole while it is written.\n'))
+               'in all [h]', 'size [TB]', 'files'), costs(a_run, task, size / runs, per_part))))
 
 
 def main() -> None:

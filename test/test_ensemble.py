@@ -7,41 +7,37 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml  # type: ignore[import-untyped]
 from helpers.reference import ROOT
-from mcap.reader import make_reader
 
-from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.streams.simulation import Simulation
+from spinning_top_sim import tools
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.topics import all_streams
 from spinning_top_sim.tools import ensemble_part, ensemble_spec
-from spinning_top_sim.tools.ensemble import _manifest, _write_manifest, main
-from spinning_top_sim.tools.ensemble_part import (
-    EnsembleError,
-    compute_part,
-    samples,
-    table,
-)
+from spinning_top_sim.tools.ensemble import main
+from spinning_top_sim.tools.ensemble_part import EnsembleError, compute_part, samples, table
 
 pytest.importorskip('distributed')
 pa = pytest.importorskip('pyarrow')
 parquet = pytest.importorskip('pyarrow.parquet')
 
+RUNS, DURATION = 40, 2.0
 SPEC = {
-    'runs': 60, 'seed': 5, 'duration': 4.0, 'runs_per_part': 2,
-    'params': [str(ROOT / 'config/wavy.yaml'), {'imu.lever_arm': [0.1, 0.0, 0.0]}],
+    'runs': RUNS, 'seed': 5, 'duration': DURATION, 'runs_per_part': 2,
+    'params': [str(ROOT / 'config/wavy.yaml'), {'imu.lever_arm': [0.1, 0.0, 0.0],
+                                                'imu.drop_rate': 0.2, 'imu.duplicate_rate': 0.2}],
     'sample': {'spin.l3': {'normal': [1.6, 0.1]}, 'initial.theta': {'uniform': [0.2, 1.2]},
                'imu.rate': {'values': [100.0, 200.0]},
                'params': {'values': [str(ROOT / f'config/imu/{name}.yaml')
                                      for name in ('bmi088', 'adis16470', 'perfect')]}},
     'streams': ['imu', 'ground_truth_imu']}
 PATIENCE = 150.0            # s, with a machine that is busy otherwise
-ENVIRONMENT = {**os.environ, 'PYTHONPATH': os.pathsep.join(
-    filter(None, [str(ROOT), os.environ.get('PYTHONPATH')]))}
 
 
 def written(folder, **changes):
@@ -51,12 +47,26 @@ def written(folder, **changes):
     return path
 
 
+def contents(folder):
+    return {str(path.relative_to(folder)): path.read_bytes()
+            for path in folder.rglob('*') if path.is_file()}
+
+
+def parts_of(specification, folder):
+    """Compute all parts without Dask; return the runs that failed."""
+    for name in ('data', 'unfinished'):
+        (folder / name).mkdir(exist_ok=True)
+    failed = {}
+    for part in range(specification.parts):
+        failed |= compute_part(specification, part, str(folder), ensemble_part.versions())
+    return failed
+
+
 @contextlib.contextmanager
 def process(*arguments):
     """Run Python in a session of its own, and kill what is left of it."""
-    running = subprocess.Popen(
-        [sys.executable, *map(str, arguments)], env=ENVIRONMENT, start_new_session=True,
-        text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    running = subprocess.Popen([sys.executable, *map(str, arguments)], start_new_session=True,
+                               text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     try:
         yield running
     finally:
@@ -65,206 +75,147 @@ def process(*arguments):
         running.communicate()
 
 
-def ensemble(*arguments):
-    return process('-P', ROOT / 'scripts/ensemble', *arguments, '--quiet')
-
-
-def finish(running):
-    """Return the exit code and what it said."""
-    _, said = running.communicate(timeout=PATIENCE)
-    return running.returncode, said
-
-
-def wait_for(folder, parts, running):
-    """Wait until so many parts are complete; return their records by path."""
+def wait_for(folder, parts):
+    """Wait until so many parts are complete."""
     end = time.monotonic() + PATIENCE
-    while time.monotonic() < end and running.poll() is None:
-        found = list((folder / 'progress').glob('part-*.json'))
-        if len(found) >= parts:
-            return found
+    while len(list((folder / 'data').glob('part-*'))) < parts:
+        assert time.monotonic() < end
         time.sleep(0.002)
-    raise AssertionError(f'{parts} parts are not there: {running.communicate(timeout=1)}')
 
 
-def workers_of(pid):
-    """Return the processes that compute for a command."""
-    children = [child for task in Path(f'/proc/{pid}/task').iterdir()
-                for child in (task / 'children').read_text().split()]
-    return [int(child) for child in children
-            if b'spawn_main' in Path(f'/proc/{child}/cmdline').read_bytes()]
+@contextlib.contextmanager
+def meanwhile(act):
+    thread = threading.Thread(target=act)
+    thread.start()
+    yield
+    thread.join()
 
 
-def contents(folder):
-    return {str(path.relative_to(folder)): path.read_bytes()
-            for path in folder.rglob('*') if path.is_file()}
+@pytest.fixture(scope='module')
+def cluster():
+    """Two workers for all ensembles."""
+    from spinning_top_sim.tools import ensemble_cluster
+
+    with ensemble_cluster.connect(2, None) as client:
+        yield client
+
+
+@pytest.fixture
+def ensemble(cluster):
+    """Return what runs the command on the workers and returns its exit code."""
+    return lambda *arguments: main([
+        *map(str, arguments), '--quiet', '--scheduler', cluster.scheduler_info()['address']])
+
+
+@pytest.fixture(scope='module')
+def whole(tmp_path_factory):
+    """Return the data of the ensemble, computed without Dask, and its specification."""
+    folder = tmp_path_factory.mktemp('ensemble')
+    path = written(folder)
+    assert parts_of(ensemble_spec.read(path), folder) == {}
+    return folder / 'data', path
 
 
 # ------------------------------------------------------------------------------------- a dataset
 
 
 def test_every_stream_has_columns_or_is_left_out():
-    """Those without a rate of their own too; each number has a name."""
+    """Those without a rate of their own, too; each number has a name."""
     names = [name for name in ensemble_spec.STREAMS if name not in ensemble_spec.WITHOUT_COLUMNS]
-    for some in (names, *([name] for name in names)):
-        specification = ensemble_spec.parse({'runs': 1, 'duration': 0.1, 'streams': some}, 'test')
-        table = ensemble_part.table(specification, 0)
-        assert table.num_rows > 1 and len(set(table.column_names)) == table.num_columns > 3
-    columns = set(ensemble_part.table(ensemble_spec.parse(
-        {'runs': 1, 'duration': 0.1, 'streams': names}, 'test'), 0).column_names)
-    assert columns >= {
+    sample = {'imu.lever_arm': {'values': [[0.1, 0.0, 0.0]]}}
+    for some in ([name] for name in names):
+        one = table(ensemble_spec.parse({'runs': 1, 'duration': 0.1, 'streams': some}, 'test'), 0)
+        assert one.num_rows > 1 and len(set(one.column_names)) == one.num_columns > 3
+    row = table(ensemble_spec.parse({'runs': 1, 'duration': 0.1, 'streams': names,
+                                     'sample': sample}, 'test'), 0).to_pylist()[0]
+    assert row['joint_states.position.nutation_joint'] == pytest.approx(np.radians(30.0))
+    assert row['~/invariants.data.l3'] == 1.6
+    assert row['imu.lever_arm'] == [0.1, 0.0, 0.0]
+    assert set(row) >= {
         'imu/dq.quaternion.w', 'imu/dv.vector.z', 'ground_truth/imu_odom.pose.pose.position.x',
-        'ground_truth/imu_timing.data.copies', '~/invariants.data.energy',
-        'joint_states.velocity.spin_joint', 'imu/mag.magnetic_field_covariance.8'}
+        'ground_truth/imu_timing.data.copies', 'joint_states.velocity.spin_joint',
+        'imu/mag.magnetic_field_covariance.8'}
 
 
-@pytest.fixture(scope='module')
-def dataset(tmp_path_factory):
-    """Return an undisturbed dataset, and its specification."""
-    folder = tmp_path_factory.mktemp('ensemble')
-    path = written(folder)
-    with ensemble(path, '-o', folder / 'whole', '--workers', 1) as running:
-        assert finish(running) == (0, '')
-    return folder / 'whole', path
+@pytest.mark.parametrize('run', [0, 7])
+def test_a_run_has_the_samples_that_its_log_has(whole, tmp_path, run):
+    """Also where the IMU loses samples, and sends some twice."""
+    folder, path = whole
+    values = ensemble_spec.read(path).values(run)
+    every = parquet.read_table(folder)
+    rows = every.filter(every['run'].to_numpy() == run)
+    assert values['imu.rate'] == [100.0, 200.0][run % 2]
+    assert rows['params'].to_pylist() == len(rows) * [run // 2 % 3]
+    assert set(rows['spin.l3'].to_pylist()) == {values['spin.l3']}
+    assert set(rows['seed'].to_pylist()) == {values['seed']}
+    assert rows['t'].to_pylist() == [k / 200.0 for k in range(401)]
+    assert not [name for name in every.column_names if 'data_raw.orientation' in name]
+    log = tmp_path / 'run.mcap'
+    assert main([str(path), '--row', str(run), '-o', str(log)]) == 0
+    templates = {f'/{stream.topic}': stream.template for stream in all_streams(values)}
+    logged = {topic: {} for topic in templates}
+    with LogReader(log) as reader:
+        for message in reader.messages():
+            if message.topic in templates:
+                logged[message.topic][message.log_time] = (
+                    templates[message.topic].decode(message.data))
+    lost = 0
+    for topic, column, field in (('imu/data_raw', 'linear_acceleration.y', 2),
+                                 ('ground_truth/imu', 'orientation.w', 0)):
+        values = rows[f'{topic}.{column}'].to_pylist()
+        kept = {round(1e9 * (t + 1.0)): value for t, value in zip(
+            rows['t'].to_pylist(), values, strict=True) if value is not None}
+        assert kept == {stamp_ns: fields[field][0, 'xyzw'.index(column[-1])]
+                        for stamp_ns, fields in logged[f'/{topic}'].items()}
+        lost = max(lost, len(values) - len(kept))
+    assert lost > 40
 
 
-def test_a_dataset_has_the_samples_of_every_run_as_simulate_has_them(dataset):
-    folder, path = dataset
-    whole = parquet.read_table(folder / 'data')
-    runs = whole['run'].to_numpy()
-    specification = ensemble_spec.read(path)
-    assert sorted(set(runs.tolist())) == list(range(60))
-    for run in (0, 7, 59):
-        values = specification.values(run)
-        rows = whole.filter(runs == run)
-        rate = [100.0, 200.0][run % 2]
-        assert values['imu.rate'] == rate
-        assert rows['params'].to_pylist() == len(rows) * [run // 2 % 3]
-        assert set(rows['spin.l3'].to_pylist()) == {values['spin.l3']}
-        assert set(rows['seed'].to_pylist()) == {values['seed']}
-        assert rows['t'].to_pylist() == [k / 200.0 for k in range(801)]
-        streams = stream_by_stream(values)
-        for topic, column in (('imu/data_raw', 'linear_acceleration.y'),
-                              ('ground_truth/imu', 'orientation.w')):
-            times, fields = streams[topic]
-            name, component = column.split('.')
-            field = ('orientation', 'angular_velocity', 'linear_acceleration').index(name)
-            every = rows[f'{topic}.{column}'].to_pylist()
-            kept = {t: value for t, value in zip(rows['t'].to_pylist(), every, strict=True)
-                    if value is not None}
-            expected = fields[field][:, 'xyzw'.index(component)].tolist()
-            assert kept == dict(zip((times / 1e9).tolist(), expected, strict=True))
-    assert not [name for name in whole.column_names if 'data_raw.orientation' in name]
+def test_two_workers_of_which_one_is_killed_make_the_same_dataset(
+        whole, tmp_path, cluster, ensemble):
+    data, path = whole
+    folder = tmp_path / 'other'
+    first, _ = cluster.run(os.getpid).values()
 
+    def kill():
+        wait_for(folder, 2)
+        os.kill(first, signal.SIGKILL)
 
-def stream_by_stream(values):
-    """Return times [ns] and fields of a run by topic, sample by sample as a node sends them."""
-    simulation = Simulation(values)
-    streams = journal.recorded_streams(simulation.streams, values)
-    found = {stream.topic: [] for stream in streams}
-
-    def write(numbers, stamp_ns, messages, size):
-        for number, data in zip(numbers, messages, strict=True):
-            stream = streams[number]
-            found[stream.topic].append((stamp_ns, stream.template.decode(bytes(data))))
-
-    simulation.log_to(write, streams)
-    simulation.advance(round(values['duration'] * 1e9))
-    return {topic: (np.array([stamp for stamp, _ in rows]),
-                    [np.concatenate(parts) for parts in zip(*(f for _, f in rows), strict=True)])
-            for topic, rows in found.items()}
-
-
-def test_the_manifest_has_specification_versions_and_hashes(dataset):
-    folder, path = dataset
+    with meanwhile(kill):
+        assert ensemble(path, '-o', folder) == 0
+    assert contents(folder / 'data') == contents(data)
     manifest = json.loads((folder / 'manifest.json').read_text())
     assert manifest['complete'] and manifest['failed'] == {}
-    assert {'spinning_top_sim', 'numpy', 'pyarrow', 'python'} <= set(manifest['versions'])
-    assert ensemble_spec.parse(manifest['specification'], 'manifest') == ensemble_spec.read(path)
-    names = {str(file.relative_to(folder)) for file in (folder / 'data').iterdir()}
-    assert set(manifest['files']) == names and len(names) == 30
-    lines = ''.join(f'{digest}  {name}\n' for name, digest in manifest['files'].items())
-    check = subprocess.run(['sha256sum', '--check', '--quiet'], cwd=folder, text=True, input=lines,
-                           check=False, capture_output=True)
-    assert check.returncode == 0, check.stdout
+    assert {'spinning_top_sim', 'numpy', 'pyarrow', 'python', 'rclpy', 'mcap', 'zstandard',
+            'lz4'} <= set(manifest['versions'])
+    assert ensemble_spec.parse(manifest['specification'], 'test') == ensemble_spec.read(path)
+    assert sorted(entry.name for entry in folder.iterdir()) == ['data', 'manifest.json']
 
 
-def test_two_workers_of_which_one_is_killed_make_the_same_dataset(dataset, tmp_path):
-    whole, path = dataset
-    with ensemble(path, '-o', tmp_path / 'other', '--workers', 2) as running:
-        wait_for(tmp_path / 'other', 3, running)
-        first, second = workers_of(running.pid)
-        os.kill(first, signal.SIGKILL)
-        assert finish(running) == (0, '')
-    assert contents(tmp_path / 'other') == contents(whole)
-
-
-def test_a_killed_and_an_interrupted_command_are_resumed(dataset, tmp_path):
-    """What is complete and whole is not computed again; the dataset is that of one command."""
-    whole, path = dataset
+def test_the_same_command_goes_on_after_an_interruption(whole, tmp_path, ensemble):
+    """A part that is there is not computed again; a torn one is."""
+    data, path = whole
     folder = tmp_path / 'other'
-    with ensemble(path, '-o', folder, '--workers', 1) as running:
-        wait_for(folder, 3, running)
-        os.kill(running.pid, signal.SIGKILL)
-    before = len(list((folder / 'progress').glob('part-*.json')))
-    assert before < 25
-    with ensemble(path, '-o', folder, '--workers', 1, '--resume') as running:
-        wait_for(folder, before + 3, running)
+    with process('-P', ROOT / 'scripts/ensemble', path, '-o', folder, '--workers', 1,
+                 '--quiet') as running:
+        wait_for(folder, 3)
         os.killpg(running.pid, signal.SIGINT)           # as a terminal does
-        code, said = finish(running)
-    assert code == 130
+        _, said = running.communicate(timeout=PATIENCE)
+    assert running.returncode == 130
     assert said.splitlines() == [
-        f'ensemble: {folder} holds what was complete: the same command with --resume goes on',
+        f'ensemble: {folder} holds what is complete: the same command goes on',
         'ensemble: interrupted']
     assert not json.loads((folder / 'manifest.json').read_text())['complete']
-    records = [json.loads(record.read_text())
-               for record in (folder / 'progress').glob('part-*.json')]
-    complete = {name: (folder / name).stat() for record in records for name in record['files']}
-    assert before + 3 <= len(complete) < 30
-    damaged = folder / complete.popitem()[0]
-    damaged.write_bytes(damaged.read_bytes()[:-1])
-    with ensemble(path, '-o', folder, '--workers', 2, '--resume') as running:
-        assert finish(running) == (0, '')
-    assert contents(folder) == contents(whole)
-    for name, then in complete.items():
-        now = (folder / name).stat()
-        assert (now.st_ino, now.st_mtime_ns) == (then.st_ino, then.st_mtime_ns)
+    torn, *kept = sorted((folder / 'data').iterdir())
+    assert 2 <= len(kept) < RUNS // 2
+    then = [(part.stat().st_ino, part.stat().st_mtime_ns) for part in kept]
+    torn.write_bytes(torn.read_bytes()[:-1])
+    assert ensemble(path, '-o', folder, '--resume') == 0        # as version 1.0 needed it
+    assert contents(folder / 'data') == contents(data)
+    assert [(part.stat().st_ino, part.stat().st_mtime_ns) for part in kept] == then
 
 
-@pytest.mark.parametrize('change', [
-    {'versions': 1}, {'files': None}, {'complete': 1}, {'specification': []}, {'format': 2}])
-def test_what_is_no_manifest_is_refused(dataset, tmp_path, capsys, change):
-    manifest = json.loads((dataset[0] / 'manifest.json').read_text())
-    place = tmp_path / 'manifest.json'
-    for text in (json.dumps({**manifest, **change}), '[' * 100_000, '[]', '{"format": 1}'):
-        place.write_text(text)
-        for arguments in ([str(tmp_path), '--row', '0', '-o', str(tmp_path / 'one.mcap')],
-                          [str(dataset[1]), '--resume', '-o', str(tmp_path)]):
-            assert main(arguments) == 2
-            error = capsys.readouterr().err
-            assert error.startswith(f'ensemble: {place} is no manifest') and error.count('\n') == 1
-
-
-def test_damaged_files_of_a_complete_dataset_are_computed_again(tmp_path):
-    """And no others; runs that failed are as they were."""
-    folder = tmp_path / 'logs'
-    command = (written(tmp_path, runs=6, duration=0.1, format='mcap', sample={
-        'spin.lz': {'values': [1.42, 1e30, 1.4, 1.41]}}), '-o', folder, '--workers', 1)
-    with ensemble(*command) as running:
-        assert finish(running)[0] == 0
-    before = contents(folder)
-    lost, damaged, _, *kept = sorted((folder / 'data').iterdir())       # runs 0, 2, 3, and 4
-    then = [(path.stat().st_ino, path.stat().st_mtime_ns) for path in kept]
-    lost.unlink()
-    damaged.write_bytes(bytes(100))
-    with ensemble(*command, '--resume') as running:
-        code, said = finish(running)
-    assert code == 0 and said.startswith('ensemble: 2 of 6 runs failed, see manifest.json; run 1:')
-    assert contents(folder) == before
-    assert [(path.stat().st_ino, path.stat().st_mtime_ns) for path in kept] == then
-
-
-def test_a_cluster_whose_scheduler_is_killed(dataset, tmp_path):
-    whole, path = dataset
+def test_a_cluster_whose_scheduler_is_killed(whole, tmp_path, capsys):
     folder, place = tmp_path / 'other', tmp_path / 'scheduler.json'
     common = ('--scheduler-file', place, '--host', '127.0.0.1', '--no-dashboard')
     with process('-m', 'dask', 'scheduler', '--port', 0, *common) as scheduler, process(
@@ -273,70 +224,80 @@ def test_a_cluster_whose_scheduler_is_killed(dataset, tmp_path):
         while not (place.exists() and place.read_text()) and time.monotonic() < end:
             time.sleep(0.01)
         address = json.loads(place.read_text())['address']
-        with ensemble(path, '-o', folder, '--scheduler', address) as running:
-            wait_for(folder, 3, running)
+
+        def kill():
+            wait_for(folder, 3)
             scheduler.kill()
-            code, said = finish(running)
-    assert code == 1
-    assert said.splitlines()[-1] == 'ensemble: the scheduler is lost'
-    with ensemble(path, '-o', folder, '--resume') as running:
-        assert finish(running) == (0, '')
-    assert contents(folder) == contents(whole)
+
+        with meanwhile(kill):
+            assert main([str(whole[1]), '-o', str(folder), '--scheduler', address]) == 1
+    assert capsys.readouterr().err.splitlines()[-1] == 'ensemble: the scheduler is lost'
 
 
-def test_a_row_alone_is_that_of_the_dataset(dataset, tmp_path):
-    """From the manifest alone."""
-    whole, _ = dataset
-    (tmp_path / 'alone').mkdir()
-    (tmp_path / 'alone/manifest.json').write_bytes((whole / 'manifest.json').read_bytes())
-    for name in ('one.parquet', 'one.mcap'):
-        assert main([str(tmp_path / 'alone'), '--row', '41', '-o', str(tmp_path / name)]) == 0
-    every = parquet.read_table(whole / 'data')
+def test_a_row_alone_is_computed_from_the_manifest(whole, tmp_path):
+    data, path = whole
+    from dataclasses import asdict
+    (tmp_path / 'manifest.json').write_text(json.dumps({
+        'format': 1, 'versions': ensemble_part.versions(),
+        'specification': asdict(ensemble_spec.read(path))}))
+    assert main([str(tmp_path), '--row', '31', '-o', str(tmp_path / 'one.parquet')]) == 0
+    every = parquet.read_table(data)
     assert parquet.read_table(tmp_path / 'one.parquet').equals(
-        every.filter(every['run'].to_numpy() == 41).combine_chunks())
-    with open(tmp_path / 'one.mcap', 'rb') as file:
-        reader = make_reader(file)
-        counts = reader.get_summary().statistics.message_count
-        stated = {record.name: record.metadata for record in reader.iter_metadata()}
-    # 200 Hz for four seconds, of the IMU, its bias and its truth; and the start
-    assert counts == 3 * 801 + 1
-    specification = ensemble_spec.parse(
-        json.loads((whole / 'manifest.json').read_text())['specification'], 'manifest')
-    assert parameters.checked(json.loads(
-        stated['spinning_top_sim']['parameters'])) == specification.values(41)
+        every.filter(every['run'].to_numpy() == 31).combine_chunks())
+    assert main([str(tmp_path), '--row', '31', '-o', str(tmp_path / 'one.parquet')]) == 1
 
 
-def test_logs_and_failed_runs(tmp_path):
-    """A run that no motion begins, or that ends early, is told with its reason."""
-    path = written(tmp_path, runs=6, duration=1.0, format='mcap', streams=[], sample={
+def test_logs_and_failed_runs(tmp_path, capsys, ensemble):
+    """A run that no motion begins is told with its reason; a log that is lost is made again."""
+    path = written(tmp_path, runs=6, duration=0.2, format='mcap', streams=[], sample={
         'initial.theta': {'values': [0.5, 0.5, 3.0]}, 'spin.lz': {'values': [1.42, 1e30]}})
-    with ensemble(path, '-o', tmp_path / 'logs', '--workers', 1) as running:
-        code, said = finish(running)
-    assert code == 0
-    assert said.startswith('ensemble: 3 of 6 runs failed, see manifest.json; run 3: ValueError: ')
-    assert said.count('\n') == 1
-    manifest = json.loads((tmp_path / 'logs/manifest.json').read_text())
-    assert list(manifest['failed']) == ['3', '4', '5']
-    assert all('ValueError: no motion from theta' in why for why in manifest['failed'].values())
-    assert list(manifest['files']) == [f'data/run-{run:09d}.mcap' for run in range(3)]
-    assert main([str(tmp_path / 'logs'), '--row', '2', '-o', str(tmp_path / 'one.mcap')]) == 0
-    assert (tmp_path / 'one.mcap').read_bytes() == (
-        tmp_path / 'logs/data/run-000000002.mcap').read_bytes()
+    folder = tmp_path / 'logs'
+
+    def compute():
+        assert ensemble(path, '-o', folder) == 0
+        said = capsys.readouterr().err
+        assert said.startswith('ensemble: 3 of 6 runs failed, see manifest.json; run 3: ValueErr')
+        assert said.count('\n') == 1
+        return contents(folder)
+
+    before = compute()
+    failed = json.loads(before['manifest.json'])['failed']
+    assert list(failed) == ['3', '4', '5']
+    assert all('ValueError: no motion from theta' in why for why in failed.values())
+    logs = sorted((folder / 'data').iterdir())
+    assert [log.name for log in logs] == [f'run-{run:09d}.mcap' for run in range(3)]
+    assert main([str(folder), '--row', '2', '-o', str(tmp_path / 'one.mcap')]) == 0
+    assert (tmp_path / 'one.mcap').read_bytes() == logs[2].read_bytes()
+    logs[0].unlink()
+    then = logs[1].stat().st_ino
+    assert compute() == before
+    assert logs[1].stat().st_ino == then
+
+
+def test_a_part_that_is_there_tells_its_failed_runs(tmp_path):
+    specification = ensemble_spec.parse({
+        'runs': 3, 'duration': 0.05, 'runs_per_part': 3,
+        'sample': {'spin.lz': {'values': [1.42, 1e30, 1.4]}}}, 'test')
+    failed = parts_of(specification, tmp_path)
+    assert list(failed) == ['1']
+    assert parts_of(specification, tmp_path) == failed
+    part, = (tmp_path / 'data').iterdir()
+    assert set(parquet.read_table(part)['run'].to_pylist()) == {0, 2}
 
 
 # --------------------------------------------------------------------------------- what is drawn
 
 
 def test_what_is_drawn_has_the_distributions_and_does_not_depend_on_other_names():
-    given = {'runs': 4000, 'duration': 1.0, 'seed': 3}
+    given = {'runs': 2000, 'duration': 1.0, 'seed': 3}
     one = ensemble_spec.parse({**given, 'sample': {
         'spin.l3': {'uniform': [1.0, 3.0]}, 'initial.theta': {'values': [0.1, 0.2]}}}, 'one')
     more = ensemble_spec.parse({**given, 'sample': {
         'top.mass': {'log_uniform': [0.1, 10.0]}, 'spin.l3': {'uniform': [1.0, 3.0]},
         'spin.lz': {'normal': [2.0, 0.5]}, 'initial.theta': {'values': [0.1, 0.2]},
         'imu.rate': {'values': [10, 20, 30]}}}, 'more')
-    drawn = [more.drawn(run) for run in range(4000)]
-    for run in (0, 1, 3999):
+    drawn = [more.drawn(run) for run in range(2000)]
+    for run in (0, 1, 1999):
         assert one.drawn(run).items() <= drawn[run].items()
     columns = {name: np.array([row[name] for row in drawn]) for name in drawn[0]}
     # Five standard errors of the mean, and of the standard deviation.
@@ -344,12 +305,20 @@ def test_what_is_drawn_has_the_distributions_and_does_not_depend_on_other_names(
             (columns['spin.l3'], 2.0, 1.0 / np.sqrt(3.0)),
             (columns['spin.lz'], 2.0, 0.5),
             (np.log10(columns['top.mass']), 0.0, 1.0 / np.sqrt(3.0))):
-        assert abs(values.mean() - mean) < 5.0 * deviation / np.sqrt(4000)
-        assert abs(values.std() - deviation) < 5.0 * deviation / np.sqrt(2 * 4000)
-    assert len(set(columns['seed'].tolist())) == 4000
+        assert abs(values.mean() - mean) < 5.0 * deviation / np.sqrt(2000)
+        assert abs(values.std() - deviation) < 5.0 * deviation / np.sqrt(2 * 2000)
+    assert len(set(columns['seed'].tolist())) == 2000
     pairs = list(zip(columns['initial.theta'], columns['imu.rate'], strict=True))
     assert pairs[:6] == pairs[6:12] and len(set(pairs[:6])) == 6
-    assert abs(np.corrcoef(columns['spin.l3'], columns['spin.lz'])[0, 1]) < 5.0 / np.sqrt(4000)
+    assert abs(np.corrcoef(columns['spin.l3'], columns['spin.lz'])[0, 1]) < 5.0 / np.sqrt(2000)
+
+
+@pytest.mark.parametrize(('runs', 'duration', 'together'), [
+    (10 ** 6, 10.0, 100), (1000, 10.0, 20), (10, 10.0, 1), (10 ** 6, 1e5, 1)])
+def test_a_part_has_so_many_runs_by_default(runs, duration, together):
+    """At most 200 000 rows of 200 Hz, and at least 50 parts."""
+    given = {'runs': runs, 'duration': duration}
+    assert ensemble_spec.parse(given, 'test').runs_per_part == together
 
 
 def test_a_worker_with_other_versions_computes_nothing(tmp_path):
@@ -365,92 +334,46 @@ def test_samples_of_a_run_are_arrays():
     assert set(found) == {'imu/data_raw', 'ground_truth/imu_bias', '~/invariants', 'imu/mag',
                           'ground_truth/mag'}
     assert len(found['imu/mag'][0]) == 0
-    times, fields = found['imu/data_raw']
+    times, columns = found['imu/data_raw']
     assert times.tolist() == [5_000_000 * k for k in range(101)]
-    assert {name: field.shape for name, field in fields.items()} == {
-        'angular_velocity': (101, 3), 'linear_acceleration': (101, 3)}
+    assert {name: len(column) for name, column in columns.items()} == {
+        f'{field}.{axis}': 101 for field in ('angular_velocity', 'linear_acceleration')
+        for axis in 'xyz'}
 
 
-def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(tmp_path):
-    """An IMU with a magnetometer beside one without; a value that is unset in some runs."""
-    grades = [str(ROOT / f'config/imu/{name}.yaml') for name in ('bmi088', 'icm_20948')]
+def test_a_run_of_several_blocks_of_steps_is_whole():
     specification = ensemble_spec.parse({
-        'runs': 4, 'duration': 0.05, 'runs_per_part': 4, 'sample': {
-            'params': {'values': [*grades]}, 'spin.lz': {'values': [None, 1.4]}}}, 'test')
-    (tmp_path / 'progress').mkdir()
-    (tmp_path / 'data').mkdir()
-    record = compute_part(specification, 0, str(tmp_path), ensemble_part.versions())
-    assert (len(record['files']), record['failed']) == (1, {})
-    runs = [table(specification, run) for run in range(4)]
-    assert parquet.read_table(tmp_path / 'data').equals(
-        pa.concat_tables(runs).combine_chunks())
-    for run, one in enumerate(runs):
-        assert one.schema == runs[0].schema
-        assert set(one['spin.lz'].to_pylist()) == {None if run < 2 else 1.4}
-        samples_of_mag = len(one) - one['imu/mag.magnetic_field.x'].null_count
-        assert samples_of_mag == [0, 6][run % 2]
+        'runs': 1, 'duration': 40.0, 'streams': ['pose'],
+        'params': [{'solver.rtol': 1e-13, 'pose.rate': 10.0}]}, 'test')
+    one = table(specification, 0)
+    assert one['t'].to_pylist() == [k / 10.0 for k in range(401)]
+    norm = sum(one[f'pose.pose.orientation.{axis}'].to_numpy() ** 2 for axis in 'xyzw')
+    assert np.abs(norm - 1.0).max() < 1e-14
 
 
-def test_runs_without_a_sample_have_no_rows(tmp_path):
-    grades = [str(ROOT / f'config/imu/{name}.yaml') for name in ('bmi088', 'icm_20948')]
-    specification = ensemble_spec.parse({
-        'runs': 2, 'runs_per_part': 1, 'duration': 0.05, 'params': [{'record.streams': ['mag']}],
-        'sample': {'params': {'values': grades}}}, 'test')
-    for name in ('progress', 'data'):
-        (tmp_path / name).mkdir()
-    for part in range(2):
-        record = compute_part(specification, part, str(tmp_path), ensemble_part.versions())
-        assert (len(record['files']), record['failed']) == (1, {})
-    assert [len(table(specification, run)) for run in range(2)] == [0, 6]
-    assert len(parquet.read_table(tmp_path / 'data')) == 6
-
-
-def test_a_grid_in_another_order_is_another_one(tmp_path):
-    sample = {'initial.theta': {'values': [0.3, 0.6]}, 'spin.l3': {'values': [1.5, 1.7]}}
-    one, other = (ensemble_spec.parse({'runs': 4, 'duration': 1.0, 'sample': dict(order)}, 'test')
-                  for order in (sample.items(), reversed(sample.items())))
-    manifest = _manifest(tmp_path, one, resume=False)
-    _write_manifest(tmp_path, manifest)
-    assert _manifest(tmp_path, one, resume=True) == manifest
-    with pytest.raises(ValueError, match='has another specification: sample'):
-        _manifest(tmp_path, other, resume=True)
-
-
-def test_an_ensemble_that_stopped_with_its_first_manifest_is_resumed(tmp_path):
-    specification = ensemble_spec.parse({'runs': 4, 'duration': 1.0}, 'test')
-    (tmp_path / 'manifest.json.new').write_text('{"for')
-    for resume in (True, False):
-        assert not _manifest(tmp_path, specification, resume=resume)['complete']
-
-
-def test_the_versions_are_those_that_are_in_the_logs():
-    assert {'rclpy', 'numpy', 'mcap', 'zstandard', 'lz4'} <= set(ensemble_part.versions())
-
-
-def test_streams_that_are_named_have_the_same_columns_in_all_runs():
-    specification = ensemble_spec.parse({
-        'runs': 2, 'duration': 0.05, 'streams': ['imu', 'mag'], 'sample': {'params': {'values': [
-            {'mag.enabled': False, 'increments.enabled': True}, {'imu.enabled': False}]}}}, 'test')
-    assert table(specification, 0).schema == table(specification, 1).schema
-    assert table(specification, 0)['imu/mag.magnetic_field.x'].null_count < 11
-
-
-def test_a_row_of_logs_without_columns_is_refused(tmp_path, capsys):
-    path = written(tmp_path, format='mcap', streams=['clock'])
-    assert main([str(path), '--row', '0', '-o', str(tmp_path / 'one.parquet')]) == 2
-    assert capsys.readouterr().err == (
-        'ensemble: the streams clock have no columns: only a log (.mcap) can have them\n')
-
-
-def test_columns_have_the_names_of_joints_and_invariants():
-    specification = ensemble_spec.parse({
-        'runs': 1, 'duration': 0.1, 'streams': ['pose', 'joint_states', 'invariants'],
-        'sample': {'imu.lever_arm': {'values': [[0.1, 0.0, 0.0]]}}}, 'test')
-    row = table(specification, 0).to_pylist()[0]
-    assert row['joint_states.position.nutation_joint'] == pytest.approx(np.radians(30.0))
-    assert row['~/invariants.data.l3'] == 1.6
-    assert row['imu.lever_arm'] == [0.1, 0.0, 0.0]
-    assert len(row) == 2 + 2 + 4 + 6 + 8
+@pytest.mark.parametrize(('content', 'counts'), [
+    # A magnetometer in one of two IMUs; a value that is unset in some runs.
+    ({'runs': 4, 'sample': {'params': {'values': [
+        str(ROOT / f'config/imu/{name}.yaml') for name in ('bmi088', 'icm_20948')]},
+        'spin.lz': {'values': [None, 1.4]}}}, [0, 6, 0, 6]),
+    # Named streams are in all runs, whatever the parameters say.
+    ({'runs': 2, 'streams': ['imu', 'mag'], 'sample': {'params': {'values': [
+        {'mag.enabled': False, 'increments.enabled': True}, {'imu.enabled': False}]}}}, [6, 6]),
+    # A run without any sample has no rows.
+    ({'runs': 2, 'params': [{'record.streams': ['mag']}], 'sample': {'params': {'values': [
+        {'mag.enabled': False}, {'mag.enabled': True}]}}}, [0, 6])])
+def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(
+        tmp_path, content, counts):
+    specification = ensemble_spec.parse(
+        {'duration': 0.05, 'runs_per_part': 4, **content}, 'test')
+    assert parts_of(specification, tmp_path) == {}
+    runs = [table(specification, run) for run in range(specification.runs)]
+    assert parquet.read_table(tmp_path / 'data').equals(pa.concat_tables(runs).combine_chunks())
+    mag = [one['imu/mag.magnetic_field.x'] for one in runs]
+    assert [len(column) - column.null_count for column in mag] == counts
+    if 'spin.lz' in content['sample']:
+        assert [set(one['spin.lz'].to_pylist()) for one in runs] == [
+            {None}, {None}, {1.4}, {1.4}]
 
 
 # -------------------------------------------------------------------------------------- bad input
@@ -472,6 +395,7 @@ def test_columns_have_the_names_of_joints_and_invariants():
     ({'sample': {'spin.l3': {'normal': [2, -1]}}}, 'deviation >= 0'),
     ({'sample': {'top.mass': {'log_uniform': [0, 1]}}}, '0 < low <= high'),
     ({'sample': {'top.mass': {'uniform': [-1, 1]}}}, 'top.mass = -1: must be a number >= 0'),
+    ({'sample': {'top.mass': {'uniform': [1, 1e31]}}}, 'top.mass = 1e+31: must be a number >= 0'),
     ({'sample': {'spin.l3': {'values': []}}}, 'must have one value at least'),
     ({'sample': {'spin.l3': [1, 2]}}, 'spin.l3 = [1, 2]: must be one of uniform'),
     ({'sample': {'solver.method': {'values': ['exact', 'euler']}}}, "'euler': must be one of"),
@@ -499,28 +423,55 @@ def test_a_bad_specification_is_refused_and_makes_nothing(tmp_path, capsys, chan
     assert not (tmp_path / 'out').exists()
 
 
-def test_folders_are_not_overwritten_and_only_their_own_ensemble_is_resumed(
-        dataset, tmp_path, capsys):
-    whole, path = dataset
-    before = contents(whole)
-    assert main([str(path), '-o', str(whole)]) == 2
-    assert 'exists and is not overwritten: --resume goes on with it' in capsys.readouterr().err
-    other = written(tmp_path, seed=6, streams=['pose'])
-    assert main([str(other), '-o', str(whole), '--resume']) == 2
+def test_a_folder_of_something_else_is_refused(whole, tmp_path, capsys, ensemble):
+    _, path = whole
+    folder = tmp_path / 'runs'
+    one = written(tmp_path, runs=1, duration=0.05, sample={
+        'initial.theta': {'values': [0.3, 0.6]}, 'spin.l3': {'values': [1.5, 1.7]}})
+    assert ensemble(one, '-o', folder) == 0
+    before = contents(folder)
+    assert ensemble(one, '-o', folder) == 0             # it is complete
+    assert contents(folder) == before
+    assert ensemble(path, '-o', folder) == 2
     error = capsys.readouterr().err
-    assert 'another specification: seed = 5, not 6, streams = [' in error and 'pose' in error
-    assert main([str(path), '-o', str(tmp_path), '--resume']) == 2
-    assert 'has no manifest.json' in capsys.readouterr().err
-    assert main([str(path), '-o', str(whole), '--resume', '--quiet']) == 0       # it is complete
-    assert contents(whole) == before
+    assert f'{folder} has another specification: runs = 1, not 40, duration' in error
+    assert error.endswith(': choose a new folder, or --overwrite\n')
+    turned = written(tmp_path, runs=1, duration=0.05, sample={      # it is another grid
+        'spin.l3': {'values': [1.5, 1.7]}, 'initial.theta': {'values': [0.3, 0.6]}})
+    assert ensemble(turned, '-o', folder) == 2
+    assert 'has another specification: sample = ' in capsys.readouterr().err
+    assert contents(folder) == before
+    (folder / 'notes').write_text('mine')
+    assert ensemble(turned, '-o', folder, '--overwrite') == 0
+    after = contents(folder)
+    assert after.pop('notes') == b'mine'
+    assert after.keys() == before.keys() and not after.items() & before.items()
+    for arguments in ([], ['--overwrite']):
+        assert ensemble(path, '-o', tmp_path, *arguments) == 2
+        assert capsys.readouterr().err.endswith(
+            f'{tmp_path} exists and has no manifest.json: choose a new folder\n')
+
+
+@pytest.mark.parametrize('text', [
+    '{"format": 2, "versions": 1, "specification": {}}',
+    '{"format": 2, "versions": {}, "specification": []}',
+    '{"format": 3, "versions": {}, "specification": {}}', '[]', '{"format": 1}', '[' * 100_000])
+def test_what_is_no_manifest_is_refused(whole, tmp_path, capsys, text):
+    place = tmp_path / 'manifest.json'
+    place.write_text(text)
+    for arguments in ([str(tmp_path), '--row', '0', '-o', str(tmp_path / 'one.mcap')],
+                      [str(whole[1]), '-o', str(tmp_path)]):
+        assert main(arguments) == 2
+        error = capsys.readouterr().err
+        assert error.startswith(f'ensemble: {place} is no manifest') and error.count('\n') == 1
 
 
 @pytest.mark.parametrize(('arguments', 'said'), [
-    (['--row', '60', '-o', 'one.mcap'], '--row 60: must be from 0 to 59'),
+    (['--row', '40', '-o', 'one.mcap'], '--row 40: must be from 0 to 39'),
     (['--row', '1', '-o', 'one.csv'], 'one.csv: the name must end in .mcap or .parquet'),
     (['-o', 'out', '--workers', '0'], '--workers 0: must be'),
-    (['-o', 'out', '--workers', '1', '--scheduler', 'tcp://127.0.0.1:1'], 'must not be given'),
-])
+    (['-o', 'out', '--scheduler', 'host'], '--scheduler host: must be such as tcp://host:8786'),
+    (['-o', 'out', '--workers', '1', '--scheduler', 'tcp://127.0.0.1:1'], 'must not be given')])
 def test_bad_arguments_are_refused(tmp_path, monkeypatch, capsys, arguments, said):
     path = written(tmp_path)
     monkeypatch.chdir(tmp_path)
@@ -529,12 +480,19 @@ def test_bad_arguments_are_refused(tmp_path, monkeypatch, capsys, arguments, sai
     assert [entry.name for entry in tmp_path.iterdir()] == ['spec.yaml']
 
 
+def test_a_row_of_logs_without_columns_is_refused(tmp_path, capsys):
+    path = written(tmp_path, format='mcap', streams=['clock'])
+    assert main([str(path), '--row', '0', '-o', str(tmp_path / 'one.parquet')]) == 2
+    assert capsys.readouterr().err == (
+        'ensemble: the streams clock have no columns: only a log (.mcap) can have them\n')
+
+
 @pytest.mark.parametrize('name', ['distributed', 'pyarrow'])
-def test_what_is_not_installed_is_named(tmp_path, name):
-    arguments = [str(written(tmp_path)), '-o', str(tmp_path / 'out')]
-    with process('-c', f'import sys; sys.modules[{name!r}] = None\n'
-                 f'from spinning_top_sim.tools.ensemble import main\nsys.exit(main({arguments}))',
-                 ) as running:
-        code, said = finish(running)
-    assert code == 1 and "pip install 'spinning_top_sim[exam]'" in said and name in said
+def test_what_is_not_installed_is_named(tmp_path, monkeypatch, capsys, name):
+    monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.delitem(sys.modules, 'spinning_top_sim.tools.ensemble_cluster', raising=False)
+    monkeypatch.delattr(tools, 'ensemble_cluster', raising=False)
+    assert main([str(written(tmp_path)), '-o', str(tmp_path / 'out')]) == 1
+    error = capsys.readouterr().err
+    assert "pip install 'spinning_top_sim[exam]'" in error and name in error
     assert not (tmp_path / 'out').exists()

@@ -125,7 +125,7 @@ def test_kalibr_gets_the_parameters(folder):
 
 def test_kalibr_gets_matrices_that_are_not_the_identity(tmp_path):
     matrix = [1.01, 0.0, 0.0, 0.002, 0.99, 0.0, 0.0, 0.003, 1.0]
-    assert simulate.main([*options(NOISY, **{'imu.accelerometer_M': matrix}), '--duration', '0.1',
+    assert simulate.main([*options(NOISY, **{'imu.accelerometer_M': matrix}), '--duration', '0.01',
                           '-o', str(tmp_path / 'run.mcap'), '--quiet', '--namespace', 'left',
                           *exports(tmp_path, 'kalibr')]) == 0
     content = yaml.safe_load((tmp_path / 'imu.yaml').read_text())
@@ -165,7 +165,7 @@ def test_parameters_that_wait_for_a_reset_are_not_in_effect(folder):
     assert run.values_in_effect == run.values_at_recording
 
 
-@pytest.mark.parametrize('text', ['tum', 'tum:', 'kitti:a', 'a.tum'])
+@pytest.mark.parametrize('text', ['tum', 'tum:', 'kitti:a'])
 def test_a_wrong_kind_is_told_with_the_right_ones(tmp_path, capsys, text):
     with pytest.raises(SystemExit):
         simulate.main(['--export', text, '-o', str(tmp_path / 'run.mcap')])
@@ -181,7 +181,7 @@ def test_a_table_has_no_exports(tmp_path, capsys):
 
 def test_inspect_refuses_what_the_log_lacks_and_what_is_there(tmp_path, folder, capsys):
     log = tmp_path / 'run.mcap'
-    assert simulate.main(['--duration', '0.1', '-o', str(log), '--quiet']) == 0
+    assert simulate.main(['--duration', '0.01', '-o', str(log), '--quiet']) == 0
     assert inspect.main([str(log), *exports(tmp_path, 'tum')]) == 2
     assert 'no ground_truth/imu_odom' in capsys.readouterr().err
     assert inspect.main([str(folder / 'run.mcap'), *exports(folder, 'tum')]) == 1

@@ -5,9 +5,11 @@
 What is measured is compared with the closed form, which test_exact.py holds against 30 digits.
 """
 
+import contextlib
 import itertools
 import json
 import math
+import os
 import re
 import struct
 import subprocess
@@ -21,15 +23,14 @@ from helpers.reference import ROOT, SCENES, scene_parameters
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from spinning_top_sim import tools
 from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.streams.simulation import Simulation
+from spinning_top_sim.streams.cdr import Template
 from spinning_top_sim.tools import analysis, cli, inspect, recover, simulate
-from spinning_top_sim.tools.recorded_run import read_run_description, verify
 from spinning_top_sim.tools.survey import Series, survey
 
-RUN_S = 20
 NAMES = {'cusp': 'cusps', 'fast_gyroscope': 'cusps', 'free_top': 'free top', 'heavy_top': 'loops',
          'looping': 'loops', 'near_separatrix': 'waves',
          'planar_pendulum': 'planar pendulum, rotating', 'sleeping': 'sleeping',
@@ -58,10 +59,15 @@ def stepped(folder):
 
 
 @pytest.fixture(scope='module')
+def short(folder):
+    """Two motions in half a second."""
+    return log_of(folder / 'short.mcap', '--duration', 0.5, '--command', '0.3:1.7:1.4')
+
+
+@pytest.fixture(scope='module')
 def columns(folder):
-    """The exact solution in columns, with commands between the stretches."""
-    return log_of(folder / 'columns.mcap', '--duration', 12, '--command', '1.7:2.0:1.5',
-                  '--command', '3.1:1.7:1.4',
+    """The exact solution in columns, with a command between two stretches; several chunks."""
+    return log_of(folder / 'columns.mcap', '--duration', 11, '--command', '3.1:1.7:1.4',
                   '-p', 'solver.method:=exact', '-p', 'imu.accelerometer_random_walk:=0.01',
                   '-p', 'markers.enabled:=true')
 
@@ -81,6 +87,11 @@ def as_json(capsys, *arguments):
 def surveyed(path):
     with LogReader(path) as reader:
         return survey(reader)
+
+
+def chunks_of(path):
+    with open(path, 'rb') as file:
+        return make_reader(file).get_summary().chunk_indexes
 
 
 def rewritten(source, target, change=lambda topic, number, data: data, metadata=None,
@@ -127,16 +138,15 @@ def with_flipped_bit(data, byte, bit=0):
 # --------------------------------------------------------------------------------- measuring
 
 
-@pytest.mark.parametrize('method', ['exact', 'rk45'])
-@pytest.mark.parametrize('scene', SCENES)
+@pytest.mark.parametrize(('scene', 'method'), [
+    *((scene, 'exact') for scene in SCENES), ('cusp', 'rk45'), ('planar_pendulum', 'rk45'),
+    ('sleeping', 'rk45')])
 def test_every_scene_is_measured_from_its_data(tmp_path, scene, method):
-    slow = (scene, method) == ('fast_gyroscope', 'rk45')        # 80 nutations a second
-    arguments = ['--params', ROOT / f'config/{scene}.yaml', '--duration', 4 if slow else RUN_S,
-                 '-p', f'solver.method:={method}', '-p', "record.streams:=['joint_states', "
-                 "'ground_truth_imu']"]
-    if (scene, method) == ('waking_sleeper', 'rk45'):   # grows what the tolerance leaves
-        arguments += ['-p', 'solver.rtol:=1.0e-13']
-    found = surveyed(log_of(tmp_path / 'run.mcap', *arguments))
+    duration = 20 if scene in ('near_separatrix', 'waking_sleeper') else 4
+    found = surveyed(log_of(
+        tmp_path / 'run.mcap', '--params', ROOT / f'config/{scene}.yaml', '--duration', duration,
+        '-p', f'solver.method:={method}', '-p',
+        "record.streams:=['joint_states', 'ground_truth_imu']"))
     motion, = found.motions
     truth = motion.exact
     assert_exact_numbers(truth, parameters.checked(scene_parameters(scene)))
@@ -215,20 +225,22 @@ def test_the_slowest_precession_may_be_within_the_swing(tmp_path, l3, lz):
             getattr(motion.exact, name), rel=1e-2)
 
 
-def test_a_slow_topic_says_that_it_does_not_resolve_the_nutation(tmp_path):
+@pytest.mark.parametrize(('topic', 'reason'), [
+    ('joint_states', 'a nutation takes only a few samples'),
+    ('pose', '4.9 samples in a nutation are too few')])
+def test_a_slow_topic_says_that_it_does_not_resolve_the_nutation(tmp_path, topic, reason):
     found = surveyed(log_of(
-        tmp_path / 'run.mcap', '--params', ROOT / 'config/fast_gyroscope.yaml', '--duration', 5,
-        '-p', 'record.streams:=["joint_states"]', '-p', 'solver.method:=exact'))
-    motion, = found.motions
-    assert motion.measured.nutation_period is None
-    assert motion.measured.mean_precession_rate is None
-    assert 'a few samples' in motion.measured.missing[0]
+        tmp_path / 'run.mcap', '--params', ROOT / 'config/fast_gyroscope.yaml', '--duration', 2,
+        '-p', f'record.streams:=["{topic}"]', '-p', 'solver.method:=exact'))
+    measured = found.motions[0].measured
+    assert measured.nutation_period is measured.mean_precession_rate is None
+    assert reason in measured.missing[0]
 
 
 @pytest.mark.parametrize('topic', ['pose', 'ground_truth_odom', 'ground_truth_imu', 'imu_data'])
 def test_any_topic_with_an_attitude_measures_a_motion(tmp_path, topic):
     found = surveyed(log_of(
-        tmp_path / 'run.mcap', '--duration', 10, '-p', f'record.streams:=["{topic}"]',
+        tmp_path / 'run.mcap', '--duration', 3, '-p', f'record.streams:=["{topic}"]',
         '-p', 'imu_data.enabled:=true', '-p', 'imu.rpy:=[0.3, -0.2, 1.1]',
         '-p', 'solver.method:=exact', '--namespace', '/one'))
     motion, = found.motions
@@ -244,7 +256,7 @@ def test_any_topic_with_an_attitude_measures_a_motion(tmp_path, topic):
 def test_a_sleeping_top_is_measured_from_an_imu_alone(tmp_path):
     """At the pole phi is not defined, and theta' only where a topic has it."""
     found = surveyed(log_of(
-        tmp_path / 'run.mcap', '--params', ROOT / 'config/sleeping.yaml', '--duration', 2,
+        tmp_path / 'run.mcap', '--params', ROOT / 'config/sleeping.yaml', '--duration', 1,
         '-p', 'record.streams:=["ground_truth_imu"]'))
     motion, = found.motions
     assert motion.regime == 'sleeping'
@@ -252,8 +264,11 @@ def test_a_sleeping_top_is_measured_from_an_imu_alone(tmp_path):
 
 
 def test_errors_and_drifts_are_those_in_the_data(stepped, tmp_path, capsys):
-    """A pose turned by 1e-6 rad, a rate off by 1e-3: told as such, and where."""
+    """A pose turned by 1e-6 rad is told as such; one that is no attitude is left out."""
     def change(topic, number, data):
+        if topic == '/a/b/pose' and number in (10, 20, 30):
+            return data[:-32] + struct.pack('<4d', *(4 * [{10: 0.0, 20: np.nan, 30: np.inf}[
+                number]]))
         if topic == '/a/b/pose' and number == 250:
             x, y, z, w = struct.unpack_from('<4d', data, len(data) - 32)
             half = 5e-7                 # about z, in the body
@@ -265,60 +280,42 @@ def test_errors_and_drifts_are_those_in_the_data(stepped, tmp_path, capsys):
     errors = content['orientation_error']
     assert errors['/a/b/pose']['max'] == pytest.approx(1e-6, rel=1e-3)
     assert errors['/a/b/joint_states']['max'] < 1e-9
-    assert errors['/a/b/pose']['rms'] == pytest.approx(1e-6 / np.sqrt(301), rel=1e-2)
+    assert errors['/a/b/pose']['rms'] == pytest.approx(1e-6 / np.sqrt(298), rel=1e-2)
     for drifts in content['drifts'].values():
         assert 0.0 < drifts['energy'] < 1e-11 and drifts['l3'] < 1e-13
-
-
-def test_interpolation_is_as_good_as_its_bound():
-    """Ten samples in a period: off by sin(pi/10)^24 of the amplitude at most."""
-    samples = np.cos(2.0 * np.pi * np.arange(200) / 10.0 + 0.3)
-    at = np.linspace(20.0, 180.0, 1001)
-    off = analysis.interpolate(samples, at) - np.cos(2.0 * np.pi * at / 10.0 + 0.3)
-    assert np.max(np.abs(off)) < 1.5 * np.sin(np.pi / 10.0) ** 24 + 2e-15
-    assert np.array_equal(analysis.interpolate(samples, np.arange(200.0)), samples)
-
-
-@pytest.mark.parametrize('number', [0.0, np.nan, np.inf])
-def test_an_attitude_that_is_none_is_left_out(stepped, tmp_path, capsys, number):
-    """Of one message; the rest is as accurate as before."""
-    path = rewritten(stepped, tmp_path / 'run.mcap', lambda topic, index, data: (
-        data[:-32] + struct.pack('<4d', *(4 * [number]))
-        if (topic, index) == ('/a/b/pose', 250) else data))
-    code, content = as_json(capsys, path)
-    assert code == 0
-    assert content['orientation_error']['/a/b/pose']['max'] < 1e-9
     assert content['motions'][-1]['measured']['nutations'] >= 1
 
 
-def test_missing_samples_are_told_where_they_are(stepped, tmp_path, capsys):
-    path = rewritten(stepped, tmp_path / 'gap.mcap', lambda topic, number, data: (
-        None if topic == '/a/b/pose' and 50 <= number < 60 else data))
-    _, content = as_json(capsys, path)
-    pose = content['topics']['/a/b/pose']
-    assert (pose['missing'], pose['count']) == (10, 291)
-    assert pose['gaps_ns'] == [[1_500_000_000, 1_590_000_000]]
-    assert all(topic['missing'] == 0 for name, topic in content['topics'].items()
-               if topic['stream'] and name != '/a/b/pose')
+@pytest.mark.parametrize(('count', 'accuracy'), [(10, 1e-6), (20, 1e-11)])
+def test_few_samples_in_a_nutation_are_enough(count, accuracy):
+    phase = 2.0 * np.pi * np.arange(39 * count + count // 2) / count + 2.0     # 39 rises
+    half = 0.25 + 0.05 * np.cos(phase)
+    rows = np.stack((0.0 * half, np.sin(half), 0.0 * half, np.cos(half)))
+    data = analysis.Attitudes(np.arange(len(phase)) * 10_000_000, rows)
+    measured = analysis.measure(data)
+    assert measured.nutations == 38
+    assert measured.nutation_period == pytest.approx(count / 100, rel=accuracy)
+    assert measured.theta_min == pytest.approx(0.4, rel=accuracy)
+    assert measured.theta_max == pytest.approx(0.6, rel=accuracy)
 
 
 @pytest.mark.parametrize(('kept', 'gaps'), [
-    (range(3, 301), [[1_000_000_000, 1_020_000_000]]),
-    (range(296), [[3_960_000_000, 4_000_000_000]]),
-    (range(5, 290), [[1_000_000_000, 1_040_000_000], [3_900_000_000, 4_000_000_000]]),
-    ((), [[1_000_000_000, 2_000_000_000], [2_010_000_000, 3_000_000_000],
-          [3_010_000_000, 4_000_000_000]])])
-def test_missing_samples_at_the_ends_are_found_too(folder, tmp_path, capsys, kept, gaps):
+    (range(3, 51), [[1_000_000_000, 1_020_000_000]]),
+    (range(46), [[1_460_000_000, 1_500_000_000]]),
+    ([*range(5, 10), *range(20, 40)], [
+        [1_000_000_000, 1_040_000_000], [1_100_000_000, 1_190_000_000],
+        [1_400_000_000, 1_500_000_000]]),
+    ((), [[1_000_000_000, 1_300_000_000], [1_310_000_000, 1_500_000_000]])])
+def test_missing_samples_are_told_where_they_are(short, tmp_path, capsys, kept, gaps):
     """Of a topic without any, each part between two commands is a gap."""
-    whole = folder / 'ends.mcap'
-    if not whole.exists():
-        log_of(whole, '--duration', 3, '--command', '1:2.0:1.5', '--command', '2:1.7:1.4')
-    path = rewritten(whole, tmp_path / 'gap.mcap', lambda topic, number, data: (
+    path = rewritten(short, tmp_path / 'gap.mcap', lambda topic, number, data: (
         None if topic == '/pose' and number not in kept else data))
     _, content = as_json(capsys, path)
     pose = content['topics']['/pose']
-    assert (pose['missing'], pose['count']) == (301 - len(kept), len(kept))
+    assert (pose['missing'], pose['count']) == (51 - len(kept), len(kept))
     assert pose['gaps_ns'] == gaps
+    assert all(topic['missing'] == 0 for name, topic in content['topics'].items()
+               if topic['stream'] and name != '/pose')
 
 
 def test_a_long_series_keeps_its_peaks():
@@ -347,105 +344,91 @@ def verified(capsys, path):
 
 
 @pytest.mark.parametrize('name', ['stepped', 'columns'])
-def test_offline_logs_verify(name, capsys, request):
+def test_offline_logs_verify_and_a_changed_bit_is_found_wherever_it_is(
+        name, tmp_path, capsys, request):
     path = request.getfixturevalue(name)
     verdict = verified(capsys, path)
     assert verdict['identical'] and verdict['warnings'] == []
+    counts, sizes = {}, {}
     with LogReader(path) as reader:
-        counts = {}
         for message in reader.messages():
             counts[message.topic] = counts.get(message.topic, 0) + 1
+            sizes[message.topic] = len(message.data)
     counts.pop(next(name for name in counts if name.endswith('/events')))
     assert verdict['compared'] == counts
+    rng = np.random.default_rng(5)
+    places = {topic: (int(rng.integers(4, sizes[topic])), int(rng.integers(8)))
+              for topic in counts}
+    verdict = verified(capsys, rewritten(
+        path, tmp_path / 'changed.mcap', lambda topic, number, data: (
+            with_flipped_bit(data, *places[topic])
+            if topic in places and number == min(1, counts[topic] - 1) else data)))
+    first = verdict['first']
+    assert verdict['different'] == len(counts)
+    assert not (verdict['missing'] or verdict['unexpected'])
+    assert first['byte'] == places[first['topic']][0]
+    assert first['logged'] != first['computed']
 
 
 @pytest.mark.parametrize('method', ['rk45', 'exact'])
 def test_a_command_exactly_at_the_end_verifies(tmp_path, capsys, method):
-    verdict = verified(capsys, log_of(tmp_path / 'run.mcap', '--duration', 1, '--command',
-                                      '1:2.0:1.5', '-p', f'solver.method:={method}'))
+    verdict = verified(capsys, log_of(tmp_path / 'run.mcap', '--duration', 0.5, '--command',
+                                      '0.5:2.0:1.5', '-p', f'solver.method:={method}'))
     assert verdict['identical'] and verdict['compared']['/spinning_top/commands'] == 1
 
 
-@pytest.mark.parametrize('name', ['stepped', 'columns'])
-def test_a_changed_bit_is_found_wherever_it_is(name, tmp_path, capsys, request):
-    source = request.getfixturevalue(name)
-    with LogReader(source) as reader:
-        sizes = {message.topic: len(message.data) for message in reader.messages()}
-    rng = np.random.default_rng(5)
-    # Which topics, differs between the two logs.
-    for topic, size in list(sizes.items())[name == 'columns'::2]:
-        if topic.endswith('/events'):
-            continue
-        byte, bit = int(rng.integers(4, size)), int(rng.integers(8))
-        def change(name, number, data, *, place=(topic, 1), byte=byte, bit=bit):
-            return with_flipped_bit(data, byte, bit) if (name, number) == place else data
-        path = rewritten(source, tmp_path / 'changed.mcap', change)
-        verdict = verified(capsys, path)
-        first = verdict['first']
-        assert not verdict['identical'], topic
-        assert (verdict['different'], first['topic'], first['byte']) == (1, topic, byte)
-        assert first['logged'] != first['computed']
-        path.unlink()
-
-
-def test_a_difference_names_field_stamp_and_both_values(stepped, tmp_path, capsys):
-    path = rewritten(stepped, tmp_path / 'run.mcap', lambda topic, number, data: (
-        with_flipped_bit(data, len(data) - 8) if (topic, number) == ('/a/b/pose', 7) else data))
+def test_a_difference_names_field_stamp_and_both_values(short, tmp_path, capsys):
+    path = rewritten(short, tmp_path / 'run.mcap', lambda topic, number, data: (
+        with_flipped_bit(data, len(data) - 8) if (topic, number) == ('/pose', 7) else data))
     code, out, _ = told(capsys, path, '--verify')
     assert code == 1
-    said = re.search(r'first: /a/b/pose at 1\.070000000 s, byte \d+, pose\.orientation\[3\]: '
+    said = re.search(r'first: /pose at 1\.070000000 s, byte \d+, pose\.orientation\[3\]: '
                      r'in the log (\S+), computed (\S+)', out)
     logged, computed = float(said[1]), float(said[2])
     assert 0.0 < abs(logged - computed) < 3e-16
 
 
-def test_messages_too_few_and_too_many_are_told(stepped, tmp_path, capsys):
-    verdict = verified(capsys, rewritten(
-        stepped, tmp_path / 'fewer.mcap', lambda topic, number, data: (
-            None if (topic, number) == ('/a/b/pose', 100) else data)))
-    assert (verdict['missing'], verdict['unexpected'], verdict['different']) == (1, 0, 0)
-    assert verdict['first']['stamp_ns'] == 2_000_000_000
-
-
-def test_a_changed_journal_is_found(stepped, tmp_path, capsys):
+def test_a_missing_message_and_a_changed_journal_are_found(short, tmp_path, capsys):
     """A digit of a commanded momentum: the motion after it is another."""
     verdict = verified(capsys, rewritten(
-        stepped, tmp_path / 'run.mcap', lambda topic, number, data: (
-            data.replace(b'"l3": 2.0', b'"l3": 2.1') if topic.endswith('/events') else data)))
-    assert not verdict['identical'] and verdict['different'] > 1000
+        short, tmp_path / 'fewer.mcap', lambda topic, number, data: (
+            None if (topic, number) == ('/pose', 10) else data)))
+    assert (verdict['missing'], verdict['unexpected'], verdict['different']) == (1, 0, 0)
+    assert verdict['first']['stamp_ns'] == 1_100_000_000
     verdict = verified(capsys, rewritten(
-        stepped, tmp_path / 'cut.mcap', lambda topic, number, data: (
-            data.replace(b'"l3": 2.0', b'"l3"; 2.0') if topic.endswith('/events') else data)))
+        short, tmp_path / 'run.mcap', lambda topic, number, data: (
+            data.replace(b'"l3": 1.7', b'"l3": 1.8') if topic.endswith('/events') else data)))
+    assert not verdict['identical'] and verdict['different'] > 100
+    verdict = verified(capsys, rewritten(
+        short, tmp_path / 'cut.mcap', lambda topic, number, data: (
+            data.replace(b'"l3": 1.7', b'"l3"; 1.7') if topic.endswith('/events') else data)))
     assert not verdict['identical'] and verdict['first']['topic'].endswith('/events')
 
 
-def test_another_machine_is_warned_of(stepped, capsys, monkeypatch):
+def test_another_machine_is_warned_of(short, capsys, monkeypatch):
     here = provenance.surroundings()
     monkeypatch.setattr(provenance, 'surroundings', lambda: {**here, 'platform': 'abacus'})
-    verdict = verified(capsys, stepped)
+    verdict = verified(capsys, short)
     assert verdict['identical']
     assert len(verdict['warnings']) == 1 and 'abacus' in verdict['warnings'][0]
 
 
 def test_a_long_verification_tells_how_far_it_is_without_a_terminal(
         columns, capsys, monkeypatch):
-    def told_if_a_look_takes(seconds):
+    def told_if_a_look_takes(seconds, *more):
         looks = itertools.count()
         monkeypatch.setattr(cli, 'time', SimpleNamespace(
             monotonic=lambda: seconds * next(looks)))
-        return [told(capsys, columns, '--verify', *more)[2] for more in ((), ('--json',))]
+        return told(capsys, columns, '--verify', *more)[2]
 
-    long, silent = told_if_a_look_takes(6.0)
-    percents = [int(number) for number in re.findall(r'^verified (\d+)%$', long, re.MULTILINE)]
-    assert len(percents) == long.count('\n') > 2
+    said = told_if_a_look_takes(6.0)
+    percents = [int(number) for number in re.findall(r'^verified (\d+)%$', said, re.MULTILINE)]
+    assert len(percents) == said.count('\n') > 2
     assert percents == sorted(percents) and 0 < percents[0] < percents[-1] <= 100
-    assert silent == ''
-    assert told_if_a_look_takes(1e-6) == ['', '']
+    assert told_if_a_look_takes(6.0, '--json') == told_if_a_look_takes(1e-6) == ''
 
 
-@pytest.mark.parametrize('more', [{}, {'increments.enabled': True, 'imu.sampling': 'mean',
-                                       'imu.lever_arm': [0.1, -0.2, 0.3]}])
-def test_live_logs_verify(tmp_path, capsys, more):
+def test_live_logs_verify(tmp_path, capsys):
     """From the start, and from the middle with commands before; rates change, resets happen."""
     pytest.importorskip('rclpy')
     from geometry_msgs.msg import PoseStamped
@@ -453,18 +436,19 @@ def test_live_logs_verify(tmp_path, capsys, more):
 
     whole, part = tmp_path / 'whole.mcap', tmp_path / 'part.mcap'
     options = {'status_period': 0.0, 'record.uri': str(whole), 'start_paused': True,
-               'imu.gyroscope_noise_density': 0.01, **more}
+               'imu.gyroscope_noise_density': 0.01, 'increments.enabled': True,
+               'imu.sampling': 'mean', 'imu.lever_arm': [0.1, -0.2, 0.3]}
     with SimNode(tmp_path, options, namespace='/live') as node, Peer() as peer:
         pose = peer.listen(node.topic('pose'), PoseStamped)
 
         def set_now(**values):
             assert all(result.successful for result in peer.set_each(node, **values))
-            pose.wait_more(15)
+            pose.wait_more(5)
         assert peer.set_together(node, spin__l3=1.7, spin__lz=1.4).successful
         assert peer.switch(node, 'record', True).success
         assert peer.set_together(node, spin__l3=1.65, spin__lz=1.4).successful   # before t = 0
         peer.switch(node, 'set_pause', False)
-        pose.wait(20)
+        pose.wait(10)
         set_now(imu__rate=125.0, pose__rate=50.0)
         set_now(spin__lz=1.3)
         assert peer.switch(node, 'record', False).success
@@ -473,7 +457,7 @@ def test_live_logs_verify(tmp_path, capsys, more):
         set_now(spin__l3=1.8)
         set_now(imu__rate=250.0, imu__gyroscope_noise_density=0.02, solver__method='exact')
         assert peer.trigger(node, 'reset').success
-        pose.wait_more(15)
+        pose.wait_more(5)
         peer.switch(node, 'set_pause', True)
         assert peer.trigger(node, 'reset').success
         assert peer.set_together(node, spin__l3=1.9, spin__lz=1.3).successful    # before t = 0
@@ -486,7 +470,7 @@ def test_live_logs_verify(tmp_path, capsys, more):
         code, content = as_json(capsys, path, '--verify')
         verdict = content['verify']
         assert verdict['identical'] and code == 0, verdict
-        assert sum(verdict['compared'].values()) > 300
+        assert sum(verdict['compared'].values()) > 100
         assert [motion['cause'] for motion in content['motions']] == causes
         assert all(topic['missing'] == 0 and topic['off_grid'] == 0
                    for topic in content['topics'].values() if topic['stream'])
@@ -503,13 +487,29 @@ def test_an_euler_form_that_stops_verifies(tmp_path, capsys):
     assert verdict['identical'] and sum(verdict['compared'].values()) > 100
 
 
+@pytest.mark.parametrize('when', [0, 1])
+def test_a_log_that_ends_at_a_reset_or_a_start_verifies(short, tmp_path, capsys, when):
+    """Before the first sample of the motion; nothing is missing."""
+    if when:
+        end = journal.event('reset', 0, 500_000_000, epoch_ns=1_600_000_000,
+                            parameters=parameters.checked({}))
+        path = rewritten(short, tmp_path / 'reset.mcap', lambda topic, number, data: (
+            [data, end] if topic.endswith('/events') and number == 1 else data),
+            stamp=lambda topic, number, stamp_ns, copy=0: 1_600_000_000 if copy else stamp_ns)
+    else:
+        path = rewritten(short, tmp_path / 'start.mcap', lambda topic, number, data: (
+            data if topic.endswith('/events') and number == 0 else None))
+    code, content = as_json(capsys, path, '--verify')
+    assert content['verify']['identical'] and code == 0, content['verify']
+    assert all(topic['missing'] in (0, None) for topic in content['topics'].values())
+
+
 # ------------------------------------------------------------------------------ what is told
 
 
 def test_a_torn_file_is_told_and_what_is_left_verifies(columns, tmp_path, capsys):
     torn = tmp_path / 'torn.mcap'
-    with open(columns, 'rb') as file:
-        last = make_reader(file).get_summary().chunk_indexes[-1]
+    last = chunks_of(columns)[-1]
     torn.write_bytes(columns.read_bytes()[:last.chunk_start_offset + last.chunk_length // 2])
     code, out, _ = told(capsys, torn, '--verify')
     assert code == 1
@@ -518,19 +518,49 @@ def test_a_torn_file_is_told_and_what_is_left_verifies(columns, tmp_path, capsys
     code, content = as_json(capsys, torn)
     assert code == 1 and not content['whole'] and content['damage']['torn']
     assert content['damage']['lost_bytes'] > 0
-    assert content['motions'][2]['measured']['nutations'] > 5
+    assert content['motions'][1]['measured']['nutations'] > 3
 
 
-def test_text_tells_the_numbers(stepped, capsys):
+def test_an_incomplete_log_is_told_in_the_same_words_before_and_after_recover(
+        columns, tmp_path, capsys):
+    torn, whole = tmp_path / 'torn.mcap', tmp_path / 'whole.mcap'
+    data = bytearray(columns.read_bytes())
+    chunk = chunks_of(columns)[1]
+    middle = chunk.chunk_start_offset + chunk.chunk_length // 2
+    data[middle:middle + 99] = bytes(99)
+    torn.write_bytes(data)
+    assert recover.main([str(torn), '-o', str(whole)]) == 3
+    capsys.readouterr()
+    texts = []
+    for path in (torn, whole):
+        code, out, _ = told(capsys, path, '--verify')
+        assert code == 1
+        texts.append([line for line in out.splitlines() if line.startswith('verify: ')])
+    assert texts[0] == texts[1]
+    assert re.match(r'verify: incomplete, \d+ messages missing; the other \d+ are identical',
+                    texts[0][0])
+
+
+def test_text_tells_the_numbers_and_fits_into_80_columns(stepped, capsys, monkeypatch):
     text = told(capsys, stepped)[1]
     assert 'whole, 3 s' in text and '/a/b/ground_truth/imu' in text
     assert 'motion 3 (command), 1 to 2.0031 s: loops' in text
     assert re.search(r'nutation period \[s\] +0\.433970\d+ +0\.433970\d+ +-?\d\.\de-1\d', text)
     assert 'orientation error against the exact solution' in text
     assert 'journal: 3 commands, 0 resets' in text
+    monkeypatch.setenv('COLUMNS', '80')
+    out = told(capsys, stepped, '--verify')[1]
+    assert max(map(len, out.splitlines()[1:])) <= 80
+    for name in ('visualization_msgs/msg/MarkerArray', 'sensor_msgs/msg/JointState',
+                 '/a/b/ground_truth/imu_bias', '/a/b/spinning_top/invariants'):
+        assert f'{name} ' in out or f'{name}\n' in out
+    for tool in (inspect, recover, simulate):
+        with pytest.raises(SystemExit):
+            tool.main(['--help'])
+        assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
 
 
-@pytest.mark.parametrize(('width', 'stacked'), [(120, False), (98, True), (80, True), (40, True)])
+@pytest.mark.parametrize(('width', 'stacked'), [(120, False), (98, True), (40, True)])
 def test_a_table_breaks_no_cell_however_narrow(width, stacked, monkeypatch):
     """Where a line is too wide, the first column has lines of its own."""
     head = ('topic', 'type', 'messages', 'rate [Hz]', 'grid [Hz]', 'missing')
@@ -548,37 +578,29 @@ def test_a_table_breaks_no_cell_however_narrow(width, stacked, monkeypatch):
         assert [line.split() for line in lines] == cells
 
 
-def test_a_terminal_of_80_columns_holds_every_line_and_whole_names(stepped, capsys, monkeypatch):
-    monkeypatch.setenv('COLUMNS', '80')
-    out = told(capsys, stepped, '--verify')[1]
-    assert max(map(len, out.splitlines()[1:])) <= 80
-    for name in ('visualization_msgs/msg/MarkerArray', 'sensor_msgs/msg/JointState',
-                 '/a/b/ground_truth/imu_bias', '/a/b/spinning_top/invariants'):
-        assert f'{name} ' in out or f'{name}\n' in out
-    for tool in (inspect, recover, simulate):
-        with pytest.raises(SystemExit):
-            tool.main(['--help'])
-        assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
-
-
-def test_json_is_strict_and_documented(columns, capsys):
-    _, out, _ = told(capsys, columns, '--json', '--verify')
+def test_json_is_strict_and_documented(short, capsys):
+    _, out, _ = told(capsys, short, '--json', '--verify')
     content = json.loads(out, parse_constant=pytest.fail)
     page = (ROOT / 'docs/inspect.md').read_text()
     keys = set(content) | {key for name in ('damage', 'run', 'verify') for key in content[name]}
     keys |= set(content['motions'][0]) | set(content['motions'][0]['measured'])
     keys |= set(content['motions'][0]['exact']) | set(content['topics']['/pose'])
     assert {key for key in keys if f'`{key}`' not in page} == set()
+    command = content['events'][1]
+    assert (command['event'], command['t_ns'], command['stamp_ns'], command['l3']) == (
+        'command', 300_000_000, 1_300_000_000, 1.7)
 
 
-def test_a_strangers_log_is_listed(tmp_path, capsys):
+def test_a_strangers_log_is_listed_and_its_names_do_not_act_on_the_terminal(tmp_path, capsys):
     path = tmp_path / 'stranger.mcap'
     with open(path, 'wb') as file:
         writer = Writer(file)
         writer.start()
-        schema = writer.register_schema('some/Thing', 'jsonschema', b'{}')
-        channel = writer.register_channel('/thing', 'json', schema)
-        for number in range(11):
+        thing = writer.register_schema('some/Thing', 'jsonschema', b'{}')
+        evil = writer.register_schema('a/\x1b]0;b\x07', 'ros2msg', b'')
+        channels = (writer.register_channel('/thing', 'json', thing),
+                    writer.register_channel('/\x1b[2J\u202e\x9b\nline', 'cdr', evil))
+        for number, channel in itertools.product(range(11), channels):
             writer.add_message(channel, number * 100_000_000, b'{}', number * 100_000_000)
         writer.finish()
     code, content = as_json(capsys, path)
@@ -587,7 +609,10 @@ def test_a_strangers_log_is_listed(tmp_path, capsys):
     assert content['topics']['/thing']['rate'] == pytest.approx(10.0)
     code, out, _ = told(capsys, path)
     assert code == 0 and 'not recorded by spinning_top_sim' in out and '/thing' in out
-    assert told(capsys, path, '--verify')[0] == 1
+    assert out.replace('\n', '').isprintable()
+    assert '/\\x1b[2J\\u202e\\x9b\\nline' in out and 'a/\\x1b]0;b\\x07' in out
+    code, _, err = told(capsys, path, '--verify')
+    assert code == 1 and err.startswith('inspect: --verify: it was not recorded by')
     code, _, err = told(capsys, path, '--plot', tmp_path / 'no.png')
     assert code == 1 and 'nothing to draw' in err and not (tmp_path / 'no.png').exists()
 
@@ -601,45 +626,40 @@ def test_what_cannot_be_read_says_so(tmp_path, capsys, content):
     assert code == 1 and not out and str(path) in err
 
 
-def test_a_reader_that_leaves_is_no_error(stepped):
-    run = subprocess.Popen([sys.executable, '-m', 'spinning_top_sim.tools.inspect', stepped],
-                           stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    run.stdout.close()
-    assert run.stderr.read() == b''
-    assert run.wait(60) == 0
+def test_a_reader_that_leaves_is_no_error(short, monkeypatch, capsys):
+    left, output = os.pipe()
+    os.close(left)
+    with open(output, 'w') as closed:
+        monkeypatch.setattr(sys, 'stdout', closed)
+        assert inspect.main([str(short)]) == 0
+    assert capsys.readouterr().err == ''
 
 
-@pytest.mark.parametrize('tool', ['inspect', 'recover'])
-def test_a_full_output_is_told_in_a_line(stepped, tmp_path, tool):
-    option = ['-o', tmp_path / 'whole.mcap'] if tool == 'recover' else []
-    with open('/dev/full', 'w') as full:
-        run = subprocess.run(
-            [sys.executable, '-m', f'spinning_top_sim.tools.{tool}', stepped, *option],
-            stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
-    assert run.returncode == 1
-    assert run.stderr == f'{tool}: [Errno 28] No space left on device\n'
+def test_a_full_output_is_told_in_a_line(short, monkeypatch, capsys):
+    full = open('/dev/full', 'w')       # noqa: SIM115 - it cannot be closed without an error
+    monkeypatch.setattr(sys, 'stdout', full)
+    assert inspect.main([str(short)]) == 1
+    assert capsys.readouterr().err == 'inspect: [Errno 28] No space left on device\n'
+    with contextlib.suppress(OSError):
+        full.close()
 
 
-def test_wrong_arguments_are_2(capsys):
-    with pytest.raises(SystemExit) as ended:
-        inspect.main(['--no-such-thing'])
-    assert ended.value.code == 2
-
-
-@pytest.mark.parametrize(('option', 'name', 'endings'), [
-    ('--plot', 'page', '.png or .pdf or .svg'), ('--plot', 'page.xyz', '.png or .pdf or .svg'),
-    ('--animate', 'top.mp4', '.gif'), ('--animate', 'top', '.gif')])
-def test_a_picture_whose_name_has_another_ending_is_refused(
-        stepped, tmp_path, capsys, option, name, endings):
+@pytest.mark.parametrize(('arguments', 'said'), [
+    (['--no-such-thing'], 'the following arguments are required: log'),
+    (['run.mcap', '--plot', 'page'], 'page: must end in .png or .pdf or .svg'),
+    (['run.mcap', '--plot', 'page.xyz'], 'page.xyz: must end in .png or .pdf or .svg'),
+    (['run.mcap', '--animate', 'top.mp4'], 'top.mp4: must end in .gif')])
+def test_wrong_arguments_are_2(tmp_path, monkeypatch, capsys, arguments, said):
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match='2'):
-        inspect.main([str(stepped), option, str(tmp_path / name)])
-    assert f'{name}: must end in {endings}\n' in capsys.readouterr().err
+        inspect.main(arguments)
+    assert f'{said}\n' in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize('streams', [['imu'], ['invariants'], ['pose']])
+@pytest.mark.parametrize('streams', [['imu'], ['pose']])
 def test_says_what_it_cannot_tell(tmp_path, capsys, streams):
-    path = log_of(tmp_path / 'run.mcap', '--duration', 2, '-p', f'record.streams:={streams}')
+    path = log_of(tmp_path / 'run.mcap', '--duration', 0.5, '-p', f'record.streams:={streams}')
     code, out, _ = told(capsys, path, '--verify')
     assert code == 0
     assert 'drifts of E, L3, Lz: no topic with rates' in out
@@ -647,18 +667,18 @@ def test_says_what_it_cannot_tell(tmp_path, capsys, streams):
 
 
 @pytest.mark.parametrize(('key', 'text'), [
-    *itertools.product(
-        ('parameters', 'parameters_now', 'history', 'epoch_ns', 'begun_ns'),
-        ('', '[]', '[' * 100_000, '"\\ud800"', '9' * 5000, str(2 ** 63), 'NaN')),
+    *zip(itertools.cycle(('parameters', 'parameters_now', 'history', 'epoch_ns', 'begun_ns')),
+         ('', '[]', '[' * 100_000, '"\\ud800"', '9' * 5000, str(2 ** 63), 'NaN', '[]', 'NaN'),
+         strict=False),
     ('history', '[[0, 1, NaN]]'), ('history', '[[5, 1.0, 1.0], [4, 1.0, 1.0]]'),
     ('history', '[[1e300, 1.0, 1.0]]'), ('history', '[[0, 1.0, 1.0, 1.0]]'),
     ('history', '[[0, 4.0, 0.0, 0.0, 0.0, 1.0, 1.0]]'), ('epoch_ns', '-1'),
     ('begun_ns', str(10 ** 18)), ('parameters', '{"spin.l3": {}}'),
     ('parameters', '{"world_frame": "\\ud800"}'), ('parameters', '{"top.lambda1": 1e-320}')])
-def test_odd_metadata_end_in_words(stepped, tmp_path, capsys, key, text):
-    path = rewritten(stepped, tmp_path / 'odd.mcap', metadata={key: text})
+def test_odd_metadata_end_in_words(short, tmp_path, capsys, key, text):
+    path = rewritten(short, tmp_path / 'odd.mcap', metadata={key: text})
     code, out, _ = told(capsys, path, '--verify')
-    assert code in (0, 1) and '/a/b/pose' in out
+    assert code in (0, 1) and '/pose' in out
     assert 'cannot be used' in out or 'motion 1' in out or 'cannot be followed' in out
 
 
@@ -670,141 +690,84 @@ def test_odd_metadata_end_in_words(stepped, tmp_path, capsys, key, text):
     {'event': 'state', 'l3': 1.0, 'lz': 1.0},
     {'event': 'state', 'theta': -1.0, 'theta_dot': 0.0, 'phi': 0.0, 'psi': 0.0, 'l3': 1.0,
      'lz': 1.0},
-    {'event': 'state', 'theta': math.nan, 'theta_dot': 0.0, 'phi': 0.0, 'psi': 0.0, 'l3': 1.0,
-     'lz': 1.0},
     {'event': 'reset', 'parameters': {}, 'epoch_ns': 10 ** 18},
-    {'event': 'reset', 'parameters': [], 'epoch_ns': 3_500_000_000}])
-def test_an_odd_entry_of_the_journal_is_told(stepped, tmp_path, capsys, event):
+    {'event': 'reset', 'parameters': [], 'epoch_ns': 1_400_000_000}])
+def test_an_odd_entry_of_the_journal_is_told(short, tmp_path, capsys, event):
     """It is left out: the run is followed to its end all the same."""
-    data = journal.event(**{'name': event['event'], 't_ns': 0, 'sent_ns': 2_500_000_000, **{
+    data = journal.event(**{'name': event['event'], 't_ns': 0, 'sent_ns': 300_000_000, **{
         name: value for name, value in event.items() if name != 'event'}})
-    path = rewritten(stepped, tmp_path / 'odd.mcap', lambda topic, number, old: (
-        [old, data] if topic.endswith('/events') and number == 3 else old))
-    code, out, _ = told(capsys, path, '--verify')
-    assert code == 1
-    assert 'journal, entry at 3.003100000 s: ' in out or 'cannot be followed beyond' in out
-    assert 'motion 4' in out
-    _, content = as_json(capsys, path)
-    assert any('entry at 3.003100000 s: ' in note or 'cannot be followed' in note
+    path = rewritten(short, tmp_path / 'odd.mcap', lambda topic, number, old: (
+        [old, data] if topic.endswith('/events') and number == 1 else old))
+    code, content = as_json(capsys, path, '--verify')
+    assert code == 1 and len(content['motions']) >= 2
+    assert any('entry at 1.300000000 s: ' in note or 'cannot be followed' in note
                for note in content['notes'])
 
 
-def test_a_run_that_no_log_of_its_size_holds_is_not_computed(stepped, tmp_path, capsys):
+def test_a_run_that_no_log_of_its_size_holds_is_not_computed(short, tmp_path, capsys):
     """A stamp of the year 2100: neither 10^10 samples nor 10^10 steps."""
-    path = rewritten(stepped, tmp_path / 'late.mcap', lambda topic, number, data: data,
-                     stamp=lambda topic, number, stamp_ns: (
-                         4 * 10 ** 18 if (topic, number) == ('/a/b/pose', 300) else stamp_ns))
+    path = rewritten(short, tmp_path / 'late.mcap', stamp=lambda topic, number, stamp_ns: (
+        4 * 10 ** 18 if (topic, number) == ('/pose', 50) else stamp_ns))
     code, out, _ = told(capsys, path, '--verify')
     assert code == 1 and 'lacks most samples of this run' in out
     path = rewritten(
-        stepped, tmp_path / 'far.mcap', lambda topic, number, data: (
-            data.replace(b'"sent_ns": 2003100000', b'"sent_ns": 3999999999000000000').replace(
-                b'"t_ns": 2003100000', b'"t_ns": 3999999999000000000')
+        short, tmp_path / 'far.mcap', lambda topic, number, data: (
+            data.replace(b'"sent_ns": 300000000', b'"sent_ns": 3999999999000000000').replace(
+                b'"t_ns": 300000000', b'"t_ns": 3999999999000000000')
             if topic.endswith('/events') else data),
         stamp=lambda topic, number, stamp_ns: (
-            4 * 10 ** 18 if (topic.endswith('/events') and number == 3) else stamp_ns))
+            4 * 10 ** 18 if (topic.endswith('/events') and number == 1) else stamp_ns))
     code, out, _ = told(capsys, path)
     assert 'journal, entry at 4000000000.000000000 s' in out or 'integration steps' in out
 
 
-def test_changes_without_effect_cost_next_to_nothing(stepped, tmp_path, capsys, monkeypatch):
+def test_changes_without_effect_cost_next_to_nothing(short, tmp_path, capsys, monkeypatch):
     """No block of samples ends at a change of parameters that acts on no sample."""
-    calls = []
-    advance = Simulation.advance_in_blocks
-    monkeypatch.setattr(Simulation, 'advance_in_blocks', lambda self, *arguments: (
-        calls.append(arguments[0]), advance(self, *arguments)))
-    assert verified(capsys, stepped)['identical']
+    calls, encode = [], Template.encode
+    monkeypatch.setattr(Template, 'encode', lambda self, *arguments: (
+        calls.append(self), encode(self, *arguments))[1])
+    assert verified(capsys, short)['identical']
     before = len(calls)
     entries = [journal.event('parameters', t, t, status_period=float(t % 7), tick_rate=50.0)
-               for t in range(2_100_000_000, 2_200_000_000, 100_000)]
+               for t in range(310_000_000, 410_000_000, 100_000)]
     path = rewritten(
-        stepped, tmp_path / 'run.mcap', lambda topic, number, data: (
-            [data, *entries] if topic.endswith('/events') and number == 3 else data),
-        stamp=lambda topic, number, stamp_ns, copy=0: stamp_ns + (copy and 200_000_000))
+        short, tmp_path / 'run.mcap', lambda topic, number, data: (
+            [data, *entries] if topic.endswith('/events') and number == 1 else data),
+        stamp=lambda topic, number, stamp_ns, copy=0: stamp_ns + (copy and 110_000_000))
     calls.clear()
-    assert verified(capsys, path)['identical']
-    assert len(calls) == before
-
-
-@pytest.mark.parametrize('when', [0, 1])
-def test_a_log_that_ends_at_a_reset_or_a_start_verifies(tmp_path, capsys, when):
-    """Before the first sample of the motion; nothing is missing."""
-    values = parameters.checked({})
-    path = log_of(tmp_path / 'run.mcap', '--duration', 1)
-    end = journal.event('reset', 0, 1_000_000_000, epoch_ns=2_100_000_000, parameters=values)
-    if when:
-        path = rewritten(path, tmp_path / 'reset.mcap', lambda topic, number, data: (
-            [data, end] if topic.endswith('/events') else data),
-            stamp=lambda topic, number, stamp_ns, copy=0: (
-                2_100_000_000 if copy else stamp_ns))
-    else:
-        path = rewritten(path, tmp_path / 'start.mcap', lambda topic, number, data: (
-            data if topic.endswith('/events') else None))
     code, content = as_json(capsys, path, '--verify')
-    assert content['verify']['identical'] and code == 0, content['verify']
-    assert all(topic['missing'] in (0, None) for topic in content['topics'].values())
+    assert code == 0 and content['verify']['identical']
+    assert len(content['events']) == 1002
+    assert len(calls) < 3 * before + 1100       # each entry is encoded again
 
 
-def test_the_journal_is_read_without_the_chunks_that_have_none_of_it(tmp_path, monkeypatch):
-    path = log_of(tmp_path / 'run.mcap', '--duration', 30, '--command', '14:1.7:1.4')
-    with open(path, 'rb') as file:
-        chunks = make_reader(file).get_summary().chunk_indexes
+def test_what_is_missing_takes_no_memory(tmp_path, capsys):
+    path = log_of(tmp_path / 'run.mcap', '--duration', 30, '-p', 'solver.method:=exact')
+    counts = {}
     with LogReader(path) as reader:
-        read, plain = [], reader._read
-        monkeypatch.setattr(reader, '_read', lambda span: (read.append(span), plain(span))[1])
-        run = read_run_description(reader)
-        assert [event.name for event in run.events] == ['start', 'command']
-        assert len(read) <= 4 < len(chunks)
-
-
-def test_names_do_not_act_on_the_terminal(tmp_path, capsys):
-    path = tmp_path / 'evil.mcap'
-    with open(path, 'wb') as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema('a/\x1b]0;b\x07', 'ros2msg', b'')
-        channel = writer.register_channel('/\x1b[2J\u202e\x9b\nline', 'cdr', schema)
-        writer.add_message(channel, 1, b'', 1)
-        writer.finish()
-    out = told(capsys, path)[1]
-    assert out.replace('\n', '').isprintable()
-    assert '/\\x1b[2J\\u202e\\x9b\\nline' in out and 'a/\\x1b]0;b\\x07' in out
-
-
-def test_an_incomplete_log_is_told_in_the_same_words_before_and_after_recover(
-        columns, tmp_path, capsys):
-    torn, whole = tmp_path / 'torn.mcap', tmp_path / 'whole.mcap'
-    data = bytearray(columns.read_bytes())
-    with open(columns, 'rb') as file:
-        chunk = make_reader(file).get_summary().chunk_indexes[1]
-    middle = chunk.chunk_start_offset + chunk.chunk_length // 2
-    data[middle:middle + 99] = bytes(99)
-    torn.write_bytes(data)
-    assert recover.main([str(torn), '-o', str(whole)]) == 3
-    capsys.readouterr()
-    texts = []
-    for path in (torn, whole):
-        code, out, _ = told(capsys, path, '--verify')
-        assert code == 1
-        texts.append([line for line in out.splitlines() if line.startswith('verify: ')])
-        verdict = verified(capsys, path)
-        assert verdict['missing'] and not (verdict['different'] or verdict['unexpected'])
-    assert texts[0] == texts[1]
-    assert re.match(r'verify: incomplete, \d+ messages missing; the other \d+ are identical',
-                    texts[0][0])
+        for message in reader.messages():
+            counts[message.topic] = counts.get(message.topic, 0) + 1
+    thin = rewritten(path, tmp_path / 'thin.mcap', lambda topic, number, data: (
+        data if number in (0, counts[topic] - 1) or 'spinning_top/' in topic else None))
+    told(capsys, thin)                      # imports
+    tracemalloc.start()
+    verdict = verified(capsys, thin)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert verdict['missing'] == sum(
+        count - 2 for topic, count in counts.items() if 'spinning_top/' not in topic)
+    assert peak < 20e6
 
 
 # ---------------------------------------------------------------------------------- pictures
 
 
-@pytest.mark.parametrize('method', ['exact', 'rk45'])
-def test_the_path_that_is_drawn_has_cusps(tmp_path, method):
+def test_the_path_that_is_drawn_has_cusps(tmp_path):
     """At the least tilt the tip stands still, and the motion along the meridian turns round."""
     pytest.importorskip('matplotlib')
     from spinning_top_sim.tools.plots import smooth_tip
 
-    found = surveyed(log_of(tmp_path / 'run.mcap', '--duration', 6,
-                            '-p', f'solver.method:={method}'))
+    found = surveyed(log_of(tmp_path / 'run.mcap', '--duration', 4))
     time, tip, height = smooth_tip(found.shown[1])
     points = np.stack((tip.real, tip.imag, height))
     velocity = np.diff(points, axis=1) / np.diff(time)
@@ -814,7 +777,7 @@ def test_the_path_that_is_drawn_has_cusps(tmp_path, method):
     # Near a cusp the speed grows in proportion to time: half a step away it is what the
     # acceleration makes of it, the greatest there is.
     acceleration = np.max(np.linalg.norm(np.diff(velocity, axis=1), axis=0)) / step
-    for number in range(1, 9):
+    for number in range(1, 6):
         at = round(number * period / step)
         near = slice(at - 2, at + 2)
         assert np.min(speed[near]) < 1.01 * acceleration * step
@@ -825,7 +788,7 @@ def test_the_path_that_is_drawn_has_cusps(tmp_path, method):
         assert height[at] > 0.99999 * np.max(height)
 
 
-@pytest.mark.parametrize('duration', [3.0, 0.025])
+@pytest.mark.parametrize('duration', [0.5, 0.025])
 def test_in_every_frame_the_tip_is_where_the_axis_is(tmp_path, monkeypatch, duration):
     pytest.importorskip('matplotlib')
     from spinning_top_sim.tools import plots
@@ -849,33 +812,13 @@ def test_a_curve_of_a_slow_motion_has_no_more_points_than_can_be_seen():
     assert time[-1] == pytest.approx(999.99)
 
 
-def test_what_is_missing_takes_no_memory(tmp_path):
-    path = log_of(tmp_path / 'run.mcap', '--duration', 60, '-p', 'solver.method:=exact')
-    counts = {}
-    with LogReader(path) as reader:
-        for message in reader.messages():
-            counts[message.topic] = counts.get(message.topic, 0) + 1
-    thin = rewritten(path, tmp_path / 'thin.mcap', lambda topic, number, data: (
-        data if number in (0, counts[topic] - 1) or 'spinning_top/' in topic else None))
-    with LogReader(thin) as reader:
-        run = read_run_description(reader)
-        tracemalloc.start()
-        verdict = verify(reader, run, reader.span[1], lambda _: None)
-        _, peak = tracemalloc.get_traced_memory()
-        tracemalloc.stop()
-    assert verdict.missing == sum(
-        count - 2 for topic, count in counts.items() if 'spinning_top/' not in topic)
-    assert peak < 30e6
-
-
 def test_a_page_is_drawn_where_the_first_readings_are_missing(tmp_path, capsys):
     pytest.importorskip('matplotlib')
-    path = log_of(tmp_path / 'run.mcap', '--duration', 60, '-p', 'imu.rate:=1000.0')
-    with LogReader(path) as reader:
-        *others, middle = [span for span in reader._index[0] if span.start_ns < 30 * 10 ** 9]
+    path = log_of(tmp_path / 'run.mcap', '--duration', 25, '-p', 'solver.method:=exact')
     content = bytearray(path.read_bytes())
-    for span in (*others, middle):
-        content[span.offset + 100] ^= 1
+    for chunk in chunks_of(path):
+        if chunk.message_start_time < 14 * 10 ** 9:
+            content[chunk.chunk_start_offset + 100] ^= 1
     path.write_bytes(content)
     assert told(capsys, path, '--plot', tmp_path / 'page.png')[0] == 1
     assert (tmp_path / 'page.png').stat().st_size > 10_000
@@ -902,31 +845,30 @@ def test_pictures_are_drawn(stepped, tmp_path, capsys):
     assert np.mean(np.abs(shown[1] - shown[0]).max(axis=2) > 30) > 0.01
 
 
-@pytest.mark.parametrize('scene', ['fast_gyroscope', 'heavy_top', 'near_separatrix',
-                                   'planar_pendulum', 'sleeping'])
+@pytest.mark.parametrize('scene', ['fast_gyroscope', 'planar_pendulum', 'sleeping'])
 def test_a_page_is_drawn_of_odd_scenes(tmp_path, scene, capsys):
     pytest.importorskip('matplotlib')
     path = log_of(tmp_path / 'run.mcap', '--params', ROOT / f'config/{scene}.yaml', '--duration',
-                  2, '-p', 'solver.method:=exact')
+                  1, '-p', 'solver.method:=exact')
     assert told(capsys, path, '--plot', tmp_path / 'page.svg')[0] == 0
     assert (tmp_path / 'page.svg').stat().st_size > 10_000
 
 
-def test_without_matplotlib_there_is_a_hint(stepped, tmp_path):
-    code = ('import sys\nsys.modules["matplotlib"] = None\n'
-            'from spinning_top_sim.tools.inspect import main\n'
-            f'sys.exit(main([{str(stepped)!r}, "--plot", {str(tmp_path / "page.png")!r}]))')
-    run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
-                         timeout=60, check=False)
-    assert run.returncode == 1 and "pip install 'spinning_top_sim[plot]'" in run.stderr
-    assert 'Traceback' not in run.stderr and len(run.stderr.splitlines()) == 1
-    assert 'motion 3' in run.stdout                     # the rest is told all the same
+def test_without_matplotlib_there_is_a_hint(short, tmp_path, capsys, monkeypatch):
+    for name in ('matplotlib', 'matplotlib.animation', 'matplotlib.figure'):
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.delitem(sys.modules, 'spinning_top_sim.tools.plots', raising=False)
+    monkeypatch.delattr(tools, 'plots', raising=False)
+    code, out, err = told(capsys, short, '--plot', tmp_path / 'page.png')
+    assert code == 1 and "pip install 'spinning_top_sim[plot]'" in err
+    assert len(err.splitlines()) == 1
+    assert 'motion 2' in out                            # the rest is told all the same
 
 
-def test_neither_ros_nor_pictures_are_imported_unasked(stepped):
+def test_neither_ros_nor_pictures_are_imported_unasked(short):
     code = ('import sys\nfrom spinning_top_sim.tools.inspect import main\n'
             'early = sorted({"scipy"} & set(sys.modules))\n'
-            f'main([{str(stepped)!r}, "--verify"])\n'
+            f'main([{str(short)!r}, "--verify"])\n'
             'print("loaded:", early, sorted({"rclpy", "matplotlib"} & set(sys.modules)))')
     run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                          timeout=60, check=True)

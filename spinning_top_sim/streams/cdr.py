@@ -10,6 +10,7 @@ equal messages are equal bytes.
 
 import struct
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,21 +68,29 @@ class CdrWriter:
 
 
 class Template:
-    """A serialized message whose stamps and fields are replaced, many messages at a time."""
+    """
+    A serialized message whose stamps and fields are replaced, many messages at a time.
+
+    counts : how many numbers each field has
+    """
 
     def __init__(self, writer: CdrWriter) -> None:
         # Padded to four bytes, as RTPS does: what arrives is then what was sent.
         self._buffer = writer.buffer + bytes(-len(writer.buffer) % 4)
         self._stamps_at, self._fields = tuple(writer.stamps_at), tuple(writer.fields)
-        # A message as a numpy type: the fields, and the stamps if there are any.
-        columns = [(f'field{i}', f'({count},)f8', at)
-                   for i, (at, count) in enumerate(self._fields)]
+        self.counts = tuple(count for _, count in self._fields)
+        self._rows: NDArray[np.void] = np.empty(0, np.void)
+
+    @cached_property
+    def _row_type(self) -> np.dtype[np.void]:
+        """A message as a numpy type: the fields, and the stamps if there are any."""
+        columns: list[tuple[str, object, int]] = [
+            (f'field{i}', ('<f8', (count,)), at) for i, (at, count) in enumerate(self._fields)]
         for at in self._stamps_at:
             columns += [(f'sec{at}', '<i4', at), (f'nanosec{at}', '<u4', at + 4)]
         names, formats, offsets = zip(*columns, strict=True) if columns else ((), (), ())
-        self._row_type = np.dtype({'names': names, 'formats': formats, 'offsets': offsets,
-                                   'itemsize': len(self._buffer)})
-        self._rows: NDArray[np.void] = np.empty(0, self._row_type)
+        return np.dtype({'names': names, 'formats': formats, 'offsets': offsets,
+                         'itemsize': len(self._buffer)})
 
     def __len__(self) -> int:
         """Return the size of every message [bytes]."""

@@ -1,48 +1,50 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measures a motion from samples alone, as arrays; `survey` chooses which of a log these are."""
+"""Measures a motion from samples of the attitude alone; `survey` selects them from a log."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.regimes import regime
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.streams.imu import Imu
 
-Reals = NDArray[np.float64]
-Complexes = NDArray[np.complex128]
-Number = TypeVar('Number', np.float64, np.complex128)
+if TYPE_CHECKING:
+    from scipy.interpolate import BSpline
 
-# Samples through which the interpolating polynomial goes: with 10 of them in a nutation the error
-# is sin(pi/10)^24 of its amplitude.
-POINTS = 24
-LEAST_SAMPLES = 9.0         # in a nutation, for an interpolation as good as the data
-RESTS = 1e-9                # a tilt that changes less is at rest: rounding would decide [rad]
-RATE_TOLERANCE = 1e-3       # of the rates: from those in the data to those of the polynomial
-LARGEST_STEP = 2.5          # of an angle that can be unwrapped safely [rad]
-SNAP = 1e-9                 # relative distance from a special motion that is taken for it
+# Degree of the splines through the samples, and the number of samples in one.  In its middle, with
+# 10 samples in a period, the error is 1e-13 of the amplitude.
+DEGREE, WINDOW = 15, 64
+LEAST_SAMPLES = 9.0         # in a nutation, for a spline as good as the data
+RESTS = 1e-9                # a tilt that changes less does not nutate: rounding decides [rad]
+RATE_TOLERANCE = 1e-3       # relative difference between the rates of the data and of the spline
+LARGEST_STEP = 2.5          # between two samples of an angle that can be unwrapped [rad]
+SNAP = 1e-9                 # relative distance within which a motion is taken for a special one
 
 
 class Attitudes:
     """
-    Samples of the body's attitude, in order of time, and what follows from each.
+    Samples of the attitude of the body in the order of time, and what follows from each.
 
     stamps_ns : (n,) log times [ns]
-    rows : (4, n) q(world <- body) as x, y, z, w; below it, if the log has them, (3, n) angular
-        velocity in the body frame [rad/s], and (3, n) phi and psi, which count turns, and phi'
+    rows : (4, n) q(world <- body) as x, y, z, w; then, if the log has them, (3, n) angular
+        velocity in the body frame [rad/s]; then, if the log has them, phi and psi, which count
+        turns, and phi'
     time, period : (n,) since the first sample, and the mean time between two samples [s]
-    cos2, sin2 : (n,) squares, of theta/2: the smaller keeps the digits near a pole
+    cos2, sin2 : (n,) squares of the cosine and sine of theta/2; near a pole the smaller one has
+        more digits
     tip, body_tip : (n,) sin(theta) exp(i phi) and sin(theta) exp(i psi)
-    phi_dot, sin2_rate : (n,) rates of phi and sin2 [1/s], None where the log has none
+    phi_dot, sin2_rate : (n,) rates of phi and sin2 [1/s], None if the log has no rates
     """
 
-    def __init__(self, stamps_ns: NDArray[np.int64], rows: Reals) -> None:
+    def __init__(self, stamps_ns: NDArray[np.int64], rows: NDArray[np.float64]) -> None:
         self.stamps_ns, self.rows = stamps_ns, rows
         self.time = (stamps_ns - stamps_ns[:1]) * 1e-9
         self.period = float(np.max(self.time, initial=0.0)) / max(len(stamps_ns) - 1, 1)
@@ -65,12 +67,12 @@ class Attitudes:
             self.phi, self.psi = (np.unwrap(np.angle(tip)) for tip in (self.tip, self.body_tip))
 
     def first(self, seconds: float) -> Attitudes:
-        """Return the samples of the first seconds, two at least."""
+        """Return the samples of the first seconds, at least two."""
         count = max(2, int(np.searchsorted(self.time, seconds, 'right')))
         return Attitudes(self.stamps_ns[:count], self.rows[:, :count])
 
-    def constants(self, top: Top) -> tuple[Reals, Reals, Reals] | None:
-        """Return E [J], L3 and Lz [kg m^2/s] in each sample (n,); None without rates."""
+    def constants(self, top: Top) -> tuple[Column, Column, Column] | None:
+        """Return E [J], L3 and Lz [kg m^2/s] of each sample (n,); None without rates."""
         if self.omega is None:
             return None
         (one, two, spin), (up_1, up_2, height) = self.omega, self.up
@@ -81,12 +83,12 @@ class Attitudes:
 
 
 def attitudes_of(name: str, imu: Imu, stamps_ns: NDArray[np.int64],
-                 fields: tuple[Reals, ...]) -> Attitudes | None:
-    """Return the attitudes in the `Template.decode`d fields of a stream, None if it has none."""
+                 fields: tuple[NDArray[np.float64], ...]) -> Attitudes | None:
+    """Return the attitudes in the decoded fields of a stream, None if it has none."""
     rows = [field.T for field in fields]
     if name in ('ground_truth/imu', 'imu/data'):
         rows = list(map(np.vstack, imu.in_body(tuple(rows[0]), tuple(rows[1]))))
-        if imu.takes_means:         # of the rates: they are not those at the stamps
+        if imu.takes_means:         # the rates are not those at the stamps
             del rows[1]
     elif name == 'joint_states':
         (phi, theta, psi), (phi_dot, theta_dot, psi_dot) = rows
@@ -105,8 +107,8 @@ def attitudes_of(name: str, imu: Imu, stamps_ns: NDArray[np.int64],
     return Attitudes(stamps_ns[valid], columns[:, valid])
 
 
-def longest_run(blocks: list[tuple[NDArray[np.int64], Reals]]) -> Attitudes:
-    """Return the longest part without gaps, at one rate, of blocks of stamps and rows."""
+def longest_run(blocks: list[tuple[NDArray[np.int64], NDArray[np.float64]]]) -> Attitudes:
+    """Return the longest part of these blocks of stamps and rows that has one rate and no gap."""
     stamps_ns = np.concatenate([stamps_ns for stamps_ns, _ in blocks])
     rows = np.concatenate([rows for _, rows in blocks], axis=1)
     steps = np.diff(stamps_ns)
@@ -116,29 +118,9 @@ def longest_run(blocks: list[tuple[NDArray[np.int64], Reals]]) -> Attitudes:
     return Attitudes(stamps_ns[part], rows[:, part])
 
 
-def interpolate(values: NDArray[Number], at: Reals | float) -> NDArray[Number]:
-    """
-    Return values at fractional indices, or at one, on the polynomial through POINTS samples.
-
-    Berrut & Trefethen, "Barycentric Lagrange interpolation", SIAM Review 46 (2004), eq. 4.2.
-    SciPy's BarycentricInterpolator orders the nodes at random, which changes the last bits; a
-    spline is less accurate at the ends of the data.
-    """
-    points = min(POINTS, len(values))
-    at = np.asarray(at)[..., np.newaxis]
-    first = np.clip(np.floor(at).astype(int) - points // 2 + 1, 0, len(values) - points)
-    weights = np.array([(-1.0) ** k * math.comb(points - 1, k) for k in range(points)])
-    nodes = first + np.arange(points)
-    distance = at - nodes
-    hit = distance == 0.0
-    # On a sample there is that one alone.
-    terms = np.where(hit.any(axis=-1, keepdims=True), hit, weights / np.where(hit, 1.0, distance))
-    return (terms * values[nodes]).sum(axis=-1) / terms.sum(axis=-1)
-
-
 @dataclass(frozen=True)
 class Measured:
-    """The numbers of `regimes.Description`, from the samples of a motion alone."""
+    """The numbers of `regimes.Description`, measured from samples."""
 
     samples: int
     nutations: int                        # whole ones
@@ -154,10 +136,10 @@ class Measured:
 
 def measure(data: Attitudes) -> Measured:
     """
-    Measure a motion from two or more samples of it, all the same time apart.
+    Measure a motion from two or more samples at one rate.
 
-    A nutation lasts from one rise of the tip through its middle height to the next.  There its
-    time is known best, and the tip is far from the poles, where phi may jump.
+    A nutation lasts from one rise of the tip through its middle height to the next.  The tip is
+    fastest there, and far from the poles, where phi may jump.
     """
     low, high, count = _extreme(data, 1.0), _extreme(data, -1.0), len(data.stamps_ns)
     nutations, period, begin, end, reason = 0, None, 0.0, count - 1.0, ''
@@ -165,59 +147,68 @@ def measure(data: Attitudes) -> Measured:
         nutations, begin, end = _crossings(data)
         period = (end - begin) / nutations * data.period if nutations else None
         reason = 'not one whole nutation' if period is None else _unresolved(data, period)
-    precession, spin = (None if reason else _mean_rate(data, angle, phasor, begin, end)
-                        for angle, phasor in ((data.phi, data.tip), (data.psi, data.body_tip)))
+    precession, spin = (None if reason else _mean_rate(data, angle, tip, begin, end)
+                        for angle, tip in ((data.phi, data.tip), (data.psi, data.body_tip)))
     if not reason and None in (precession, spin):
         reason = 'phi or psi cannot be unwrapped: a pole, or too few samples in a turn'
-    rates = data.phi_dot
-    slowest, fastest = ((None, None) if rates is None or not np.isfinite(rates).all()
-                        else (float(np.min(rates)), float(np.max(rates))))
+    slowest = fastest = None
+    if data.phi_dot is not None and np.isfinite(data.phi_dot).all():
+        slowest, fastest = float(np.min(data.phi_dot)), float(np.max(data.phi_dot))
     return Measured(count, nutations, None if reason else period, low, high, precession, spin,
                     slowest, fastest, (reason,) if reason else ())
 
 
+def _spline(values: NDArray[np.generic], index: float) -> BSpline:
+    """Return a spline through the values (n,) around an index, as a function of the index."""
+    from scipy.interpolate import make_interp_spline  # noqa: PLC0415 - slow; --help needs none
+
+    begin = max(0, min(int(index) - WINDOW // 2, len(values) - WINDOW))
+    part = values[begin:begin + WINDOW]
+    return make_interp_spline(np.arange(begin, begin + len(part)), part,
+                              k=min(DEGREE, len(part) - 1))
+
+
 def _extreme(data: Attitudes, sign: float) -> float:
     """Return the least (sign 1) or greatest (-1) tilt, also between samples [rad]."""
-    from scipy.optimize import minimize_scalar  # noqa: PLC0415 - takes 0.5 s; --help needs none
+    from scipy.optimize import minimize_scalar  # noqa: PLC0415
 
     index = int(np.argmin(sign * data.sin2))
-    # Of the two squares the smaller one: it keeps the digits of a small angle.
+    # The smaller of the two squares has the digits of a small angle.
     near_top = bool(data.sin2[index] < 0.5)
     square, sign = (data.sin2, sign) if near_top else (data.cos2, -sign)
     extreme = float(square[index])
-    if 0 < index < len(square) - 1 and len(square) >= POINTS:
-        found = minimize_scalar(
-            lambda at: sign * interpolate(square, at), bounds=(index - 1.0, index + 1.0),
-            method='bounded', options={'xatol': 1e-9})
+    if 0 < index < len(square) - 1:
+        spline = _spline(square, index)
+        found = minimize_scalar(lambda at: sign * float(spline(at)), method='bounded',
+                                bounds=(index - 1.0, index + 1.0), options={'xatol': 1e-9})
         extreme = sign * min(sign * extreme, float(found.fun))
     angle = 2.0 * math.asin(math.sqrt(min(max(extreme, 0.0), 1.0)))
     return angle if near_top else math.pi - angle
 
 
 def _crossings(data: Attitudes) -> tuple[int, float, float]:
-    """Return how many whole nutations there are, and the indices at which they begin and end."""
+    """Return the number of whole nutations, and the indices at which they begin and end."""
     from scipy.optimize import brentq  # noqa: PLC0415
 
-    # Both rise with the axis; the smaller one keeps the digits of a small angle.
+    # Both rise with the axis; the smaller one has the digits of a small angle.
     values = -data.sin2 if np.mean(data.sin2) < 0.5 else data.cos2
-    middle = 0.5 * (float(np.min(values)) + float(np.max(values)))
-    rising = np.flatnonzero((values[:-1] < middle) & (values[1:] >= middle))
+    values = values - 0.5 * (float(np.min(values)) + float(np.max(values)))
+    rising = np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))
     if len(rising) < 2:
         return 0, 0.0, 0.0
-    begin, end = (float(brentq(lambda at: interpolate(values, at) - middle, index, index + 1.0,
-                               xtol=1e-15, rtol=1e-15)) for index in rising[[0, -1]])
+    begin, end = (float(brentq(_spline(values, index), index, index + 1.0, xtol=1e-15,
+                               rtol=1e-15)) for index in rising[[0, -1]])
     return len(rising) - 1, begin, end
 
 
 def _unresolved(data: Attitudes, period: float) -> str:
     """Return why the samples are too few for a nutation, '' if they are not."""
     rate, count = data.sin2_rate, len(data.stamps_ns)
-    if rate is not None and count > POINTS:
-        # Too few samples show a slower nutation, whose rate is not the one in the data.
-        at = np.linspace(POINTS // 2, count - POINTS // 2 - 1, 200).astype(int)
-        step = 1e-3
-        ahead, behind = (interpolate(data.sin2, at + sign * step) for sign in (1, -1))
-        difference = (ahead - behind) / (2.0 * step * data.period) - rate[at]
+    if rate is not None and count > WINDOW // 2:
+        # Too few samples show a slower nutation than there is; then the rates do not fit.
+        middle = count // 2
+        at = np.arange(middle - WINDOW // 8, middle + WINDOW // 8)
+        difference = _spline(data.sin2, middle)(at, 1) / data.period - rate[at]
         if np.max(np.abs(difference)) > RATE_TOLERANCE * np.max(np.abs(rate)):
             return ('a nutation takes only a few samples: '
                     'the rates in the data are not those of the curve')
@@ -225,24 +216,24 @@ def _unresolved(data: Attitudes, period: float) -> str:
     return '' if samples >= LEAST_SAMPLES else f'{samples:.1f} samples in a nutation are too few'
 
 
-def _mean_rate(data: Attitudes, angle: Reals, phasor: Complexes, begin: float,
+def _mean_rate(data: Attitudes, angle: Column, tip: NDArray[np.complex128], begin: float,
                end: float) -> float | None:
     """Return the mean rate of phi or psi [rad/s] between two indices, None if unknown."""
     if not data.counts_turns and (
-            not phasor.all() or np.max(np.abs(np.diff(angle))) > LARGEST_STEP):
+            not tip.all() or np.max(np.abs(np.diff(angle))) > LARGEST_STEP):
         return None
-    # The phasor is smooth where the angle jumps, and slow without its mean rate.
+    # The tip is smooth where the angle jumps at a pole, and slow without its mean rate.
     rate = (angle[-1] - angle[0]) / (len(angle) - 1)
-    slow = phasor * np.exp(-1j * rate * np.arange(len(angle)))
+    slow = tip * np.exp(-1j * rate * np.arange(len(angle)))
     at = np.array([begin, end])
     here = np.rint(at).astype(int)
-    turned = (angle[here] + rate * (at - here)
-              + np.angle(interpolate(slow, at) * np.conj(slow[here])))
+    ends = np.array([_spline(slow, index)(index) for index in at])
+    turned = angle[here] + rate * (at - here) + np.angle(ends * np.conj(slow[here]))
     return float((turned[1] - turned[0]) / ((end - begin) * data.period))
 
 
 def measured_regime(top: Top, data: Attitudes) -> str | None:
-    """Return the name of a motion from its samples, None where they have no rates."""
+    """Return the name of a motion from its samples, None if they have no rates."""
     values, rate = data.constants(top), data.sin2_rate
     if values is None or rate is None:
         return None

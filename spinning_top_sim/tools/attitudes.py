@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The attitude in a message that another node has written, in CDR (OMG DDS-XTypes, XCDR1)."""
+"""Reads the attitude from serialized messages of other nodes (OMG DDS-XTypes, XCDR1)."""
 
 import struct
 from typing import NamedTuple
@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.messages import EXACT_VARIANCE
 
-NO_ORIENTATION = -1.0           # sensor_msgs/Imu has it in the covariance
+NO_ORIENTATION = -1.0           # first variance of a sensor_msgs/Imu without orientation
 
 
 class Layout(NamedTuple):
     """
-    Where the attitude is in a message after its header.
+    Where the attitude is in a message.
 
-    strings, skipped : that come before the quaternion; of the skipped ones each has 8 bytes
-    covariance : rows of the matrix after the quaternion; the last three are of turns.  0: none
+    strings, skipped : numbers of strings and of doubles between the header and the quaternion
+    covariance : rows of the matrix after the quaternion, the last three for rotations; 0: none
     """
 
     strings: int
@@ -35,7 +35,7 @@ LAYOUTS = {
 
 
 class Attitude(NamedTuple):
-    """Stamp [ns], quaternion x, y, z, w (4,) and covariance (3, 3) [rad^2], NaN: unknown."""
+    """Stamp [ns], quaternion x, y, z, w (4,) and covariance (3, 3) [rad^2], NaN if unknown."""
 
     stamp_ns: int
     quaternion: NDArray[np.float64]
@@ -46,28 +46,28 @@ def decode(data: bytes, type_name: str) -> Attitude:
     """
     Return the attitude in a serialized message of a type of LAYOUTS.
 
-    Raises ValueError for a message that is too short, or says that it has no orientation.
+    Raises ValueError if the message is too short or has no orientation.
     """
     layout = LAYOUTS[type_name]
     order = '<' if data[1:2] == b'\1' else '>'
     try:
         seconds, nanoseconds = struct.unpack_from(f'{order}iI', data, 4)
         at = 12
-        for _ in range(1 + layout.strings):         # first the frame
+        for _ in range(1 + layout.strings):         # the first one is the frame
             at += -at % 4
             at += 4 + struct.unpack_from(f'{order}I', data, at)[0]
     except struct.error as error:
         raise ValueError(str(error)) from error
-    at += (4 - at) % 8 + 8 * layout.skipped         # aligned after the four bytes of the head
+    at += (4 - at) % 8 + 8 * layout.skipped         # aligned after the encapsulation header
     quaternion = np.frombuffer(data, f'{order}f8', 4, at)
     covariance = np.full((3, 3), np.nan)
     if layout.covariance:
         size = layout.covariance
         matrix = np.frombuffer(data, f'{order}f8', size * size, at + 32).reshape(size, size)
-        # Of a pose the first variance is that of the position.
+        # The first variance of a pose is that of the position.
         if size == 3 and matrix[0, 0] == NO_ORIENTATION:
             raise ValueError('it has no orientation')
-        # 0 is unknown (sensor_msgs), and our own streams say so of what is exact.
+        # A matrix of zeros means unknown (sensor_msgs); the streams of this package are exact.
         if np.max(np.abs(matrix[-3:, -3:])) > EXACT_VARIANCE:
             covariance = matrix[-3:, -3:]
     return Attitude(seconds * NANOSECONDS + nanoseconds, quaternion, covariance)

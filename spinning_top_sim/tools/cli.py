@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the tools share: their start, exit codes, errors in one line, progress, and tables."""
+"""What all tools share: start, exit codes, errors in one line, progress and tables."""
 
 import argparse
 import contextlib
@@ -12,13 +12,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import TextIO
 
-OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130         # 2 as argparse has it
-LINE_EVERY_S = 10.0         # of progress, without a terminal
+OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130         # argparse uses 2, too
+LINE_EVERY_S = 10.0         # between lines of progress without a terminal
 GAP = '  '                  # before each column of a table
 
 
 def _start(module: str) -> int:
-    """Import a tool and run it; return its exit code, also if Ctrl-C interrupts the imports."""
+    """Import and run a tool; return its exit code, also if Ctrl-C interrupts the imports."""
     try:
         return importlib.import_module(f'spinning_top_sim.{module}').main()
     except KeyboardInterrupt:
@@ -31,7 +31,7 @@ simulate, inspect, recover, ensemble, examine = (partial(_start, module) for mod
 
 
 class _Version(argparse.Action):
-    """Print the version, which takes time to find, where it is asked for."""
+    """Prints the version.  It is looked up only here, because that takes time."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         from spinning_top_sim.recording.provenance import version  # noqa: PLC0415
@@ -50,9 +50,10 @@ def run(name: str, help_text: str | None, argv: Sequence[str] | None,
     """
     Run a command; return its exit code.
 
-    One of `errors` gives FAILED, a ValueError among them (wrong arguments) WRONG_USAGE.
+    errors : exceptions that are printed as one line; the exit code is then FAILED, or WRONG_USAGE
+        for a ValueError
     """
-    # A closed stream is None, and a file that is opened would take its place.
+    # If a stream is closed, the next file that is opened would take its descriptor.
     sys.stdout = sys.stdout or open(os.devnull, 'w')    # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, 'w')    # noqa: SIM115
     parser = argparse.ArgumentParser(prog=name, description=help_text,
@@ -65,7 +66,7 @@ def run(name: str, help_text: str | None, argv: Sequence[str] | None,
         sys.stdout.flush()
         return code
     except BrokenPipeError:
-        # The reader of the output, such as a pager, has ended.  Python flushes it once more.
+        # The reader of the output, such as a pager, has ended.  Python flushes the output again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
     except errors as error:
@@ -80,20 +81,20 @@ def run(name: str, help_text: str | None, argv: Sequence[str] | None,
 
 
 def printable(text: str) -> str:
-    """Return a text with escapes for what would act on a terminal, or cannot be encoded."""
+    """Return a text in which characters that are not printable are escaped."""
     return ''.join(character if character.isprintable() else
                    character.encode('unicode_escape').decode() for character in text)
 
 
 def print_line(text: str, file: TextIO | None = None) -> None:
-    """Print a line, by default to the standard output, whatever a name in it holds."""
+    """Print a line, by default to the standard output; names in it cannot act on a terminal."""
     print(printable(text), file=file or sys.stdout)
 
 
 @contextlib.contextmanager
 def progress(what: str, total: float, unit: str, *, quiet: bool = False,
              ) -> Iterator[Callable[[float], None]]:
-    """Show a bar on a terminal, else a line at times; yield what takes the amount done so far."""
+    """Show progress as a bar or, without a terminal, in lines; yield what takes what is done."""
     if quiet or not total > 0.0:
         yield lambda done: None
         return
@@ -118,9 +119,9 @@ def progress(what: str, total: float, unit: str, *, quiet: bool = False,
 
 def table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
     """
-    Yield the lines of a table of text, with numbers in all columns but the first.
+    Yield the lines of a table; all columns but the first are right-aligned.
 
-    Where they are wider than the terminal, the first column has lines of its own.
+    If the table is wider than the terminal, the cells of the first column have their own lines.
     """
     cells = [[*map(printable, row)] for row in (head, *rows)]
     first, *widths = (max(map(len, column)) for column in zip(*cells, strict=True))

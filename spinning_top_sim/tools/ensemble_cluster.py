@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Dask: workers on this machine or on a cluster, and the tasks that they are given."""
+"""Workers of Dask, on this machine or a cluster, and the tasks for them."""
 
 import asyncio
 import concurrent.futures
@@ -9,7 +9,6 @@ import os
 import signal
 import uuid
 from collections.abc import Callable, Iterable, Iterator
-from itertools import count, islice
 from multiprocessing import resource_tracker
 from typing import TypeVar
 
@@ -21,29 +20,26 @@ from spinning_top_sim.tools.ensemble_part import EnsembleError
 Result = TypeVar('Result')
 
 LOOPBACK = '127.0.0.1'
-# Tasks that are submitted at a time, for each thread of the workers: enough that none waits, and
-# memory does not grow with the number of tasks.
-TASKS_A_THREAD = 4
 CONNECT_S, FIRST_WORKER_S = 10.0, 60.0
 
 
 @contextlib.contextmanager
 def connect(workers: int | None, scheduler: str | None) -> Iterator[distributed.Client]:
     """
-    Yield a client of a cluster at `scheduler`, else of so many processes on this machine.
+    Yield a client of the cluster at the address `scheduler`, else of processes on this machine.
 
-    workers : None for one process a core
+    workers : number of processes on this machine, None for one a core
 
     Raises EnsembleError if the cluster cannot be reached, or has no workers.
     """
     for handler in logging.getLogger('distributed').handlers:
-        handler.setLevel(logging.CRITICAL)          # what matters becomes an error of ours
+        handler.setLevel(logging.CRITICAL)          # errors are raised by the client
     with contextlib.ExitStack() as stack:
         if scheduler is None:
-            # Dask's profile grows with time, and memory grew with the number of runs.
+            # The profile that Dask keeps grows with time.
             stack.enter_context(dask.config.set({'distributed.worker.profile.enabled': False}))
             with _interrupts_blocked():
-                # Neither a dashboard nor a port that other machines reach.
+                # No dashboard, and no port that other machines can reach.
                 address: object = stack.enter_context(distributed.LocalCluster(
                     n_workers=workers or len(os.sched_getaffinity(0)), threads_per_worker=1,
                     host=LOOPBACK, dashboard_address=f'{LOOPBACK}:0',
@@ -62,11 +58,11 @@ def connect(workers: int | None, scheduler: str | None) -> Iterator[distributed.
 @contextlib.contextmanager
 def _interrupts_blocked() -> Iterator[None]:
     """
-    Block SIGINT in the threads and processes that are started meanwhile, for good.
+    Start threads and processes with SIGINT blocked.
 
-    A terminal sends Ctrl-C to the workers too.  This process alone shall react.
+    A terminal sends Ctrl-C to the workers, too, but only this process reacts.
     """
-    resource_tracker.ensure_running()       # when it starts later, it ends the blocking
+    resource_tracker.ensure_running()       # if it started later, it would unblock the signal
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -77,25 +73,21 @@ def _interrupts_blocked() -> Iterator[None]:
 def compute(client: distributed.Client, task: Callable[[int], Result],
             numbers: Iterable[int]) -> Iterator[Result]:
     """
-    Yield the results of task(number) in the order in which they are ready.
+    Yield the results of task(number) in the order of completion.
 
-    A task is computed again elsewhere if its worker is killed.  Raises what a task raises, and
-    EnsembleError if the scheduler is lost or a task takes its workers with it.
+    If a worker is killed, another one computes its task again.  Raises what a task raises, and
+    EnsembleError if the scheduler is lost, or if a task kills several workers.
     """
-    batch = uuid.uuid4().hex        # the cluster may have tasks of other ensembles
-    waiting, running = iter(numbers), distributed.as_completed(loop=client.loop)
-    for done in count():
-        if done % TASKS_A_THREAD == 0:              # a cluster may grow
-            room = TASKS_A_THREAD * max(sum(client.nthreads().values()), 1)
-        for number in islice(waiting, max(room - running.count(), 0)):
-            running.add(client.submit(task, number, key=f'ensemble-{batch}-{number}', pure=False))
-        if running.is_empty():
-            return
-        try:
-            yield next(running).result()
-        except distributed.KilledWorker as error:
-            raise EnsembleError(f'several workers died, all of them with the same task: {error}'
-                                ) from error
-        except (concurrent.futures.CancelledError, asyncio.CancelledError,
-                distributed.comm.CommClosedError) as error:
-            raise EnsembleError('the scheduler is lost') from error
+    # A cluster may have the tasks of several ensembles.
+    results = distributed.as_completed(
+        client.map(task, list(numbers), key=f'ensemble-{uuid.uuid4().hex}', pure=False),
+        loop=client.loop)
+    try:
+        for future in results:
+            yield future.result()
+    except distributed.KilledWorker as error:
+        raise EnsembleError(f'several workers died, all of them with the same task: {error}'
+                            ) from error
+    except (concurrent.futures.CancelledError, asyncio.CancelledError,
+            distributed.comm.CommClosedError) as error:
+        raise EnsembleError('the scheduler is lost') from error

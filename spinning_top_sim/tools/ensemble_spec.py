@@ -17,11 +17,11 @@ from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.tools.scene_file import parse_section, parse_yaml, read_scene
 
 FORMATS = ('parquet', 'mcap')
-# Streams that have no columns: a log has them, a table does not.
+# Streams that only a log can have, not a table.
 WITHOUT_COLUMNS = ('clock', 'markers')
 STREAMS = tuple(row[0] for row in parameters.STREAM_DEFAULTS)
-# A part of the dataset has so many rows at most, where its runs are shorter than that, and there
-# are so many parts at least, where there are more runs.
+# By default a part has at most this many rows, or one run, and a large ensemble at least this
+# many parts.
 ROWS_IN_A_PART, LEAST_PARTS = 200_000, 50
 VALUES, PARAMS = 'values', 'params'
 
@@ -38,7 +38,7 @@ def _log_uniform(random: np.random.Generator, low: float, high: float) -> float:
     return min(max(low * math.exp(math.log(high / low) * random.random()), low), high)
 
 
-# The function that draws, its two numbers, and what these must be.
+# By name: the function that draws from two numbers, what these must be, and the check of that.
 DISTRIBUTIONS: Mapping[str, tuple[Callable[[np.random.Generator, float, float], float], str,
                                   Callable[[float, float], bool]]] = {
     'uniform': (_uniform, '[low, high] with low <= high and a finite difference',
@@ -64,15 +64,15 @@ def run_seed(seed: int, run: int) -> int:
 @dataclass(frozen=True)
 class Specification:
     """
-    Runs 0 to runs - 1 of one scene, each with parameters of its own.
+    What the runs of an ensemble are; their numbers are 0 to runs - 1.
 
-    runs, seed : number of runs, and the seed of all that is drawn
+    runs, seed : number of runs, and the seed of all random numbers
     duration : of a run [s]
-    params : sets of parameters by name, one on top of the other; see `parse`
+    params : mappings of parameters; a later one overrides those before it
     sample : name of a parameter to {distribution: [a, b]}, or to {values: [...]}
-    streams : names of the streams that are kept; empty: those that the parameters of a run enable
+    streams : names of the streams to keep; empty: those that the parameters of a run enable
     format : 'parquet' or 'mcap'
-    runs_per_part : runs that are computed together, and in Parquet share a file
+    runs_per_part : runs that are computed by one task, and in Parquet share a file
     """
 
     runs: int
@@ -96,11 +96,11 @@ class Specification:
 
     def drawn(self, run: int) -> dict[str, Any]:
         """
-        Return what differs in a run, not checked: its seed and the sampled parameters by name.
+        Return the seed and the sampled parameters of a run by name, not checked.
 
-        What is drawn for a name does not depend on the other names.  Lists of values make a grid,
-        in which the first list changes fastest; run K is point K of it, again and again.  For
-        `params` it is the number of the chosen set.
+        The number that is drawn for a name does not depend on the other names.  Lists of values
+        span a grid, in which the first list changes fastest; run K takes point K modulo the size
+        of the grid.  `params` is the index of the chosen set.
         """
         found: dict[str, Any] = {'seed': run_seed(self.seed, run)}
         point = run
@@ -128,27 +128,30 @@ class Specification:
         return rule[VALUES]
 
     def _given(self, chosen: Mapping[str, Any]) -> dict[str, Any]:
-        """Return what is given for the runs with one of the sets."""
+        """Return the given parameters of the runs with one of the sets."""
         given: dict[str, Any] = {}
-        for some in (*self.params, chosen):
+        for some in (*self.params, chosen, {'duration': self.duration}):
             given.update(some)
-        given['duration'] = self.duration
         if self.streams:
             given['record.streams'] = self.streams
             given.update((f'{name}.enabled', True) for name in self.streams)
         return given
 
     @cached_property
+    def alternatives(self) -> Sequence[Mapping[str, Any]]:
+        """The parameters of the runs with each of the sets, without the sampled ones."""
+        defaults = {parameter.name: parameter.default for parameter in parameters.TABLE}
+        return [{**defaults, **self._given(one)} for one in self._sets]
+
+    @cached_property
     def kept(self) -> Sequence[str]:
         """
-        The streams that some run keeps, by name.
+        Names of the streams that any of the runs keeps.
 
-        All tables of an ensemble have the columns of these: else its files are no one table.
+        The table of each run has columns for all of them, so that the files form one table.
         """
-        defaults = {parameter.name: parameter.default for parameter in parameters.TABLE}
-        alternatives = [{**defaults, **self._given(one)} for one in self._sets]
         return [name for name in STREAMS
-                if any(journal.is_recorded(name, values) for values in alternatives)]
+                if any(journal.is_recorded(name, values) for values in self.alternatives)]
 
 
 def read(path: Path) -> Specification:
@@ -158,53 +161,53 @@ def read(path: Path) -> Specification:
 
 def parse(content: object, source: str, folder: Path = Path()) -> Specification:
     """
-    Return a checked specification; the fields are those of `Specification`.
+    Return a checked specification from a mapping with the fields of `Specification`.
 
-    Each set of parameters is a mapping, or the path of a parameter file, in `folder` or else in
-    the working directory.  A specification as a mapping, `dataclasses.asdict`, is one to parse.
+    A set of parameters may be given as the path of a parameter file, in `folder` or else in the
+    working directory.  `dataclasses.asdict` of a specification can be parsed again.
     Raises OSError, or ValueError, which names the source, the value and what is allowed.
     """
+    try:
+        return _parsed(content, folder)
+    except ValueError as error:
+        raise ValueError(f'{source}: {error}') from error
+
+
+def _parsed(content: object, folder: Path) -> Specification:
     if not isinstance(content, Mapping):
-        raise ValueError(f'{source}: must be a mapping with runs, duration and more')
+        raise ValueError('must be a mapping with runs, duration and more')
     names = Specification.__dataclass_fields__
     for name in content:
         if name not in names:
-            raise ValueError(f'{source}: {name if isinstance(name, str) else shown(name)}: there '
-                             'is no such entry; there are '
-                             f'{", ".join(names)}')
-    given = dict(content)
+            raise ValueError(f'{name if isinstance(name, str) else shown(name)}: there is no such '
+                             f'entry; there are {", ".join(names)}')
     for name in ('runs', 'duration'):
-        if name not in given:
-            raise ValueError(f'{source}: {name} is missing')
-    whole = {'runs': 1, 'seed': 0, 'runs_per_part': 0}
-    for name, least in whole.items():
-        value = given.setdefault(name, least)
-        if type(value) is not int or not least <= value < 2 ** 63:
-            raise ValueError(f'{source}: {name} = {shown(value)}: must be an integer >= {least}')
-    duration = given['duration'] = _check(source, 'duration', given['duration'])
-    if not duration > 0.0:
-        raise ValueError(f'{source}: duration = {duration!r}: must be a number > 0')
-    if given.setdefault('format', FORMATS[0]) not in FORMATS:
-        raise ValueError(f'{source}: format = {shown(given["format"])}: must be one of '
-                         f'{", ".join(FORMATS)}')
-    given['params'] = [_set_of(one, f'{source}: params', folder)
-                       for one in _list(given.get('params', []), f'{source}: params')]
-    given['streams'] = _streams(given.get('streams') or [], given['format'], source)
+        if name not in content:
+            raise ValueError(f'{name} is missing')
+    given = {'seed': 0, 'runs_per_part': 0, 'format': FORMATS[0], **content}
+    _check_numbers(given)
+    if given['format'] not in FORMATS:
+        raise ValueError(f'format = {shown(given["format"])}: must be one of {", ".join(FORMATS)}')
+    given['params'] = [_parameter_set(one, 'params', folder)
+                       for one in _list(given.get('params', []), 'params')]
+    given['streams'] = _streams(given.get('streams') or [], given['format'])
     sample = given.get('sample') or {}
     if not isinstance(sample, Mapping):
-        raise ValueError(f'{source}: sample = {shown(sample)}: must be a mapping of parameters')
-    given['sample'] = {name: _rule(name, rule, f'{source}: sample', folder)
-                       for name, rule in sample.items()}
+        raise ValueError(f'sample = {shown(sample)}: must be a mapping of parameters')
+    given['sample'] = {name: _rule(name, rule, folder) for name, rule in sample.items()}
     specification = Specification(**given)
     return specification if specification.runs_per_part else replace(
-        specification, runs_per_part=_runs_per_part(specification, source))
+        specification, runs_per_part=_runs_per_part(specification))
 
 
-def _check(source: str, name: str, value: object) -> Any:
-    try:
-        return parameters.BY_NAME[name].check(value)
-    except ValueError as error:
-        raise ValueError(f'{source}: {error}') from error
+def _check_numbers(given: dict[str, Any]) -> None:
+    for name, least in (('runs', 1), ('seed', 0), ('runs_per_part', 0)):
+        value = given[name]
+        if type(value) is not int or not least <= value < 2 ** 63:
+            raise ValueError(f'{name} = {shown(value)}: must be an integer >= {least}')
+    duration = given['duration'] = parameters.BY_NAME['duration'].check(given['duration'])
+    if not duration > 0.0:
+        raise ValueError(f'duration = {duration!r}: must be a number > 0')
 
 
 def _list(value: object, what: str) -> Sequence[Any]:
@@ -213,75 +216,81 @@ def _list(value: object, what: str) -> Sequence[Any]:
     return value
 
 
-def _set_of(given: object, source: str, folder: Path) -> dict[str, Any]:
-    """Return a set of parameters, of which each value is checked."""
+def _parameter_set(given: object, what: str, folder: Path) -> dict[str, Any]:
+    """Return checked parameters from a file or a mapping."""
     if isinstance(given, str) and '\0' not in given:
         beside = folder / given
         found = read_scene(beside if beside.exists() else given)
     elif isinstance(given, Mapping):
-        found = parse_section(given, source)
+        found = parse_section(given, what)
     else:
-        raise ValueError(f'{source}: {shown(given)}: must be a parameter file, or parameters and '
+        raise ValueError(f'{what}: {shown(given)}: must be a parameter file, or parameters and '
                          'their values')
-    return {name: _check(source, name, value) for name, value in found.items()}
+    return {name: parameters.BY_NAME[name].check(value) for name, value in found.items()}
 
 
-def _streams(given: object, file_format: str, source: str) -> list[str]:
-    names = list(_list(given, f'{source}: streams'))
+def _streams(given: object, file_format: str) -> list[str]:
+    names = list(_list(given, 'streams'))
     allowed = [name for name in STREAMS if file_format != 'parquet' or name not in WITHOUT_COLUMNS]
     for name in names:
         if name not in allowed:
-            raise ValueError(f'{source}: streams: {shown(name)}: must be some of '
-                             f'{", ".join(allowed)} with format: {file_format}')
+            raise ValueError(f'streams: {shown(name)}: must be some of {", ".join(allowed)} with '
+                             f'format: {file_format}')
     return names
 
 
-def _rule(name: object, rule: object, source: str, folder: Path) -> dict[str, list[Any]]:
+def _rule(name: object, rule: object, folder: Path) -> dict[str, list[Any]]:
     """Return how a parameter is sampled, checked: {distribution: [a, b]}, or {values: [...]}."""
-    if name != PARAMS and not parse_section({name: 0.0}, source):
-        raise ValueError(f'{source}: {name} is of ROS and has no effect')
-    if str(name).endswith('.enabled') or name in ('record.streams', 'publish_clock'):
-        raise ValueError(f'{source}: {name} must not be sampled: `streams`, or a set of `params`, '
-                         'says which streams there are')
-    what = f'{source}: {name}'
+    what, kinds = f'sample: {name}', (*DISTRIBUTIONS, VALUES)
+    if name != PARAMS:
+        _check_sampled(name)
     if not isinstance(rule, Mapping) or len(rule) != 1:
-        raise ValueError(f'{what} = {shown(rule)}: must be one of '
-                         f'{", ".join((*DISTRIBUTIONS, VALUES))} with a list')
+        raise ValueError(f'{what} = {shown(rule)}: must be one of {", ".join(kinds)} with a list')
     (kind, given), = rule.items()
-    if kind not in (*DISTRIBUTIONS, VALUES):
-        raise ValueError(f'{what}: there is no distribution {kind}; there are '
-                         f'{", ".join((*DISTRIBUTIONS, VALUES))}')
+    if kind not in kinds:
+        raise ValueError(f'{what}: there is no distribution {kind}; there are {", ".join(kinds)}')
     items = _list(given, f'{what}: {kind}')
-    if kind == VALUES:
-        if not items:
-            raise ValueError(f'{what}: values = []: must have one value at least')
-        return {kind: [_set_of(item, what, folder) if name == PARAMS else
-                       _check(source, str(name), item) for item in items]}
-    if name == PARAMS or not parameters.BY_NAME[str(name)].is_double:
-        raise ValueError(f'{what}: {kind}: must be values, because the parameter is no double')
+    if kind != VALUES:
+        return {kind: _bounds(str(name), kind, items)}
+    if not items:
+        raise ValueError(f'{what}: values = []: must have one value at least')
+    return {kind: [_parameter_set(item, what, folder) if name == PARAMS else
+                   parameters.BY_NAME[str(name)].check(item) for item in items]}
+
+
+def _check_sampled(name: object) -> None:
+    """Raise ValueError for a parameter that cannot be sampled."""
+    if not parse_section({name: 0.0}, 'sample'):
+        raise ValueError(f'sample: {name} is of ROS and has no effect')
+    if str(name).endswith('.enabled') or name in ('record.streams', 'publish_clock'):
+        raise ValueError(f'sample: {name} must not be sampled: `streams`, or a set of `params`, '
+                         'says which streams there are')
+
+
+def _bounds(name: str, kind: str, items: Sequence[Any]) -> list[float]:
+    """Return the two numbers of a distribution, checked."""
+    if name == PARAMS or not parameters.BY_NAME[name].is_double:
+        raise ValueError(f'sample: {name}: {kind}: must be values, because the parameter is no '
+                         'double')
     _, allowed, is_allowed = DISTRIBUTIONS[kind]
-    if len(items) != 2 or not all(
+    if not (len(items) == 2 and all(
             isinstance(item, int | float) and not isinstance(item, bool)
-            and abs(item) <= sys.float_info.max for item in items) or not is_allowed(
-                *map(float, items)):
-        raise ValueError(f'{what}: {kind} = {shown(given)}: must be {allowed}')
+            and abs(item) <= sys.float_info.max for item in items)
+            and is_allowed(*map(float, items))):
+        raise ValueError(f'sample: {name}: {kind} = {shown(items)}: must be {allowed}')
     for bound in items[:1] if kind == 'normal' else items:
-        _check(source, str(name), bound)
-    return {kind: [float(item) for item in items]}
+        parameters.BY_NAME[name].check(bound)
+    return [float(item) for item in items]
 
 
-def _runs_per_part(specification: Specification, source: str) -> int:
-    """Return how many runs are worth a task; a run that is refused fails alone, later."""
-    try:
-        values = specification.values(0)
-    except ValueError:
-        values = parameters.checked({'duration': specification.duration})
+def _runs_per_part(specification: Specification) -> int:
+    """Return how many runs are worth a task."""
     names = [name for name in specification.kept
              if specification.format != 'parquet' or name not in WITHOUT_COLUMNS]
     if not names:
-        raise ValueError(f'{source}: no stream is enabled; streams: must name one of '
-                         f'{", ".join(STREAMS)}')
-    # What has no rate of its own has that of the IMU.
+        raise ValueError(f'no stream is enabled; streams: must name one of {", ".join(STREAMS)}')
+    values = specification.alternatives[0]
+    # A stream without a rate of its own has that of the IMU.
     rows = values['duration'] * max(
         values.get(f'{name}.rate', values['imu.rate']) for name in names)
     return max(1, min(int(ROWS_IN_A_PART / max(rows, 1.0)), specification.runs // LEAST_PARTS))

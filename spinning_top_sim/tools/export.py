@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Exports of a log to the files of other tools.
+Writes files for other tools from a log.
 
 TUM: "timestamp tx ty tz qx qy qz qw", in s and m (vision.in.tum.de, RGB-D dataset, file formats).
 EuRoC: state_groundtruth_estimate0/data.csv and imu0/data.csv (M. Burri et al., "The EuRoC micro
@@ -30,9 +30,9 @@ if TYPE_CHECKING:       # simulate writes tables without mcap
     from spinning_top_sim.recording.reader import LogReader
     from spinning_top_sim.tools.recorded_run import RunDescription
 
-BLOCK = 16384               # messages read together
+BLOCK = 16384               # messages that are read together
 RAW, BIAS, ODOMETRY = 'imu/data_raw', 'ground_truth/imu_bias', 'ground_truth/imu_odom'
-# Parameter that switches a topic on.
+# Parameter that enables a topic.
 SWITCHES = {RAW: 'imu.enabled', BIAS: 'imu.enabled', ODOMETRY: 'ground_truth_imu_odom.enabled'}
 KALIBR_NEEDS = tuple(f'imu.{kind}_{name}' for kind in ('accelerometer', 'gyroscope')
                      for name in ('noise_density', 'random_walk'))
@@ -46,7 +46,7 @@ Reals = NDArray[np.float64]
 
 
 class ExportError(ValueError):
-    """An export cannot be made of this run; the text says why."""
+    """A file cannot be made of this run; the text says why."""
 
 
 class Export(NamedTuple):
@@ -75,9 +75,9 @@ def _parse(text: str) -> Export:
 
 def check(exports: Sequence[Export], topics: Collection[str], values: Mapping[str, Any]) -> None:
     """
-    Refuse what cannot be made of a run with these topics and parameters.
+    Check that these files can be made of a run with these topics and parameters.
 
-    Raises ExportError, or FileExistsError.
+    Raises ExportError or FileExistsError.
     """
     for kind, path in exports:
         for topic in KINDS[kind][0]:
@@ -93,11 +93,11 @@ def check(exports: Sequence[Export], topics: Collection[str], values: Mapping[st
 
 
 def write(reader: LogReader, run: RunDescription, exports: Sequence[Export]) -> Iterator[str]:
-    """Write the files; yield a line about each.  Raises as `check` does, and OSError."""
+    """Write the files; yield a line about each.  Raises ExportError or OSError."""
     check(exports, run.topics, run.values_in_effect)
     for kind, path in exports:
         lines = KINDS[kind][1](reader, run)
-        first = next(lines, '')         # what is refused leaves no file
+        first = next(lines, '')         # a run that is refused leaves no file
         with open(path, 'x', encoding='utf-8') as file:
             file.write(first)
             file.writelines(lines)
@@ -122,7 +122,7 @@ def _euroc(reader: LogReader, run: RunDescription) -> Iterator[str]:
     for stamps_ns, (position, orientation, velocity, _) in _blocks(reader, run, ODOMETRY):
         x, y, z, w = orientation.T
         world = attitude.in_body((-x, -y, -z, w), tuple(velocity.T))
-        # The bias of the newest reading.
+        # The bias of the last reading before the sample.
         newest = np.maximum(np.searchsorted(bias_ns, stamps_ns, 'right') - 1, 0)
         yield from _csv(stamps_ns, position, np.column_stack((w, x, y, z)),
                         np.column_stack(world), bias[newest])
@@ -158,7 +158,7 @@ def _matrix(rows: Sequence[float]) -> list[list[float]]:
 
 def _blocks(reader: LogReader, run: RunDescription, topic: str,
             ) -> Iterator[tuple[NDArray[np.int64], tuple[Reals, ...]]]:
-    """Yield stamps (n,) [ns] and fields of the messages of a stream, in blocks."""
+    """Yield stamps (n,) [ns] and fields of the messages of a stream, block by block."""
     template = next(stream.template for stream in all_streams(run.values_in_effect)
                     if stream.topic == topic)
     messages = reader.messages(topics=[run.topics[topic]])
@@ -167,7 +167,7 @@ def _blocks(reader: LogReader, run: RunDescription, topic: str,
         yield template.stamps_ns(data), template.decode(data)
 
 
-# Name: the topics that it needs, and what yields its text.
+# Of each kind: the topics that it needs, and the generator of its text.
 KINDS: dict[str, tuple[Sequence[str], Callable[..., Iterator[str]]]] = {
     'tum': ((ODOMETRY,), _tum), 'euroc': ((ODOMETRY, BIAS), _euroc),
     'euroc_imu': ((RAW,), _euroc_imu), 'kalibr': ((RAW,), _kalibr)}

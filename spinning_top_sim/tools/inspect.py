@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Show what is in a log: topics, gaps, the motions measured from the data beside
-the exact ones, drifts, errors.  Reads damaged logs too.
+Show what is in a log: topics, gaps, drifts, errors, and the motions as measured
+from the data beside the exact ones. Reads damaged logs, too.
 
 exit codes:
   0    no fault was found
@@ -28,12 +28,12 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import cli, export
 from spinning_top_sim.tools.recorded_run import RunDescription
-from spinning_top_sim.tools.survey import Motion, Survey, survey
+from spinning_top_sim.tools.survey import MotionReport, Survey, survey
 from spinning_top_sim.tools.verify import Verdict, verify
 
-MOST_MOTIONS = 12           # shown one by one in the text
+MOST_MOTIONS = 12           # in the text
 DEGREES = math.degrees(1.0)
-# Rows of the table of a motion: what it is, field of Description and Measured, factor.
+# Rows of the table of a motion: text, field of Description and Measured, factor.
 ROWS = (('nutation period [s]', 'nutation_period', 1.0),
         ('mean precession [rad/s]', 'mean_precession_rate', 1.0),
         ('mean spin [rad/s]', 'mean_spin_rate', 1.0),
@@ -65,22 +65,16 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _picture(endings: tuple[str, ...], name: str) -> Path:
-    """Return the path of a picture.  Raises ArgumentTypeError for another ending than these."""
+    """Return the path of a picture.  Raises ArgumentTypeError if it has another ending."""
     if Path(name).suffix.lower() not in endings:
         raise argparse.ArgumentTypeError(f'{name}: must end in {" or ".join(endings)}')
     return Path(name)
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    verdict = None
     with LogReader(arguments.log) as reader:
         found = survey(reader)
-        if arguments.verify and found.run is not None:
-            begin_ns, end_ns = found.damage.start_ns, found.end_ns
-            with cli.progress('verified', (end_ns - begin_ns) / NANOSECONDS, 's',
-                          quiet=arguments.json) as show:
-                verdict = verify(reader, found.run, end_ns,
-                                 lambda stamp_ns: show((stamp_ns - begin_ns) / NANOSECONDS))
+        verdict = _verified(arguments, reader, found) if arguments.verify else None
         if arguments.export and found.run is None:
             raise export.ExportError(f'--export: {found.foreign_reason}')
         exported = list(export.write(reader, found.run, arguments.export)) if found.run else []
@@ -89,20 +83,30 @@ def _run(arguments: argparse.Namespace) -> int:
     else:
         for line in _as_text(found, verdict):
             cli.print_line(line)
-    passed = found.whole and not found.damage.defects
-    if arguments.verify:
-        if verdict is None:
-            cli.print_line(f'inspect: --verify: {found.foreign_reason}', sys.stderr)
-        passed = passed and verdict is not None and verdict.identical
     for line in exported:
         cli.print_line(line, sys.stderr if arguments.json else None)
-    if arguments.plot is not None or arguments.animate is not None:
-        passed = _draw(arguments, found) and passed
+    drawn = _draw(arguments, found)
+    verified = not arguments.verify or (verdict is not None and verdict.identical)
+    passed = found.whole and not found.damage.defects and verified and drawn
     return cli.OK if passed else cli.FAILED
 
 
+def _verified(arguments: argparse.Namespace, reader: LogReader, found: Survey) -> Verdict | None:
+    """Return the result of --verify, None for a log of another program."""
+    if found.run is None:
+        cli.print_line(f'inspect: --verify: {found.foreign_reason}', sys.stderr)
+        return None
+    begin_ns, end_ns = found.damage.start_ns, found.end_ns
+    with cli.progress('verified', (end_ns - begin_ns) / NANOSECONDS, 's',
+                      quiet=arguments.json) as show:
+        return verify(reader, found.run, end_ns,
+                      lambda stamp_ns: show((stamp_ns - begin_ns) / NANOSECONDS))
+
+
 def _draw(arguments: argparse.Namespace, found: Survey) -> bool:
-    """Draw the pictures that are asked for; return whether that worked."""
+    """Draw the pictures; return whether there was no error."""
+    if arguments.plot is None and arguments.animate is None:
+        return True
     try:
         if found.shown is None:
             raise ValueError('nothing to draw: no attitude of a top in this log')
@@ -123,40 +127,41 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> bool:
 
 
 def _as_json(found: Survey, verdict: Verdict | None) -> object:
-    """Return all findings as what JSON can hold; docs/inspect.md tells the keys."""
+    """Return the findings for JSON; docs/inspect.md has the keys."""
     damage, run = found.damage, found.run
     content: dict[str, object] = {
         'file': str(found.path), 'whole': found.whole,
-        'damage': {'torn': damage.truncated, 'report': damage.lines(), **{
-            key: getattr(damage, key) for key in (
-                'lost_bytes', 'lost_chunks', 'missing_messages', 'missing_exactly')}},
+        'damage': {'torn': damage.truncated, 'report': damage.lines(), **_fields_of(
+            damage, 'lost_bytes', 'lost_chunks', 'missing_messages', 'missing_exactly')},
         'begin_ns': damage.start_ns, 'end_ns': damage.end_ns,
         'duration': (damage.end_ns - damage.start_ns) / NANOSECONDS,
         'topics': {name: asdict(topic) for name, topic in found.topics.items()},
         'ours': run is not None, 'why_not_ours': found.foreign_reason or None,
         'notes': [*_broken_entries(run), *found.notes],
-        'run': run and {
-            'parameters': run.values_at_start, 'seed': run.values_at_start['seed'],
-            'epoch_ns': run.epoch_ns, 'begun_ns': run.begun_ns, **run.surroundings},
-        'events': [
-            {'event': event.name, 'stamp_ns': event.stamp_ns, 't_ns': event.t_ns, **event.details}
-            for event in (run.events if run else ())],
+        'run': None, 'events': [], 'verify': None,
         'motions': [{
-            **{key: getattr(motion, key) for key in (
-                'cause', 'begin_ns', 'end_ns', 'source', 'regime')},
-            **{key: getattr(motion.segment, key) for key in ('l3', 'lz', 'energy')},
+            **_fields_of(motion, 'cause', 'begin_ns', 'end_ns', 'source', 'regime'),
+            **_fields_of(motion.segment, 'l3', 'lz', 'energy'),
             'exact': motion.exact and asdict(motion.exact),
             'measured': motion.measured and asdict(motion.measured)} for motion in found.motions],
         'drifts': {topic: {name: series.largest for name, series in drifts.items()}
                    for topic, drifts in found.drifts.items()},
         'orientation_error': {topic: {'max': series.largest, 'rms': series.rms}
-                              for topic, series in found.errors.items()},
-        'verify': verdict and {
-            'identical': verdict.identical, 'whole': found.whole, **asdict(verdict),
-            'first': verdict.first and verdict.first._asdict()},
-    }
+                              for topic, series in found.errors.items()}}
+    if run is not None:
+        content['run'] = {'parameters': run.values_at_start, 'seed': run.values_at_start['seed'],
+                          **_fields_of(run, 'epoch_ns', 'begun_ns'), **run.surroundings}
+        content['events'] = [{'event': event.name, **_fields_of(event, 'stamp_ns', 't_ns'),
+                              **event.details} for event in run.events]
+    if verdict is not None:
+        content['verify'] = {'identical': verdict.identical, 'whole': found.whole,
+                             **asdict(verdict), 'first': verdict.first and verdict.first._asdict()}
     # Numbers that JSON does not have become null.
     return json.loads(json.dumps(content), parse_constant=lambda name: None)
+
+
+def _fields_of(source: object, *names: str) -> dict[str, object]:
+    return {name: getattr(source, name) for name in names}
 
 
 def _broken_entries(run: RunDescription | None) -> list[str]:
@@ -192,6 +197,12 @@ def _as_text(found: Survey, verdict: Verdict | None) -> Iterator[str]:
         yield from _motion(number, motion, damage.start_ns)
     if len(found.motions) > MOST_MOTIONS:
         yield f'and {len(found.motions) - MOST_MOTIONS} more motions (all are in --json)'
+    yield from _accuracy(found)
+    if verdict is not None:
+        yield from _verdict(verdict)
+
+
+def _accuracy(found: Survey) -> Iterator[str]:
     if found.drifts:
         yield from cli.table(
             'largest drifts since the start of each motion, relative', ('from', 'E', 'L3', 'Lz'),
@@ -201,13 +212,11 @@ def _as_text(found: Survey, verdict: Verdict | None) -> Iterator[str]:
         yield 'drifts of E, L3, Lz: no topic with rates (joint_states, ground_truth/...)'
     if found.errors:
         yield from cli.table('orientation error against the exact solution [rad]',
-                         ('from', 'max', 'rms'),
-                         [(topic, f'{series.largest:.3g}', f'{series.rms:.3g}')
-                          for topic, series in found.errors.items()])
+                             ('from', 'max', 'rms'),
+                             [(topic, f'{series.largest:.3g}', f'{series.rms:.3g}')
+                              for topic, series in found.errors.items()])
     else:
         yield 'orientation error: no topic with an attitude'
-    if verdict is not None:
-        yield from _verdict(verdict)
 
 
 def _topics(found: Survey) -> Iterator[str]:
@@ -224,7 +233,7 @@ def _topics(found: Survey) -> Iterator[str]:
             yield f'{name}: {topic.odd_size} messages do not have the size of this stream'
 
 
-def _motion(number: int, motion: Motion, begin_ns: int) -> Iterator[str]:
+def _motion(number: int, motion: MotionReport, begin_ns: int) -> Iterator[str]:
     exact, measured = motion.exact, motion.measured
     begin, end = (max(at_ns - begin_ns, 0) / NANOSECONDS
                   for at_ns in (motion.begin_ns, motion.end_ns))

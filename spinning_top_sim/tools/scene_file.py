@@ -11,15 +11,15 @@ import yaml
 from spinning_top_sim.physics.top import shown
 from spinning_top_sim.streams import parameters
 
-# Names of nodes in a file that stand for the node spinning_top.
+# Sections of a file that apply to the node spinning_top.
 NODES = ('/**', '/*', 'spinning_top', '/spinning_top', '/**/spinning_top')
-# Parameters that every node has; rclpy takes them.
+# Parameters that rclpy declares for every node.
 ROS_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
 STRING_TAG = 'tag:yaml.org,2002:str'
 
 
 class _Loader(yaml.SafeLoader):
-    """Finds the types of plain scalars as rcl does: 1e5 is a double, 1_000 and ~ are strings."""
+    """Resolves plain scalars as rcl does: 1e5 is a double, 1_000 and ~ are strings."""
 
     def compose_node(self, *place: object) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
@@ -44,18 +44,18 @@ for _type, _pattern in (
 
 def read_scene(path: str | Path) -> dict[str, object]:
     """
-    Return what a ROS 2 parameter file sets for the node spinning_top, by name, not checked yet.
+    Return the parameters of the node spinning_top in a ROS 2 parameter file, not checked.
 
-    Raises OSError, or ValueError which names the file and what is wrong with it.
+    Raises OSError, or ValueError, which names the file.
     """
     return known(parse_scene(Path(path).read_bytes(), str(path)), str(path))
 
 
 def parse_scene(text: str | bytes, source: str) -> dict[str, object]:
     """
-    Return what the text of a parameter file sets for the node spinning_top, by any name.
+    Return the parameters of the node spinning_top in the text of a file, whatever their names.
 
-    Raises ValueError, which names the source and what is wrong with it.
+    Raises ValueError, which names the source.
     """
     content = parse_yaml(text, source)
     sections = [node['ros__parameters'] for name, node in content.items()
@@ -68,12 +68,12 @@ def parse_scene(text: str | bytes, source: str) -> dict[str, object]:
 
 
 def parse_section(section: Mapping[object, object], source: str) -> dict[str, object]:
-    """Return parameters by name, not checked yet.  Raises ValueError, which names the source."""
+    """Return the parameters in a mapping, not checked.  Raises ValueError, as `parse_scene`."""
     return known(dict(_flatten(section)), source)
 
 
 def parse_assignment(text: str) -> tuple[str, object]:
-    """Return name and value of NAME:=VALUE, the value read as YAML.  Raises ValueError."""
+    """Return the name and the value, which is YAML, of NAME:=VALUE.  Raises ValueError."""
     name, separator, yaml_text = text.partition(':=')
     if not separator:
         raise ValueError(f'{text!r}: must be NAME:=VALUE')
@@ -83,7 +83,7 @@ def parse_assignment(text: str) -> tuple[str, object]:
 
 
 def parse_yaml(text: str | bytes, source: str) -> object:
-    """Return what YAML says, with the types of rcl.  Raises ValueError, which names the source."""
+    """Return the content of YAML with the types of rcl.  Raises ValueError, as `parse_scene`."""
     try:
         return yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -91,7 +91,7 @@ def parse_yaml(text: str | bytes, source: str) -> object:
 
 
 def _flatten(section: Mapping[object, object], prefix: str = '') -> Iterator[tuple[str, object]]:
-    """Yield dotted names and values of the parameters in a section."""
+    """Yield the dotted names and the values of parameters."""
     for name, value in section.items():
         if isinstance(value, Mapping):
             yield from _flatten(value, f'{prefix}{name}.')
@@ -100,12 +100,12 @@ def _flatten(section: Mapping[object, object], prefix: str = '') -> Iterator[tup
 
 
 def is_of_ros(name: str) -> bool:
-    """Whether rclpy takes a parameter of this name."""
+    """Return whether rclpy declares a parameter of this name."""
     return name.partition('.')[0] in ROS_PARAMETERS
 
 
 def known(values: Mapping[str, object], source: str) -> dict[str, object]:
-    """Return the values but for those of ROS.  Raises ValueError for others than ours."""
+    """Return the values without those of ROS.  Raises ValueError for unknown parameters."""
     ours = {name: value for name, value in values.items() if not is_of_ros(name)}
     for name, value in ours.items():
         if name not in parameters.BY_NAME:

@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What is in a log, and how accurate that is.
+Finds out what is in a log, and how accurate that is.
 
-`_follow_run` computes the motions of the run.  `_analyse` compares each block of messages with
-the motion that it is of, in one pass.  Then `_count` looks for gaps in each topic, and `_measure`
-measures each motion from the samples of its source.
+`survey` computes the motions of the run, compares each message with the motion that it belongs to,
+counts the samples of each topic, and measures each motion from the samples of one topic.
 """
 
 import itertools
 import math
 from bisect import bisect_left
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
@@ -29,48 +27,53 @@ from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.path import Segment
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools import analysis, recorded_run
-from spinning_top_sim.tools.analysis import Attitudes, Measured, Reals
+from spinning_top_sim.tools.analysis import Attitudes, Measured
 from spinning_top_sim.tools.recorded_run import LATEST_NS, ODD, RunDescription, reason_of
 
-BLOCK = 16384               # messages of all topics analysed together
-MOST_POINTS = 20_000        # of a series that is kept for a picture
-MOST_GAPS = 10              # listed one by one
+BLOCK = 16384               # messages of all topics that are analysed together
+MOST_POINTS = 20_000        # of a series that are kept for a picture
+MOST_GAPS = 10              # that are listed
 MOST_EXACT = 1000           # motions that are compared with the exact one: 10 ms each
-SHOWN_NUTATIONS, SHOWN_S = 8.0, 10.0      # in pictures: whichever is longer
+SHOWN_NUTATIONS, SHOWN_S = 8.0, 10.0      # duration of the pictures, the longer of both
 IMU_TOPICS = ('imu/data_raw', 'ground_truth/imu', 'ground_truth/imu_bias')
-# Streams that measure a motion, the best first: angles; exact rates; noisy rates; none.
+# Streams that a motion can be measured from, the most accurate first.
 SOURCES = ('joint_states', 'ground_truth/imu', 'ground_truth/odom', 'imu/data', 'pose')
-ENOUGH_SAMPLES = 12.0       # in a nutation: a faster stream shows nothing new
+ENOUGH_SAMPLES = 12.0       # in a nutation; a higher rate adds no accuracy
 Stamps = NDArray[np.int64]
+Rows = NDArray[np.float64]
 
 
 @dataclass
 class TopicReport:
-    """What is in a topic, in the words of docs/inspect.md."""
+    """The findings about a topic, with the keys of docs/inspect.md."""
 
     type: str
-    stream: str | None = None             # which of our streams it is
+    stream: str | None = None             # topic of the stream of this package
     count: int = 0
-    rate: float | None = None             # mean rate [Hz]
+    rate: float | None = None             # mean [Hz]
     grid_rate: float | None = None        # by the parameters [Hz]
-    missing: int | None = None            # samples on the grid that are not in the log
-    off_grid: int = 0                     # samples that are not on it
+    missing: int | None = None            # samples of the grid that are not in the log
+    off_grid: int = 0                     # stamps beside the grid
     # The first gaps: log times of the first and the last missing sample [ns]
     gaps_ns: list[tuple[int, int]] = field(default_factory=list)
-    odd_size: int = 0                     # messages of another size than the stream's
-    longest_step_ns: int = 0              # longest time between two messages [ns]
+    odd_size: int = 0                     # messages that do not have the size of the stream
+    longest_step_ns: int = 0              # between two messages
 
 
 class Series:
-    """Statistics of a long series of numbers, and `points`: at most MOST_POINTS of it."""
+    """
+    The largest value and the root mean square of a long series.
+
+    points : (2, n) log times [ns] and values for a picture; at most MOST_POINTS, with the peaks
+    """
 
     def __init__(self) -> None:
-        self.points = np.empty((2, 0))      # log times [ns], values
+        self.points = np.empty((2, 0))
         self.largest = self._square_sum = 0.0
         self._count = 0
 
-    def add(self, times_ns: Stamps, values: Reals) -> None:
-        """Append values, without those that are not finite."""
+    def add(self, times_ns: Stamps, values: Rows) -> None:
+        """Append the values that are finite."""
         points = np.stack((times_ns, values))[:, np.isfinite(values)]
         sizes = np.abs(points[1])
         self.largest = max(self.largest, float(np.max(sizes, initial=0.0)))
@@ -78,19 +81,19 @@ class Series:
         self._count += len(sizes)
         self.points = np.concatenate((self.points, points), axis=1)
         while self.points.shape[1] > MOST_POINTS:
-            # Of two neighbours the larger one.
+            # Keep the larger one of two neighbours.
             pairs = np.abs(self.points[1, :self.points.shape[1] // 2 * 2]).reshape(-1, 2)
             self.points = self.points[:, 2 * np.arange(len(pairs)) + np.argmax(pairs, axis=1)]
 
     @property
     def rms(self) -> float:
-        """Root of the mean square; NaN without values."""
+        """Root mean square; NaN without values."""
         return math.sqrt(self._square_sum / self._count) if self._count else math.nan
 
 
 @dataclass
 class Section:
-    """A part of a motion with the same rates: the samples later than begin_ns, up to end_ns."""
+    """A part of a motion in which the rates stay the same: samples in (begin_ns, end_ns]."""
 
     begin_ns: int                         # log times [ns]
     end_ns: int
@@ -99,21 +102,21 @@ class Section:
 
 
 @dataclass
-class Motion:
-    """One motion of the top, from the start, a command or a reset to the next."""
+class MotionReport:
+    """A motion of the top, from its cause to the next one."""
 
     cause: str                            # start, command, state or reset
     origin_ns: int                        # log time of the t = 0 of `segment` [ns]
     segment: Segment                      # its constants and its exact solution
-    exact: Description | None             # None where the closed form cannot hold it
-    source: str | None                    # topic that measures it best
+    exact: Description | None             # None if the closed form cannot represent it
+    source: str | None                    # topic that it is measured from
     streams: dict[str, Stream]            # by topic of the log
     imu: Imu
-    # Of the source: log times (n,) [ns], and `Attitudes.rows`
-    samples: list[tuple[Stamps, Reals]] = field(default_factory=list)
+    # Log times (n,) [ns] and `Attitudes.rows` of the source
+    samples: list[tuple[Stamps, Rows]] = field(default_factory=list)
     sections: list[Section] = field(default_factory=list)
-    measured: Measured | None = None      # the numbers of `exact` from these samples
-    regime: str | None = None             # name of the motion by them
+    measured: Measured | None = None      # the numbers of `exact`, from the samples
+    regime: str | None = None             # name of the motion, from the samples
 
     @property
     def begin_ns(self) -> int:
@@ -134,25 +137,25 @@ class Survey:
     end_ns: int                           # log time up to which samples were recorded [ns]
     topics: dict[str, TopicReport]
     run: RunDescription | None = None     # None for a log that this package did not record
-    foreign_reason: str = ''              # why not
-    motions: list[Motion] = field(default_factory=list)
-    # By topic, of energy, l3 and lz: relative to the beginning of the motion, if that is not 0.
+    foreign_reason: str = ''              # why it is None
+    motions: list[MotionReport] = field(default_factory=list)
+    # Drifts of energy, l3 and lz since the begin of the motion by topic, relative if not from 0
     drifts: dict[str, dict[str, Series]] = field(default_factory=dict)
-    errors: dict[str, Series] = field(default_factory=dict)     # of attitudes, by topic [rad]
-    # The first motion with samples, and its samples shown in pictures.
-    shown: tuple[Motion, Attitudes] | None = None
-    # By topic: (n, 7) time [s], angular velocity [rad/s], specific force [m/s^2].
-    readings: dict[str, list[Reals]] = field(default_factory=dict)
+    errors: dict[str, Series] = field(default_factory=dict)     # of attitudes by topic [rad]
+    # For pictures: the first motion with samples, and the first of these
+    shown: tuple[MotionReport, Attitudes] | None = None
+    # For pictures, by topic: (n, 7) time [s], angular velocity [rad/s], specific force [m/s^2]
+    readings: dict[str, list[Rows]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     @property
     def shown_s(self) -> float:
-        """How long the samples shown in pictures last [s]."""
+        """Duration of the pictures [s]."""
         exact = self.motions[0].exact
         return max(SHOWN_S, SHOWN_NUTATIONS * ((exact and exact.nutation_period) or 0.0))
 
 
-@np.errstate(all='ignore')                  # odd numbers are findings, too
+@np.errstate(all='ignore')                  # a log may hold any numbers
 def survey(reader: LogReader) -> Survey:
     """Return the findings about a log.  Raises LogError."""
     damage = reader.damage
@@ -164,18 +167,7 @@ def survey(reader: LogReader) -> Survey:
         _follow_run(found, found.run)
     except recorded_run.ForeignLogError as error:
         found.foreign_reason = str(error)
-    ends_ns = [motion.end_ns for motion in found.motions[:-1]]
-    blocks_ns: defaultdict[str, list[Stamps]] = defaultdict(lambda: [np.empty(0, np.int64)])
-    messages = reader.messages()
-    while block := sorted(itertools.islice(messages, BLOCK), key=attrgetter('topic')):
-        for topic, group in itertools.groupby(block, attrgetter('topic')):
-            samples = list(group)
-            blocks_ns[topic].append(_stamps(samples))
-            if found.motions and found.topics[topic].stream is not None:
-                for number, part in itertools.groupby(
-                        samples, lambda sample: bisect_left(ends_ns, sample.log_time)):
-                    _analyse(found, found.motions[number], topic, list(part))
-    stamps_ns = {topic: np.concatenate(blocks_ns[topic]) for topic in found.topics}
+    stamps_ns = _read_messages(found, reader)
     sections = [section for motion in found.motions for section in motion.sections]
     if sections:        # the last entry of the journal may be later than the last sample
         last = sections[-1]
@@ -189,7 +181,7 @@ def survey(reader: LogReader) -> Survey:
 
 
 def _follow_run(found: Survey, run: RunDescription) -> None:
-    """Note the motions of a run, and why it cannot be followed on."""
+    """Compute the motions of a run; add a note if it cannot be followed to its end."""
     for name, topic in run.topics.items():
         found.topics[topic].stream = name
     motions = found.motions
@@ -205,7 +197,7 @@ def _follow_run(found: Survey, run: RunDescription) -> None:
                        if stream.topic in run.topics}
             if event.name != 'parameters':
                 exact = simulation.describe() if len(motions) < MOST_EXACT else None
-                motions.append(Motion(
+                motions.append(MotionReport(
                     event.name, simulation.epoch_ns + simulation.segment.start_ns,
                     simulation.segment, exact, _source(run, streams, exact), streams,
                     Imu(simulation.values)))
@@ -219,17 +211,34 @@ def _follow_run(found: Survey, run: RunDescription) -> None:
 
 def _source(run: RunDescription, streams: Mapping[str, Stream],
             exact: Description | None) -> str | None:
-    """Return the topic that measures a motion best."""
+    """Return the topic that a motion is measured from, as docs/inspect.md says."""
     period_ns = ((exact and exact.nutation_period) or math.inf) * NANOSECONDS
     return max((run.topics[name] for name in SOURCES if name in run.topics), default=None,
                key=lambda name: min(period_ns / streams[name].period_ns, ENOUGH_SAMPLES))
+
+
+def _read_messages(found: Survey, reader: LogReader) -> dict[str, Stamps]:
+    """Compare all messages with their motions; return the log times of each topic [ns]."""
+    ends_ns = [motion.end_ns for motion in found.motions[:-1]]
+    blocks_ns = {topic: [np.empty(0, np.int64)] for topic in found.topics}
+    messages = reader.messages()
+    while block := sorted(itertools.islice(messages, BLOCK), key=attrgetter('topic')):
+        for topic, group in itertools.groupby(block, attrgetter('topic')):
+            samples = list(group)
+            blocks_ns[topic].append(_stamps(samples))
+            if found.motions and found.topics[topic].stream is not None:
+                for number, part in itertools.groupby(
+                        samples, lambda sample: bisect_left(ends_ns, sample.log_time)):
+                    _analyse(found, found.motions[number], topic, list(part))
+    return {topic: np.concatenate(parts) for topic, parts in blocks_ns.items()}
 
 
 def _stamps(samples: Sequence[LogMessage]) -> Stamps:
     return np.array([min(sample.log_time, LATEST_NS) for sample in samples], np.int64)
 
 
-def _analyse(found: Survey, motion: Motion, topic: str, samples: list[LogMessage]) -> None:
+def _analyse(found: Survey, motion: MotionReport, topic: str, samples: list[LogMessage]) -> None:
+    """Compare samples of a stream with their motion."""
     stream, segment = motion.streams[topic], motion.segment
     fitting = [sample for sample in samples if len(sample.data) == len(stream.template)]
     found.topics[topic].odd_size += len(samples) - len(fitting)
@@ -259,7 +268,7 @@ def _analyse(found: Survey, motion: Motion, topic: str, samples: list[LogMessage
 
 
 def _count(report: TopicReport, stamps_ns: Stamps, sections: list[Section], topic: str) -> None:
-    """Count a topic's messages, and compare those of a stream with the grid of each section."""
+    """Count the messages of a topic; compare those of a stream with the grid of each section."""
     report.count = len(stamps_ns)
     if report.count > 1:
         report.longest_step_ns = int(np.max(np.diff(stamps_ns)))
@@ -274,7 +283,7 @@ def _count(report: TopicReport, stamps_ns: Stamps, sections: list[Section], topi
         is_on_grid = (here - epoch_ns) % period_ns == 0
         report.grid_rate = NANOSECONDS / period_ns
         report.off_grid += int(np.count_nonzero(~is_on_grid))
-        # A sample that was sent twice does not make up for one that is missing.
+        # A sample that is there twice does not replace a missing one.
         report.missing = (report.missing or 0) + last - first - len(np.unique(here[is_on_grid]))
         edges_ns = np.array([first * period_ns + epoch_ns, *here,
                              (last + 1) * period_ns + epoch_ns])
@@ -284,7 +293,8 @@ def _count(report: TopicReport, stamps_ns: Stamps, sections: list[Section], topi
                                    int(edges_ns[place + 1]) - period_ns))
 
 
-def _measure(found: Survey, motion: Motion) -> None:
+def _measure(found: Survey, motion: MotionReport) -> None:
+    """Measure a motion from the samples of its source."""
     samples, motion.samples = motion.samples, []
     data = analysis.longest_run(samples) if samples else None
     if data is None or len(data.stamps_ns) < 2:

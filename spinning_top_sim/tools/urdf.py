@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robot description of a scene: urdf/spinning_top.urdf.xacro with the scene's parameters."""
+"""The robot description of a scene, from urdf/spinning_top.urdf.xacro."""
 
 import re
 from collections.abc import Mapping
@@ -10,14 +10,14 @@ from spinning_top_sim.streams import parameters
 
 XACRO_FILE = 'spinning_top.urdf.xacro'
 FRAMES = ('world_frame', 'body_frame', 'imu.frame_id')
-# The parameters that are arguments of the xacro file, by their names there.
+# Arguments of the xacro file and the parameters that they are taken from.
 ARGUMENTS = {name.removeprefix('top.').replace('.', '_'): name for name in (
     'top.mass', 'top.com_distance', 'top.lambda1', 'top.lambda3', 'imu.lever_arm', 'imu.rpy',
     *FRAMES)}
 
 
 def arguments(values: Mapping[str, Any]) -> dict[str, str]:
-    """Return the arguments of the xacro file.  Raises ValueError for frames that form no tree."""
+    """Return the arguments of the xacro file.  Raises ValueError if the frames form no tree."""
     for name in FRAMES:
         if not re.fullmatch(r'[\w.-]+(/[\w.-]+)*', values[name]):
             raise ValueError(f'{name} = {values[name]!r}: must be letters, digits, _ . - with / '
@@ -39,7 +39,7 @@ def arguments(values: Mapping[str, Any]) -> dict[str, str]:
 
 
 def robot_description(values: Mapping[str, Any], folder: str | Path) -> str:
-    """Return the URDF; `folder` has the xacro file.  Raises ValueError as `arguments` does."""
+    """Return the URDF from the xacro file in a folder.  Raises ValueError as `arguments` does."""
     import xacro  # noqa: PLC0415
 
     document = xacro.process_file(str(Path(folder) / XACRO_FILE), mappings=arguments(values))
@@ -47,7 +47,7 @@ def robot_description(values: Mapping[str, Any], folder: str | Path) -> str:
 
 
 def inertia_warning(values: Mapping[str, Any]) -> str:
-    """Return why the robot description has no inertia, '' if it has."""
+    """Return why the robot description has no inertia, '' if it has one."""
     top = parameters.top_of(values)
     if top.mass > 0.0 and top.lambda1_at_com > 0.0 and top.is_realizable:
         return ''
