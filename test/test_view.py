@@ -19,7 +19,7 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import simulate
 from spinning_top_sim.view import command, model
-from spinning_top_sim.view.track import Columns, Motion, Track, state_of
+from spinning_top_sim.view.track import Samples, Track, state_of
 
 COMMAND_S = 3.0
 
@@ -43,8 +43,8 @@ def shown(log):
 
 def truth(shown, stamp_ns):
     """Return the exact state at a stamp before the command."""
-    values = shown.track.values
-    return solve(shown.track.top, parameters.start_state(values),
+    values = shown.values
+    return solve(shown.top, parameters.start_state(values),
                  [(stamp_ns - shown.origin_ns) * 1e-9])
 
 
@@ -65,82 +65,77 @@ def test_a_sector_is_closed_and_faces_outwards(angles):
         assert {(b, a) for a, b in edges} == set(edges)
 
 
-def test_columns_keep_what_is_later_and_forget_what_is_old():
-    columns = Columns(2)
+def test_samples_are_in_order_and_old_ones_are_forgotten():
+    track = Track('', parameters.checked({}))
     for begin in range(0, 3000, 100):
-        stamps = np.arange(begin, begin + 150)      # half of them are there already
-        columns.append(stamps, np.column_stack((stamps, -stamps)))
-        columns.forget(begin - 500)
-    assert columns.stamps_ns.tolist() == list(range(2400, 3050))
-    assert (columns.rows[:, 0] == columns.stamps_ns).all()
-    assert columns.at(2399) is None
-    assert columns.at(2500)[0] == 2500
-    assert columns.at(99999)[0] == 3049
-    assert columns.part(2500, 2502)[0].tolist() == [2500, 2501, 2502]
-
-
-def test_columns_order_what_comes_in_disorder():
-    columns = Columns(1)
-    columns.append(np.array([3, 1, 2, 1]), np.array([[3.0], [1.0], [2.0], [9.0]]))
-    assert columns.stamps_ns.tolist() == [1, 2, 3] == columns.rows[:, 0].tolist()
-    assert columns.at(2)[0] == 2
+        stamps = np.arange(begin + 149, begin - 1, -1)      # half of them are there already
+        track.add('pose', Samples(stamps, np.column_stack(4 * (stamps + 0.001 * begin,))))
+        track.forget(begin - 500)
+    samples = track.samples['pose']
+    assert samples.stamps_ns.tolist() == list(range(2400, 3050))
+    assert samples.rows[-1].tolist() == 4 * [3049 + 2.9]
+    assert samples.rows[110].tolist() == 4 * [2510 + 2.4]       # the first of its stamp
+    assert samples.at(2399) is None
+    assert samples.at(2500)[0] == 2500
+    assert samples.at(99999)[0] == 3049
+    assert samples.part(2500, 2502).stamps_ns.tolist() == [2500, 2501, 2502]
 
 
 def test_a_log_shows_the_published_attitude_at_every_stamp(log, shown):
     from spinning_top_sim.streams.topics import all_streams
-    template = next(stream.template for stream in all_streams(shown.track.values)
+    template = next(stream.template for stream in all_streams(shown.values)
                     if stream.topic == 'pose')
     with LogReader(log) as reader:
         for message in reader.messages(topics=['/pose']):
-            stamp_ns, row = shown.track.attitudes.at(message.log_time)
+            stamp_ns, row = shown.attitudes.at(message.log_time)
             assert stamp_ns == message.log_time
             assert row[:4] == pytest.approx(template.decode(message.data)[0][0], abs=1e-15)
 
 
 def test_motions_of_a_log_begin_with_its_commands(shown):
-    first, second = shown.track.motions
+    first, second = shown.motions
     assert (first.words[0], second.words[0]) == ('cusps', 'loops')
     assert (second.l3, second.lz) == (2.0, 1.5)
     assert shown.commands_ns == [second.begin_ns]
     assert second.begin_ns - shown.origin_ns == COMMAND_S * 1e9
-    assert shown.track.motion_at(second.begin_ns - 1) is first
-    assert shown.track.motion_at(second.begin_ns) is second
+    assert shown.motion_at(second.begin_ns - 1) is first
+    assert shown.motion_at(second.begin_ns) is second
     assert first.theta_range[0] == pytest.approx(math.radians(30.0))
 
 
 @pytest.mark.parametrize('name', model.ARROWS)
 def test_arrows_are_the_vectors_in_the_world(shown, name):
     stamp_ns = shown.origin_ns + 1_230_000_000
-    exact, top = truth(shown, stamp_ns), shown.track.top
+    exact, top = truth(shown, stamp_ns), shown.top
     omega = exact.angular_velocity[0]
     body = {'angular velocity': omega,
             'angular momentum': omega * [top.lambda1, top.lambda1, top.lambda3],
-            'specific force': np.ravel(exact.specific_force(shown.track.values['imu.lever_arm'])),
+            'specific force': np.ravel(exact.specific_force(shown.values['imu.lever_arm'])),
             }[name]
     x, y, z, w = exact.quaternion[0]
     rotation = np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
                          [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
                          [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])
-    drawn = model.arrow(shown.track, name, stamp_ns)
+    drawn = model.arrow(shown, name, stamp_ns)
     expected = rotation @ body
     assert drawn / np.linalg.norm(drawn) == pytest.approx(expected / np.linalg.norm(expected),
                                                           abs=1e-8)
     if name == 'angular momentum':      # Lz is conserved, and L3 the usual length
-        assert drawn[2] / model.reach(shown.track) == pytest.approx(
+        assert drawn[2] / model.reach(shown) == pytest.approx(
             exact.lz[0] / exact.l3[0], abs=1e-8)
 
 
 def test_the_trace_ends_at_the_tip_and_breaks_where_it_jumps(shown):
     stamp_ns = shown.origin_ns + 2_000_000_000
-    lines = model.trace(shown.track, stamp_ns)
+    lines = model.trace(shown, stamp_ns)
     exact = truth(shown, stamp_ns)
     assert lines[-1, 1] == pytest.approx(
-        model.reach(shown.track) * np.ravel(exact.rows_axis), abs=1e-6)
+        model.reach(shown) * np.ravel(exact.rows_axis), abs=1e-6)
     assert len(lines) == 200            # 2 s at 100 Hz
     track = Track('', parameters.checked({}))
     half = math.sqrt(0.5)
-    track.columns['pose'].append(np.array([0, 1, 2, 3]), np.array(
-        [(0, 0, 0, 1), (0, 0.01, 0, 1), (0, half, 0, half), (0, half, 0.01, half)], float))
+    track.add('pose', Samples(np.arange(4), np.array(
+        [(0, 0, 0, 1), (0, 0.01, 0, 1), (0, half, 0, half), (0, half, 0.01, half)], float)))
     assert len(model.trace(track, 3)) == 2
 
 
@@ -149,12 +144,12 @@ def test_curves_are_the_published_numbers(shown):
     for name, expected, tolerance in zip(model.CURVES[:2], (
             lambda exact: math.degrees(exact.theta[0]), lambda exact: exact.phi_dot[0]),
             (1e-8, 1e-7), strict=True):
-        stamps_ns, values = model.curve(shown.track, name, shown.origin_ns, end_ns)
+        stamps_ns, values = model.curve(shown, name, shown.origin_ns, end_ns)
         for at in (0, 100, -1):
             assert values[at] == pytest.approx(expected(truth(shown, int(stamps_ns[at]))),
                                                abs=tolerance)
     for name in model.CURVES[2:]:
-        _, values = model.curve(shown.track, name, shown.origin_ns, end_ns)
+        _, values = model.curve(shown, name, shown.origin_ns, end_ns)
         assert len(values) == 26
         assert (values < -9.0).all()
 
@@ -171,13 +166,12 @@ def test_a_live_track_names_the_motion_from_its_samples(start, words):
     moved = solve(track.top, start, np.arange(200) * 0.01)
     rows = np.column_stack((moved.quaternion, moved.angular_velocity, moved.phi_dot))
     for k, row in enumerate(rows):
-        track.columns['joint_states'].append(np.array([k]), row[np.newaxis])
+        track.add('joint_states', Samples(np.array([k]), row[np.newaxis]))
         track.follow()
     (motion,) = track.motions           # one: rounding begins no other
     assert motion.words[0] == words
     (energy, l3, lz), _ = state_of(track.top, rows[50])
     assert (energy, l3, lz) == pytest.approx((moved.energy[50], start.l3, start.lz), abs=1e-9)
-    assert isinstance(motion, Motion)
 
 
 def test_means_of_the_rates_are_drawn_as_the_rates(tmp_path):
@@ -188,7 +182,7 @@ def test_means_of_the_rates_are_drawn_as_the_rates(tmp_path):
         path = tmp_path / f'{sampling}.mcap'
         assert simulate.main(['--duration', '1', '-o', str(path), '--quiet', '-p',
                               f'imu.sampling:={sampling}', '-p', 'imu.rpy:=[0.3, 0.0, 1.0]']) == 0
-        rows.append(read_logs([path])[0].track.columns['ground_truth/imu'].rows)
+        rows.append(read_logs([path])[0].samples['ground_truth/imu'].rows)
     assert rows[0].shape == rows[1].shape == (201, 10)
     assert (rows[0][:, :4] == rows[1][:, :4]).all()
     assert rows[1][1:, 4:7] == pytest.approx((rows[0][1:, 4:7] + rows[0][:-1, 4:7]) / 2, abs=2e-3)
@@ -242,12 +236,12 @@ def test_two_logs_of_one_time_lie_on_each_other(log, tmp_path):
     torn = tmp_path / 'torn.mcap'
     torn.write_bytes(log.read_bytes()[:-60_000])
     whole, part = read_logs([log, torn])
-    assert (whole.track.name, part.track.name) == ('cusp', 'torn')
+    assert (whole.name, part.name) == ('cusp', 'torn')
     assert 'truncated' in part.note
     assert not whole.note
     assert whole.span[0] == part.span[0] < part.span[1] <= whole.span[1]
-    row = part.track.attitudes.at(part.span[1])[1]
-    assert model.angle_apart(row, whole.track.attitudes.at(part.span[1])[1]) == 0.0
+    row = part.attitudes.at(part.span[1])[1]
+    assert model.angle_apart(row, whole.attitudes.at(part.span[1])[1]) == 0.0
 
 
 def test_a_log_without_attitudes_is_refused(tmp_path):
@@ -283,11 +277,11 @@ def estimate(log, tmp_path):
 def test_the_log_of_another_program_is_shown_as_the_top_of_ours(log, estimate):
     from spinning_top_sim.view.log import read_logs
     ours, theirs = read_logs([log, estimate])
-    assert theirs.track.top == ours.track.top
+    assert theirs.top == ours.top
     assert (theirs.span, theirs.commands_ns, theirs.note) == (ours.span, [], '')
-    assert not theirs.track.motions
+    assert not theirs.motions
     for stamp_ns in np.linspace(*ours.span, 7).astype(int):
-        one, other = (each.track.columns['pose'].at(stamp_ns) for each in (ours, theirs))
+        one, other = (each.samples['pose'].at(stamp_ns) for each in (ours, theirs))
         assert one[0] == other[0]
         assert one[1][:4] == pytest.approx(other[1][:4], abs=1e-15)
 
@@ -368,16 +362,16 @@ def page():
 
 def test_a_part_that_is_switched_on_at_one_stamp_is_drawn_for_it(page, shown):
     stamp_ns = shown.origin_ns + NANOSECONDS
-    page.set_tracks([shown.track])
-    page.draw([shown.origin_ns], shown.origin_ns)
+    page.set_tracks([shown])
+    page.draw(shown.origin_ns, shown.origin_ns)
     page._trace.value = False
-    page.draw([stamp_ns], shown.origin_ns)
+    page.draw(stamp_ns, shown.origin_ns)
     page._trace.value = page.arrows[0].value = True
-    page.draw([stamp_ns], shown.origin_ns)
+    page.draw(stamp_ns, shown.origin_ns)
     (top,) = page._tops
     assert top._arrows[0].points[0, 1] == pytest.approx(
-        model.arrow(shown.track, model.ARROWS[0], stamp_ns), abs=1e-6)
-    assert (top._trace.points == model.trace(shown.track, stamp_ns)).all()
+        model.arrow(shown, model.ARROWS[0], stamp_ns), abs=1e-6)
+    assert (top._trace.points == model.trace(shown, stamp_ns)).all()
 
 
 def test_the_page_follows_a_pause_whatever_else_is_wrong(page):
@@ -393,10 +387,10 @@ def test_the_page_follows_a_pause_whatever_else_is_wrong(page):
 def test_a_page_tells_the_attitude_where_it_knows_no_motion(page):
     track = Track('', parameters.checked({}))
     page.set_tracks([track])
-    page._tell([NANOSECONDS], 0)
+    page._tell(NANOSECONDS, 0)
     assert 'no samples yet' in page._words.content
-    track.columns['pose'].append(np.array([NANOSECONDS]), np.array([[0.0, 0.6, 0.0, 0.8]]))
-    page.draw([NANOSECONDS], 0)
+    track.add('pose', Samples(np.array([NANOSECONDS]), np.array([[0.0, 0.6, 0.0, 0.8]])))
+    page.draw(NANOSECONDS, 0)
     assert page._words.content.strip().splitlines() == [
         '- t = 1.000 s, stamp 1.000000000', '- q = 0.000000, 0.600000, 0.000000, 0.800000']
 
