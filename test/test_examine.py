@@ -398,26 +398,6 @@ def test_waiting_for_a_processor_is_not_slowness(monkeypatch, tmp_path):
     assert trial._working_time() - began == pytest.approx(0.5)
 
 
-class OnDevice:
-    """Numbers that cannot be converted, as a torch tensor with requires_grad."""
-
-    def __array__(self, *arguments, **options):
-        raise RuntimeError('call detach() first')
-
-
-@pytest.mark.parametrize('name', ['said', 'covariance', 'bias'])
-def test_what_cannot_be_converted_is_told(slow, name):
-    class Strange(Vqf):
-        def update(self, *readings):
-            attitude = super().update(*readings)
-            return OnDevice() if name == 'said' else attitude
-
-    if name != 'said':
-        setattr(Strange, name, OnDevice())
-    with pytest.raises(InvalidOutputError, match='of 100 raises RuntimeError: call detach'):
-        follow(Strange, slow)
-
-
 def test_what_is_not_known_is_nan(slow):
     class Forgetful(Vqf):
         number = 0

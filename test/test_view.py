@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the page draws, as numbers; no browser, no ROS."""
 
+import importlib
 import math
 import socket
-import threading
 import urllib.request
 
 import numpy as np
@@ -17,10 +17,15 @@ from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.tools import simulate
+from spinning_top_sim.streams.topics import all_streams
+from spinning_top_sim.tools import recorded_run, simulate
 from spinning_top_sim.view import command, model
 from spinning_top_sim.view.track import Samples, Track, state_of
 
+viser = pytest.importorskip('viser')
+logs, pages, server, controls_of = (
+    importlib.import_module(f'spinning_top_sim.view.{name}')
+    for name in ('log', 'page', 'server', 'controls'))
 COMMAND_S = 3.0
 
 
@@ -36,9 +41,7 @@ def log(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def shown(log):
-    pytest.importorskip('viser')
-    from spinning_top_sim.view.log import read_logs
-    return read_logs([log])[0]
+    return logs.read_logs([log])[0]
 
 
 def truth(shown, stamp_ns):
@@ -82,7 +85,6 @@ def test_samples_are_in_order_and_old_ones_are_forgotten():
 
 
 def test_a_log_shows_the_published_attitude_at_every_stamp(log, shown):
-    from spinning_top_sim.streams.topics import all_streams
     template = next(stream.template for stream in all_streams(shown.values)
                     if stream.topic == 'pose')
     with LogReader(log) as reader:
@@ -175,67 +177,67 @@ def test_a_live_track_names_the_motion_from_its_samples(start, words):
 
 
 def test_means_of_the_rates_are_drawn_as_the_rates(tmp_path):
-    pytest.importorskip('viser')
-    from spinning_top_sim.view.log import read_logs
     rows = []
     for sampling in ('instant', 'mean'):
         path = tmp_path / f'{sampling}.mcap'
         assert simulate.main(['--duration', '1', '-o', str(path), '--quiet', '-p',
                               f'imu.sampling:={sampling}', '-p', 'imu.rpy:=[0.3, 0.0, 1.0]']) == 0
-        rows.append(read_logs([path])[0].samples['ground_truth/imu'].rows)
+        rows.append(logs.read_logs([path])[0].samples['ground_truth/imu'].rows)
     assert rows[0].shape == rows[1].shape == (201, 10)
     assert (rows[0][:, :4] == rows[1][:, :4]).all()
     assert rows[1][1:, 4:7] == pytest.approx((rows[0][1:, 4:7] + rows[0][:-1, 4:7]) / 2, abs=2e-3)
 
 
-def test_a_log_that_begins_later_shows_nothing_before(page, tmp_path):
-    from spinning_top_sim.view.log import Player, read_logs
-    from spinning_top_sim.view.page import PLOT_EVERY
-    paths = tmp_path / 'a.mcap', tmp_path / 'b.mcap'
-    for path, epoch in zip(paths, ('1', '2'), strict=True):
-        assert simulate.main(['--duration', '2', '-o', str(path), '--epoch', epoch]) == 0
-    player = Player(page, read_logs(paths))
+@pytest.fixture(scope='module')
+def later(tmp_path_factory):
+    """Return logs of two seconds whose epochs are 1, 2 and 1000 s."""
+    folder = tmp_path_factory.mktemp('later')
+    paths = {epoch: folder / f'{epoch}.mcap' for epoch in (1, 2, 1000)}
+    for epoch, path in paths.items():
+        assert simulate.main(['--quiet', '--duration', '2', '-o', str(path), '--epoch',
+                              str(epoch)]) == 0
+    return paths
+
+
+def test_a_log_that_begins_later_shows_nothing_before(page, later):
+    player = logs.Player(page, logs.read_logs([later[1], later[2]]))
     player.draw_next(2.5)
     assert all(top.drawn and top._root.visible for top in page._tops)
     player._slider.value = 0.2
-    for _ in range(PLOT_EVERY):
+    for _ in range(pages.PLOT_EVERY):
         player.draw_next(0.0)
     assert page._tops[0].drawn and not page._tops[1].drawn and not page._tops[1]._root.visible
     assert 'no samples yet' in page._words.content
     assert 'angle between' not in page._words.content
 
 
-def test_each_of_two_logs_has_its_own_time(page, tmp_path):
-    from spinning_top_sim.view.log import Player, read_logs
-    paths = tmp_path / 'a.mcap', tmp_path / 'b.mcap'
-    for path, epoch in zip(paths, ('1', '1000'), strict=True):
-        assert simulate.main(['--duration', '1', '-o', str(path), '--epoch', epoch]) == 0
-    Player(page, read_logs(paths)).draw_next(0.5)
+def test_each_of_two_logs_has_its_own_time(page, later):
+    player = logs.Player(page, logs.read_logs([later[1], later[1000]]))
+    player.draw_next(0.5)
+    assert player.length == 2.0
     assert page._words.content.count('- t = 0.500 s, stamp ') == 2
+    assert 'angle between the two: 0°' in page._words.content
 
 
-def test_a_truncated_log_that_cannot_be_followed_is_told_as_both(log, tmp_path, monkeypatch):
-    pytest.importorskip('viser')
-    from spinning_top_sim.tools import recorded_run
-    from spinning_top_sim.view.log import read_logs
+@pytest.fixture(scope='module')
+def torn(log, tmp_path_factory):
+    path = tmp_path_factory.mktemp('torn') / 'torn.mcap'
+    path.write_bytes(log.read_bytes()[:-60_000])
+    return path
 
+
+def test_a_truncated_log_that_cannot_be_followed_is_told_as_both(torn, monkeypatch):
     def odd(*_):
         raise recorded_run.DepartureError('nowhere')
 
     monkeypatch.setattr(recorded_run, 'rerun', odd)
-    torn = tmp_path / 'torn.mcap'
-    torn.write_bytes(log.read_bytes()[:-60_000])
-    (shown,) = read_logs([torn])
+    (shown,) = logs.read_logs([torn])
     assert shown.note == ('torn.mcap: it is truncated: shown as far as it goes; the run cannot be '
                           'followed: DepartureError: nowhere')
 
 
-def test_two_logs_of_one_time_lie_on_each_other(log, tmp_path):
-    pytest.importorskip('viser')
-    from spinning_top_sim.view.log import read_logs
-    torn = tmp_path / 'torn.mcap'
-    torn.write_bytes(log.read_bytes()[:-60_000])
-    whole, part = read_logs([log, torn])
+def test_two_logs_of_one_time_lie_on_each_other(log, torn):
+    whole, part = logs.read_logs([log, torn])
     assert (whole.name, part.name) == ('cusp', 'torn')
     assert 'truncated' in part.note
     assert not whole.note
@@ -245,13 +247,11 @@ def test_two_logs_of_one_time_lie_on_each_other(log, tmp_path):
 
 
 def test_a_log_without_attitudes_is_refused(tmp_path):
-    pytest.importorskip('viser')
-    from spinning_top_sim.view.log import read_logs
     path = tmp_path / 'clock.mcap'
     assert simulate.main(['--duration', '1', '-o', str(path), '-p',
                           'record.streams:=[invariants]']) == 0
     with pytest.raises(LogError, match='no attitude of a top'):
-        read_logs([path])
+        logs.read_logs([path])
 
 
 @pytest.fixture
@@ -275,8 +275,7 @@ def estimate(log, tmp_path):
 
 
 def test_the_log_of_another_program_is_shown_as_the_top_of_ours(log, estimate):
-    from spinning_top_sim.view.log import read_logs
-    ours, theirs = read_logs([log, estimate])
+    ours, theirs = logs.read_logs([log, estimate])
     assert theirs.top == ours.top
     assert (theirs.span, theirs.commands_ns, theirs.note) == (ours.span, [], '')
     assert not theirs.motions
@@ -287,8 +286,7 @@ def test_the_log_of_another_program_is_shown_as_the_top_of_ours(log, estimate):
 
 
 def test_a_player_follows_its_buttons_and_the_slider(log, estimate, page):
-    from spinning_top_sim.view.log import Player, read_logs
-    player = Player(page, read_logs([estimate, log]))
+    player = logs.Player(page, logs.read_logs([estimate, log]))
     assert player.length == pytest.approx(6.0)
     player.draw_next(1.0)
     assert player._slider.value == pytest.approx(1.0)
@@ -310,35 +308,29 @@ def test_a_player_follows_its_buttons_and_the_slider(log, estimate, page):
 
 @pytest.mark.skipif(not socket.has_ipv6, reason='no IPv6')
 def test_the_server_may_be_on_ipv6():
-    pytest.importorskip('viser')
-    from spinning_top_sim.view.server import _free_port
     try:
         socket.create_server(('::1', 0), family=socket.AF_INET6).close()
     except OSError:
         pytest.skip('no ::1')
-    assert _free_port('::1', None) >= 8080
+    assert server._free_port('::1', None) >= 8080
 
 
-def test_the_server_is_on_loopback_and_takes_the_next_free_port():
-    pytest.importorskip('viser')
-    from spinning_top_sim.view.page import Page
-    pages = [Page('one', '127.0.0.1', None), Page('two', '127.0.0.1', None)]
+def test_the_server_is_on_loopback_and_takes_the_next_free_port(page):
+    other = pages.Page('two', '127.0.0.1', None)
     try:
-        one, two = (page.server.get_port() for page in pages)
+        one, two = page.server.get_port(), other.server.get_port()
         assert one != two
-        for page in pages:
-            assert urllib.request.urlopen(page.address, timeout=30).status == 200
+        for each in (page, other):
+            assert urllib.request.urlopen(each.address, timeout=30).status == 200
         with pytest.raises(OSError, match=f'127.0.0.1 port {one}: '):
-            Page('three', '127.0.0.1', one)
-        assert pages[0].server.request_share_url() is None
+            pages.Page('three', '127.0.0.1', one)
+        assert page.server.request_share_url() is None
         host = socket.gethostbyname(socket.gethostname())
         if not host.startswith('127.'):
             with pytest.raises(OSError):        # nobody listens there
                 socket.create_connection((host, one), 5.0)
     finally:
-        for page in pages:
-            page.close()
-    assert threading.active_count() < 50
+        other.close()
 
 
 @pytest.mark.parametrize(('arguments', 'told'), [
@@ -353,9 +345,7 @@ def test_wrong_arguments_are_told_in_one_line(log, capsys, arguments, told):
 
 @pytest.fixture
 def page():
-    pytest.importorskip('viser')
-    from spinning_top_sim.view.page import Page
-    page = Page('one', '127.0.0.1', None)
+    page = pages.Page('one', '127.0.0.1', None)
     yield page
     page.close()
 
@@ -375,8 +365,7 @@ def test_a_part_that_is_switched_on_at_one_stamp_is_drawn_for_it(page, shown):
 
 
 def test_the_page_follows_a_pause_whatever_else_is_wrong(page):
-    from spinning_top_sim.view.controls import Controls
-    controls = Controls(page, None, [])
+    controls = controls_of.Controls(page, None, [])
     for state, label in (('paused', 'Resume'), ('failed', 'Resume'), ('running', 'Pause')):
         controls.tell_status('this machine cannot keep up', {
             'state': state, 'recorder': 'off', 'simulated time [s]': '1.0',
@@ -395,35 +384,22 @@ def test_a_page_tells_the_attitude_where_it_knows_no_motion(page):
         '- t = 1.000 s, stamp 1.000000000', '- q = 0.000000, 0.600000, 0.000000, 0.800000']
 
 
-def test_a_page_of_another_site_is_refused():
+def test_a_page_of_another_site_is_refused(page):
     """Raw handshakes, as a browser sends them for a page that it has from elsewhere."""
-    viser = pytest.importorskip('viser')
-    from spinning_top_sim.view.page import Page
-    page = Page('one', '127.0.0.1', None)
     port = page.server.get_port()
-
-    def shake_hands(host, origin=None):
+    own = f'127.0.0.1:{port}'
+    for host, origin, code in (
+            (own, f'http://{own}', 101), (own, None, 101),      # None: no browser
+            (own, 'http://evil.example', 403), (own, 'null', 403),      # a file
+            # A name of another site that stands for this address.
+            (f'evil.example:{port}', f'http://evil.example:{port}', 403)):
         lines = ['GET / HTTP/1.1', f'Host: {host}', 'Upgrade: websocket', 'Connection: Upgrade',
                  'Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==', 'Sec-WebSocket-Version: 13',
                  f'Sec-WebSocket-Protocol: viser-v{viser.__version__}',
                  *([f'Origin: {origin}'] if origin else []), '', '']
         with socket.create_connection(('127.0.0.1', port), 30.0) as connection:
             connection.sendall('\r\n'.join(lines).encode())
-            return int(connection.recv(4096).split()[1])
-
-    own = f'127.0.0.1:{port}'
-    try:
-        assert shake_hands(own, f'http://{own}') == 101
-        assert shake_hands(f'localhost:{port}', f'http://localhost:{port}') == 101
-        assert shake_hands(own) == 101                          # no browser
-        assert shake_hands(own, 'http://evil.example') == 403
-        assert shake_hands(own, f'http://127.0.0.1:{port + 1}') == 403
-        assert shake_hands(own, 'null') == 403                  # a file, or a sandboxed frame
-        # A name of another site that stands for this address.
-        assert shake_hands(f'evil.example:{port}', f'http://evil.example:{port}') == 403
-        assert shake_hands(f'evil.example:{port}') == 403
-    finally:
-        page.close()
+            assert int(connection.recv(4096).split()[1]) == code, (host, origin)
 
 
 @pytest.mark.parametrize(('asked', 'origin', 'allowed'), [
@@ -433,6 +409,4 @@ def test_a_page_of_another_site_is_refused():
     ('robot:8080', 'http://robot', False), ('192.0.2.7:8080', 'http://192.0.2.8:8080', False),
     ('[::1', None, False)])
 def test_names_and_addresses_of_the_page(asked, origin, allowed):
-    pytest.importorskip('viser')
-    from spinning_top_sim.view.server import refusal
-    assert (refusal(asked, origin, {'robot'}) == '') is allowed
+    assert (server.refusal(asked, origin, {'robot'}) == '') is allowed
