@@ -275,9 +275,8 @@ def test_without_heading_a_world_north_east_down_and_the_sign_of_gravity_are_the
 
 
 def test_a_filter_that_goes_on_from_run_to_run_gets_the_same_verdict(report):
-    for name in ('vqf', 'vqf-6d'):          # the heading counts, and does not
-        found = report(name, 'frame_ned', restart=False)
-        assert found.faults == report(name, 'frame_ned').faults, found
+    found = report('vqf', 'frame_ned', restart=False)       # without a heading it is another
+    assert found.faults == report('vqf', 'frame_ned').faults, found
 
 
 def test_a_covariance_is_measured_but_not_judged_from_run_to_run(report):
@@ -455,25 +454,26 @@ def update_for_ever():
 
 
 @pytest.mark.parametrize(('said', 'says'), [
-    (update_for_ever, 'update 1 of 100 takes more than 1 s: killed'),
+    (update_for_ever, 'update 1 of 100 takes more than 2 s: killed'),
     (lambda: ctypes.string_at(0), 'update 1 of 100 ends the process: Segmentation fault'),
     (partial(os._exit, 3), 'update 1 of 100 ends the process: exit code 3'),
     (partial(sys.exit, 3), 'update 1 of 100 raises SystemExit: 3')])
 def test_a_filter_that_never_returns_or_crashes_is_told(monkeypatch, slow, said, says):
-    monkeypatch.setattr(isolation, 'LONGEST_S', 1.0)
+    if says.endswith('killed'):
+        monkeypatch.setattr(isolation, 'LONGEST_S', 2.0)
     with pytest.raises(InvalidOutputError, match=says):
         follow(partial(Bad, said), slow, feed=isolation.feed_apart)
 
 
 def test_a_filter_that_takes_long_but_goes_on_is_not_killed(monkeypatch, slow):
-    monkeypatch.setattr(isolation, 'LONGEST_S', 1.0)
+    monkeypatch.setattr(isolation, 'LONGEST_S', 2.0)
 
     def work():
-        time.sleep(0.3)
+        time.sleep(0.5)
         return 0.0, 0.0, 0.0, 1.0
 
-    short = slow.part(slice(6))
-    assert len(follow(partial(Bad, work), short, feed=isolation.feed_apart).estimates) == 6
+    short = slow.part(slice(5))
+    assert len(follow(partial(Bad, work), short, feed=isolation.feed_apart).estimates) == 5
 
 
 def test_a_process_of_its_own_changes_nothing(report):

@@ -184,19 +184,20 @@ class Player:
         if self._now != self._drawn_at:
             set_value(self._slider, self._now)
             self._drawn_at = self._slider.value
-        self._draw(self._now)
+        self.draw(self._now)
 
-    def _draw(self, now: float) -> None:
+    def draw(self, now: float) -> None:
+        """Draw the picture of a time [s]."""
         self._page.draw(self._begin_ns + round(now * NANOSECONDS), self._origin_ns)
 
     def write_html(self, path: Path) -> str:
         """Write a file that plays the first minute by itself; return its length and size."""
-        self._draw(0.0)
+        self.draw(0.0)
         serializer = self._page.server.get_scene_serializer()
         seconds = min(self.length, LONGEST_HTML_S)
         for picture in range(1, int(seconds * RATE) + 1):
             serializer.insert_sleep(1.0 / RATE)
-            self._draw(picture / RATE)
+            self.draw(picture / RATE)
         motions = [motion for track in self._tracks for motion in track.motions[:1]]
         caption = ''.join(f'<b>{html.escape(motion.words[0])}</b><br>' + ''.join(
             f'{html.escape(words)}<br>' for words in motion.words[1:]) for motion in motions)
