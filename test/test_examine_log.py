@@ -200,8 +200,8 @@ def test_the_heading_in_a_log_counts_from_the_north_that_is_asked_for(log, besid
     heading = partial(examine_log, log, '/imu/data')
     assert heading(north='true').measures['heading_rms_deg'] < 1e-9
     declination = math.degrees(math.atan2(1.57, 21.02))
-    assert heading(north='magnetic').measures['heading_rms_deg'] == pytest.approx(
-        declination, rel=1e-6)
+    (outcome,) = heading(north='magnetic').outcomes
+    assert np.degrees(outcome.errors.heading) == pytest.approx(-declination, rel=1e-6)
     with pytest.raises(ValueError, match='does not say where magnetic north is'):
         examine_log(beside(disturbed), '/estimate', north='magnetic')
 

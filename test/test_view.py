@@ -141,6 +141,19 @@ def test_the_trace_ends_at_the_tip_and_breaks_where_it_jumps(shown):
     assert len(model.trace(track, 3)) == 2
 
 
+def test_the_trace_between_distant_samples_is_that_of_their_velocities(shown):
+    moved = solve(shown.top, parameters.start_state(shown.values), np.arange(20) * 0.04)
+    track = Track('', shown.values)
+    track.add('joint_states', Samples(np.arange(20) * 40_000_000, np.column_stack(
+        (moved.quaternion, moved.angular_velocity, moved.phi_dot))))
+    stamps_ns, axis, joined = model.path(track, 0, NANOSECONDS)
+    track.follow()
+    assert track.motions[0].words == shown.motions[0].words     # those of the start
+    assert len(stamps_ns) == 4 * 19 + 1 and joined.all()
+    exact = solve(shown.top, parameters.start_state(shown.values), stamps_ns * 1e-9)
+    assert axis == pytest.approx(np.column_stack(exact.rows_axis), abs=1e-4)
+
+
 def test_curves_are_the_published_numbers(shown):
     end_ns = shown.origin_ns + 2_500_000_000
     for name, expected, tolerance in zip(model.CURVES[:2], (
@@ -161,6 +174,7 @@ def test_curves_are_the_published_numbers(shown):
     (State(theta=0.5, l3=1.6, lz=1.3), 'loops'),
     (State(theta=0.0, l3=2.0, lz=2.0), 'sleeping'),
     (State(theta=0.0, theta_dot=2.0, l3=1.6, lz=1.6), 'through the top'),
+    (State(theta=0.7, theta_dot=1.0, l3=1.6, lz=1.6), 'through the top'),
     (State(theta=1.0, theta_dot=0.5, l3=0.0, lz=0.0), 'planar pendulum, swinging')])
 def test_a_live_track_names_the_motion_from_its_samples(start, words):
     values = parameters.checked({})
@@ -216,6 +230,7 @@ def test_each_of_two_logs_has_its_own_time(page, later):
     player.draw_next(0.5)
     assert player.length == 2.0
     assert page._words.content.count('- t = 0.500 s, stamp ') == 2
+    assert all(np.isfinite(values).any() for values in page._plots[0].data)
     assert 'angle between the two: 0°' in page._words.content
 
 
@@ -353,15 +368,22 @@ def page():
 def test_a_part_that_is_switched_on_at_one_stamp_is_drawn_for_it(page, shown):
     stamp_ns = shown.origin_ns + NANOSECONDS
     page.set_tracks([shown])
-    page.draw(shown.origin_ns, shown.origin_ns)
-    page._trace.value = False
-    page.draw(stamp_ns, shown.origin_ns)
-    page._trace.value = page.arrows[0].value = True
+    page._trace.value = page._bounds.value = False
     page.draw(stamp_ns, shown.origin_ns)
     (top,) = page._tops
+    page.arrows[0].value = True
+    page.draw(stamp_ns, shown.origin_ns)
     assert top._arrows[0].points[0, 1] == pytest.approx(
         model.arrow(shown, model.ARROWS[0], stamp_ns), abs=1e-6)
+    page._trace.value = True
+    page.draw(stamp_ns, shown.origin_ns)
     assert (top._trace.points == model.trace(shown, stamp_ns)).all()
+    assert not any(bound.visible for bound in top._bounds)
+    page._bounds.value = True
+    page.draw(stamp_ns, shown.origin_ns)
+    for bound, theta in zip(top._bounds, shown.motions[0].theta_range, strict=True):
+        assert bound.visible
+        assert (bound.points == model.circle(model.reach(shown), theta)).all()
 
 
 def test_the_page_follows_a_pause_whatever_else_is_wrong(page):
@@ -380,6 +402,7 @@ def test_a_page_tells_the_attitude_where_it_knows_no_motion(page):
     assert 'no samples yet' in page._words.content
     track.add('pose', Samples(np.array([NANOSECONDS]), np.array([[0.0, 0.6, 0.0, 0.8]])))
     page.draw(NANOSECONDS, 0)
+    assert not any(bound.visible for bound in page._tops[0]._bounds)
     assert page._words.content.strip().splitlines() == [
         '- t = 1.000 s, stamp 1.000000000', '- q = 0.000000, 0.600000, 0.000000, 0.800000']
 
