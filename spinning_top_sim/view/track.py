@@ -178,11 +178,6 @@ class Track:
         if self._constants is not None and _same(self.top, constants, self._constants):
             return
         self._constants = constants
-        with contextlib.suppress(ValueError):       # a start that is no motion
-            start = parameters.start_state(self.values)
-            first = ExactSolution(self.top, start).states(range(1))
-            if _same(self.top, constants, (float(first.energy[0]), start.l3, start.lz)):
-                state = start           # it has no rounding error
         description = None
         with contextlib.suppress(ArithmeticError, ValueError):
             description = dataclasses.replace(ExactSolution(self.top, state).describe(),
