@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exam of a running node: in lockstep, sample by sample."""
 
+import importlib
 import os
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -9,6 +11,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from helpers.node_harness import wait_for
 from helpers.reference import ROOT
 
 from spinning_top_sim.exam import scenarios
@@ -18,24 +21,23 @@ from spinning_top_sim.exam.trial import InvalidOutputError, NodeError, follow
 
 pytest.importorskip('rclpy')
 pytest.importorskip('vqf')
+live = importlib.import_module('spinning_top_sim.exam.live')
 NODE = f'{sys.executable} {ROOT / "examples/attitude_node.py"}'
 
 
 @pytest.fixture(scope='module')
 def run():
-    return scenarios.record(replace(scenarios.SLOW, duration=3.0), scenarios.CALIBRATED, 1)
+    return scenarios.record(replace(scenarios.SLOW, duration=1.5), scenarios.CALIBRATED, 1)
 
 
 def test_a_node_says_what_its_filter_says_in_every_run(run):
-    from spinning_top_sim.exam.live import NodeExam
-
     # The node takes the first sample for the begin of its first step.
     direct = follow(partial(Vqf, magnetic=False), run.part(slice(1, None)))
-    with NodeExam('imu/data', NODE) as node:
+    with live.NodeExam('imu/data', NODE) as node:
         for _ in range(2):
-            outcome = follow(node.make_filter, run)
+            outcome = follow(node.start, run)
             assert np.max(np.abs(outcome.estimates[1:] - direct.estimates)) < 1e-9
-            assert not len(outcome.covariances.samples)
+            assert np.isnan(outcome.covariances).all()
 
 
 @pytest.fixture
@@ -47,27 +49,30 @@ def running():
     process.wait()
 
 
-def test_a_node_that_runs_gets_one_run_after_the_other(run, running):
-    from spinning_top_sim.exam.live import NodeExam
-
+def test_a_node_that_runs_gets_one_run_after_the_other(run, running, capfd):
     twice = run.after(run)
     direct = follow(partial(Vqf, magnetic=False), twice.part(slice(1, None)))
-    with NodeExam('imu/data') as node:
-        outcome = follow(node.make_filter, twice)
+    with live.NodeExam('imu/data') as node:
+        outcome = follow(node.start, twice)
         assert np.max(np.abs(outcome.estimates[1:] - direct.estimates)) < 1e-9
-    with NodeExam('imu/data') as node:          # later than the first one, for the node
-        follow(node.make_filter, run)
-        running.kill()
+        # Another source of samples is told.
+        assert main(['--topic', 'imu/data']) == 1
+        assert ('/clock is published by examine and examine: end the others'
+                in capfd.readouterr().err)
+    with live.NodeExam('imu/data') as node:          # later than the first one, for the node
+        filter_ = node.start()
+        readings = run.gyroscope[0], run.accelerometer[0], run.magnetometer[0], 0.01
+        for _ in range(10):
+            filter_.update(*readings)
+        running.send_signal(signal.SIGINT)
         running.wait()
-        assert node.wait(lambda: not node.imu.get_subscription_count(), 60.0)
+        wait_for('the node to leave the graph', lambda: not node.is_there())
         with pytest.raises(NodeError, match='the node that reads imu/data_raw and publishes imu/d'
                            'ata has gone'):
-            node.check()
+            filter_.update(*readings)
 
 
 def test_a_node_that_does_not_run_is_told(monkeypatch, capfd):
-    from spinning_top_sim.exam import live
-
     monkeypatch.setattr(live, 'PATIENCE_S', 0.5)
     assert main(['--topic', '/imu/data']) == 1
     said = capfd.readouterr().err
@@ -90,34 +95,22 @@ def test_what_is_no_command_is_told(command, why, capfd):
     assert capfd.readouterr().err == f'examine: {command!r} is no command: {why}\n'
 
 
-def test_another_source_of_samples_is_told(running, capfd):
-    from spinning_top_sim.exam.live import NodeExam
-
-    with NodeExam('imu/data'):
-        assert main(['--topic', 'imu/data']) == 1
-    assert '/clock is published by examine and examine: end the others' in capfd.readouterr().err
-
-
 def test_a_node_that_ends_is_told(run):
-    from spinning_top_sim.exam.live import NodeExam
-
-    with (NodeExam('imu/data', f'{sys.executable} -c pass') as node,
+    with (live.NodeExam('imu/data', f'{sys.executable} -c pass') as node,
           pytest.raises(InvalidOutputError, match='the node has ended with 0')):
-        follow(node.make_filter, run)
+        follow(node.start, run)
 
 
 def test_a_node_that_does_not_answer_is_told(run, monkeypatch):
-    from spinning_top_sim.exam import live
-
     monkeypatch.setattr(live, 'FIRST_PATIENCE_S', 0.05)
     deaf = ("import rclpy; from sensor_msgs.msg import Imu; rclpy.init(); "
             "node = rclpy.create_node('deaf'); node.create_publisher(Imu, 'imu/data', 1); "
             "s = node.create_subscription(Imu, 'imu/data_raw', lambda message: None, 1); "
             'rclpy.spin(node)')
     with (live.NodeExam('imu/data', f'{sys.executable} -c "{deaf}"') as node,
-          pytest.raises(InvalidOutputError, match='update 6 of 300 raises RuntimeError: no '
+          pytest.raises(InvalidOutputError, match='update 6 of 150 raises RuntimeError: no '
                         r'attitude has the stamp 1\.0600')):
-        follow(node.make_filter, run)
+        follow(node.start, run)
 
 
 def test_the_example_for_launch_testing_passes(tmp_path):

@@ -3,7 +3,6 @@
 
 import os
 import signal
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -205,46 +204,33 @@ def test_a_scene_brings_its_start_and_leaves_the_sensor_alone(live, monkeypatch)
     assert not any(name.startswith('imu.') for name in values)
 
 
-def kill(view):
-    os.killpg(view.process.pid, signal.SIGKILL)
-
-
-def hang(view):
-    os.killpg(view.process.pid, signal.SIGSTOP)
-
-
-def crawl(view):
-    """Let the page have a tenth of its time."""
-    for _ in range(15):
-        os.killpg(view.process.pid, signal.SIGSTOP)
-        time.sleep(0.18)
-        os.killpg(view.process.pid, signal.SIGCONT)
-        time.sleep(0.02)
-
-
-@pytest.mark.parametrize('trouble', [kill, hang, crawl])
-def test_a_page_in_trouble_does_not_slow_the_node(peer, diagnostics, tmp_path, trouble):
+def test_a_page_in_trouble_does_not_slow_the_node(peer, diagnostics, tmp_path):
     pytest.importorskip('viser')
     path = tmp_path / 'run.mcap'
     with SimNode(tmp_path, {'record.enabled': True, 'record.uri': str(path),
                             'pose.rate': 200.0}) as node:
         poses = peer.listen(node.topic('pose'), PoseStamped)
-        view = SimNode(tmp_path / 'view', namespace=node.namespace, program=VIEW)
-        with view:
+        with SimNode(tmp_path / 'view', namespace=node.namespace, program=VIEW) as view:
             wait_for('the page to listen', lambda: peer.node.count_subscribers(
                 node.topic('ground_truth/odom_throttle')))
-            poses.wait_more(100)
             before = diagnostics.next(node)
-            trouble(view)
-            # Three seconds of simulated time, and of real time: a hung page stays that long.
-            poses.wait_more(600)
-            after = diagnostics.next(node)
-            if trouble is not kill:
+            for _ in range(10):         # it has a tenth of its time
+                os.killpg(view.process.pid, signal.SIGSTOP)
+                poses.wait_more(36)
                 os.killpg(view.process.pid, signal.SIGCONT)
-                assert view.alive
-                # Killed while it makes a port of shared memory, as it may when it goes on, it
-                # would block all who open that port (Fast DDS).
-                assert view.end() == 0
+                poses.wait_more(4)
+            assert view.alive
+            # It hangs for two seconds of simulated time, which is the real time.
+            os.killpg(view.process.pid, signal.SIGSTOP)
+            poses.wait_more(400)
+            os.killpg(view.process.pid, signal.SIGCONT)
+            # Killed while it makes a port of shared memory, as it may when it goes on, it would
+            # block all who open that port (Fast DDS).
+            poses.wait_more(200)
+            assert view.alive
+            view.kill()
+            poses.wait_more(100)
+        after = diagnostics.next(node)
         assert after['clock slip [s]'] == before['clock slip [s]'] == '0.000'
         assert after['recorder'] == 'recording'
         assert node.end() == 0
@@ -252,6 +238,5 @@ def test_a_page_in_trouble_does_not_slow_the_node(peer, diagnostics, tmp_path, t
         stamps = {topic: np.array([message.log_time for message in reader.messages(
             topics=[f'{node.namespace}{topic}'])]) for topic in PERIODS}
     for topic, period in PERIODS.items():
-        assert len(stamps[topic]) > 3.0e9 / period
+        assert len(stamps[topic]) > 4.0e9 / period
         assert (np.diff(stamps[topic]) == period).all(), topic
-

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Published attitude filters in the form that the exam takes; `pip install 'spinning_top_sim[exam]'`.
+Adapters of published attitude filters; `pip install 'spinning_top_sim[exam]'` installs most.
 
-Each has the settings that its package comes with, and starts from the attitude that its first
-readings show.  With `magnetic=False` it does not get the magnetometer.
+Each filter has the default settings of its package, and starts from the attitude of its first
+readings.  With `magnetic=False` it does not use the magnetometer.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ FROM_NWU = Rotation.from_euler('z', 90.0, degrees=True)
 
 
 class Vqf:
-    """VQF (Laidig and Seel 2023), package vqf.  Its period is fixed: lost samples are repeated."""
+    """VQF (Laidig and Seel 2023), package vqf.  Its period is fixed: it repeats lost samples."""
 
     def __init__(self, magnetic: bool = True) -> None:
         from vqf import VQF  # noqa: PLC0415
@@ -43,17 +43,17 @@ class Vqf:
 
     @property
     def bias(self) -> Reals:
-        """Of the gyroscope [rad/s]."""
+        """Gyroscope bias [rad/s]."""
         bias: Reals = self._filter.getBiasEstimate()[0]
         return bias
 
 
 class Ahrs:
     """
-    Madgwick's and Mahony's filter and the EKF of the package ahrs (M. Garcia 2020).
+    The filters of Madgwick and Mahony and the EKF of the package ahrs (M. Garcia 2020).
 
-    Madgwick's takes north for its x axis.  The EKF calls a frame NED in which the accelerometer
-    reads +g along z at rest, which is up here.
+    The x axis of Madgwick's world points north.  The EKF calls its frame NED, but a resting
+    accelerometer reads +g along z there, which is up here.
     """
 
     def __init__(self, name: str, magnetic: bool = True) -> None:
@@ -78,20 +78,20 @@ class Ahrs:
             start = from_two_vectors(accelerometer, magnetometer if uses_field else None)
             self._attitude = (self._turn.inv() * Rotation.from_quat(start)).as_quat()[W_FIRST]
         elif self._name == 'EKF':
-            # It asks this attribute, not its argument, whether there is a magnetometer.
+            # This attribute, not the argument, tells it whether there is a magnetometer.
             self._filter.mag = np.empty(0) if uses_field else None
             self._attitude = self._filter.update(self._attitude, *readings, dt=dt)
         elif uses_field:
             self._attitude = self._filter.updateMARG(self._attitude, *readings, dt=dt)
         else:
             self._attitude = self._filter.updateIMU(self._attitude, *readings, dt=dt)
-        said = np.asarray(self._attitude)[W_LAST]
-        turned: Reals = (self._turn * Rotation.from_quat(said)).as_quat()
+        attitude = Rotation.from_quat(np.asarray(self._attitude)[W_LAST])
+        turned: Reals = (self._turn * attitude).as_quat()
         return turned
 
 
 class Imufusion:
-    """Madgwick's later filter (thesis of 2014, ch. 7), package imufusion; deg/s and g."""
+    """Madgwick's later filter (thesis of 2014, ch. 7), package imufusion; it takes deg/s and g."""
 
     def __init__(self, magnetic: bool = True) -> None:
         import imufusion  # noqa: PLC0415
@@ -116,7 +116,7 @@ class Imufusion:
 
 
 class Gtsam:
-    """Rotations preintegrated by gtsam: it only integrates the rates (Forster et al. 2017)."""
+    """Preintegration of the rates by the package gtsam (Forster et al. 2017)."""
 
     def __init__(self) -> None:
         import gtsam  # noqa: PLC0415
@@ -136,7 +136,7 @@ class Gtsam:
         return said
 
 
-# By name; those with six axes do not get the magnetometer.
+# By name; '-6d' is without magnetometer.
 FILTERS: dict[str, Callable[[], Filter]] = {
     'reference': ReferenceFilter,
     'vqf': Vqf, 'vqf-6d': partial(Vqf, magnetic=False),

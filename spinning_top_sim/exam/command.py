@@ -32,7 +32,7 @@ from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.tools import cli
 from spinning_top_sim.tools.ensemble_part import EnsembleError
 
-# Which options each subject of an exam has.
+# Options for each kind of subject.
 OPTIONS = {'a log': ('topic', 'truth', 'heading'), 'a node': ('topic', 'level', 'imu', 'seeds'),
            '--filter': ('level', 'imu', 'seeds', 'workers')}
 
@@ -46,17 +46,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('log', type=Path, nargs='?', help='an MCAP file with the attitudes and the truth')
-    add('--topic', help='of the attitudes; without a log and --node those of a node that runs and '
+    add('--topic', help='topic of the attitudes; without a log and --node, of a running node that '
         'reads imu/data_raw and imu/mag')
     add('--truth', help='topic of the truth; default: ground_truth/imu, ground_truth/odom or pose')
     add('--heading', choices=NORTHS, help='the heading in the log must be right, from true or '
         'magnetic north; default: it must be steady')
-    add('--node', metavar='COMMAND', help='examine a ROS node that reads imu/data_raw and '
-        'imu/mag; it is started for every run, and gets a sample when it has answered the one '
-        'before')
+    add('--node', metavar='COMMAND', help='command that starts a ROS node that reads imu/data_raw '
+        'and imu/mag; each run starts it anew, and waits for its answer to each sample')
     add('--filter', choices=FILTERS, metavar='NAME',
         help=f'examine a published filter: {", ".join(FILTERS)}')
-    add('--level', choices=SEEDS, help='of the exam of a filter or node; default: quick')
+    add('--level', choices=SEEDS, help='level of the exam of a filter or node; default: quick')
     add('--imu', metavar='FILE', help='parameter file of the IMU, as in config/imu')
     add('--seeds', type=int, metavar='N', help='number of noisy runs')
     add('--workers', type=int, metavar='N',
@@ -90,7 +89,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the options that are given, by name.  Raises ValueError for those of others."""
+    """Return the given options by name.  Raise ValueError for those of another subject."""
     subject = ('a log' if arguments.log is not None else
                '--filter' if arguments.filter is not None else 'a node')
     options = {name: value for names in OPTIONS.values() for name in names
@@ -114,7 +113,7 @@ def _report(arguments: argparse.Namespace) -> Report:
         return examine_log(arguments.log, **options)
     if arguments.filter is not None:
         make_filter = FILTERS[arguments.filter]
-        make_filter()           # imports its package, once for all runs
+        make_filter()           # imports its package once, before the runs fork
         return examine(make_filter, subject=arguments.filter, **options)
     from spinning_top_sim.exam.live import examine_node  # noqa: PLC0415 - needs ROS
 

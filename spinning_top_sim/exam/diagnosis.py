@@ -1,50 +1,52 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Names faults of a filter from their signatures, each with its evidence.
+Identifies the faults of a filter by their signatures, and gives the evidence for each.
 
-A misreading that stays the same is found by undoing it: the attitudes, or the readings, are
-changed as the fault would have it, and the error vanishes.
+A constant misinterpretation of readings or attitudes is identified by inverting it: if the error
+disappears, it was the cause.
 """
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import measures
-from spinning_top_sim.exam.measures import Reals, errors_of, rms
-from spinning_top_sim.exam.trial import Input, Outcome, Output, same
+from spinning_top_sim.exam.measures import rms
+from spinning_top_sim.exam.scenarios import Reals
+from spinning_top_sim.exam.trial import ChangeAttitudes, ChangeReadings, Outcome, same
 
 FAULTS = ('first_order_integration', 'gyroscope_units', 'conjugated', 'component_order',
           'frame_ned', 'gravity_sign', 'lever_arm', 'stamp_offset', 'no_bias_estimate',
           'covariance_small', 'covariance_large', 'diverges', 'invalid_output')
 
-# The thresholds; docs/exam.md says how far from them filters are.  Errors [rad].
-GROSS = np.radians(3.0)         # of a filter that may misread something
+# Thresholds; docs/exam.md compares them with the values of filters.  Errors are in rad.
+GROSS = np.radians(3.0)         # a smaller error is no misreading
 DIVERGED = np.radians(10.0)
-EXPLAINED = 0.25                # of the error is left where its cause is undone
+EXPLAINED = 0.25                # of the error is left at most when its cause is undone
 FIRST_ORDER = np.radians(0.2)   # on the fast motion
-FIRST_ORDER_LEFT = 0.5          # of that error, with rates for which such steps are right
+FIRST_ORDER_LEFT = 0.5          # of that error, with rates for which first-order steps are right
 LEVER_ARM = np.radians(1.0)     # between the attitudes with and without the lever arm
-AHEAD, DELAYED = -1.5, 0.75     # steps: a filter that corrects before its step is ahead by one
-BIAS_LEFT_S = 0.05              # error for the bias that causes it [rad/(rad/s)]
-BIAS_REMAINS = 0.9              # of that error, between the second and the last quarter
-BIAS_FOUND = 0.05               # of the bias, by the estimate
-CONSISTENT = 0.9999             # probability of the band of the NEES
+AHEAD, DELAYED = -1.5, 0.75     # steps; a filter that corrects before its step is ahead by one
+BIAS_LEFT_S = 0.05              # error relative to the bias that causes it [rad/(rad/s)]
+BIAS_REMAINS = 0.9              # of that error, from the second to the last quarter
+BIAS_FOUND = 0.05               # of the bias, by the filter's estimate
+CONSISTENT = 0.9999             # probability of the NEES band
 
 
 class Fault(NamedTuple):
     """
-    What is wrong with a filter.
+    A fault of a filter.
 
     Parameters
     ----------
     name : str
         One of FAULTS.
     evidence : str
-        From what it follows.
+        Why the exam reports it.
     """
 
     name: str
@@ -53,46 +55,34 @@ class Fault(NamedTuple):
 
 class Hypothesis(NamedTuple):
     """
-    A misreading, in words, and how to undo it.
+    A possible misreading, and how to undo it.
 
-    given : what the filter must get for its readings; None: them
-    read : what its attitudes are then
+    given : changes the readings for the filter; None leaves them as they are
+    read : changes the attitudes of the filter
     """
 
     faults: tuple[str, ...]
     text: str
-    given: Input | None = None
-    read: Output = same
+    given: ChangeReadings | None = None
+    read: ChangeAttitudes = same
 
 
-def _turned(left: Sequence[float], right: Sequence[float] = (0.0, 0.0, 0.0, 1.0)) -> Output:
-    """Return what turns an attitude on both sides, by quaternions x, y, z, w."""
-    def read(estimates: Reals) -> Reals:
-        turned: Reals = (Rotation.from_quat(left) * Rotation.from_quat(estimates)
-                         * Rotation.from_quat(right)).as_quat()
-        return turned
-    return read
+def _turned(left: Sequence[float], right: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
+            ) -> ChangeAttitudes:
+    """Return the multiplication of attitudes by quaternions x, y, z, w on both sides."""
+    return lambda estimates: (Rotation.from_quat(left) * Rotation.from_quat(estimates)
+                              * Rotation.from_quat(right)).as_quat()
 
 
-def conjugate(estimates: Reals) -> Reals:
-    """Return the inverse attitudes."""
-    return estimates * (-1.0, -1.0, -1.0, 1.0)
-
-
-def w_last(estimates: Reals) -> Reals:
-    """Return x, y, z, w of w, x, y, z."""
-    return np.roll(estimates, -1, axis=-1)
-
-
-def _scaled(factor: float) -> Input:
+def _scaled(factor: float) -> ChangeReadings:
     return lambda gyroscope, accelerometer, dt: (factor * gyroscope, accelerometer)
 
 
 def for_first_order(gyroscope: Reals, accelerometer: Reals, dt: Reals) -> tuple[Reals, Reals]:
     """
-    Return the rates for which a step q + q w dt/2, normalised, is right.
+    Return the rates for which the normalised first-order step q + q w dt/2 is exact.
 
-    Such a step turns by 2 atan(|w| dt/2), less than |w| dt by |w dt|^3/12.
+    Such a step turns by 2 atan(|w| dt/2), which is less than |w| dt by |w dt|^3/12.
     """
     half = 0.5 * dt * np.linalg.norm(gyroscope, axis=1)
     longer = np.tan(np.minimum(half, 1.5)) / np.where(half > 0.0, half, 1.0)
@@ -100,23 +90,24 @@ def for_first_order(gyroscope: Reals, accelerometer: Reals, dt: Reals) -> tuple[
 
 
 _HALF = 0.5 ** 0.5
+_CONJUGATE, _W_LAST = np.array((-1.0, -1.0, -1.0, 1.0)), [1, 2, 3, 0]
 NED_WORLD = Hypothesis(('frame_ned',), 'read as attitude in a world north-east-down',
                        read=_turned((_HALF, _HALF, 0.0, 0.0)))
 GRAVITY_SIGN = Hypothesis(
     ('gravity_sign',), 'with the sign of the accelerometer changed',
     given=lambda gyroscope, accelerometer, dt: (gyroscope, -accelerometer))
-# What can be found from attitudes alone comes first.
+# These need the attitudes only.
 READINGS = (
-    Hypothesis(('component_order',), 'read as w, x, y, z', read=w_last),
-    Hypothesis(('conjugated',), 'conjugated', read=conjugate),
+    Hypothesis(('component_order',), 'read as w, x, y, z', read=lambda q: q[:, _W_LAST]),
+    Hypothesis(('conjugated',), 'conjugated', read=lambda q: q * _CONJUGATE),
     NED_WORLD,
     Hypothesis(('frame_ned',), 'read as attitude of axes forward-right-down in a world '
                'north-east-down', read=_turned((_HALF, _HALF, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))),
     Hypothesis(('frame_ned',), 'read as attitude in a world north-west-up',
                read=_turned((0.0, 0.0, _HALF, _HALF))),
     Hypothesis(('conjugated', 'component_order'), 'read as w, x, y, z and conjugated',
-               read=lambda estimates: conjugate(w_last(estimates))))
-# What harms a filter least comes first.
+               read=lambda q: q[:, _W_LAST] * _CONJUGATE))
+# These need another run.  The order is that of the harm to a right filter, least first.
 REPEATED = (
     GRAVITY_SIGN,
     Hypothesis(('gyroscope_units',), 'with the gyroscope multiplied by pi/180',
@@ -125,7 +116,7 @@ REPEATED = (
 
 
 def marks(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
-    """Return what docs/exam.md defines of the errors of filters, over several runs."""
+    """Return the measures of the errors in several runs, as defined in docs/exam.md."""
     settled = [outcome.last() for outcome in outcomes]
     errors = [outcome.errors for outcome in settled]
     return {
@@ -146,23 +137,22 @@ def error_of(outcome: Outcome, absolute: bool) -> float:
 
 
 def explain(outcome: Outcome, absolute: bool,
-            again: Callable[[Hypothesis], Outcome] | None) -> Hypothesis | None:
+            again: Callable[[Hypothesis], Outcome] | None = None) -> Hypothesis | None:
     """
-    Return the misreading that makes the error of a settled filter vanish, if there is one.
+    Return the misreading whose inversion removes the error of a settled filter, or None.
 
-    absolute : whether the heading counts
-    again : repeats the run for a hypothesis; None where that cannot be done
+    absolute : whether the heading is judged
+    again : repeats the run for a hypothesis; None if that is not possible
     """
     before = error_of(outcome, absolute)
     if before < GROSS:
         return None
-    tried = [(rms(errors_of(one.read(outcome.estimates), outcome.run.truth).attitude(absolute)),
-              one) for one in READINGS]
-    if again is not None:
-        for one in REPEATED:
-            if min(error for error, _ in tried) <= EXPLAINED * before:
-                break
-            tried.append((error_of(again(one), absolute), one))
+    tried = [(error_of(replace(outcome, estimates=one.read(outcome.estimates)), absolute), one)
+             for one in READINGS]
+    for one in REPEATED:
+        if again is None or min(error for error, _ in tried) <= EXPLAINED * before:
+            break
+        tried.append((error_of(again(one), absolute), one))
     after, best = min(tried, key=lambda pair: pair[0])
     if after > EXPLAINED * before:
         return None
@@ -174,7 +164,7 @@ def explain(outcome: Outcome, absolute: bool,
 
 
 def stamp_fault(outcome: Outcome, absolute: bool) -> tuple[measures.Offset, Fault | None]:
-    """Look for an error of a settled filter that is a delay."""
+    """Return the time offset of a settled filter, and the fault if it explains the error."""
     run = outcome.run
     offset = measures.time_offset(outcome.estimates, run.truth, run.rates, absolute)
     steps = offset.seconds / float(np.median(run.dt))
@@ -188,7 +178,7 @@ def stamp_fault(outcome: Outcome, absolute: bool) -> tuple[measures.Offset, Faul
 
 
 def first_order_fault(before: float, after: float, rate: float) -> Fault | None:
-    """Judge errors on the fast motion [rad], as it is and for what a first-order step leaves."""
+    """Judge errors [rad] on the fast motion, `after` with the rates of `for_first_order`."""
     if before < FIRST_ORDER or after > FIRST_ORDER_LEFT * before:
         return None
     return Fault('first_order_integration',
@@ -197,28 +187,21 @@ def first_order_fault(before: float, after: float, rate: float) -> Fault | None:
 
 
 def lever_arm_fault(effect: float, arm: float) -> Fault | None:
-    """Judge the attitude error that a lever arm [m] adds [rad]."""
+    """Judge the tilt [rad] that a lever arm [m] causes."""
     if effect < LEVER_ARM:
         return None
     return Fault('lever_arm', f'on a lever arm of {arm:g} m the attitude differs by '
                  f'{_degrees(effect)} from that without: its acceleration is taken for gravity')
 
 
-class BiasEffect(NamedTuple):
+def judge_bias(plus: Outcome, minus: Outcome, bias: Reals,
+               absolute: bool) -> tuple[dict[str, float], Fault | None]:
     """
-    What a constant bias of the gyroscope does.
+    Return measures of the effect of a gyroscope bias, and the fault if there is one.
 
-    early, late : attitude error for the bias, in the second and the last quarter [s]
-    found : share of the bias in the filter's estimate at the end; None without one
+    plus, minus : runs with this bias [rad/s] and its opposite; errors of other causes cancel
+    absolute : False judges the tilt only
     """
-
-    early: float
-    late: float
-    found: float | None
-
-
-def bias_effect(plus: Outcome, minus: Outcome, bias: Reals, absolute: bool) -> BiasEffect:
-    """Compare runs with this bias [rad/s] and its opposite; errors of other causes cancel."""
     size = float(np.linalg.norm(bias))
     one, other = (Rotation.from_quat(outcome.estimates) for outcome in (plus, minus))
     if absolute:
@@ -227,33 +210,29 @@ def bias_effect(plus: Outcome, minus: Outcome, bias: Reals, absolute: bool) -> B
         verticals = [turn.inv().apply((0.0, 0.0, 1.0)) for turn in (one, other)]
         apart = np.linalg.norm(verticals[0] - verticals[1], axis=1)
     quarter = len(apart) // 4
-    found = None
-    if len(plus.biases.values) and len(minus.biases.values):
-        change = 0.5 * (plus.biases.values[-1] - minus.biases.values[-1])
-        found = float(change @ bias / size ** 2)
-    return BiasEffect(rms(apart[quarter:2 * quarter]) / (2.0 * size),
-                      rms(apart[-quarter:]) / (2.0 * size), found)
-
-
-def bias_fault(effect: BiasEffect, absolute: bool) -> Fault | None:
-    """Judge what a bias does to tilt, and to the heading where there is a magnetometer."""
-    estimated = (effect.late < BIAS_REMAINS * effect.early if effect.found is None else
-                 effect.found > BIAS_FOUND)
-    if estimated or effect.late < BIAS_LEFT_S:
-        return None
-    what = 'attitude' if absolute else 'tilt'
-    text = (f'a bias of the gyroscope of 1 deg/s leaves an error of the {what} of '
-            f'{effect.late:.3g} deg, after {effect.early:.3g} deg earlier')
-    if effect.found is not None:
-        text += f', and the estimate has {effect.found:.1%} of the bias'
-    return Fault('no_bias_estimate', text)
+    early, late = (rms(apart[part]) / (2.0 * size)
+                   for part in (slice(quarter, 2 * quarter), slice(-quarter, None)))
+    estimates = [known[-1] for outcome in (plus, minus)
+                 if len(known := outcome.biases[~np.isnan(outcome.biases[:, 0])])]
+    found = (float(0.5 * (estimates[0] - estimates[1]) @ bias / size ** 2)
+             if len(estimates) == 2 else math.nan)
+    measured = {'bias_error_s': late, 'bias_found': found}
+    estimated = late < BIAS_REMAINS * early if math.isnan(found) else found > BIAS_FOUND
+    if estimated or late < BIAS_LEFT_S:
+        return measured, None
+    text = (f'a bias of the gyroscope of 1 deg/s leaves an error of the '
+            f'{"attitude" if absolute else "tilt"} of {late:.3g} deg, after {early:.3g} deg '
+            'earlier')
+    if not math.isnan(found):
+        text += f', and the estimate has {found:.1%} of the bias'
+    return measured, Fault('no_bias_estimate', text)
 
 
 def consistency(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, measures.Nees]:
-    """Return the NEES of tilt and attitude by name, as far as there are covariances."""
-    runs = [(one.estimates[samples], one.run.truth[samples], covariances)
+    """Return the NEES of 'tilt' and 'attitude', as far as the filter has covariances."""
+    runs = [(one.estimates[known], one.run.truth[known], one.covariances[known])
             for one in (outcome.last(0.75) for outcome in outcomes)
-            for samples, covariances in (one.covariances,) if len(samples)]
+            if np.any(known := np.all(np.isfinite(one.covariances), axis=(1, 2)))]
     if not runs:
         return {}
     found = {what: measures.nees_of(runs, whole)
@@ -262,17 +241,14 @@ def consistency(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, measur
 
 
 def nees_marks(found: Mapping[str, measures.Nees]) -> dict[str, float]:
-    """Return the measures of what `consistency` returns."""
-    marked: dict[str, float] = {}
-    for what, nees in found.items():
-        name = 'nees' if what == 'tilt' else 'nees_attitude'
-        low, high = nees.band()
-        marked |= {name: nees.ratio, f'{name}_low': low, f'{name}_high': high}
-    return marked
+    """Return the result of `consistency` as measures."""
+    names = {'tilt': 'nees', 'attitude': 'nees_attitude'}
+    return {f'{names[what]}{end}': value for what, nees in found.items()
+            for end, value in zip(('', '_low', '_high'), (nees.ratio, *nees.band()), strict=True)}
 
 
 def covariance_fault(found: Mapping[str, measures.Nees]) -> Fault | None:
-    """Judge what `consistency` returns."""
+    """Judge the result of `consistency`."""
     for what, nees in found.items():
         low, high = nees.band(CONSISTENT)
         if not low <= nees.ratio <= high:
@@ -284,7 +260,7 @@ def covariance_fault(found: Mapping[str, measures.Nees]) -> Fault | None:
 
 
 def divergence(outcome: Outcome, absolute: bool) -> Fault | None:
-    """Judge the error at the end."""
+    """Judge the error in the last quarter."""
     last = outcome.last(0.25)
     error = error_of(last, True) if absolute else rms(last.errors.tilt)
     if error < DIVERGED:

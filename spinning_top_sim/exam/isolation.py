@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Feeds a filter in a process of its own: one that never returns, or crashes, harms nothing else.
+Feeds a filter in a process of its own, so that a filter that hangs or crashes harms nothing else.
 
-The process is a copy of this one, which needs neither to find nor to import the filter's class.
+The process is a fork of this one, so it need not import the class of the filter.
 """
 
 import contextlib
@@ -19,24 +19,23 @@ from multiprocessing.connection import Connection
 from spinning_top_sim.exam.trial import (
     InvalidOutputError,
     MakeFilter,
+    Output,
     Readings,
-    Said,
     feed,
     update_of,
 )
 
-# An update may take this long, and so may making the filter.
+# The longest time that an update, or making the filter, may take.
 LONGEST_S = 10.0
 
 
-def feed_apart(make_filter: MakeFilter, readings: Readings) -> Said:
-    """Do as `feed`.  A filter that crashes, or never returns, raises InvalidOutputError too."""
-    reached = memoryview(mmap.mmap(-1, 8)).cast('q')        # both processes see it
+def feed_apart(make_filter: MakeFilter, readings: Readings) -> Output:
+    """Do as `feed`.  Also raise InvalidOutputError for a filter that crashes or never returns."""
+    reached = memoryview(mmap.mmap(-1, 8)).cast('q')        # shared by both processes
     receiver, sender = Pipe(duplex=False)
-    for stream in (sys.stdout, sys.stderr):
-        stream.flush()          # else both write what is in the buffer
+    _flush()            # or both processes write what is buffered
     with warnings.catch_warnings():
-        # Of other threads, which the copy does not have: it runs nothing but the filter.
+        # A fork has no other threads; this one needs none, as it only runs the filter.
         warnings.simplefilter('ignore', DeprecationWarning)
         process = os.fork()
     if not process:
@@ -49,34 +48,36 @@ def feed_apart(make_filter: MakeFilter, readings: Readings) -> Said:
                 if reached[0] != before:
                     before, since = reached[0], time.monotonic()
                 elif time.monotonic() - since > LONGEST_S:
-                    answer = (f'{update_of(before, readings)} takes more than {LONGEST_S:g} s: '
-                              'killed')
-                    break
-            else:
-                answer = receiver.recv()
+                    raise InvalidOutputError(f'{update_of(before, readings)} takes more than '
+                                             f'{LONGEST_S:g} s: killed')
+            answer = receiver.recv()
     finally:
-        os.kill(process, signal.SIGKILL)        # one that has ended keeps its code
+        os.kill(process, signal.SIGKILL)        # no effect on the exit code of an ended process
         code = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
         receiver.close()
     if answer is None:
         how = signal.strsignal(-code) if code < 0 else f'exit code {code}'
         raise InvalidOutputError(f'{update_of(reached[0], readings)} ends the process: {how}')
-    if isinstance(answer, str):
-        raise InvalidOutputError(answer)
-    said: Said = answer
-    return said
+    if isinstance(answer, InvalidOutputError):
+        raise answer
+    output: Output = answer
+    return output
 
 
 def _serve(make_filter: MakeFilter, readings: Readings, reached: memoryview,
            sender: Connection) -> None:
-    """Feed the filter, send what comes of it, and end the process, whatever happens."""
+    """Feed the filter, send the result and end the process, whatever happens."""
     try:
         signal.signal(signal.SIGINT, signal.SIG_DFL)        # no traceback after Ctrl-C
         try:
             sender.send(feed(make_filter, readings, partial(reached.__setitem__, 0)))
         except InvalidOutputError as error:
-            sender.send(str(error))
-        for stream in (sys.stdout, sys.stderr):
-            stream.flush()
+            sender.send(error)
+        _flush()
     finally:
         os._exit(1)
+
+
+def _flush() -> None:
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The exam of a ROS node: it gets one sample at a time, and the next one when it has answered.
+The exam of a ROS node, in lockstep: the node gets a sample when it has answered the one before.
 
-So the verdict does not depend on the load of the machine.  A node that the exam starts is started
-for every run.  One that runs already gets all runs one after the other.
+So the result does not depend on the load of the machine.  Either the exam starts the node anew
+for every run, or a running node gets all runs one after the other.
 """
 
 import contextlib
@@ -41,10 +41,10 @@ except ImportError:
 IMU_TOPIC, FIELD_TOPIC = 'imu/data_raw', 'imu/mag'
 PATIENCE_S = 20.0               # for a node to start, and for an answer
 FIRST_PATIENCE_S, UNANSWERED = 1.0, 5       # some nodes do not answer their first samples
-START_NS = NANOSECONDS          # in ROS a stamp of 0 is "no time"
-# A node that runs must never see time go back, not even from one exam to the next.  So the stamp
-# of an exam's first sample is the machine's time multiplied by FASTEST: no exam is fed faster than
-# that.  The stamps begin anew after 460 days, before their seconds overflow.
+START_NS = NANOSECONDS          # in ROS a stamp of 0 means "no time"
+# A running node must never see time go back, not even from one exam to the next.  So the first
+# stamp of an exam is the uptime of the machine multiplied by FASTEST, the greatest speed-up of an
+# exam.  The stamps start again after 460 days, before their seconds overflow.
 FASTEST, LAST_NS = 50, 2 * 10 ** 9 * NANOSECONDS
 NAME, FRAME = 'examine', 'imu_link'
 
@@ -58,15 +58,11 @@ def examine_node(topic: str, command: str | None = None, level: str = 'quick',
     Parameters
     ----------
     topic : str
-        Of its attitudes, sensor_msgs/Imu, each with the stamp of its sample.
+        Topic of its attitudes, sensor_msgs/Imu, each with the stamp of its sample.
     command : str, optional
-        Starts the node for each run, without a shell; without it the node runs already.
-    level : {'quick', 'full'}, optional
-        As of `examine`.
-    imu : mapping, str or Path, optional
-        As of `examine`.
-    seeds : int or iterable of int, optional
-        As of `examine`.
+        Command that starts the node for each run, without a shell; default: the node runs.
+    level, imu, seeds : optional
+        As for `examine`.
 
     Returns
     -------
@@ -76,29 +72,28 @@ def examine_node(topic: str, command: str | None = None, level: str = 'quick',
     Raises
     ------
     ValueError
-        For a topic or command that is none, and as `examine` does.
+        If the topic or command is invalid, or as `examine`.
     NodeError
-        If the node is not there, or others publish on its topics.
+        If the node is not found, or other nodes publish on its topics.
     """
     with NodeExam(topic, command) as node:
-        return examine(node.make_filter, level, imu, seeds, subject=command or topic,
+        return examine(node.start, level, imu, seeds, subject=command or topic,
                        isolated=False, restart=command is not None)
 
 
 class NodeExam(contextlib.AbstractContextManager['NodeExam']):
     """
-    Feeds a node: `make_filter` returns it in the form that the exam takes.
+    A node under examination, which is also a `trial.Filter`.
 
-    topic : sensor_msgs/Imu with the attitudes that it publishes, each with the stamp of its sample
-    command : of the node, which reads `imu/data_raw` and `imu/mag`; None: it runs already
-
-    Raises ValueError for a topic that ROS does not allow, and for a command without words.
+    The arguments are those of `examine_node`.  Raises ValueError if one of them is invalid.
     """
+
+    slowest = float('inf')      # `update` has its own timeout
 
     def __init__(self, topic: str, command: str | None = None) -> None:
         try:
             expand_topic_name(topic, NAME, '/')
-        except ValueError:          # its text has the place in rcl's source
+        except ValueError:          # its text names a line of rcl
             raise ValueError(f'{topic!r} is no name of a topic: must be such as imu/data, with '
                              'letters, digits, _ and /') from None
         self._command = None if command is None else _words(command)
@@ -110,12 +105,13 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         self._executor = Executor(context=self._context)
         self._executor.add_node(self._node)
         profile = QoSProfile(depth=100)
-        self.clock, self.imu, self.field = (
+        self._clock, self._imu, self._field = (
             self._node.create_publisher(kind, name, profile) for kind, name in (
                 (Clock, '/clock'), (Imu, IMU_TOPIC), (MagneticField, FIELD_TOPIC)))
-        self.said: dict[int, Any] = {}
         self._subscription = self._node.create_subscription(Imu, topic, self._take, profile)
         self._process: subprocess.Popen[bytes] | None = None
+        self._answers: dict[int, Any] = {}          # by stamp [ns]
+        self.covariance: NDArray[np.float64] | None = None
 
     def __exit__(self, *exception: object) -> None:
         self._end_process()
@@ -123,49 +119,94 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         self._node.destroy_node()
         rclpy.shutdown(context=self._context)
 
-    def make_filter(self) -> 'NodeFilter':
+    def start(self) -> 'NodeExam':
         """
-        Start the node anew, or find the one that runs.
+        Start the node anew, or find the running one; return it as a filter.
 
-        Raises RuntimeError if it does not start, and NodeError if none runs, or if others publish
-        on its topics.
+        Raises RuntimeError if it does not start, and NodeError if none runs, or if other nodes
+        publish on its topics.
         """
-        self.said.clear()
         self._end_process()
         if self._command is not None:
             self._process = subprocess.Popen(self._command, start_new_session=True)
-        there = self.wait(self._is_there, PATIENCE_S)
+        there = self._wait(self.is_there, PATIENCE_S)
         self._find_others()
-        if there:
-            return NodeFilter(self, START_NS if self._process is not None else
-                              FASTEST * time.monotonic_ns() % LAST_NS + START_NS)
-        missing = ' and none '.join(
-            [f'reads {IMU_TOPIC}'] * (not self.imu.get_subscription_count())
-            + [f'publishes {self._topic}'] * (not self._node.count_publishers(self._topic)))
-        text = (f'no node {missing} within {PATIENCE_S:g} s, with ROS_DOMAIN_ID='
-                f'{os.environ.get("ROS_DOMAIN_ID", "0")}: check that it runs, its '
-                'ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE, its namespace and remappings')
-        raise RuntimeError(text) if self._process is not None else NodeError(text)
+        if not there:
+            missing = ' and none '.join(
+                [f'reads {IMU_TOPIC}'] * (not self._imu.get_subscription_count())
+                + [f'publishes {self._topic}'] * (not self._node.count_publishers(self._topic)))
+            text = (f'no node {missing} within {PATIENCE_S:g} s, with ROS_DOMAIN_ID='
+                    f'{os.environ.get("ROS_DOMAIN_ID", "0")}: check that it runs, its '
+                    'ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE, its namespace and '
+                    'remappings')
+            raise RuntimeError(text) if self._process is not None else NodeError(text)
+        self._now_ns = (START_NS if self._process is not None else
+                        FASTEST * time.monotonic_ns() % LAST_NS + START_NS)
+        self._sent = self._answered = 0
+        self._answers.clear()
+        self.covariance = None
+        return self
 
-    def check(self) -> None:
-        """Raise NodeError if a node that was not started here is there no more."""
-        if self._command is None and not self._is_there():
+    def update(self, gyroscope: NDArray[np.float64], accelerometer: NDArray[np.float64],
+               magnetometer: NDArray[np.float64] | None, dt: float) -> NDArray[np.float64]:
+        """Publish the readings, and wait for the attitude with their stamp."""
+        self._now_ns += round(dt * NANOSECONDS)
+        self._sent += 1
+        self._publish(gyroscope, accelerometer, magnetometer)
+        patience = PATIENCE_S if self._answered else FIRST_PATIENCE_S
+        if not self._wait(lambda: self._now_ns in self._answers, patience):
+            if self._answered or self._sent > UNANSWERED:
+                self._tell_no_answer(patience)
+            return np.array((0.0, 0.0, 0.0, 1.0))
+        self._answered += 1
+        message = self._answers.pop(self._now_ns)
+        self._answers.clear()
+        matrix = np.array(message.orientation_covariance).reshape(3, 3)
+        self.covariance = None if matrix[0, 0] == NO_ORIENTATION else matrix
+        q = message.orientation
+        return np.array((q.x, q.y, q.z, q.w))
+
+    def _publish(self, gyroscope: NDArray[np.float64], accelerometer: NDArray[np.float64],
+                 magnetometer: NDArray[np.float64] | None) -> None:
+        clock, imu = Clock(), Imu()
+        clock.clock.sec, clock.clock.nanosec = divmod(self._now_ns, NANOSECONDS)
+        imu.header.stamp, imu.header.frame_id = clock.clock, FRAME
+        imu.orientation_covariance[0] = NO_ORIENTATION
+        for vector, values in ((imu.angular_velocity, gyroscope),
+                               (imu.linear_acceleration, accelerometer)):
+            vector.x, vector.y, vector.z = values.tolist()
+        self._clock.publish(clock)
+        if magnetometer is not None:
+            field = MagneticField(header=imu.header)
+            (field.magnetic_field.x, field.magnetic_field.y,
+             field.magnetic_field.z) = magnetometer.tolist()
+            self._field.publish(field)
+        self._imu.publish(imu)
+
+    def _tell_no_answer(self, patience: float) -> None:
+        if self._command is None and not self.is_there():
             raise NodeError(f'the node that reads {IMU_TOPIC} and publishes {self._topic} has '
-                                'gone')
+                            'gone')
+        others = (f'; others came, such as {min(self._answers) * 1e-9:.9f} s'
+                  if self._answers else '')
+        raise RuntimeError(f'no attitude has the stamp {self._now_ns * 1e-9:.9f} s of its sample '
+                           f'within {patience:g} s{others}')
 
-    def _is_there(self) -> bool:
-        return bool(self.imu.get_subscription_count() and self._node.count_publishers(self._topic))
+    def is_there(self) -> bool:
+        """Return whether a node reads the samples, and one publishes the attitudes."""
+        return bool(self._imu.get_subscription_count()
+                    and self._node.count_publishers(self._topic))
 
     def _find_others(self) -> None:
-        """Raise NodeError if other nodes publish what the exam does, or several the attitudes."""
+        """Raise NodeError if a topic of the exam has several publishers."""
         for name in ('/clock', IMU_TOPIC, FIELD_TOPIC, self._topic):
             nodes = [one.node_name for one in self._node.get_publishers_info_by_topic(name)]
             if len(nodes) > 1:
                 raise NodeError(f'{name} is published by {" and ".join(sorted(nodes))}: end the '
                                 'others, because the exam needs the topic alone')
 
-    def wait(self, condition: Callable[[], object], seconds: float) -> bool:
-        """Spin until a condition holds; return False after so long.  A node that ends raises."""
+    def _wait(self, condition: Callable[[], object], seconds: float) -> bool:
+        """Spin until a condition holds; return False on timeout.  Raise if the node has ended."""
         end = time.monotonic() + seconds
         while not condition():
             if time.monotonic() > end:
@@ -177,7 +218,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
 
     def _take(self, message: Any) -> None:
         stamp = message.header.stamp
-        self.said[stamp.sec * NANOSECONDS + stamp.nanosec] = message
+        self._answers[stamp.sec * NANOSECONDS + stamp.nanosec] = message
 
     def _end_process(self) -> None:
         process, self._process = self._process, None
@@ -189,62 +230,13 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(5.0)
                 break
-        # Its endpoints leave the graph, so that the next node is not taken for this one.
-        self.wait(lambda: not self.imu.get_subscription_count()
-                  and not self._node.count_publishers(self._topic), PATIENCE_S)
-
-
-class NodeFilter:
-    """A running node as a filter, see `trial.Filter`."""
-
-    slowest = float('inf')      # it waits itself
-
-    def __init__(self, exam: NodeExam, start_ns: int) -> None:
-        self._exam = exam
-        self._now_ns = start_ns
-        self._answered = self._sent = 0
-        self.covariance: NDArray[np.float64] | None = None
-
-    def update(self, gyroscope: NDArray[np.float64], accelerometer: NDArray[np.float64],
-               magnetometer: NDArray[np.float64] | None, dt: float) -> NDArray[np.float64]:
-        """Publish the readings, and wait for the attitude with their stamp."""
-        exam, said = self._exam, self._exam.said
-        self._now_ns += round(dt * NANOSECONDS)
-        self._sent += 1
-        clock, imu = Clock(), Imu()
-        clock.clock.sec, clock.clock.nanosec = divmod(self._now_ns, NANOSECONDS)
-        imu.header.stamp, imu.header.frame_id = clock.clock, FRAME
-        imu.orientation_covariance[0] = NO_ORIENTATION
-        for vector, values in ((imu.angular_velocity, gyroscope),
-                               (imu.linear_acceleration, accelerometer)):
-            vector.x, vector.y, vector.z = values.tolist()
-        exam.clock.publish(clock)
-        if magnetometer is not None:
-            field = MagneticField(header=imu.header)
-            (field.magnetic_field.x, field.magnetic_field.y,
-             field.magnetic_field.z) = magnetometer.tolist()
-            exam.field.publish(field)
-        exam.imu.publish(imu)
-        patience = PATIENCE_S if self._answered else FIRST_PATIENCE_S
-        if not exam.wait(lambda: self._now_ns in said, patience):
-            if self._answered or self._sent > UNANSWERED:
-                exam.check()
-                raise RuntimeError(
-                    f'no attitude has the stamp {self._now_ns * 1e-9:.9f} s of its sample within '
-                    f'{patience:g} s' + (f'; others came, such as {min(said) * 1e-9:.9f} s'
-                                         if said else ''))
-            return np.array((0.0, 0.0, 0.0, 1.0))
-        self._answered += 1
-        message = said.pop(self._now_ns)
-        said.clear()
-        matrix = np.array(message.orientation_covariance).reshape(3, 3)
-        self.covariance = None if matrix[0, 0] == NO_ORIENTATION else matrix
-        q = message.orientation
-        return np.array((q.x, q.y, q.z, q.w))
+        # Wait until its endpoints leave the graph, so that they are not taken for the next node's.
+        self._wait(lambda: not self._imu.get_subscription_count()
+                   and not self._node.count_publishers(self._topic), PATIENCE_S)
 
 
 def _words(command: str) -> list[str]:
-    """Return the words of a command line.  Raises ValueError for none, or an open quotation."""
+    """Return the words of a command line.  Raises ValueError."""
     try:
         words = shlex.split(command)
     except ValueError as error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One page about an exam: the verdict, and the errors over time."""
+"""A page of figures about an exam: the faults, and the errors over time."""
 
 import textwrap
 from pathlib import Path
@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from spinning_top_sim.exam.report import Report
 
-LEAST_DEG = 1e-4                # that is drawn
+LEAST_DEG = 1e-4                # lower limit of the logarithmic axis
 
 
 def draw_page(report: Report, path: Path) -> None:
@@ -22,10 +22,10 @@ def draw_page(report: Report, path: Path) -> None:
     report : Report
         What `examine` has returned.
     path : Path
-        File to write, in the format of its ending.
+        File to write; its suffix decides the format.
     """
     with rc_context({'axes.spines.right': False, 'axes.spines.top': False, 'font.size': 9,
-                     'text.parse_math': False}):        # a filter may say '$'
+                     'text.parse_math': False}):        # texts of a filter may contain '$'
         figure = Figure(figsize=(11.0, 7.0), layout='constrained')
         grid = figure.add_gridspec(2, 2, width_ratios=(3.0, 2.0))
         tilt, heading = (figure.add_subplot(grid[row, 0]) for row in (0, 1))

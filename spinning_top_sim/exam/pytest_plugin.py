@@ -12,12 +12,10 @@ from spinning_top_sim.exam.report import Report
 @pytest.fixture
 def pass_exam() -> Callable[..., Report]:
     """
-    Return `examine` that fails the test if there are faults, except some that are known.
+    Return a function that examines a filter and fails the test if it has faults.
 
-    Returns
-    -------
-    callable
-        Takes the arguments of `examine`, and `known`, names of faults; returns the report.
+    The function takes the arguments of `examine`, and `known`, names of faults that are allowed.
+    It returns the report.
     """
     def pass_exam(*arguments: object, known: Iterable[str] = (), **options: object) -> Report:
         __tracebackhide__ = True

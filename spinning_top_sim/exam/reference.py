@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A filter without the faults that the exam looks for: it is what the exam itself is tested on."""
+"""A filter without the faults that the exam looks for, used to test the exam itself."""
 
 import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.scenarios import CALIBRATED, FIELD, GRAVITY, Reals
 
-# A specific force whose size is this far from gravity [standard deviations] is no gravity.
+# A specific force whose norm differs from gravity by more standard deviations is not trusted.
 LARGEST_DEVIATION = 5.0
-# What is assumed of it then [m/s^2], and for how long [s].
+# Its standard deviation is then assumed to be this [m/s^2], for so long [s].
 DISTURBED, DISTURBED_S = 0.5 * GRAVITY, 2.0
 UP = np.array((0.0, 0.0, GRAVITY))
 
@@ -20,25 +20,21 @@ class ReferenceFilter:
     """
     A multiplicative extended Kalman filter of attitude and bias (Markley 2003).
 
-    The rates are integrated in closed form.  Specific force and field are compared with gravity
-    and the known field; a force of another size than gravity is hardly believed.  The covariance
-    is of the error's rotation vector in the frame of the sensor.
+    The rates are integrated in closed form.  Specific force and magnetic field are compared with
+    gravity and the known field; a force whose norm is not that of gravity has little weight.
 
     Parameters
     ----------
-    gyroscope_density : float
-        Of its white noise [rad/s/sqrt(Hz)].
-    accelerometer_density : float
-        Of its white noise [m/s^2/sqrt(Hz)].
+    gyroscope_density, accelerometer_density, field_density : float
+        White noise of gyroscope, accelerometer and magnetometer [rad/s/sqrt(Hz)],
+        [m/s^2/sqrt(Hz)], [T/sqrt(Hz)].
     field : tuple of three float
-        In the world, east, north, up [T].
-    field_density : float
-        Of the white noise of the magnetometer [T/sqrt(Hz)].
+        Magnetic field in the world: east, north, up [T].
     bias_stddev : float
-        Standard deviation of the gyroscope's bias before it is estimated [rad/s].
+        Initial standard deviation of the gyroscope bias [rad/s].
     """
 
-    is_gravity_trusted = False      # every specific force is taken for gravity
+    is_gravity_trusted = False      # True: every specific force counts as gravity
 
     def __init__(self, gyroscope_density: float = CALIBRATED['imu.gyroscope_noise_density'],
                  accelerometer_density: float = CALIBRATED['imu.accelerometer_noise_density'],
@@ -54,29 +50,13 @@ class ReferenceFilter:
 
     @property
     def covariance(self) -> Reals:
-        """Of the rotation vector from the estimate to the truth, sensor frame (3, 3) [rad^2]."""
+        """Covariance of the error's rotation vector in the sensor frame (3, 3) [rad^2]."""
         covariance: Reals = self._p[:3, :3]
         return covariance
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
-        """
-        Take the readings of a step, as `Filter.update`.
-
-        Parameters
-        ----------
-        gyroscope, accelerometer : (3,) array
-            Mean angular velocity [rad/s], and specific force at the end [m/s^2].
-        magnetometer : (3,) array or None
-            Field at the end [T].
-        dt : float
-            Length of the step [s].
-
-        Returns
-        -------
-        (4,) array
-            q(world <- sensor) as x, y, z, w.
-        """
+        """Take the readings of a step; return the attitude at its end, see `trial.Filter`."""
         if not len(self._quaternion):
             self._quaternion = from_two_vectors(accelerometer, magnetometer)
         else:
@@ -96,7 +76,7 @@ class ReferenceFilter:
         return self._quaternion.copy()
 
     def predict(self, rates: Reals, dt: float) -> None:
-        """Turn by the rates [rad/s] for dt [s]."""
+        """Advance by a rotation with constant rates [rad/s] for dt [s]."""
         turn = rates * dt
         self._quaternion = self.integrate(self._quaternion, turn)
         transition = np.eye(6)
@@ -106,11 +86,11 @@ class ReferenceFilter:
         self._p[:3, :3] += self._densities[0] ** 2 * dt * np.eye(3)
 
     def integrate(self, quaternion: Reals, turn: Reals) -> Reals:
-        """Return a quaternion after a turn by a rotation vector in the frame of the sensor."""
+        """Return the quaternion after a rotation by a rotation vector in the sensor frame."""
         return product(quaternion, exponential(turn))
 
     def _correct(self, pairs: Sequence[tuple[Reals, Reals, float]]) -> None:
-        """Compare readings with the vectors in the world that they are of; each has a variance."""
+        """Correct by pairs of a reading and its vector in the world, each with its variance."""
         into_sensor = matrix_of(self._quaternion).T
         expected = [into_sensor @ world for _, world, _ in pairs]
         h = np.concatenate([_cross(vector) for vector in expected])
@@ -123,11 +103,11 @@ class ReferenceFilter:
         self._quaternion = product(self._quaternion, exponential(change[:3]))
         self.bias = self.bias + change[3:]
         p = self._p - gain @ with_reading.T
-        self._p = 0.5 * (p + p.T)       # else rounding makes it indefinite
+        self._p = 0.5 * (p + p.T)       # keeps it symmetric in spite of rounding
 
 
 def product(p: Reals, q: Reals) -> Reals:
-    """Return the quaternion product p q, x, y, z, w, of norm 1."""
+    """Return the normalised quaternion product p q, as x, y, z, w."""
     a, b, c, d = p.tolist()
     x, y, z, w = q.tolist()
     r = np.array((d * x + a * w + b * z - c * y, d * y - a * z + b * w + c * x,
@@ -145,7 +125,7 @@ def exponential(vector: Reals) -> Reals:
 
 
 def matrix_of(quaternion: Reals) -> Reals:
-    """Return the matrix of a unit quaternion (3, 3)."""
+    """Return the rotation matrix (3, 3) of a unit quaternion."""
     x, y, z, w = quaternion.tolist()
     return np.array((
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
@@ -160,23 +140,13 @@ def _cross(vector: Reals) -> Reals:
 
 def from_two_vectors(up: Reals, magnetometer: Reals | None) -> Reals:
     """
-    Return the attitude in which a vector points up, and the field has no east component (TRIAD).
+    Return the attitude in which `up` is vertical and the field has no east component (TRIAD).
 
-    Without a field any heading will do.
+    Without a field the heading is arbitrary.
     """
     z = up / np.linalg.norm(up)
     north = magnetometer if magnetometer is not None else np.eye(3)[np.argmin(np.abs(z))]
     x = np.cross(north, z)
     x /= np.linalg.norm(x)
-    rows: NDArray[np.float64] = np.stack((x, np.cross(z, x), z))
-    # Shepperd's method, by the largest of the four.
-    squares = np.append(2.0 * np.diag(rows) - np.trace(rows), np.trace(rows))   # 4 q^2 - 1
-    k = int(np.argmax(squares))
-    odd = np.array((rows[2, 1] - rows[1, 2], rows[0, 2] - rows[2, 0], rows[1, 0] - rows[0, 1]))
-    if k == 3:
-        q = np.array((*odd, 1.0 + squares[3]))
-    else:
-        q = np.array((*(rows[k] + rows[:, k]), odd[k]))
-        q[k] = 1.0 + squares[k]
-    unit: Reals = q / np.linalg.norm(q)
-    return unit
+    quaternion: Reals = Rotation.from_matrix(np.stack((x, np.cross(z, x), z))).as_quat()
+    return quaternion

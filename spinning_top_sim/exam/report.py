@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The verdict on a filter, as text, JSON and JUnit XML."""
+"""The result of an exam as text, JSON and JUnit XML."""
 
 import json
 import math
@@ -14,7 +14,7 @@ from spinning_top_sim.exam.trial import Outcome
 @dataclass(frozen=True)
 class Report:
     """
-    What an exam has found; `str(report)` is readable.
+    The result of an exam; `str(report)` is readable.
 
     Parameters
     ----------
@@ -23,9 +23,9 @@ class Report:
     found : sequence of Fault
         The faults with their evidence.
     measures : mapping of str to float
-        By name; docs/exam.md defines them.  NaN: could not be measured.
+        Measures by name, as defined in docs/exam.md.  NaN: could not be measured.
     outcomes : sequence of Outcome
-        What the filter said in the runs, for pictures.
+        Output of the filter in the runs, for pictures.
     """
 
     subject: str
@@ -40,7 +40,7 @@ class Report:
 
     @property
     def faults(self) -> list[str]:
-        """Names of the faults, of `diagnosis.FAULTS`."""
+        """Names of the faults found, from `diagnosis.FAULTS`."""
         return [fault.name for fault in self.found]
 
     def __str__(self) -> str:
@@ -50,42 +50,27 @@ class Report:
         return '\n'.join(lines)
 
     def measure_lines(self) -> list[str]:
-        """Return the measures in words, but for those that could not be measured."""
+        """Return the measures in words, except those that could not be measured."""
         return [f'{name:<26}{value:>12.4g}' for name, value in self.measures.items()
                 if not math.isnan(value)]
 
     def as_json(self) -> str:
-        """
-        Return everything as JSON.
-
-        Returns
-        -------
-        str
-            An object with subject, passed, faults, evidence and measures; what is not finite is
-            null.
-        """
+        """Return a JSON object of subject, passed, faults, evidence and measures, null for NaN."""
         return json.dumps({
             'subject': self.subject, 'passed': self.passed, 'faults': self.faults,
-            'evidence': {fault.name: fault.evidence for fault in self.found},
+            'evidence': dict(self.found),
             'measures': {name: value if math.isfinite(value) else None
                          for name, value in self.measures.items()}}, indent=2)
 
     def as_junit(self) -> str:
-        """
-        Return the verdict as JUnit XML.
-
-        Returns
-        -------
-        str
-            A test suite with a test case for each fault of FAULTS.
-        """
+        """Return JUnit XML: a test suite with a test case for each fault of FAULTS."""
         suite = ElementTree.Element('testsuite', name=f'examine {self.subject}',
                                     tests=str(len(FAULTS)), failures=str(len(self.found)),
                                     errors='0', skipped='0')
         properties = ElementTree.SubElement(suite, 'properties')
         for name, value in self.measures.items():
             ElementTree.SubElement(properties, 'property', name=name, value=f'{value:.9g}')
-        evidence = {fault.name: fault.evidence for fault in self.found}
+        evidence = dict(self.found)
         for name in FAULTS:
             case = ElementTree.SubElement(suite, 'testcase', classname='examine', name=name)
             if name in evidence:

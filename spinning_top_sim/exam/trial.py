@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A filter, fed with a run: what it says, and what is wrong with that."""
+"""Feeds a filter with the readings of a run, and checks what it returns."""
 
 import contextlib
 import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -16,22 +16,22 @@ from spinning_top_sim.exam.measures import Errors, errors_of
 from spinning_top_sim.exam.scenarios import Reals, Run, Truth
 from spinning_top_sim.tools.cli import printable
 
-# A covariance and a bias are read after so many updates.
+# Covariance and bias are read after every tenth update.
 READ_EVERY = 10
-# A filter may take this many times as long as the run lasts, and some time to compile itself [s].
+# A filter may take this many times the duration of the run, and some time to compile [s].
 SLOWEST, START_S = 2.0, 5.0
-# Its second number is how long this thread has waited for a processor [ns].
+# The second number in this file is how long this thread has waited for a processor [ns].
 WAITING = Path('/proc/thread-self/schedstat')
 NORM_TOLERANCE = 1e-3
 
 
 class Filter(Protocol):
     """
-    What the exam takes for an attitude filter.
+    An attitude filter as the exam uses it.
 
     It may also have `covariance` (3, 3), of the rotation vector from its attitude to the true one
-    [rad^2], and `bias` (3,), of the gyroscope [rad/s].  The exam reads both after updates; None,
-    and a covariance of zeros, is unknown.
+    [rad^2], and `bias` (3,), of the gyroscope [rad/s].  The exam reads both after updates.  None,
+    and a covariance of zeros, means unknown.
     """
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
@@ -58,13 +58,13 @@ class Filter(Protocol):
 
 
 MakeFilter = Callable[[], Filter]
-# Takes gyroscope and accelerometer (n, 3) and the steps (n,); returns what to give instead.
-Input = Callable[[Reals, Reals, Reals], tuple[Reals, Reals]]
-Output = Callable[[Reals], Reals]
+# From gyroscope and accelerometer (n, 3) and the steps (n,) to the readings that are fed instead.
+ChangeReadings = Callable[[Reals, Reals, Reals], tuple[Reals, Reals]]
+ChangeAttitudes = Callable[[Reals], Reals]
 
 
 class InvalidOutputError(Exception):
-    """What a filter returned, or that it raised an error, in one line."""
+    """The filter raised an error or returned something invalid; the text is one line."""
 
 
 class NodeError(Exception):
@@ -72,7 +72,7 @@ class NodeError(Exception):
 
 
 class Readings(NamedTuple):
-    """What a filter gets: (n, 3) each, the field None for none, and the steps (n,) [s]."""
+    """Readings for a filter: (n, 3) each, `magnetometer` may be None, and the steps (n,) [s]."""
 
     gyroscope: Reals
     accelerometer: Reals
@@ -80,46 +80,25 @@ class Readings(NamedTuple):
     dt: Reals
 
 
-class Known(NamedTuple):
-    """What is known after some samples: their numbers (m,), and the values (m, ...)."""
-
-    samples: NDArray[np.int64]
-    values: Reals
-
-    def since(self, first: int) -> 'Known':
-        """Return what is known from a sample on."""
-        kept = self.samples >= first
-        return Known(self.samples[kept] - first, self.values[kept])
-
-
-UNKNOWN = Known(np.empty(0, dtype=np.int64), np.empty(0))
-
-
-class Said(NamedTuple):
-    """
-    What a filter said.
-
-    estimates : q(world <- sensor) (n, 4), of norm 1
-    covariances, biases : of (3, 3) [rad^2] and (3,) [rad/s]
-    """
-
-    estimates: Reals
-    covariances: Known
-    biases: Known
-
-
+# Attitudes, covariances and biases as in `Outcome`.
+Output = tuple[Reals, Reals, Reals]
 # Feeds a new filter.
-Feed = Callable[[MakeFilter, Readings], Said]
+Feed = Callable[[MakeFilter, Readings], Output]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a filter said along a motion, as `Said` has it."""
+    """
+    Output of a filter along a motion.
+
+    estimates : unit quaternions q(world <- sensor) (n, 4)
+    covariances, biases : (n, 3, 3) [rad^2] and (n, 3) [rad/s], NaN where unknown
+    """
 
     run: Truth
     estimates: Reals
-    covariances: Known
-    biases: Known
+    covariances: Reals
+    biases: Reals
 
     @property
     def errors(self) -> Errors:
@@ -127,52 +106,51 @@ class Outcome:
         return errors_of(self.estimates, self.run.truth)
 
     def last(self, fraction: float = 0.5) -> 'Outcome':
-        """Return the last part of the outcome, by default where the filter has settled."""
+        """Return the last part; by default the second half, in which the filter has settled."""
         return self.since(round(len(self.estimates) * (1.0 - fraction)))
 
     def since(self, first: int) -> 'Outcome':
-        """Return the outcome from a sample on."""
-        return replace(self, run=self.run.part(slice(first, None)),
-                       estimates=self.estimates[first:],
-                       covariances=self.covariances.since(first), biases=self.biases.since(first))
+        """Return the part from a sample on."""
+        return Outcome(self.run.part(slice(first, None)), self.estimates[first:],
+                       self.covariances[first:], self.biases[first:])
 
 
 def same(estimates: Reals) -> Reals:
-    """Return what is given."""
+    """Return the argument."""
     return estimates
 
 
 def feed(make_filter: MakeFilter, readings: Readings,
-         tell: Callable[[int], object] = lambda number: None) -> Said:
+         tell: Callable[[int], object] = lambda number: None) -> Output:
     """
-    Feed a new filter.
+    Return the output of a new filter.
 
     tell : is called before each update with its number, from 1 on
 
-    Raises InvalidOutputError for a filter that raises, returns no unit quaternion or is too slow.
+    Raises InvalidOutputError if the filter raises, returns no unit quaternion, or is too slow.
     """
-    k = 0
-    said: list[Reals] = []
-    covariances: dict[int, Reals] = {}
-    biases: dict[int, Reals] = {}
-    # The filter may keep or change what it gets.
+    k, n = 0, len(readings.dt)
+    attitudes = np.empty((n, 4))
+    covariances, biases = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan)
+    # Copies, because the filter may keep or change its arguments.
     gyroscope, accelerometer = readings.gyroscope.copy(), readings.accelerometer.copy()
-    fields = ([None] * len(gyroscope) if readings.magnetometer is None else
+    fields = ([None] * n if readings.magnetometer is None else
               readings.magnetometer.copy())
     try:
         filter_ = make_filter()
-        update = filter_.update
         allowed = START_S + getattr(filter_, 'slowest', SLOWEST) * np.cumsum(readings.dt)
         begin = _working_time()
         for k, (rate, force, field, dt) in enumerate(zip(
                 gyroscope, accelerometer, fields, readings.dt.tolist(), strict=True), start=1):
             tell(k)
-            said.append(_numbers(f'update {k} returns', update(rate, force, field, dt), (4,),
-                                 '4 numbers x, y, z, w'))
+            attitudes[k - 1] = _numbers(f'update {k} returns', filter_.update(
+                rate, force, field, dt), (4,), '4 numbers x, y, z, w')
             if k % READ_EVERY == 0:
-                _check_speed(_working_time() - begin, allowed[k - 1], update_of(k, readings))
-                if (covariance := _covariance_of(filter_)) is not None:
-                    covariances[k - 1] = covariance
+                if (spent := _working_time() - begin) > allowed[k - 1]:
+                    raise InvalidOutputError(
+                        f'too slow: {update_of(k, readings)} ends after {spent:.3g} s, and must '
+                        f'within {allowed[k - 1]:.3g} s')
+                covariances[k - 1] = _covariance_of(filter_)
                 if (bias := getattr(filter_, 'bias', None)) is not None:
                     biases[k - 1] = _finite('bias', bias, (3,))
     except (InvalidOutputError, NodeError):
@@ -180,48 +158,45 @@ def feed(make_filter: MakeFilter, readings: Readings,
     except (Exception, SystemExit) as error:
         raise InvalidOutputError(f'{update_of(k, readings)} raises '
                                  f'{type(error).__name__}: {one_line(error)}') from error
-    return Said(_quaternions(np.array(said)), _known(covariances), _known(biases))
+    return _quaternions(attitudes), covariances, biases
 
 
-def update_of(number: int, readings: Readings) -> str:
-    """Return in words which update it is, from 1 on; 0: the filter is not made yet."""
-    return f'update {number} of {len(readings.dt)}' if number else 'making the filter'
-
-
-def follow(make_filter: MakeFilter, run: Run, given: Input | None = None, read: Output = same,
-           magnetometer: bool = True, feed: Feed = feed) -> Outcome:
+def follow(make_filter: MakeFilter, run: Run, changes: Iterable[ChangeReadings] = (),
+           read: ChangeAttitudes = same, magnetometer: bool = True,
+           feed: Feed = feed) -> Outcome:
     """
-    Feed a new filter with a run.
+    Return the outcome of a run that is fed to a new filter.
 
-    given, read : how the readings are changed before the filter gets them, and its attitudes after
-    magnetometer : False gives None
+    changes : are applied in turn to the readings before the filter gets them
+    read : is applied to the attitudes that the filter returns
+    magnetometer : False feeds None instead of the field
 
     Raises InvalidOutputError as `feed` does.
     """
     gyroscope, accelerometer = run.gyroscope, run.accelerometer
-    if given is not None:
-        gyroscope, accelerometer = given(gyroscope, accelerometer, run.dt)
-    said = feed(make_filter, Readings(gyroscope, accelerometer,
-                                      run.magnetometer if magnetometer else None, run.dt))
-    return Outcome(run, read(said.estimates), said.covariances, said.biases)
+    for change in changes:
+        gyroscope, accelerometer = change(gyroscope, accelerometer, run.dt)
+    field = run.magnetometer if magnetometer else None
+    estimates, covariances, biases = feed(
+        make_filter, Readings(gyroscope, accelerometer, field, run.dt))
+    return Outcome(run, read(estimates), covariances, biases)
+
+
+def update_of(number: int, readings: Readings) -> str:
+    """Return which update this is, in words; update 0 is the making of the filter."""
+    return f'update {number} of {len(readings.dt)}' if number else 'making the filter'
 
 
 def _working_time() -> float:
-    """Return a time [s] that stands still while this thread waits for a processor."""
+    """Return a time [s] that does not count while this thread waits for a processor."""
     waited_ns = 0
-    with contextlib.suppress(OSError):      # there on Linux only
+    with contextlib.suppress(OSError):      # the file exists on Linux only
         waited_ns = int(WAITING.read_text(encoding='ascii').split()[1])
     return time.perf_counter() - 1e-9 * waited_ns
 
 
-def _check_speed(spent: float, allowed: float, where: str) -> None:
-    if spent > allowed:
-        raise InvalidOutputError(f'too slow: {where} ends after {spent:.3g} s, and must within '
-                                 f'{allowed:.3g} s')
-
-
 def _quaternions(rows: Reals) -> Reals:
-    """Return what was said (n, 4) as unit quaternions.  Raises InvalidOutputError."""
+    """Return the output of a filter (n, 4) as unit quaternions.  Raises InvalidOutputError."""
     if len(bad := no_attitudes(rows)):
         k = int(bad[0])
         what = (f'its norm is {math.hypot(*rows[k]):.6g}' if np.all(np.isfinite(rows[k])) else
@@ -233,20 +208,20 @@ def _quaternions(rows: Reals) -> Reals:
 
 
 def no_attitudes(quaternions: Reals) -> NDArray[np.intp]:
-    """Return the numbers of those (n, 4) whose norm is not 1."""
+    """Return the indices of the rows (n, 4) whose norm is not 1."""
     with np.errstate(over='ignore'):
         norms = np.linalg.norm(quaternions, axis=1)
     return np.flatnonzero(~(np.abs(norms - 1.0) <= NORM_TOLERANCE))
 
 
-def _covariance_of(filter_: Filter) -> Reals | None:
-    """Return the covariance that a filter has, None: unknown.  Raises InvalidOutputError."""
+def _covariance_of(filter_: Filter) -> Reals | float:
+    """Return the covariance of a filter, NaN if unknown.  Raises InvalidOutputError."""
     value = getattr(filter_, 'covariance', None)
     if value is None:
-        return None
+        return math.nan
     covariance = _finite('covariance', value, (3, 3))
-    if not np.any(covariance):      # as messages of ROS have it
-        return None
+    if not np.any(covariance):      # ROS messages mark an unknown covariance by zeros
+        return math.nan
     if is_indefinite(covariance):
         raise InvalidOutputError(f'covariance is {_short(covariance.tolist())}: must have no '
                                  'negative eigenvalue')
@@ -254,16 +229,16 @@ def _covariance_of(filter_: Filter) -> Reals | None:
 
 
 def is_indefinite(covariances: Reals) -> NDArray[np.bool_]:
-    """Return which of the covariances (..., 3, 3), finite, have a negative eigenvalue (...)."""
+    """Return which of the finite matrices (..., 3, 3) have a negative eigenvalue (...)."""
     largest = np.maximum(np.max(np.abs(covariances), axis=(-1, -2), keepdims=True), 1e-300)
-    scaled = covariances / largest      # else the largest doubles overflow
+    scaled = covariances / largest      # so that no sum overflows
     eigenvalues = np.linalg.eigvalsh(0.5 * (scaled + np.swapaxes(scaled, -1, -2)))
     indefinite: NDArray[np.bool_] = eigenvalues[..., 0] < -1e-9
     return indefinite
 
 
 def _finite(name: str, value: object, shape: tuple[int, ...]) -> Reals:
-    """Return a copy of what a filter says of itself.  Raises InvalidOutputError."""
+    """Return a copy of an attribute of the filter.  Raises InvalidOutputError."""
     allowed = f'{" x ".join(map(str, shape))} finite numbers'
     numbers = _numbers(f'{name} is', value, shape, allowed)
     if not np.all(np.isfinite(numbers)):
@@ -272,11 +247,7 @@ def _finite(name: str, value: object, shape: tuple[int, ...]) -> Reals:
 
 
 def _numbers(what: str, value: object, shape: tuple[int, ...], allowed: str) -> Reals:
-    """
-    Return a copy of what a filter says, which may change it later.
-
-    Raises InvalidOutputError for another shape.
-    """
+    """Return a copy of a value, which the filter may change later.  Raises InvalidOutputError."""
     try:
         numbers = np.array(value, dtype=float)
     except (TypeError, ValueError):
@@ -287,12 +258,8 @@ def _numbers(what: str, value: object, shape: tuple[int, ...], allowed: str) -> 
     return numbers
 
 
-def _known(values: dict[int, Reals]) -> Known:
-    return Known(np.array([*values]), np.array([*values.values()])) if values else UNKNOWN
-
-
 def one_line(value: object) -> str:
-    """Return what a filter says, or its name, as one printable line."""
+    """Return the text of a value as one printable line."""
     return printable(' '.join(str(value).split()))
 
 

@@ -85,9 +85,9 @@ def _show_logs(arguments: argparse.Namespace) -> int:
 
 def _open_page(arguments: argparse.Namespace, title: str) -> Page:
     """
-    Return the page, shown by the browser if there is one, and say where it is.
+    Return the page; print its address, and open it in the browser if there is a desktop.
 
-    Raises ValueError for a wrong port, OSError where there cannot be a page.
+    Raises ValueError for a wrong port, and OSError if the server cannot start.
     """
     if arguments.port is not None and not 0 <= arguments.port <= LAST_PORT:
         raise ValueError(f'--port {arguments.port}: must be from 0 to {LAST_PORT}')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the live page can tell a sim_node: sliders and buttons, and its answers in words."""
+"""The controls of the live page: sliders and buttons for a sim_node, and its answers."""
 
 import math
 import threading
@@ -14,12 +14,12 @@ from spinning_top_sim.view.page import Page, set_value
 
 TIME_SCALES = ('0.1', '0.25', '0.5', '1', '2', '5', '10')
 STEPS = 1000                    # of a slider
-LEFT_ALONE_S = 1.0              # a slider that nobody has moved for so long follows the node
+LEFT_ALONE_S = 1.0              # after that a slider follows the node again
 NO_SCENE = '(as it was started)'
 
 
 class Commands(Protocol):
-    """What can be asked of a node; each returns what is said then, or raises with the reason."""
+    """Requests to a node; each returns the message to show, or raises with the reason."""
 
     def call(self, name: str, *on: bool) -> str: ...
     def set_parameters_together(self, values: Mapping[str, Any]) -> str: ...
@@ -29,16 +29,16 @@ class Commands(Protocol):
 
 
 class Controls:
-    """The controls.  Their callbacks run in threads of viser, one of them at a time acts."""
+    """The controls.  Their callbacks run in threads of viser; only one at a time acts."""
 
     def __init__(self, page: Page, node: Commands, scenes: Sequence[str]) -> None:
         self._page, self._node = page, node
         self._lock = threading.Lock()
         self._paused = False
-        self._spin: list[float] | None = None                   # L3 and Lz of the node
-        self._wanted: dict[int, float] = {}                     # of them, by sliders not sent yet
-        self._moved_at = 0.0                                    # on the monotonic clock
-        self._shown = [math.nan, math.nan]                      # on the sliders
+        self._spin: list[float] | None = None       # L3 and Lz of the node
+        self._wanted: dict[int, float] = {}         # values of moved sliders, not sent yet
+        self._moved_at = 0.0                        # time of the last move, monotonic clock
+        self._shown = [math.nan, math.nan]          # values on the sliders
         gui = page.gui
         with page.controls:
             self._status = gui.add_markdown('*waiting for sim_node*')
@@ -63,7 +63,7 @@ class Controls:
                         if scene.value != NO_SCENE else '')
 
     def _act(self, action: Callable[[], str]) -> None:
-        """Do something, and say what was done, or why not."""
+        """Act, and show the message or the reason of the refusal."""
         with self._lock:
             try:
                 self._page.message.content = action()
@@ -71,7 +71,7 @@ class Controls:
                 self._page.message.content = f'**refused:** {error}'
 
     def _on_change(self, handle: viser.GuiInputHandle[Any], action: Callable[[], str]) -> None:
-        """Act where somebody in a browser has changed an input."""
+        """Act when somebody in a browser has changed an input."""
         @handle.on_update
         def _(event: viser.GuiEvent[Any]) -> None:
             if event.client is not None:
@@ -82,7 +82,7 @@ class Controls:
             if event.client is not None:
                 self._moved_at = time.monotonic()
                 self._wanted[number] = float(self._sliders[number].value)
-                # While one waits for its answer, a slider moves on: then its newest place counts.
+                # A slider may move while a request waits: then only its newest value is sent.
                 self._act_on_sliders()
         return _moved
 
@@ -97,7 +97,7 @@ class Controls:
         try:
             said = self._node.command(l3, lz)
         except Exception:
-            self._leave_sliders()           # they go back
+            self._leave_sliders()           # show the spin of the node again
             if self._spin is not None:
                 self.show_spin(*self._spin)
             raise
@@ -121,8 +121,8 @@ class Controls:
         self._pause.label = 'Resume' if paused else 'Pause'
 
     def set_range(self, top: Top, l3: float, lz: float) -> None:
-        """Let the sliders reach twice as far as what this top has, and what it may need."""
-        usual = 2.0 * math.sqrt(top.lambda1 * abs(top.gravity_torque))      # where a top wakes up
+        """Set the range of the sliders to twice the greater of the present and the usual spin."""
+        usual = 2.0 * math.sqrt(top.lambda1 * abs(top.gravity_torque))      # least spin to sleep
         reach = 2.0 * (max(abs(l3), abs(lz), usual) or 1.0)
         digits = 1 - math.floor(math.log10(reach))
         reach = math.ceil(reach * 10.0 ** digits) / 10.0 ** digits
@@ -132,15 +132,15 @@ class Controls:
         self.show_spin(l3, lz)
 
     def _leave_sliders(self) -> None:
-        """Let the next `show_spin` set the sliders in any case."""
+        """Make the next `show_spin` set the sliders in any case."""
         self._moved_at, self._shown = 0.0, [math.nan, math.nan]
 
     def show_spin(self, l3: float, lz: float) -> None:
-        """Let the sliders show the spin of the node, unless somebody moves them."""
+        """Show the spin of the node on the sliders, unless somebody is moving them."""
         self._spin = [l3, lz]
         if time.monotonic() - self._moved_at > LEFT_ALONE_S:
             for k, (slider, value) in enumerate(zip(self._sliders, self._spin, strict=True)):
-                # A place that is set again would undo a move whose callback is still to come.
+                # Setting an unchanged value would undo a move whose callback has not come yet.
                 if not abs(value - self._shown[k]) < 0.5 * slider.step:
                     set_value(slider, min(max(value, slider.min), slider.max))
                     self._shown[k] = value
@@ -154,7 +154,7 @@ class Controls:
         self._spin = [values['spin.l3'], values['spin.lz']]
 
     def tell_status(self, message: str, numbers: Mapping[str, str]) -> None:
-        """Show what /diagnostics says."""
+        """Show the content of /diagnostics."""
         recorder, path = numbers['recorder'], numbers.get('recorded file', '')
         self._status.content = ' · '.join(filter(None, (
             message, f't = {float(numbers["simulated time [s]"]):.1f} s',
@@ -166,7 +166,7 @@ class Controls:
             set_value(self._record, recorder == 'recording')
 
     def tell_end(self, reason: str) -> None:
-        """Say why no samples come; a later `tell_status` takes its place."""
+        """Show why no samples come, until the next `tell_status`."""
         text = f'**{reason}**'
         if self._status.content != text:
             self._status.content = text

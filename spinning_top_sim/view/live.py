@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a running sim_node: a node that listens to it, and asks as any ROS client does."""
+"""The page of a running sim_node: a node that subscribes to it, and calls its services."""
 
 import math
 import struct
@@ -36,19 +36,19 @@ from spinning_top_sim.view.controls import Controls
 from spinning_top_sim.view.page import CATCH_UP_S, RATE, WINDOW_NS, Page
 from spinning_top_sim.view.track import (
     ENERGY_DRIFT,
-    LATEST_NS,
     ORIENTATION_ERROR,
     WIDTHS,
-    Columns,
+    Samples,
     Track,
+    empty,
 )
 
-# The newest of few: a page that is slow or hangs never makes the node wait.
+# Best effort and a short queue, so that a slow page never makes the node wait.
 QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 INBOX = 2000                    # messages that wait for the next picture
-ANSWER_S = 5.0                  # a service that takes longer does not answer
-SILENT_S = 5.0                  # /diagnostics come every second
-RESTART_NS = NANOSECONDS        # stamps that go back by more are those of another run
+ANSWER_S = 5.0                  # timeout of a service call
+SILENT_S = 5.0                  # timeout of /diagnostics, which come every second
+RESTART_NS = NANOSECONDS        # a step back of the stamps by more is another run
 KEPT_NS = 2 * max(WINDOW_NS, model.TRACE_NS)
 OF_THE_START = [parameter.name for parameter in parameters.TABLE
                 if parameter.effect is parameters.Effect.RESET]
@@ -57,15 +57,15 @@ KIND_OF = {'pose': PoseStamped, 'joint_states': JointState, 'ground_truth/odom':
 
 
 class RefusedError(Exception):
-    """The sim_node refuses, or does not answer; the text is its reason."""
+    """The sim_node refuses or does not answer; the text is the reason."""
 
 
 class LiveView(Node):
     """
-    The node `view`, with the names of the sim_node in the same namespace.
+    The node `view`, for the sim_node of the same namespace.
 
-    The executor's thread takes messages and answers, the page's thread draws, and those of the
-    page's controls wait for answers.
+    The thread of the executor takes messages and answers, the thread of the page draws, and the
+    threads of the page's controls wait for answers.
     """
 
     def __init__(self, page: Page) -> None:
@@ -85,13 +85,13 @@ class LiveView(Node):
                 ('set_parameters_atomically', SetParametersAtomically), ('set_pause', SetBool),
                 ('record', SetBool), ('step', Trigger), ('reset', Trigger))}
         self._track: Track | None = None
-        self._stale = True                      # the parameters have to be read again
-        # Whether those of the start are those of the motion: until a reset they may be later.
+        self._stale = True              # the parameters have to be read again
+        # Parameters that take effect at a reset are those of the motion only after a reset.
         self._motion_is_new = True
-        self._origin_ns: int | None = None      # stamp of t = 0; unknown in the first second
-        self._errors: tuple[float, float] | None = None         # not drawn yet
+        self._origin_ns: int | None = None      # stamp of t = 0; unknown before /diagnostics
+        self._errors: tuple[float, float] | None = None         # from /diagnostics, not drawn yet
         self._heard_at = math.inf       # when /diagnostics came last, on the monotonic clock
-        self._gone = False                      # whether the page says that the node has ended
+        self._gone = False              # whether the page says that the node has ended
         self._stopped = False
         self._controls = Controls(page, self, sorted(scene_files()))
         self._thread = threading.Thread(target=self._draw, name='page', daemon=True)
@@ -107,18 +107,14 @@ class LiveView(Node):
         self._page.close()
 
     def _listen(self, topic: str) -> None:
-        def _receive(data: Any) -> None:         # serialized: `raw`
+        def _receive(data: Any) -> None:        # serialized, because of `raw`
             self._inbox.append((topic, data))
             self._arrived.set()
         self._listeners[topic] = self.create_subscription(
             KIND_OF[topic], throttle.TOPICS.get(topic, topic), _receive, QOS, raw=True)
 
     def _listen_as_needed(self) -> None:
-        """
-        Listen to as little as is shown: each message costs the node some time.
-
-        Where it throttles a topic, these are few.
-        """
+        """Subscribe to the topics that are shown only: each message costs the node some time."""
         if self._track is None:
             return
         needed = {'pose', 'joint_states'}
@@ -144,17 +140,14 @@ class LiveView(Node):
                 self._errors = float(numbers['energy drift']), float(
                     numbers['orientation error [rad]'])
 
-    def _expect_new_motion(self) -> None:
-        self._motion_is_new = self._stale = True
-
-    def _is_heard(self) -> bool:
-        """Whether there is still a sim_node, as far as that is known."""
-        return (self._services_of_sim['get_parameters'].service_is_ready()
-                and time.monotonic() < self._heard_at + SILENT_S)
-
     def _on_parameters(self, event: ParameterEvent) -> None:
         if event.node == self._sim:
             self._stale = True
+
+    def _expect_new_motion(self) -> None:
+        self._motion_is_new = self._stale = True
+
+    # The thread of the page.
 
     def _draw(self) -> None:
         due = time.monotonic()
@@ -167,18 +160,37 @@ class LiveView(Node):
                     return
                 self.get_logger().error(traceback.format_exc(), throttle_duration_sec=5.0)
             time.sleep(max(due - time.monotonic(), 0.0))
-            # Messages as frequent as pictures: at fixed times, some pictures would have none.
+            # If messages are as frequent as pictures, some pictures would have no new message.
             self._arrived.wait(1.0 / RATE)
 
     def _draw_once(self) -> None:
-        if self._stale and self._services_of_sim['get_parameters'].service_is_ready():
+        ready = self._services_of_sim['get_parameters'].service_is_ready()
+        if self._stale and ready:
             self._read_parameters()
-        track = self._track
-        if track is None:
+        if self._track is None:
             return
-        self._gone = not self._is_heard()
+        self._gone = not ready or time.monotonic() > self._heard_at + SILENT_S
         if self._gone:
             self._controls.tell_end(f'{self._sim} has ended, or does not answer')
+        self._take_messages()
+        track = self._track
+        if not len(track.attitudes.rows):
+            return
+        newest_ns = track.span[1]
+        if self._errors is not None:
+            row = np.full((1, WIDTHS['~/invariants']), math.nan)
+            row[0, [ENERGY_DRIFT, ORIENTATION_ERROR]] = self._errors
+            track.add('~/invariants', Samples(np.array([newest_ns]), row))
+            self._errors = None
+        track.forget(newest_ns - KEPT_NS)
+        track.follow()
+        if track.motions:
+            self._controls.show_spin(track.motions[-1].l3, track.motions[-1].lz)
+        self._page.draw(newest_ns, self._origin_ns or newest_ns)
+
+    def _take_messages(self) -> None:
+        """Add the messages of the inbox to the track."""
+        assert self._track is not None
         arrived = defaultdict(list)
         self._arrived.clear()
         while self._inbox:
@@ -186,29 +198,15 @@ class LiveView(Node):
             arrived[topic].append(data)
         for topic, messages in arrived.items():
             stamps_ns = [_stamp_ns(data) for data in messages]
-            newest = track.columns[topic].at(LATEST_NS)
-            if newest is not None and stamps_ns[-1] < newest[0] - RESTART_NS:
+            known_ns = self._track.samples[topic].stamps_ns
+            if len(known_ns) and stamps_ns[-1] < known_ns[-1] - RESTART_NS:
                 # The sim_node was started again; its t = 0 is not known yet.
-                track, self._origin_ns = self._begin_track(track.values), None
+                self._begin_track(self._track.values)
+                self._origin_ns = None
                 self._expect_new_motion()
-            track.add(topic, stamps_ns, messages)
-        for topic, width in WIDTHS.items():         # else old samples would stay the best ones
-            if topic != '~/invariants' and topic not in self._listeners and len(
-                    track.columns[topic].stamps_ns):
-                track.columns[topic] = Columns(width)
-        if track.span is None:
-            return
-        newest_ns = track.span[1]
-        errors, self._errors = self._errors, None
-        if errors is not None:
-            row = np.full((1, WIDTHS['~/invariants']), math.nan)
-            row[0, [ENERGY_DRIFT, ORIENTATION_ERROR]] = errors
-            track.columns['~/invariants'].append(np.array([newest_ns]), row)
-        track.forget(newest_ns - KEPT_NS)
-        track.follow()
-        if track.motions:
-            self._controls.show_spin(track.motions[-1].l3, track.motions[-1].lz)
-        self._page.draw([newest_ns], self._origin_ns or newest_ns)
+            self._track.add(topic, self._track.decode(topic, stamps_ns, messages))
+        for topic in KIND_OF.keys() - self._listeners.keys():   # these get old
+            self._track.samples[topic] = empty(topic)
 
     def _read_parameters(self) -> None:
         """Read the parameters of the sim_node, and begin a new track if it is another top."""
@@ -221,7 +219,7 @@ class LiveView(Node):
             self._stale, self._motion_is_new = True, motion_is_new
             return
         shown = list(map(parameter_value_to_python, answer.values))
-        # The present spin need not be one to start with.
+        # The present spin is not checked: it need not be possible at the start.
         values = {**parameters.checked(dict(zip(names, shown, strict=False))),
                   **dict(zip(SPIN, shown[-len(SPIN):], strict=True))}
         self._controls.show_values(values)
@@ -232,17 +230,16 @@ class LiveView(Node):
         else:
             self._track.values = values
 
-    def _begin_track(self, values: Mapping[str, Any]) -> Track:
-        """Show what comes from now on instead of what has come."""
+    def _begin_track(self, values: Mapping[str, Any]) -> None:
+        """Drop all samples, and draw the top with these parameters."""
         self._track = Track('', values)
         self._page.set_tracks([self._track])
         self._controls.set_range(self._track.top, *(values[name] for name in SPIN))
-        return self._track
 
     # Called by the page's controls, in threads of their own.
 
     def _ask(self, name: str, request: object) -> Any:
-        """Return the answer of a service.  Raises RefusedError where there is none."""
+        """Return the answer of a service.  Raises RefusedError if there is none."""
         client: Client = self._services_of_sim[name]
         if not client.service_is_ready():
             raise RefusedError(f'there is no {self._sim}')
@@ -257,7 +254,7 @@ class LiveView(Node):
         return future.result()
 
     def call(self, name: str, *on: bool) -> str:
-        """Call a service of the sim_node; return what it says.  Raises RefusedError."""
+        """Call a service of the sim_node; return its message.  Raises RefusedError."""
         request = SetBool.Request(data=on[0]) if on else Trigger.Request()
         answer = self._ask(name, request)
         if not answer.success:
@@ -267,7 +264,7 @@ class LiveView(Node):
         return f'{name.removeprefix("set_")}: {answer.message}'
 
     def set_parameters_together(self, values: Mapping[str, Any]) -> str:
-        """Set parameters of the sim_node, all or none.  Raises RefusedError."""
+        """Set parameters of the sim_node, all or none; return them.  Raises RefusedError."""
         result = self._ask('set_parameters_atomically', SetParametersAtomically.Request(
             parameters=[Parameter(name, value=list(value) if isinstance(value, tuple) else value
                                   ).to_parameter_msg() for name, value in values.items()])).result
@@ -277,26 +274,25 @@ class LiveView(Node):
                          f'{name} = {value}' for name, value in values.items())
 
     def command(self, l3: float, lz: float) -> str:
-        """Let L3 and Lz jump [kg m^2/s].  Raises RefusedError."""
+        """Set L3 and Lz [kg m^2/s].  Raises RefusedError."""
         return self.set_parameters_together(dict(zip(SPIN, (l3, lz), strict=True)))
 
     def height(self) -> float | None:
-        """Return cos(theta) of the newest attitude."""
-        sample = self._track and self._track.attitudes.at(LATEST_NS)
-        if not sample:
+        """Return cos(theta) of the newest attitude, None without samples."""
+        if self._track is None or not len(self._track.attitudes.rows):
             return None
-        x, y, z, w = sample[1][:4].tolist()
+        x, y, z, w = self._track.attitudes.rows[-1][:4].tolist()
         return float(w * w + z * z - (x * x + y * y))
 
     def load_scene(self, name: str) -> str:
-        """Start again with a scene; return what it could not change.  Raises RefusedError."""
+        """Restart with a scene; return what it could not change.  Raises RefusedError."""
         try:
             world = World.read(name)
             values = world.values({})
             start = parameters.start_state(values)
         except (OSError, ValueError) as error:
             raise RefusedError(str(error)) from error
-        # Together with `initial.*`, the spin is that of the next start.
+        # Set together with `initial.*`, the spin is that of the next start.
         self.set_parameters_together({
             **{key: value for key, value in values.items()
                if key in world.given or key.startswith(OF_A_WORLD)},
@@ -307,7 +303,7 @@ class LiveView(Node):
 
 
 def _drawn(values: Mapping[str, Any]) -> list[Any]:
-    """Return what a track depends on."""
+    """Return the parameters on which the drawing depends."""
     return [value for name, value in values.items()
             if name.startswith('top.') or name in (
                 'world_frame', 'body_frame', 'imu.frame_id', 'imu.rpy', 'imu.lever_arm')]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The server of the page: on which port, and which pages of a browser may talk to it."""
+"""The server of the page: its port, and the web pages that may talk to it."""
 
 import contextlib
 import errno
@@ -22,11 +22,11 @@ PORTS = 100                     # tried in turn
 
 class Server(viser.ViserServer):
     """
-    Serves to who has the address, and to nobody else.
+    Serves this page, and refuses requests that come from the pages of other sites.
 
-    A browser sends the pages of any site to any address.  So a request is refused whose `Origin`
-    is another site, or whose `Host` is a name that is not this machine's: another site can let
-    its own name stand for this address.  Raises OSError if the port cannot be used.
+    A request is refused if its `Origin` is another site, or if its `Host` is not a name of this
+    machine: another site can let its own name stand for this address (DNS rebinding).  Raises
+    OSError if the port cannot be used.
     """
 
     def __init__(self, host: str, port: int | None) -> None:
@@ -34,10 +34,10 @@ class Server(viser.ViserServer):
             super().__init__(host=host, port=_free_port(host, port), verbose=False)
 
     def request_share_url(self, verbose: bool = True) -> None:
-        """Refuse: viser would ask a server in the internet to pass the page on."""
+        """Do nothing: viser would share the page by a public server."""
 
     def stop(self) -> None:
-        """Stop, without a word on the terminal."""
+        """Stop, and print nothing."""
         with contextlib.redirect_stdout(io.StringIO()):
             super().stop()
 
@@ -56,7 +56,7 @@ def _free_port(host: str, port: int | None, first: int = 8080) -> int:
 
 
 def _names(host: str) -> set[str]:
-    """Return the names by which a browser may ask for the page, besides addresses."""
+    """Return the names of this machine that a request may contain."""
     own = socket.gethostname()
     return {name.lower() for name in (host, 'localhost', own, f'{own}.local', socket.getfqdn())}
 
@@ -65,39 +65,31 @@ def refusal(asked: str | None, origin: str | None, names: set[str]) -> str:
     """
     Return why a request is refused; '' if it is not.
 
-    asked : the header `Host`;  origin : the header `Origin`, None where no browser asks
-    names : allowed, besides addresses
+    asked : the header `Host`;  origin : the header `Origin`, None if no browser asks
+    names : the names that are allowed; addresses always are
     """
-    if asked and not _is_address(asked) and _hostname(asked) not in names:
+    if asked and not _is_own(asked, names):
         return f'Host: {asked}: must be an address or one of {", ".join(sorted(names))}'
     if origin is not None and origin.partition('://')[2].lower() != (asked or '').lower():
         return f'Origin: {origin}: must be the address of this page, {asked}'
     return ''
 
 
-def _hostname(asked: str) -> str:
-    """Return the host without the port; '' where there is none."""
-    try:
-        return urllib.parse.urlsplit(f'//{asked}').hostname or ''
-    except ValueError:          # as a bracket that does not close
-        return ''
-
-
-def _is_address(asked: str) -> bool:
-    try:
-        ipaddress.ip_address(_hostname(asked))
-    except ValueError:
-        return False
-    return True
+def _is_own(asked: str, names: set[str]) -> bool:
+    host = ''
+    with contextlib.suppress(ValueError):       # malformed, or no address
+        host = urllib.parse.urlsplit(f'//{asked}').hostname or ''
+        ipaddress.ip_address(host)
+        return True
+    return host in names
 
 
 @contextlib.contextmanager
 def _guarded(names: set[str]) -> Iterator[None]:
     """
-    Let what is served within refuse the requests of other sites.
+    Make the servers that are started in this context refuse requests of other sites.
 
-    viser passes `websockets` no `origins`, which could not look at `Host` either; so this puts a
-    question before the one that viser answers requests with.
+    viser has no option for it, so this wraps the function by which viser answers requests.
     """
     serve = websockets.asyncio.server.serve
 

@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The exam of logs: attitudes of other nodes beside the truth."""
+
+import json
+import math
+import struct
+from functools import partial
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from helpers.reference import ROOT
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim.exam.command import main
+from spinning_top_sim.exam.diagnosis import FAULTS
+from spinning_top_sim.exam.log import examine_log
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.rosbag2 import RecordedTopic
+from spinning_top_sim.recording.writer import create_file
+from spinning_top_sim.streams import messages
+from spinning_top_sim.tools.simulate import main as simulate
+
+IMU, QUATERNION, POSE, POSE_COVARIANCE, ODOMETRY = TYPES = (
+    'sensor_msgs/msg/Imu', 'geometry_msgs/msg/QuaternionStamped', 'geometry_msgs/msg/PoseStamped',
+    'geometry_msgs/msg/PoseWithCovarianceStamped', 'nav_msgs/msg/Odometry')
+HALF = 0.5 ** 0.5
+
+
+def write(path, topics, rows, metadata=None):
+    """Write a log of rows (topic's index, stamp [ns], data)."""
+    file = create_file(path, [RecordedTopic(*topic) for topic in topics], metadata or {},
+                       compression='none')
+    for row in rows:
+        file.append(*row)
+    file.write_chunk()
+    file.finish()
+    return path
+
+
+def simulated(path, *options):
+    assert simulate(['--quiet', '-o', str(path), '--duration', '10', '-p',
+                     'imu_data.enabled:=true', '--params', str(ROOT / 'config/wavy.yaml'),
+                     *options]) == 0
+    return path
+
+
+@pytest.fixture(scope='module')
+def log(tmp_path_factory):
+    return simulated(tmp_path_factory.mktemp('log') / 'run.mcap',
+                     '-p', 'imu.rpy:=[0.3, -0.2, 1.0]')
+
+
+@pytest.fixture(scope='module')
+def beside(log, tmp_path_factory):
+    """Return what writes attitudes of a sensor beside its truth, as messages of another writer."""
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with LogReader(log) as reader:
+        truth = [(0, message.log_time, message.data)
+                 for message in reader.messages(['/ground_truth/imu'])]
+    q = [store.deserialize_cdr(data, IMU).orientation for _, _, data in truth]
+    quaternions = np.array([(one.x, one.y, one.z, one.w) for one in q])
+
+    def made(type_name, *values):
+        return store.types[type_name](*values)
+
+    def filled(type_name, header, quaternion, variance):
+        q = made('geometry_msgs/msg/Quaternion', *quaternion)
+        zero = made('geometry_msgs/msg/Vector3', 1.0, 2.0, 3.0)
+        pose = made('geometry_msgs/msg/Pose', made('geometry_msgs/msg/Point', 1.0, 2.0, 3.0), q)
+        matrix = np.diag([-1.0, 9.0, 9.0] + [variance] * 3).ravel()     # position unknown
+        with_covariance = made('geometry_msgs/msg/PoseWithCovariance', pose, matrix)
+        twist = made('geometry_msgs/msg/TwistWithCovariance',
+                     made('geometry_msgs/msg/Twist', zero, zero), np.zeros(36))
+        return made(type_name, header, *{
+            IMU: (q, (variance * np.eye(3)).ravel(), zero, np.zeros(9), zero, np.zeros(9)),
+            QUATERNION: (q,), POSE: (pose,), POSE_COVARIANCE: (with_covariance,),
+            ODOMETRY: ('sensor', with_covariance, twist)}[type_name])
+
+    def write_beside(said, type_name=IMU, variance=0.0, delay_ns=0):
+        rows = []
+        for (_, stamp_ns, _), one in zip(truth, said(quaternions), strict=True):
+            stamp = made('builtin_interfaces/msg/Time', *divmod(stamp_ns + delay_ns, 10 ** 9))
+            header = made('std_msgs/msg/Header', stamp, 'a frame')
+            rows.append((1, stamp_ns, bytes(store.serialize_cdr(
+                filled(type_name, header, one, variance), type_name))))
+        return write(tmp_path_factory.mktemp('beside') / 'run.mcap',
+                     (('/ground_truth/imu', IMU), ('/estimate', type_name)), truth + rows)
+    return write_beside
+
+
+def disturbed(quaternions, deviation=0.01):
+    noise = deviation * np.random.default_rng(5).standard_normal((len(quaternions), 3))
+    return (Rotation.from_quat(quaternions) * Rotation.from_rotvec(noise)).as_quat()
+
+
+@pytest.mark.parametrize('type_name', TYPES)
+def test_attitudes_of_every_type_are_read(beside, type_name):
+    report = examine_log(beside(disturbed, type_name, variance=1e-4), 'estimate', north='true')
+    assert report.passed, report
+    assert report.measures['tilt_rms_deg'] == pytest.approx(math.degrees(0.01 * 2 ** 0.5),
+                                                            rel=0.05)
+    assert ('nees' in report.measures) == (type_name in (IMU, POSE_COVARIANCE, ODOMETRY))
+
+
+@pytest.mark.parametrize(('name', 'said', 'options'), [
+    ('component_order', lambda q: np.roll(q, 1, axis=1), {}),
+    ('frame_ned', lambda q: (Rotation.from_quat((HALF, HALF, 0.0, 0.0))
+                             * Rotation.from_quat(q)).as_quat(), {}),
+    ('stamp_offset', disturbed, {'delay_ns': 20_000_000}),
+    ('covariance_small', disturbed, {'variance': 0.5e-4}),
+    ('covariance_large', disturbed, {'variance': 2e-4}),
+    ('diverges', lambda q: np.roll(q, 100, axis=0), {}),
+    ('invalid_output', lambda q: q * np.where(np.arange(len(q)) == 777, np.nan, 1.0)[:, None],
+     {}),
+    ('invalid_output', disturbed, {'variance': -1e-4})])
+def test_faults_of_attitudes_in_a_log_are_named(beside, name, said, options):
+    report = examine_log(beside(said, **options), '/estimate', north='true')
+    assert report.faults == [name], report
+
+
+@pytest.mark.parametrize('truth', [None, '/imu/data', 'ground_truth/odom'])
+def test_the_truth_may_be_of_the_sensor_or_of_the_body(log, truth):
+    """The IMU is turned on the body."""
+    report = examine_log(log, '/ground_truth/imu', truth or '/imu/data', north='true')
+    assert report.passed and report.measures['tilt_rms_deg'] < 1e-6
+
+
+def test_a_delay_in_a_log_is_in_steps_of_the_filter(tmp_path):
+    """Attitudes at 1 kHz, 3 ms late, beside a truth of 200 Hz, which is interpolated."""
+    rows = []
+    with LogReader(simulated(tmp_path / 'run.mcap', '-p', 'imu_data.rate:=1000.0',
+                             '-p', 'ground_truth_imu.rate:=200.0')) as reader:
+        for message in reader.messages(['/ground_truth/imu', '/imu/data']):
+            if message.topic == '/ground_truth/imu':
+                rows.append((0, message.log_time, message.data))
+                continue
+            stamp_ns = message.log_time + 3_000_000
+            stamp = struct.pack('<iI', *divmod(stamp_ns, 10 ** 9))
+            rows.append((1, message.log_time, message.data[:4] + stamp + message.data[12:]))
+    report = examine_log(write(tmp_path / 'late.mcap', (
+        ('/ground_truth/imu', IMU), ('/late', IMU)), rows), '/late', north='true')
+    assert report.faults == ['stamp_offset']
+    assert report.measures['stamp_offset_s'] == pytest.approx(0.003, rel=0.02)
+
+
+@pytest.mark.parametrize(('odd', 'says'), [
+    ({'parameters': '[]'}, r'the parameters in the metadata of .*run\.mcap cannot be used: Attr'),
+    ({'parameters': 'rpy'}, r'the parameters in the metadata of .*run\.mcap cannot be used: JSON'),
+    ({'parameters': '{"imu.rpy": "level"}'}, "cannot be used: ValueError: imu.rpy = 'level'"),
+    ((0.0, 0.0, 0.0, 0.0), r'/ground_truth/imu has the quaternion \[0\.0, 0\.0, 0\.0, 0\.0\] at '
+     r'1\.070000000 s: its norm must be 1')])
+def test_an_odd_log_is_refused_by_what_is_odd_in_it(tmp_path, odd, says):
+    template = messages.imu('imu', *3 * (messages.EXACT,))
+    metadata, seventh = (odd, (0.0, 0.0, 0.0, 1.0)) if isinstance(odd, dict) else ({}, odd)
+    rows = [(index, stamp_ns := 10 ** 9 + number * 10 ** 7, template.encode_one(
+        stamp_ns, seventh if (number, index) == (7, 0) else (0.0, 0.0, 0.0, 1.0),
+        (0.0, 0.0, 0.0), (0.0, 0.0, 9.8))) for number in range(100) for index in range(2)]
+    path = write(tmp_path / 'run.mcap', (('/ground_truth/imu', IMU), ('/estimate', IMU)), rows,
+                 metadata)
+    with pytest.raises(ValueError, match=says):
+        examine_log(path, '/estimate')
+
+
+@pytest.mark.parametrize(('others', 'truth', 'says'), [
+    ((), None, 'has no other topic ground_truth/imu, ground_truth/odom, pose with attitudes'),
+    ((('/left/pose', 'sensor_msgs/msg/JointState'),), None, 'has no other topic ground_truth'),
+    ((('/pose', POSE),), None, '/pose has 0 messages: must have 100'),
+    ((), 'ekf/pose', 'the truth of /ekf/pose cannot be ekf/pose: must be another topic')])
+def test_a_topic_is_not_its_own_truth(tmp_path, others, truth, says):
+    template = messages.pose_stamped('world')
+    rows = [(len(others), stamp_ns, template.encode_one(stamp_ns, (0.0, 0.0, 0.0, 1.0)))
+            for stamp_ns in range(10 ** 9, 2 * 10 ** 9, 10 ** 7)]
+    path = write(tmp_path / 'run.mcap', (*others, ('/ekf/pose', POSE)), rows)
+    with pytest.raises(ValueError, match=says):
+        examine_log(path, '/ekf/pose', truth)
+
+
+def test_the_command_judges_a_log(beside, log, tmp_path, capsys):
+    junit, page = tmp_path / 'junit.xml', tmp_path / 'page.png'
+    bad = beside(lambda q: q * (-1.0, -1.0, -1.0, 1.0))
+    assert main([str(bad), '--topic', '/estimate', '--heading', 'true', '--json', '--junit',
+                 str(junit), '--page', str(page)]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found['faults'] == ['conjugated'] and not found['passed']
+    assert found['measures']['convergence_s'] is None
+    suite = ElementTree.parse(junit).getroot()
+    assert suite.get('tests') == str(len(FAULTS)) and suite.get('failures') == '1'
+    assert [case.get('name') for case in suite if case.find('failure') is not None] == [
+        'conjugated']
+    assert page.read_bytes().startswith(b'\x89PNG')
+    # By the pose of the body and the mounting that the log has.
+    assert main([str(log), '--topic', '/imu/data', '--truth', '/pose', '--heading', 'true']) == 0
+    assert 'passed' in capsys.readouterr().out
+
+
+def test_the_heading_in_a_log_counts_from_the_north_that_is_asked_for(log, beside):
+    heading = partial(examine_log, log, '/imu/data')
+    assert heading(north='true').measures['heading_rms_deg'] < 1e-9
+    declination = math.degrees(math.atan2(1.57, 21.02))
+    (outcome,) = heading(north='magnetic').outcomes
+    assert np.degrees(outcome.errors.heading) == pytest.approx(-declination, rel=1e-6)
+    with pytest.raises(ValueError, match='does not say where magnetic north is'):
+        examine_log(beside(disturbed), '/estimate', north='magnetic')
+
+
+@pytest.mark.parametrize(('arguments', 'code', 'says'), [
+    (['--topic', '/nix'], 2, 'has no topic /nix; it has /pose'),
+    (['--topic', '/joint_states'], 2, 'has the type sensor_msgs/msg/JointState'),
+    (['--topic', '/imu/data_raw'], 2, 'it has no orientation'),
+    ([], 2, '--topic'),
+    (['--topic', '/pose', '--page', 'a.gif'], 2, 'must end in .png')])
+def test_wrong_arguments_about_a_log(log, capsys, arguments, code, says):
+    try:
+        assert main([str(log), *arguments]) == code
+    except SystemExit as end:
+        assert end.code == code
+    assert says in capsys.readouterr().err
+
+
+def test_a_log_that_is_not_there_is_told(capsys):
+    assert main(['nix.mcap', '--topic', '/a']) == 1
+    assert 'nix.mcap' in capsys.readouterr().err
