@@ -20,7 +20,7 @@ from spinning_top_sim.nodes import throttle
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.simulation import Simulation
+from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.view.track import Track
 
 VIEW = ('-m', 'spinning_top_sim.view.command', '--no-browser', '--port', '0')
@@ -122,7 +122,7 @@ def test_the_page_goes_on_where_the_clock_of_a_new_run_is_earlier(live):
     live._page.set_tracks([live._track])
     live._listen_as_needed()
     for epoch_ns in (100 * NANOSECONDS, 5 * NANOSECONDS):
-        run = Simulation(values, epoch_ns)
+        run = LiveSimulation(values, epoch_ns)
         taken = record(run, 'ground_truth/odom')
         run.advance(NANOSECONDS // 2)
         live._inbox.extend((topic, data) for topic, _, data in taken)
@@ -179,7 +179,7 @@ def test_the_page_goes_on_with_the_topics_that_come(live):
     values = parameters.checked({'spin.lz': 1.4})
     live._stale, live._track = False, Track('', values)
     live._page.set_tracks([live._track])
-    run = Simulation(values, NANOSECONDS)
+    run = LiveSimulation(values, NANOSECONDS)
     taken = record(run, 'ground_truth/odom', 'pose', 'joint_states')
     for number, enabled in enumerate((True, False, True)):
         live._track.values = {**values, 'ground_truth_odom.enabled': enabled}
