@@ -121,7 +121,7 @@ class ExactSolution:
     def _check_start(self) -> None:
         """Refuse constants so far apart that doubles lose the start among them."""
         start, first = self.start, ThetaValues(self._theta, Times.from_ns(range(1)))
-        alpha, beta, theta_dot = (float(x[0]) for x in (*first.moduli, first.rates[0]))
+        alpha, beta, theta_dot = (float(x[0]) for x in (*first.moduli, first.theta_dot))
         cosine, sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
         # Relative to the distance from either pole, and to a small velocity of the axis.
         across = ((self._bottom_rate * (sine / cosine) if self._bottom_rate else 0.0)

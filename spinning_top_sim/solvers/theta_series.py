@@ -88,6 +88,12 @@ class ThetaForm:
             return Series.of(COS_ODD, self._odd)
         return Series.of(COS_EVEN, self._even if number == 3 else _alternating(self._even))
 
+    def at_zero(self, number: int) -> Decimal:
+        """Return theta3 or theta4 at y = 0, or what the transformation makes of them."""
+        if number == 3:
+            return sum(self._even, ZERO)
+        return sum(self._odd if self.imaginary else _alternating(self._even), ZERO)
+
     @property
     def odd_over_even(self) -> Decimal:
         """The transforms of theta1 and theta4 have lost a factor 2 q'^(1/4), of theta2 not."""
@@ -97,7 +103,8 @@ class ThetaForm:
         """Return c with d(sn^2 chi)/dchi = c theta1(2y)/D(y)^4, for theta4 and theta3 as D."""
         # 2 sn cn dn by the quotients of DLMF 22.2 and the duplication of theta1 [DLMF 20.7.10];
         # c from the first term at y = 0, where chi = (2K/pi) y.
-        even = self.theta(4).leading ** 4 * self.mean.quarter_period / self.theta(1).leading
+        slope = sum((2 * k + 1) * x for k, x in enumerate(_alternating(self._odd)))
+        even = self.at_zero(4) ** 4 * self.mean.quarter_period / slope
         return even, -even * (16 * self.nome if self.imaginary else 1)
 
     def shifted(self, amplitude: Decimal) -> tuple[tuple[Series, Series], tuple[Series, Series]]:

@@ -400,7 +400,7 @@ def _scaled_parts(form: ThetaForm, is_beta: bool, sense: int, amplitude: Decimal
         theta1 = form.theta(1).scaled(-ONE if is_beta else ONE), None
         theta2 = form.theta(2), None
     # alpha is largest at u2, where N is odd, and beta at u1: both at the centre of theta2.
-    scale = size * form.theta(4 if is_beta else 3).leading / theta2[0].leading
+    scale = size * form.at_zero(4 if is_beta else 3) / theta2[0].leading
     scaled1, scaled2 = (
         (real.scaled(factor), imag and imag.scaled(factor))
         for (real, imag), factor in ((theta1, scale * form.odd_over_even if is_beta else scale),

@@ -73,9 +73,12 @@ class ThetaFunctions:
 
     def _take_series(self, motion: ThetaMotion) -> None:
         factors = motion.alpha, motion.beta
-        rows = [row for part in (0, 1) for row in (_row(factor, part) for factor in factors)]
+        rows = [[one[part] or NOTHING for one in factor.parts]
+                for part in (0, 1) for factor in factors]
+        signs = [[x.sign] for x in factors] + [[x.sense] for x in factors]
         self.prefactors = [(even.prefactor, odd.prefactor) for even, odd in rows]
-        self.coefficients = np.array([_coefficients(row) for row in rows]).transpose(2, 0, 1)
+        self.coefficients = (np.array(signs)[:, :, np.newaxis]
+                             * np.array([_coefficients(row) for row in rows])).transpose(2, 0, 1)
         self.real = [k for k, factor in enumerate(factors) if not factor.sense]
         self.zeros = {k: self.prefactors[k].index(SIN_ODD)
                       for k, factor in enumerate(factors) if factor.crosses}
@@ -83,7 +86,7 @@ class ThetaFunctions:
         self.magnifier = 2.0 ** -math.frexp(smallest)[1] if smallest else 1.0
         self.u_dot = np.array([in_range("cos(theta)'", x * Decimal(self.magnifier))
                                for x in motion.u_dot])
-        self.u_dot_coefficients = _coefficients([motion.u_dot_series]).T
+        self.u_dot_coefficients = np.array(_coefficients([motion.u_dot_series])).T
 
     def turns(self, quarters: Number, offset: Number, half_theta: Number) -> Number:
         """
@@ -150,7 +153,7 @@ class ThetaValues:
         for k, (one, other) in enumerate(constants.prefactors):
             rows[k] *= bases[one] if one == other else np.where(odd, bases[other], bases[one])
         self._real, self._imag = rows[:2], rows[2:]
-        self._sin_cos, self._cos_y, self._odd = bases[3], cos, odd
+        self._sin_cos, self._cos_y = bases[3], cos
 
     @cached_property
     def moduli(self) -> Matrix:
@@ -219,26 +222,12 @@ class ThetaValues:
         return found
 
     @cached_property
-    def rates(self) -> Matrix:
-        """The rate of theta [rad/s], and the cosine and sine of psi, (3, n)."""
-        found = np.empty((3, len(self._offset)))
-        found[0] = self._theta_dot()
-        # psi is the argument of alpha less that of beta.
-        real, imag = self._alpha_beta
-        moduli = self.moduli.copy()
-        moduli[self._constants.real] = 1.0  # it may be 0, and its sign is in theta
-        cos, sin = real / moduli, imag / moduli
-        for k in self._constants.real:
-            cos[k], sin[k] = self._rotations[0][k], self._rotations[1][k]
-        found[1] = cos[0] * cos[1] + sin[0] * sin[1]
-        found[2] = sin[0] * cos[1] - cos[0] * sin[1]
-        return found
-
-    def _theta_dot(self) -> Column | float:
+    def theta_dot(self) -> Column:
+        """[rad/s]."""
         # theta' = -u'/sin(theta), and u' is a theta series of 2y.
         constants, xi, (alpha, beta) = self._constants, self._xi, self.moduli
         if not constants.u_dot.any():
-            return 0.0                      # at rest, perhaps at a pole
+            return np.zeros(len(xi))        # at rest, perhaps at a pole
         size, prefactor, without = alpha * alpha + beta * beta, self._sin_cos, [alpha, beta]
         for k, parity in constants.zeros.items():       # there sin y is divided out
             here = self._parity == parity
@@ -249,6 +238,19 @@ class ThetaValues:
         theta_dot: Column = -constants.u_dot.take(self._parity) * (series / size) / (
             constants.magnifier * without[0] * without[1])
         return theta_dot
+
+    @cached_property
+    def rates(self) -> Matrix:
+        """The rate of theta [rad/s], and the cosine and sine of psi, (3, n)."""
+        # psi is the argument of alpha less that of beta.
+        real, imag = self._alpha_beta
+        moduli = self.moduli.copy()
+        moduli[self._constants.real] = 1.0  # it may be 0, and its sign is in theta
+        cos, sin = real / moduli, imag / moduli
+        for k in self._constants.real:
+            cos[k], sin[k] = self._rotations[0][k], self._rotations[1][k]
+        return np.stack((self.theta_dot, cos[0] * cos[1] + sin[0] * sin[1],
+                         sin[0] * cos[1] - cos[0] * sin[1]))
 
 
 def in_range(name: str, value: Decimal) -> float:
@@ -270,16 +272,10 @@ def _amplitude(name: str, factor: Factor) -> float:
     return float(min(sizes))
 
 
-def _row(factor: Factor, part: int) -> list[Series]:
-    """Return R (part 0) or s J (part 1) at even and at odd N."""
-    return [(one[part] or NOTHING).scaled(Decimal(factor.sense if part else factor.sign))
-            for one in factor.parts]
-
-
-def _coefficients(row: Sequence[Series]) -> Matrix:
+def _coefficients(row: Sequence[Series]) -> list[list[float]]:
     """Return the polynomials' coefficients in doubles, highest power first, (len(row), k)."""
-    return np.array([[0.0] * (MOST_TERMS - len(x.polynomial))
-                     + [float(c) for c in reversed(x.polynomial)] for x in row])
+    return [[0.0] * (MOST_TERMS - len(x.polynomial)) + [*map(float, reversed(x.polynomial))]
+            for x in row]
 
 
 def _column(values: Iterable[float]) -> Matrix:
