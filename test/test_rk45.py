@@ -167,7 +167,9 @@ def test_ten_minutes_of_the_cusp_scene():
     period = exact.nutation_period
     cusps = period * np.arange(int(seconds / period) + 1)
     tenth = int(10.0 / period)
-    first, rest = (stepped.states_at_seconds(t) for t in np.split(cusps, [tenth + 1]))
+    first = stepped.states_at_seconds(cusps[:tenth + 1])
+    assert stepped.evaluations <= 10.0 * 1500
+    rest = stepped.states_at_seconds(cusps[tenth + 1:])
     for states in (first, rest):
         assert np.abs(states.phi_dot).max() <= 1e-6
         assert np.abs(states.energy / first.energy[0] - 1.0).max() <= 1e-12
@@ -176,18 +178,9 @@ def test_ten_minutes_of_the_cusp_scene():
     truth = exact.states_at_seconds(cusps[tenth:tenth + 1])
     assert angle(first.quaternion[-1], truth.quaternion[0]) < 1e-8
     last, truth = stepped.states_at_seconds(np.array([seconds])), solve(top, start, [seconds])
-    print(angle(last.quaternion[0], truth.quaternion[0]), last.phi[0] - truth.phi[0])
     assert angle(last.quaternion[0], truth.quaternion[0]) < 3e-8
     assert abs(last.phi[0] - truth.phi[0]) < 3e-8
     assert stepped.evaluations <= seconds * 1500
-
-
-def test_ten_seconds_of_the_cusp_scene_cost_no_more_than_the_average():
-    top, start, values = cusp_scene()
-    stepped = propagate(top, start, method='rk45', rtol=values['solver.rtol'],
-                        atol=values['solver.atol'])
-    stepped.reach(10 * SECOND)
-    assert stepped.evaluations <= 10.0 * 1500
 
 
 @pytest.mark.parametrize('offset', [1e-2, 1e-4, 1e-6, 1e-9, 0.0])
@@ -258,7 +251,7 @@ LITERAL_FAILURES = {
 
 
 @pytest.mark.parametrize('name', LITERAL_FAILURES)
-@pytest.mark.parametrize('rtol', [1e-3, 1e-6, 1e-9])
+@pytest.mark.parametrize('rtol', [1e-3, 1e-9])
 def test_the_literal_equations_stop_with_advice_where_they_fail(name, rtol):
     fields, t = LITERAL_FAILURES[name]
     start = State(**fields)
@@ -359,26 +352,6 @@ def test_bad_times_are_refused(t, message):
     top, start, _ = cusp_scene()
     with pytest.raises(ValueError, match=message):
         solve(top, start, t, method='rk45')
-
-
-def test_no_times_give_empty_columns():
-    top, start, _ = cusp_scene()
-    for method in ('rk45', 'exact'):
-        motion = solve(top, start, [], method=method)
-        assert motion.theta.shape == (0,) and motion.quaternion.shape == (0, 4)
-
-
-@pytest.mark.parametrize('scale', [1e150, 1e-150])
-def test_scales_at_the_edge_of_doubles_are_right_or_refused(scale):
-    """The motion is the same when mass, inertia and momenta are scaled together."""
-    def motion(by):
-        top = Top(lambda1=by, lambda3=0.5 * by, mass=by, com_distance=0.5, gravity=9.8)
-        return solve(top, State(theta=0.6, l3=6.0 * by, lz=4.5 * by), [1.0], method='rk45')
-    try:
-        scaled = motion(scale)
-    except (ValueError, IntegrationError):
-        return
-    assert angle(scaled.quaternion[0], motion(1.0).quaternion[0]) < 1e-9
 
 
 @pytest.mark.parametrize(('l3', 'lz'), [(1.0, 1.0), (1.0, -1.0), (0.0, 0.0)])
@@ -607,40 +580,3 @@ def test_a_motion_leaves_nothing_for_the_garbage_collector(settings):
         assert [reference() for reference in there] == [None, None]
     finally:
         gc.enable()
-
-
-def of_size(lambda1, lambda3, torque, **start):
-    return (Top(lambda1=lambda1, lambda3=lambda3, mass=1.0, com_distance=torque, gravity=1.0),
-            State(**{'phi': 0.3, 'psi': -0.7, **start}))
-
-
-# Time scales, rates and products of rates at the ends of the range of doubles.
-EXTREMES = {
-    'slow': of_size(1e20, 1e20, 5e-324, theta=1.0, theta_dot=0.0, l3=0.0, lz=0.0),
-    'slow spin': of_size(1e30, 1e25, 1e-300, theta=2.0, theta_dot=-1e-310, l3=1e-150, lz=1e-151),
-    'fast': of_size(1e8, 1e8, 1e290, theta=1e-8, theta_dot=-1e-20, l3=0.0, lz=0.0),
-    'thin': of_size(0.006, 5e-324, 0.1, theta=2.0, theta_dot=-0.003, l3=0.0, lz=0.0),
-    'thin, spinning': of_size(1e-8, 1e-310, 1e-309, theta=math.pi, theta_dot=-1e-150, l3=-1e-310,
-                              lz=1e-310),
-    'thick': of_size(1e150, 1e-150, -1e-143, theta=1e-8, theta_dot=-1e3, l3=-1e20, lz=-1e20),
-    'turned far': of_size(1.0, 0.5, 4.9, theta=0.6, l3=2.0, lz=1.0, phi=1.7e308, psi=1.7e308),
-    'light': of_size(1e-8, 1e-8, 1e-20, theta=0.4, theta_dot=3.0, l3=1e-9, lz=1e-10),
-    'heavy': of_size(1e8, 2e8, 1e8, theta=3.1, theta_dot=0.3, l3=1e6, lz=-1e6),
-}
-
-
-@pytest.mark.filterwarnings('error')
-@pytest.mark.parametrize('equations', ['transport', 'euler'])
-@pytest.mark.parametrize('name', EXTREMES)
-def test_tops_of_extreme_sizes_are_solved_or_refused(name, equations):
-    top, start = EXTREMES[name]
-    for t in ([0.0, 1e-3], [100.0], [0.0, 1e171]):
-        try:
-            motion = solve(top, start, t, method='rk45', equations=equations, rtol=1e-6)
-            for column in ('theta', 'phi', 'psi', 'theta_dot', 'phi_dot', 'psi_dot', 'quaternion',
-                           'angular_velocity', 'angular_acceleration', 'energy'):
-                assert np.isfinite(getattr(motion, column)).all(), column
-        except (ValueError, IntegrationError) as refusal:
-            assert len(str(refusal)) > 25
-        else:
-            assert motion.theta[0] == pytest.approx(start.theta, abs=1e-9) or t[0] > 0.0
