@@ -263,13 +263,12 @@ def in_range(name: str, value: Decimal) -> float:
 
 def _amplitude(name: str, factor: Factor) -> float:
     """Return the lesser of the largest coefficients at even and at odd N."""
-    sizes = [max(abs(x) for part in parts if part for x in part.polynomial)
-             for parts in factor.parts]
-    for size in sizes:
-        if 0 < size < LEAST_AMPLITUDE:
-            raise ValueError(f'the amplitude of {name} is {size:.3e}: the start is too close to a '
+    sizes = [[max(map(abs, part.polynomial)) for part in parts if part] for parts in factor.parts]
+    for real, *_ in sizes:
+        if 0 < real < LEAST_AMPLITUDE:
+            raise ValueError(f'the amplitude of {name} is {real:.3e}: the start is too close to a '
                              f'pole or to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
-    return float(min(sizes))
+    return float(min(map(max, sizes)))
 
 
 def _coefficients(row: Sequence[Series]) -> list[list[float]]:
