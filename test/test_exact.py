@@ -307,7 +307,7 @@ def test_a_tiny_oscillation_has_its_rate_and_is_refused_below_what_doubles_hold(
                                          abs=0.0)
     assert np.abs(motion.theta_dot) == pytest.approx(
         1e-200 * rate * np.abs(np.sin(rate * t)), rel=1e-14, abs=0.0)
-    with pytest.raises(ValueError, match='the amplitude of .* at least 1E-290'):
+    with pytest.raises(ValueError, match=r'the amplitude of .* at least 1E-290'):
         solve(top, start(1e-300, l3=0.0, lz=0.0), [0.0])
 
 
