@@ -580,3 +580,40 @@ def test_a_motion_leaves_nothing_for_the_garbage_collector(settings):
         assert [reference() for reference in there] == [None, None]
     finally:
         gc.enable()
+
+
+def of_size(lambda1, lambda3, torque, **start):
+    return (Top(lambda1=lambda1, lambda3=lambda3, mass=1.0, com_distance=torque, gravity=1.0),
+            State(**{'phi': 0.3, 'psi': -0.7, **start}))
+
+
+# Time scales, rates and products of rates at the ends of the range of doubles.
+EXTREMES = {
+    'slow': of_size(1e20, 1e20, 5e-324, theta=1.0, theta_dot=0.0, l3=0.0, lz=0.0),
+    'slow spin': of_size(1e30, 1e25, 1e-300, theta=2.0, theta_dot=-1e-310, l3=1e-150, lz=1e-151),
+    'fast': of_size(1e8, 1e8, 1e290, theta=1e-8, theta_dot=-1e-20, l3=0.0, lz=0.0),
+    'thin': of_size(0.006, 5e-324, 0.1, theta=2.0, theta_dot=-0.003, l3=0.0, lz=0.0),
+    'thin, spinning': of_size(1e-8, 1e-310, 1e-309, theta=math.pi, theta_dot=-1e-150, l3=-1e-310,
+                              lz=1e-310),
+    'thick': of_size(1e150, 1e-150, -1e-143, theta=1e-8, theta_dot=-1e3, l3=-1e20, lz=-1e20),
+    'turned far': of_size(1.0, 0.5, 4.9, theta=0.6, l3=2.0, lz=1.0, phi=1.7e308, psi=1.7e308),
+    'light': of_size(1e-8, 1e-8, 1e-20, theta=0.4, theta_dot=3.0, l3=1e-9, lz=1e-10),
+    'heavy': of_size(1e8, 2e8, 1e8, theta=3.1, theta_dot=0.3, l3=1e6, lz=-1e6),
+}
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('equations', ['transport', 'euler'])
+@pytest.mark.parametrize('name', EXTREMES)
+def test_tops_of_extreme_sizes_are_solved_or_refused(name, equations):
+    top, start = EXTREMES[name]
+    for t in ([0.0, 1e-3], [100.0], [0.0, 1e171]):
+        try:
+            motion = solve(top, start, t, method='rk45', equations=equations, rtol=1e-6)
+            for column in ('theta', 'phi', 'psi', 'theta_dot', 'phi_dot', 'psi_dot', 'quaternion',
+                           'angular_velocity', 'angular_acceleration', 'energy'):
+                assert np.isfinite(getattr(motion, column)).all(), column
+        except (ValueError, IntegrationError) as refusal:
+            assert len(str(refusal)) > 25
+        else:
+            assert motion.theta[0] == pytest.approx(start.theta, abs=1e-9) or t[0] > 0.0

@@ -16,7 +16,7 @@ import test_extremes as extremes
 from helpers.random_tops import random_case
 from helpers.reference import scene_parameters
 from stress.tops import EXACT, blocks, check_block, natural_rate, report, state_of, time_limit
-from test_extremes import START, TOP
+from test_extremes import METHODS, START, TOP
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics.top import ContinuedState
@@ -46,6 +46,23 @@ def answer(top, start, t, **method):
 
 def assert_same_attitude(one, other, bound):
     assert np.abs(one.quaternion - other.quaternion).max() <= bound
+
+
+@pytest.mark.parametrize('method', METHODS[:2], ids=('exact', 'transport'))
+@pytest.mark.parametrize('power', [-500, -100, 100, 480])
+def test_the_motion_is_the_same_at_every_scale_of_mass_and_of_time(power, method):
+    base = answer(TOP, START, [0.5, 1.0], **method)
+    by = 2.0 ** power
+    heavier = {**TOP, 'lambda1': by * 0.123, 'lambda3': by * 0.15, 'mass': by * 2.0}
+    motion = answer(heavier, {**START, 'l3': by * 1.6, 'lz': by * 1.1}, [0.5, 1.0], **method)
+    if motion is not None:
+        assert_same_attitude(motion, base, 2.0 * EXACT)
+    assert motion is not None or abs(power) > 400
+    by = 2.0 ** (power // 4)
+    quick = {**START, 'theta_dot': by * 0.4, 'l3': by * 1.6, 'lz': by * 1.1}
+    motion = answer({**TOP, 'gravity': by * by * 9.8}, quick, np.array([0.5, 1.0]) / by, **method)
+    assert motion is not None
+    assert_same_attitude(motion, base, 2.0 * EXACT)
 
 
 NEXT_TO_PI = math.nextafter(math.pi, 0.0)
