@@ -15,7 +15,6 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.regimes import (
     Description,
     nutation_cubic,
-    precession_extremes,
     regime,
     swing,
 )
@@ -390,31 +389,12 @@ def test_the_cubic_keeps_its_digits_next_to_both_poles(theta):
         assert value == pytest.approx(float(exact), rel=1e-14, abs=0.0)
 
 
-@pytest.mark.parametrize('momenta', [(1.0, 1.3), (1.0, -1.3), (-1.0, 1.3), (0.0, 1.3), (0.0, -1.3),
-                                     (1.3, 1.0), (1.0, 1.0), (0.0, 0.0)])
-@pytest.mark.parametrize('tilts', [(0.3, 0.9), (0.5, 2.0), (1.2, 2.9), (2.3, 2.9)])
-def test_the_extremes_of_the_precession_are_those_of_its_samples(momenta, tilts):
-    """At the turning points, or between them, where L3 u^2 - 2 Lz u + L3 = 0."""
-    l3, lz = momenta
-    theta = np.linspace(*tilts, 200_001)
-    rates = (lz - l3 * np.cos(theta)) / (TOP['lambda1'] * np.sin(theta) ** 2)
-    found = precession_extremes(Top(**TOP), State(theta=tilts[0], l3=l3, lz=lz), *tilts)
-    assert found == pytest.approx((rates.min(), rates.max()), rel=1e-9, abs=1e-12)
-
-
 @pytest.mark.parametrize(('low', 'high', 'text'), [
     (12.3456, 45.6789, '12.35 to 45.68'), (30.0, 30.00123, '30 to 30.001'),
     (12.3456, 12.3456, '12.35 to 12.35'), (-1e-17, 2.0, '0 to 2'), (-3.0, 1e-17, '-3 to 0')])
 def test_a_description_shows_ranges_with_as_many_digits_as_tell_their_ends_apart(low, high, text):
     motion = Description('waves', 1.0, 0.5, 0.7, 0.0, low, high, 0.0, 0.5, 2.0)
     assert f'precession 0 rad/s ({text}), spin' in str(motion)
-
-
-def test_an_animation_ends_with_the_last_sample():
-    pytest.importorskip('matplotlib')
-    top = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
-    motion = solve(top, State(theta=0.5, l3=1.6, lz=1.3), np.linspace(0.1, 0.3, 5))
-    assert len(list(motion.animate().new_frame_seq())) == 5
 
 
 @pytest.mark.parametrize('theta', [0.2, 2.1])

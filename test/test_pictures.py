@@ -43,6 +43,8 @@ def test_animate_shows_samples_in_time():
     animation = motion.animate(fps=5.0, speed=0.5)
     html = animation.to_jshtml()
     assert len(re.findall(r'frames\[\d+\] = ', html)) == 11
+    late = solve(TOP, CUSP, np.linspace(0.1, 0.3, 5))       # 0.3 - 0.1 is less than 0.2
+    assert len(list(late.animate().new_frame_seq())) == 5
     axes = animation._fig.axes[0]
     assert axes.texts[0].get_text() == 't = 1.00 s'         # the last one that was drawn
     # The mark of the disc is where the body is.

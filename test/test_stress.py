@@ -8,25 +8,15 @@ same on all processors and tells the worst cases.
 
 import math
 import os
-import re
-import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import test_extremes as extremes
 from helpers.random_tops import random_case
 from helpers.reference import scene_parameters
-from stress.tops import (
-    COLUMNS,
-    EXACT,
-    UNIT,
-    blocks,
-    check_block,
-    natural_rate,
-    report,
-    state_of,
-    time_limit,
-)
+from stress.tops import EXACT, blocks, check_block, natural_rate, report, state_of, time_limit
+from test_extremes import METHODS, START, TOP
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics.top import ContinuedState
@@ -36,7 +26,7 @@ from spinning_top_sim.solvers.propagator import propagate
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.simulation import Simulation
 
-TOPS = int(os.environ.get('STRESS_TOPS', '250'))
+TOPS = int(os.environ.get('STRESS_TOPS', '145'))
 
 
 @pytest.mark.parametrize('seeds', blocks(0, TOPS), ids=lambda seeds: f'{seeds[0]}-{seeds[-1]}')
@@ -50,44 +40,12 @@ def test_random_tops(seeds):
 
 # ------------------------------------------------------------------------------ edge inputs
 
-TOP = {'lambda1': 0.123, 'lambda3': 0.15, 'mass': 2.0, 'com_distance': 0.15, 'gravity': 9.8}
-START = {'theta': 0.6, 'theta_dot': 0.4, 'phi': 0.3, 'psi': -1.2, 'l3': 1.6, 'lz': 1.1}
-METHODS = ({'method': 'exact'}, {'method': 'rk45', 'rtol': 1e-6},
-           {'method': 'rk45', 'rtol': 1e-6, 'equations': 'euler'})
-# What may be said instead of an answer; a ValueError names the field or says "too far apart".
-REFUSED = (r'(theta|theta_dot|l3|lz|lambda1|lambda3|mass|com_distance|gravity|t) = '
-           r'|too far apart|closer to the separatrix|at most|at least')
-
-
 def answer(top, start, t, **method):
-    """Return the motion, after looking at every column; None if it was refused in words."""
-    try:
-        with time_limit(5.0), warnings.catch_warnings():
-            warnings.simplefilter('error')
-            motion = solve(Top(**top), State(**start), t, **method)
-            for name in (*COLUMNS, 'theta_folded', 'l3', 'lz'):
-                assert np.all(np.isfinite(getattr(motion, name))), name
-    except (ValueError, IntegrationError) as error:
-        assert isinstance(error, IntegrationError) or re.search(REFUSED, str(error)), error
-        return None
-    assert np.abs(np.linalg.norm(motion.quaternion, axis=1) - 1.0).max(initial=0.0) <= UNIT
-    return motion
+    return extremes.answer({**top, **start}, {'method': 'exact', **method}, t)
 
 
 def assert_same_attitude(one, other, bound):
     assert np.abs(one.quaternion - other.quaternion).max() <= bound
-
-
-@pytest.mark.parametrize('method', METHODS, ids=('exact', 'transport', 'euler'))
-@pytest.mark.parametrize('name', [*TOP, *START])
-def test_any_size_of_any_number_gives_an_answer_or_a_reason(name, method):
-    """Times are such that no more than thousands of steps are asked for."""
-    for exponent in (-324, -308, -300, -200, -160, -150, -100, -30, -16, 30, 100, 150, 200, 300):
-        for side in (1.0, -1.0):
-            value = side * (5e-324 if exponent == -324 else 10.0 ** exponent)
-            top, start = dict(TOP), dict(START)
-            (top if name in top else start)[name] = value
-            answer(top, start, [0.0, 0.5, 1.0], **method)
 
 
 @pytest.mark.parametrize('method', METHODS[:2], ids=('exact', 'transport'))
@@ -110,9 +68,8 @@ def test_the_motion_is_the_same_at_every_scale_of_mass_and_of_time(power, method
 NEXT_TO_PI = math.nextafter(math.pi, 0.0)
 
 
-@pytest.mark.parametrize('theta', [0.0, 5e-324, 1e-300, 1e-160, 1e-20, 1e-12, math.pi,
-                                   NEXT_TO_PI])
-@pytest.mark.parametrize('theta_dot', [0.0, 1e-320, 1e-160, 1e-20, 0.3])
+@pytest.mark.parametrize('theta', [0.0, 1e-300, 1e-160, 1e-20, 1e-12, math.pi, NEXT_TO_PI])
+@pytest.mark.parametrize('theta_dot', [0.0, 1e-160, 1e-20, 0.3])
 @pytest.mark.parametrize('l3', [0.0, 0.3, 5.0])
 def test_starts_at_the_poles_and_next_to_them_are_right_or_refused(theta, theta_dot, l3):
     """
@@ -152,14 +109,6 @@ def test_times_of_any_kind(t):
     ns = np.array([round(float(instant) * 1e9) for instant in t], np.int64)
     by_ns = ExactSolution(Top(**TOP), State(**START)).states(ns)
     assert np.abs(motion.quaternion - by_ns.quaternion).max(initial=0.0) <= 2.0 * EXACT
-
-
-@pytest.mark.parametrize('t', [1.0, np.float64(1.0), [[1.0]], [math.nan], [math.inf], [1e300],
-                               ['a'], [None], [[]], [1j], {'t': 1.0}])
-def test_bad_times_are_refused_by_name(t):
-    for method in METHODS:
-        with pytest.raises((ValueError, IntegrationError), match=r'\bt\b'), time_limit(5.0):
-            solve(Top(**TOP), State(**START), t, **method)
 
 
 def test_a_time_beyond_patience_is_refused_at_once():
@@ -206,9 +155,13 @@ CONTINUED = [-0.3, -1.5, math.pi + 0.4, 2.0 * math.pi - 0.1, 2.0 * math.pi + 0.2
              -math.pi - 0.1, 100.3, -40.0]
 
 
-@pytest.mark.parametrize('theta', CONTINUED)
-@pytest.mark.parametrize('momenta', [(0.0, 0.0), (1.6, 1.6), (1.6, -1.6), (0.0, 0.9), (1.6, 1.1)])
-@pytest.mark.parametrize('gravity', [9.8, -9.8, 0.0])
+MOMENTA = (0.0, 0.0), (1.6, 1.6), (1.6, -1.6), (0.0, 0.9), (1.6, 1.1)
+# Every pair of gravity and momenta, with branches in turn.
+BRANCHES = [(CONTINUED[(3 * i + k) % 10], momenta, gravity)
+            for i, momenta in enumerate(MOMENTA) for k, gravity in enumerate((9.8, -9.8, 0.0))]
+
+
+@pytest.mark.parametrize(('theta', 'momenta', 'gravity'), BRANCHES)
 def test_both_methods_go_on_from_any_branch(theta, momenta, gravity):
     """A motion that was commanded after its axis went over the top, any number of times."""
     l3, lz = momenta
@@ -348,7 +301,7 @@ def mirrored(top, start, t):
 def test_steps_of_a_scaled_or_mirrored_top_are_the_same_to_the_last_bit(change, signs):
     """Powers of 2 and signs do not round: so no absolute tolerance and no handedness hides."""
     compared = 0
-    for seed in range(120):
+    for seed in range(60):
         pair = stepped_and_changed(seed, change)
         if pair is None:
             continue
@@ -356,7 +309,7 @@ def test_steps_of_a_scaled_or_mirrored_top_are_the_same_to_the_last_bit(change, 
         assert np.array_equal(one.quaternion, other.quaternion * signs), random_case(seed)
         assert motion.evaluations == changed.evaluations
         compared += 1
-    assert compared > 80
+    assert compared > 40
 
 
 @pytest.mark.parametrize('method', ['exact', 'rk45'])
@@ -368,7 +321,7 @@ def test_a_motion_turned_upside_down_or_restarted_is_the_same(method):
     tried, away from the separatrix (m1 > 1e-2).
     """
     bound, compared = {'exact': 1e-11, 'rk45': 1e-5}[method], 0
-    for seed in range(200):
+    for seed in range(100):
         case = random_case(seed)
         top, start = case.top, case.start
         solution = ExactSolution(top, start)
@@ -392,4 +345,4 @@ def test_a_motion_turned_upside_down_or_restarted_is_the_same(method):
             rounded = math.ulp(abs(middle.phi) + abs(middle.psi))
             assert max(apart) <= bound + rounded, case
         compared += 1
-    assert compared > 50
+    assert compared > 25

@@ -13,8 +13,7 @@ from stress.disk import NO_COMPILER
 
 
 @pytest.mark.parametrize(('part', 'first', 'count'), [
-    ('logs', 4, 5), ('nodes', 0, 6), ('services', 0, 1), ('disk', 0, 4),
-    ('sensor', 1, 1)])
+    ('logs', 4, 1), ('nodes', 0, 1), ('services', 0, 1), ('disk', 0, 1), ('sensor', 1, 1)])
 def test_a_few_seeds(part, first, count):
     result = runner.run(part, first, count)
     assert not result.failures, '\n'.join(result.failures)
@@ -24,7 +23,7 @@ def test_a_few_seeds(part, first, count):
     print(f'{dict(result.outcomes)}, {result.peak_mb:.0f} MB at most')
 
 
-PATIENCE_S = 10.0
+PATIENCE_S = 4.0
 MEMORY_MB = 500
 
 
@@ -48,7 +47,7 @@ def test_the_runner_sees_errors_hangs_deaths_and_memory(monkeypatch):
     assert result.seeds == 7
     assert result.outcomes == {'fine': 3, 'FAILED': 4}
     for seed, (failure, words) in enumerate(zip(sorted(result.failures), (
-            ('ValueError', 'a fault', 'in check'), ('not done after 10 s', 'in check'),
+            ('ValueError', 'a fault', 'in check'), ('not done after 4 s', 'in check'),
             ('died with code -6', 'Aborted'), ('MemoryError',)), strict=True), start=1):
         assert failure.startswith(f'broken: seed {seed}: ')
         assert failure.endswith(f'python test/stress broken --first {seed} --count 1')

@@ -145,31 +145,35 @@ def _bisect(f0: float, f1: float, f2: float, f3: float, end: float) -> float:
 
 def regime(top: Top, state: State, coincide: float = COINCIDE) -> str:
     """Return the motion's name; coincide: relative distance below which roots are one."""
-    l3, lz = state.l3, state.lz
-    scale = abs(l3) + abs(lz)
-    low, high = swing(top, state)
-    resting = high - low <= coincide
+    moves = state.l3 != 0.0 or state.lz != 0.0
     if top.gravity_torque == 0.0:
-        return 'free top' if scale or state.theta_dot else 'at rest'
-    if resting and 1.0 - abs(low) <= coincide:
-        if scale == 0.0:
-            return 'at rest'
-        if (low > 0.0) != (top.gravity_torque > 0.0):       # the centre of mass is below
-            return 'hanging'
-        stable = l3 * l3 > 4.0 * top.lambda1 * abs(top.gravity_torque)
-        return 'sleeping' if stable else 'sleeping, unstable'
-    if scale == 0.0:
+        return 'free top' if moves or state.theta_dot else 'at rest'
+    low, high = swing(top, state)
+    rests = high - low <= coincide
+    if rests and 1.0 - abs(low) <= coincide:
+        return _vertical_regime(top, state.l3, upright=low > 0.0) if moves else 'at rest'
+    if not moves:
         rotating = high >= 1.0 - coincide and low <= -1.0 + coincide
         return f'planar pendulum, {"rotating" if rotating else "swinging"}'
-    if resting:
-        return 'steady precession'
+    return 'steady precession' if rests else _precessing_regime(state, low, high, coincide)
+
+
+def _vertical_regime(top: Top, l3: float, upright: bool) -> str:
+    if upright != (top.gravity_torque > 0.0):       # the centre of mass is below
+        return 'hanging'
+    stable = l3 * l3 > 4.0 * top.lambda1 * abs(top.gravity_torque)
+    return 'sleeping' if stable else 'sleeping, unstable'
+
+
+def _precessing_regime(state: State, low: float, high: float, coincide: float) -> str:
+    l3, lz = state.l3, state.lz
     if l3 == 0.0:
         return 'spherical pendulum'
-    reversal = lz / l3          # cos(theta) at which phi' changes sign
     if lz == l3 and high >= 1.0 - coincide:
         return 'through the top'
     if lz == -l3 and low <= -1.0 + coincide:
         return 'through the bottom'
+    reversal = lz / l3          # cos(theta) at which phi' changes sign
     if min(abs(reversal - low), abs(reversal - high)) <= coincide * max(1.0, abs(reversal)):
         return 'cusps'
     return 'loops' if low < reversal < high else 'waves'

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Point = tuple[float, float, float]
-NO_PICTURES = "pictures need matplotlib: pip install 'spinning_top_sim[plot]' ({})"
 _LARGEST = np.finfo(float).max
 
 
@@ -249,11 +250,7 @@ class States:
         ValueError
             If there are less than two times, or if they do not ascend.
         """
-        try:
-            from spinning_top_sim.physics.pictures import plot  # noqa: PLC0415
-        except ImportError as error:
-            raise ImportError(NO_PICTURES.format(error)) from error
-        return plot(self)
+        return cast('Figure', _pictures().plot(self))
 
     def animate(self, fps: float = 20.0, speed: float = 1.0) -> FuncAnimation:
         """
@@ -278,8 +275,13 @@ class States:
         ValueError
             For an argument out of range, or as `plot`.
         """
-        try:
-            from spinning_top_sim.physics.pictures import animate  # noqa: PLC0415
-        except ImportError as error:
-            raise ImportError(NO_PICTURES.format(error)) from error
-        return animate(self, fps, speed)
+        return cast('FuncAnimation', _pictures().animate(self, fps, speed))
+
+
+def _pictures() -> ModuleType:
+    """Import matplotlib only where something is drawn: it takes long to start."""
+    try:
+        return import_module('spinning_top_sim.physics.pictures')
+    except ImportError as error:
+        raise ImportError('pictures need matplotlib: '
+                          f"pip install 'spinning_top_sim[plot]' ({error})") from error

@@ -2,10 +2,7 @@
 """
 The exact motion of the heavy symmetric top, at the same cost and accuracy for every time.
 
-`theta_setup` finds the theta functions of a trajectory once; here they are evaluated in doubles.
-Three things keep the error at a few roundings after years: the rates come from decimal arithmetic,
-their products with the time are sums of two doubles, and the phase of the nutation is counted from
-the nearest quarter period.
+`theta_setup` finds the theta functions of a motion once, `theta_values` evaluates them in doubles.
 """
 
 from __future__ import annotations
@@ -22,15 +19,16 @@ from spinning_top_sim.physics.regimes import Description, axis_rests, precession
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.decimal_math import pi, precision
-from spinning_top_sim.solvers.exact_attitude import AttitudeSeries
-from spinning_top_sim.solvers.nutation import MOST, Nutation, NutationColumns, in_range
 from spinning_top_sim.solvers.theta_setup import ThetaMotion, set_up
-from spinning_top_sim.solvers.times import LARGEST_NS, Rate, Times
+from spinning_top_sim.solvers.theta_values import MOST, ThetaFunctions, ThetaValues, in_range
+from spinning_top_sim.solvers.times import LARGEST_NS, Times
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
 MOST_TURNS = 2.0 ** 52
 # Closer to the separatrix hyperbolic functions overflow.
 LEAST_M1 = Decimal('1e-290')
+# Times that are evaluated together: the temporaries of more do not fit into the cache.
+BLOCK = 8192
 
 
 class ExactSolution:
@@ -39,8 +37,7 @@ class ExactSolution:
 
     theta goes smoothly through a pole that is passed exactly (and out of [0, pi]), phi and psi are
     unwrapped, the quaternion's sign is continuous.  On every motion each of them is within 5e-15,
-    relative to the value or to its start where these are larger than 1.  Symbols and sources are
-    those of `theta_setup`.
+    relative to the value or to its start where these are larger than 1.
 
     Parameters
     ----------
@@ -88,7 +85,6 @@ class ExactSolution:
         motion = set_up(top, start)
         with precision(motion.digits):
             self._take_constants(motion)
-            self._series = AttitudeSeries(motion)
         self._check_start()
 
     def _take_constants(self, motion: ThetaMotion) -> None:
@@ -100,27 +96,23 @@ class ExactSolution:
         # 2 K/w, two quarter periods
         self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
         alpha, beta = motion.alpha, motion.beta
-        precession, spin = alpha.rate + beta.rate, alpha.rate - beta.rate
         in_range('the rate of the nutation', motion.quarter_rate)
         in_range('the rate of (phi + psi)/2', alpha.rate)
         in_range('the rate of (phi - psi)/2', beta.rate)
-        self.mean_precession_rate = in_range('mean precession rate', precession)
-        self.mean_spin_rate = in_range('mean spin rate', spin)
-        self.theta_min, self.theta_max = (float(x) for x in motion.theta_bounds)
+        self.mean_precession_rate = in_range('mean precession rate', alpha.rate + beta.rate)
+        self.mean_spin_rate = in_range('mean spin rate', alpha.rate - beta.rate)
+        self.theta_min, self.theta_max = (
+            2.0 * math.atan2(sine, cosine) for sine, cosine in motion.half_angles)
 
         l3, lz = Decimal(start.l3), Decimal(start.lz)
         two_lambda1, two_pi = 2 * Decimal(top.lambda1), 2 * pi()
         self._bottom_rate = in_range('(lz + l3)/(2 lambda1)', (lz + l3) / two_lambda1)
         self._top_rate = in_range('(lz - l3)/(2 lambda1)', (lz - l3) / two_lambda1)
         in_range('l3/lambda3', l3 / Decimal(top.lambda3))
-        self._nutation = Nutation(motion, start.theta)
-        self._precession, self._spin = Rate(precession), Rate(spin)
+        self._theta = ThetaFunctions(motion, start.theta)
         # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
         self._phi_phase = float(Decimal(start.phi) - alpha.start_argument - beta.start_argument)
         self._psi_phase = float(Decimal(start.psi) - alpha.start_argument + beta.start_argument)
-        self._rotations = tuple(
-            (Rate(factor.rate / two_pi), float(two_pi * factor.phase_turns))
-            for factor in (alpha, beta))
         fastest = max(abs(motion.quarter_rate), abs(alpha.rate / two_pi), abs(beta.rate / two_pi),
                       Decimal('1e-300'))
         limit = min(Decimal(MOST_TURNS) / fastest, MOST)
@@ -128,8 +120,8 @@ class ExactSolution:
 
     def _check_start(self) -> None:
         """Refuse constants so far apart that doubles lose the start among them."""
-        start, first = self.start, self._nutation.at(Times.from_ns(range(1)))
-        alpha, beta, theta_dot = (float(x[0]) for x in (first.alpha, first.beta, first.theta_dot))
+        start, first = self.start, ThetaValues(self._theta, Times.from_ns(range(1)))
+        alpha, beta, theta_dot = (float(x[0]) for x in (*first.moduli, first.theta_dot))
         cosine, sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
         # Relative to the distance from either pole, and to a small velocity of the axis.
         across = ((self._bottom_rate * (sine / cosine) if self._bottom_rate else 0.0)
@@ -201,37 +193,46 @@ class _ExactStates(States):
         return self._times.seconds
 
     @cached_property
-    def _nutation(self) -> NutationColumns:
-        """The nutation of the motion with theta in [0, pi] at the start."""
-        return self._solution._nutation.at(self._times)
+    def _block(self) -> ThetaValues:
+        return ThetaValues(self._solution._theta, self._times)
+
+    def _rows(self, name: str) -> NDArray[np.float64]:
+        """Return an attribute (k, n) of `ThetaValues`, computed a block at a time."""
+        blocks = (self._block,) if len(self) <= BLOCK else (
+            ThetaValues(self._solution._theta, self._times[first:first + BLOCK])
+            for first in range(0, len(self), BLOCK))
+        rows: list[NDArray[np.float64]] = [getattr(block, name) for block in blocks]
+        return rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1)
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:
-        rows = self._solution._series.quaternion(self._times)
+        rows = self._rows('quaternion')
         x, y, z, w = -rows if self._solution._turns % 2 else rows
         return x, y, z, w
 
     @cached_property
     def half_angle_squares(self) -> tuple[Column, Column]:
-        scale = 1.0 / np.hypot(self._nutation.alpha, self._nutation.beta)
-        cosine, sine = scale * self._nutation.alpha, scale * self._nutation.beta
+        cosine, sine = self._rows('half_theta')
         return cosine * cosine, sine * sine
 
     @cached_property
     def angles(self) -> tuple[Column, Column, Column]:
-        solution, nutation = self._solution, self._nutation
+        solution = self._solution
         half_turn = math.pi if solution._mirrored else 0.0
-        alpha, beta = nutation.alpha_argument, nutation.beta_argument
-        phi, phi_rest = solution._precession.product(self._times)
-        psi, psi_rest = solution._spin.product(self._times)
-        theta = 2.0 * nutation.half_theta
-        return (phi + (phi_rest + ((solution._phi_phase - half_turn) + (alpha + beta))),
+        precession, phi, theta, spin, psi = self._rows('angles')
+        return (precession + (phi + (solution._phi_phase - half_turn)),
                 (-theta if solution._mirrored else theta) + solution._turns * math.tau,
-                psi + (psi_rest + ((solution._psi_phase + half_turn) + (alpha - beta))))
+                spin + (psi + (solution._psi_phase + half_turn)))
 
     @cached_property
     def theta_dot(self) -> Column:
-        return -self._nutation.theta_dot if self._solution._mirrored else self._nutation.theta_dot
+        theta_dot: Column = self._axis_rates[0]
+        return -theta_dot if self._solution._mirrored else theta_dot
+
+    @cached_property
+    def _axis_rates(self) -> NDArray[np.float64]:
+        """Theta' of the motion with theta in [0, pi] at the start, cos(psi) and sin(psi)."""
+        return self._rows('rates')
 
     @cached_property
     def transverse_velocity(self) -> tuple[Column, Column]:
@@ -241,18 +242,13 @@ class _ExactStates(States):
         phi' sin(theta) is Lz - L3 cos(theta) over lambda1 sin(theta), in half angles: nothing
         cancels, and at a pole that can be reached the singular term is absent.
         """
-        solution, nutation = self._solution, self._nutation
-        precession = 0.0 * nutation.alpha
+        solution = self._solution
+        theta_dot, cos_psi, sin_psi = self._axis_rates
+        cosine, sine = self._rows('half_theta')
+        precession = 0.0 * cosine
         if solution._bottom_rate:
-            precession = precession + solution._bottom_rate * (nutation.beta / nutation.alpha)
+            precession = precession + solution._bottom_rate * (sine / cosine)
         if solution._top_rate:
-            precession = precession + solution._top_rate * (nutation.alpha / nutation.beta)
-        # psi is the difference of the arguments of alpha and beta, here less whole turns.
-        alpha, beta = (
-            2.0 * math.pi * np.add(*rate.fraction(self._times)) + (start + argument)
-            for (rate, start), argument in zip(
-                solution._rotations, (nutation.alpha_argument, nutation.beta_argument),
-                strict=True))
-        cos_psi, sin_psi = np.cos(alpha - beta), np.sin(alpha - beta)
-        return (nutation.theta_dot * sin_psi - precession * cos_psi,
-                nutation.theta_dot * cos_psi + precession * sin_psi)
+            precession = precession + solution._top_rate * (cosine / sine)
+        return (theta_dot * sin_psi - precession * cos_psi,
+                theta_dot * cos_psi + precession * sin_psi)

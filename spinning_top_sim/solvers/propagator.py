@@ -16,8 +16,8 @@ from spinning_top_sim.physics.regimes import axis_rests
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.solvers.nutation import MOST
 from spinning_top_sim.solvers.rk45 import EulerMotion, TransportMotion
+from spinning_top_sim.solvers.theta_values import MOST
 
 METHODS = ('rk45', 'exact')
 EQUATIONS = ('transport', 'euler')

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Times as sums of two doubles, and the phases that rates make of them."""
+"""Times as sums of two doubles, and their products with rates."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from decimal import Decimal
 from functools import cached_property
 
@@ -29,119 +30,89 @@ def halves(x: Number) -> tuple[Number, Number]:
 
 class Times:
     """
-    Times since the start of a motion, as exact sums of two doubles in the unit they come in.
+    Times since the start of a motion, as sums of two doubles.
 
-    The sums are computed when they are first asked for: those of a block stay in the cache.
-
-    ns : (n,) integers [ns], None where the times are given as doubles
-    t : (n,) doubles [s]
+    unit : 'ns' for integers, 's' for doubles
+    high, low : (n,) nearest doubles, and what they leave out, which may be one 0
+    latest : the largest time either way
     """
 
-    def __init__(self, ns: NDArray[np.int64] | range | None, t: Column | None = None) -> None:
-        self.ns, self._t = ns, t
+    def __init__(self, unit: str, high: Column, low: Column | float, latest: float) -> None:
+        self.unit, self.high, self.low, self.latest = unit, high, low, latest
 
     @classmethod
     def from_ns(cls, ns: NDArray[np.int64] | range) -> Times:
         """Return the times of integer nanoseconds (n,); raise ValueError for anything else."""
         if isinstance(ns, range):
-            if any(not -2 ** 63 <= extreme < 2 ** 63 for extreme in (
-                    *ns[:1], *ns[-1:], ns.step)):
+            first, last = (ns[0], ns[-1]) if ns else (0, 0)
+            if not -2 ** 63 <= min(first, last, ns.step) <= max(first, last, ns.step) < 2 ** 63:
                 raise ValueError(f'times_ns = {ns!r}: must be within int64')
-            return cls(ns)
-        count = np.array(ns)        # not the caller's: columns are computed later
-        if count.ndim != 1 or (count.size and count.dtype.kind not in 'iu'):
-            raise ValueError(f'times_ns has shape {count.shape} and type {count.dtype}: must be '
-                             '(n,) integer nanoseconds')
-        if count.dtype.kind == 'u' and count.size and int(count.max()) >= 2 ** 63:
-            raise ValueError(f'times_ns = {int(count.max())}: must be within int64')
-        return cls(count.astype(np.int64))
+            # `numpy.arange` takes its length from doubles.
+            count = first + ns.step * np.arange(len(ns), dtype=np.int64)
+        else:
+            count = np.asarray(ns)
+            if count.ndim != 1 or (count.size and count.dtype.kind not in 'iu'):
+                raise ValueError(f'times_ns has shape {count.shape} and type {count.dtype}: must '
+                                 'be (n,) integer nanoseconds')
+            first, last = (int(count.min()), int(count.max())) if count.size else (0, 0)
+            if last >= 2 ** 63:
+                raise ValueError(f'times_ns = {last}: must be within int64')
+            count = count.astype(np.int64)
+        latest = float(max(abs(first), abs(last)))
+        if latest <= 2.0 ** 53:
+            return cls('ns', count.astype(np.float64), 0.0, latest)
+        upper = (count >> 20).astype(np.float64) * 2.0 ** 20
+        lower = (count & (2 ** 20 - 1)).astype(np.float64)
+        high = upper + lower
+        return cls('ns', high, lower - (high - upper), latest)
 
     @classmethod
     def from_seconds(cls, t: Column) -> Times:
         """Return the times of doubles [s]."""
-        return cls(None, t.copy())
+        return cls('s', t.copy(), 0.0, float(np.abs(t).max(initial=0.0)))
 
     @property
-    def latest(self) -> float:
-        """The largest time either way."""
-        given = self._given
-        if not len(given):
-            return 0.0
-        ends = (given[0], given[-1]) if isinstance(given, range) else (given.max(), given.min())
-        return max(abs(float(end)) for end in ends)
-
-    @property
-    def unit(self) -> str:
-        """Nanoseconds for integers, seconds for doubles."""
-        return 's' if self.ns is None else 'ns'
-
-    @cached_property
-    def _sums(self) -> tuple[Column, Column]:
-        """Nearest doubles, and what they leave out."""
-        ns = self.ns
-        if ns is None:
-            return self.seconds, np.broadcast_to(0.0, len(self))
-        if isinstance(ns, range):       # `numpy.arange` takes its length from doubles
-            ns = (ns.start if ns else 0) + ns.step * np.arange(len(ns), dtype=np.int64)
-        if self.latest <= 2.0 ** 53:
-            return ns.astype(np.float64), np.broadcast_to(0.0, len(ns))
-        upper = (ns >> 20).astype(np.float64) * 2.0 ** 20
-        lower = (ns & (2 ** 20 - 1)).astype(np.float64)
-        high = upper + lower
-        return high, lower - (high - upper)
-
-    @property
-    def high(self) -> Column:
-        """Nearest doubles (n,)."""
-        return self._sums[0]
-
-    @property
-    def low(self) -> Column:
-        """What the nearest doubles leave out (n,)."""
-        return self._sums[1]
+    def seconds(self) -> Column:
+        """(n,) [s]."""
+        return self.high if self.unit == 's' else self.high / 1e9 + self.low / 1e9
 
     @cached_property
     def halves(self) -> tuple[Column, Column]:
         """The nearest doubles, split; see `halves`."""
         return halves(self.high)
 
-    @property
-    def seconds(self) -> Column:
-        """(n,) [s]."""
-        return self.high / 1e9 + self.low / 1e9 if self._t is None else self._t
-
     def __len__(self) -> int:
-        return len(self._given)
+        return len(self.high)
 
-    def __getitem__(self, part: slice | NDArray[np.bool_]) -> Times:
-        if self.ns is None:
-            return Times(None, self.seconds[part])
-        if isinstance(self.ns, range) and isinstance(part, slice):
-            return Times(self.ns[part])
-        return Times(np.asarray(self.ns)[part])
-
-    @property
-    def _given(self) -> NDArray[np.int64] | range | Column:
-        return self.seconds if self.ns is None else self.ns
+    def __getitem__(self, part: slice) -> Times:
+        low = self.low if isinstance(self.low, float) else self.low[part]
+        return Times(self.unit, self.high[part], low, self.latest)
 
 
-class Rate:
-    """A rate [1/s] as two doubles; its product with a time has no error that grows with it."""
+class Rates:
+    """k rates [1/s] as two doubles each: their products with times have no error that grows."""
 
-    def __init__(self, per_second: Decimal) -> None:
-        self._constants = {
-            unit: double_double(per_second * scale) for unit, scale in UNITS.items()}
+    def __init__(self, per_second: Sequence[Decimal]) -> None:
+        # (k, 1) by unit: nearest doubles, their halves, and what they leave out
+        self._constants = {}
+        for unit, scale in UNITS.items():
+            high, low = np.array([double_double(rate * scale) for rate in per_second]).T
+            rates = high[:, np.newaxis]
+            self._constants[unit] = rates, *halves(rates), low[:, np.newaxis]
 
-    def product(self, times: Times) -> tuple[Column, Column]:
-        """Return rate * t as nearest doubles and what they leave out."""
-        rate_high, rate_low = self._constants[times.unit]
-        r1, r2 = halves(rate_high)
+    def products(self, times: Times) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return rate * t, (k, n), as nearest doubles and what they leave out."""
+        rate, r1, r2, rate_low = self._constants[times.unit]
         t1, t2 = times.halves
-        high = rate_high * times.high
-        rest = ((r1 * t1 - high) + r1 * t2 + r2 * t1)
-        return high, (rest + r2 * t2) + (rate_low * times.high + rate_high * times.low)
-
-    def fraction(self, times: Times) -> tuple[Column, Column]:
-        """Return rate * t less whole numbers: doubles in [-1/2, 1/2] and small rests."""
-        high, rest = self.product(times)
-        return high - np.rint(high), rest
+        high = rate * times.high
+        # Exact up to the last product of halves (Dekker).
+        rest = r1 * t1
+        rest -= high
+        rest += r1 * t2
+        rest += r2 * t1
+        rest += r2 * t2
+        small = rate_low * times.high
+        if not isinstance(times.low, float):
+            small += rate * times.low
+        rest += small
+        return high, rest

@@ -231,9 +231,8 @@ def main():
             {'t': t, 'theta': state[0], 'thetadot': state[1], 'phi': state[2], 'psi': state[3],
              'q': state[4:]} for t, state in zip(case['times'], texts, strict=True)]})
         print(case['name'], file=sys.stderr, flush=True)
-    json.dump({'note': 'q is w x y z; made by make_hard_cases.py', 'cases': made},
-              sys.stdout, indent=1)
-    print()
+    cases = ',\n'.join(json.dumps(case, separators=(',', ':')) for case in made)
+    print('{"note":"q is w x y z; made by make_hard_cases.py","cases":[\n' + cases + '\n]}')
 
 
 if __name__ == '__main__':

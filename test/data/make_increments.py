@@ -153,4 +153,4 @@ def case(scene, arm, rpy, begin_ns):
 if __name__ == '__main__':
     rows = [row for arguments in CASES for row in case(*arguments)]
     Path(__file__).with_name('increments.json').write_text(
-        '[\n' + ',\n'.join(map(json.dumps, rows)) + '\n]\n')
+        '[\n' + ',\n'.join(json.dumps(row, separators=(',', ':')) for row in rows) + '\n]\n')

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The roots of the nutation's cubic and their distances, in long decimals without cancellation."""
+
+from decimal import Decimal, getcontext, localcontext
+from typing import NamedTuple
+
+from spinning_top_sim.solvers.decimal_math import ONE, ZERO
+
+MOST_NEWTON_STEPS = 5000
+KEPT_DIGITS = 40        # what must be left of the digits after the discriminant has cancelled
+SAME = Decimal('1e-35')
+
+
+class RootsTooCloseError(ArithmeticError):
+    """Two roots of the cubic agree to most of the digits at hand."""
+
+
+class Roots(NamedTuple):
+    """The roots y1 <= 0 <= y2 < y3 and the gaps y2 - y1 and y3 - y2."""
+
+    y1: Decimal
+    y2: Decimal
+    y3: Decimal
+    gap21: Decimal
+    gap32: Decimal
+
+    @property
+    def gap31(self) -> Decimal:
+        return self.y3 - self.y1
+
+
+def cubic_roots(f0: Decimal, f1: Decimal, f2: Decimal, f3: Decimal) -> Roots:
+    """
+    Return the roots of f0 + f1 y + f2 y^2 + f3 y^3, all real, with f0 >= 0 and f3 > 0.
+
+    Raises RootsTooCloseError if more digits are needed to tell two of them apart.
+    """
+    a2, a1, a0 = f2 / f3, f1 / f3, f0 / f3
+    if not f0:                                  # turning point, cusp or pole: y = 0 is a root
+        low, high, gap = _quadratic_roots(-a2, a1)
+        roots = (Roots(ZERO, low, high, low, gap) if low > 0
+                 else Roots(low, ZERO, high, -low, high))
+    else:
+        y, side = _isolated_root(a2, a1, a0)
+        product = -a0 / y
+        # The sum of the other two.  Next to a pole one of them is small, and -a2 - y cancels.
+        total = -a2 - y if 2 * abs(y) < abs(a2) else (a1 - product) / y
+        low, high, gap = _quadratic_roots(total, product)
+        roots = (Roots(y, low, high, low - y, gap) if side < 0
+                 else Roots(low, high, y, gap, y - high))
+    _check(roots, a2, a1, a0)
+    return roots
+
+
+def _quadratic_roots(total: Decimal, product: Decimal) -> tuple[Decimal, Decimal, Decimal]:
+    """Return the roots x1 <= x2 of x^2 - total x + product, and x2 - x1."""
+    discriminant = total * total - 4 * product
+    if discriminant < total * total * Decimal(10) ** (KEPT_DIGITS - getcontext().prec):
+        raise RootsTooCloseError
+    gap = discriminant.sqrt()
+    large = (total + gap) / 2 if total > 0 else (total - gap) / 2
+    small = product / large
+    return min(large, small), max(large, small), gap
+
+
+def _isolated_root(a2: Decimal, a1: Decimal, a0: Decimal) -> tuple[Decimal, int]:
+    """
+    Return the root of y^3 + a2 y^2 + a1 y + a0 that lies alone on its side of -a2/3, and the side.
+
+    Newton's method from beyond all roots (Fujiwara's bound) approaches it monotonically.
+    """
+    centre = -a2 / 3
+    side = -1 if ((centre + a2) * centre + a1) * centre + a0 > 0 else 1
+    with localcontext(prec=8):
+        y = side * Decimal('2.001') * max(abs(a2), abs(a1).sqrt(), abs(a0) ** (ONE / 3))
+    resolution = Decimal(10) ** (3 - getcontext().prec)
+    for _ in range(MOST_NEWTON_STEPS):
+        step = (((y + a2) * y + a1) * y + a0) / ((3 * y + 2 * a2) * y + a1)
+        y -= step
+        if step * side <= abs(y) * resolution:
+            return y, side
+    raise RootsTooCloseError
+
+
+def _check(roots: Roots, a2: Decimal, a1: Decimal, a0: Decimal) -> None:
+    """Ask for more digits if the roots do not reproduce the coefficients (Vieta)."""
+    y1, y2, y3 = roots[:3]
+    for wanted, terms in ((-a2, (y1, y2, y3)), (a1, (y1 * y2, y2 * y3, y3 * y1)),
+                          (-a0, (y1 * y2 * y3,))):
+        if abs(sum(terms) - wanted) > SAME * sum(map(abs, terms)):
+            raise RootsTooCloseError

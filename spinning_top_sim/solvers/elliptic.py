@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Elliptic integrals by Gauss' arithmetic-geometric mean, in long decimals.
+
+One sequence of means of a_0 and g_0 gives the complete integrals of the first and of the third
+kind and the nome, and, with one more square root a step, an incomplete integral of the first kind.
+No step subtracts numbers of one size, and all converge quadratically.
+
+    a_(n+1) = (a_n + g_n)/2,  g_(n+1) = sqrt(a_n g_n),  c_n = sqrt(a_n^2 - g_n^2)    [DLMF 19.8(i)]
+
+The modulus is k = c_0/a_0, its complement k' = g_0/a_0.  The arguments a_0, g_0, c_0 need no
+common scale: the functions depend on their ratios only, but for the mean itself.
+"""
+
+from decimal import Decimal, getcontext
+
+from spinning_top_sim.solvers.decimal_math import ZERO
+
+# Coefficients of lambda, lambda^5, lambda^9 ... in the nome [DLMF 19.5.6].  The first one that is
+# left out contributes less than 1e-23 for k^2 <= 1/2.
+NOME_COEFFICIENTS = 1, 2, 15, 150, 1707
+
+
+class GaussMean:
+    """
+    The arithmetic-geometric mean M of the square roots of two numbers.
+
+    mean : M; the quarter period K(k) is (pi/2) a_0/M [DLMF 19.8.5]
+
+    a_square, g_square : a_0^2 and g_0^2
+    c_square : a_0^2 - g_0^2, which the caller knows without cancellation
+    """
+
+    def __init__(self, a_square: Decimal, g_square: Decimal, c_square: Decimal) -> None:
+        a, g, c = a_square.sqrt(), g_square.sqrt(), c_square.sqrt()
+        self._means, self._c = [(a, g)], [c]
+        tolerance = _tolerance()
+        while len(self._c) < 2 or c > a * tolerance:
+            a, g = (a + g) / 2, (a * g).sqrt()
+            c = c * c / (4 * a)                     # [DLMF 19.8.3]
+            self._means.append((a, g))
+            self._c.append(c)
+        self.mean = a
+
+    @property
+    def quarter_period(self) -> Decimal:
+        """2 K(k)/pi."""
+        return self._means[0][0] / self.mean
+
+    def nome(self) -> Decimal:
+        """Return q = exp(-pi K'/K) to 23 digits, for k^2 <= 1/2."""
+        (a, _), (_, g), c = self._means[0], self._means[1], self._c[1]
+        small = a * c / (a + g) ** 2                # (1 - sqrt(k'))/(1 + sqrt(k'))/2
+        power, total = small ** 4, ZERO
+        for coefficient in reversed(NOME_COEFFICIENTS):
+            total = total * power + coefficient
+        return small * total
+
+    def mean_reciprocal(self, x1: Decimal, x2: Decimal) -> Decimal:
+        """
+        Return the mean of 1/x over a period, where x = x1 + (x2 - x1) sn^2, x1 and x2 > 0.
+
+        It is Pi(alpha^2, k)/(x1 K) with alpha^2 = 1 - x2/x1 [DLMF 19.8.7, 19.8.8].  To subtract
+        nothing, the sum of the Q_n there is replaced by 2 less that sum, which exchanging x1 and
+        x2 turns into the sum, and the last Q_n by the value for k = 0.
+        """
+        (a, g), *_ = self._means
+        square, product = a * a * x2 / x1, a * g    # p_n^2 and a_n g_n
+        if square < product:
+            x1, x2, square = x2, x1, product * product / square
+        total, weight = ZERO, Decimal(1)
+        for a, g in self._means[:-1]:
+            product = a * g
+            denominator = square + product
+            total += weight * 2 * product / denominator
+            weight *= (square - product) / (2 * denominator)
+            square = denominator * denominator / (4 * square)
+        total += weight * 2 * self.mean / (self.mean + square.sqrt())
+        return 1 / x2 + (1 / x1 - 1 / x2) * total / 2
+
+    def amplitude(self, square: Decimal, sense: int) -> Decimal:
+        """
+        Return sin(pi u/(2K)) from sn^2(u), or sinh(pi u/(2K)) from -sn^2(iu).
+
+        By descending Gauss transformations [DLMF 19.8.18], which leave u/K as it is and end at
+        k = 0.  In terms of h = a/sin or a/sinh of the amplitude a step is a mean too.
+
+        square : sn^2(u) in [0, 1] with sense -1; -sn^2(iu) >= 0 with sense 1
+        """
+        if not square:
+            return ZERO
+        a, _ = self._means[0]
+        h = a / square.sqrt()
+        tolerance = _tolerance()
+        for c in self._c:
+            h = (h + (h * h + sense * c * c).sqrt()) / 2
+            if c < h * tolerance:
+                break
+        return self.mean / h
+
+
+def _tolerance() -> Decimal:
+    """Return the size of c/a whose square is negligible."""
+    return Decimal(10) ** (-(getcontext().prec // 2) - 1)

@@ -1,0 +1,290 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The exact motion at many times, in doubles; `theta_setup` explains the symbols.
+
+Three phases are products of a rate and the time, whose error does not grow with time: that of the
+nutation in quarter periods, and those of the rotations exp i(r t + c) of alpha and beta in quarter
+turns.  Each is reduced to the nearest integer.  What is left is an angle of at most pi/4 and keeps
+its relative precision: a top races past a pole that it misses by little.
+
+All arithmetic is elementwise, so that a value does not depend on the other values in its block.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from decimal import Decimal
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.physics.attitude import Column, Number
+from spinning_top_sim.solvers.decimal_math import ZERO, double_double, pi
+from spinning_top_sim.solvers.theta_series import COS_EVEN, MOST_TERMS, SIN_ODD, Series
+from spinning_top_sim.solvers.theta_setup import Factor, ThetaMotion
+from spinning_top_sim.solvers.times import Rates, Times
+
+# glibc gives freed memory back at once, and clears the pages again at the next use, until it has
+# freed a block of this size [mallopt(3): M_MMAP_THRESHOLD].  It doubles the speed of large blocks.
+np.empty(2 ** 22, np.uint8)
+
+Matrix = NDArray[np.float64]
+QUARTER = 0.5 * math.pi         # the angle of a quarter period or turn [rad]
+# Cosine and sine of 0, 1, 2 and 3 quarter turns.
+COSINES, SINES = np.array(((1.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, -1.0)))
+# Smaller amplitudes leave no room for their products in doubles, larger numbers none for halves.
+LEAST_AMPLITUDE, MOST = Decimal('1e-290'), Decimal('1e290')
+NOTHING = Series(COS_EVEN, (ZERO,))
+
+
+class ThetaFunctions:
+    """
+    The constants of a motion in doubles.
+
+    Raises ValueError if doubles cannot hold an amplitude or a rate.
+
+    rates, offset, offset_rest, start_quarters : of the three phases, (3, 1).  At t = 0 a phase is
+        start_quarters + offset + offset_rest.
+    drifts : kappa of alpha and beta, (2, 1)
+    prefactors : at even and at odd N, of the rows R of alpha, R of beta, s J of alpha, s J of beta
+    coefficients : of the polynomials, highest power first, by row, at even and at odd N, (k, 4, 2)
+    real : the numbers, 0 and 1, of those of alpha and beta that have s = 0
+    zeros : of the ones that pass a pole: 0 or 1, whether R = 0 at even or at odd N and y = 0
+    u_dot, u_dot_coefficients : of u', times `magnifier`, a power of 2 for small amplitudes
+    """
+
+    def __init__(self, motion: ThetaMotion, start_theta: float) -> None:
+        factors = motion.alpha, motion.beta
+        self.rates = Rates([motion.quarter_rate, *(x.rate * 2 / pi() for x in factors)])
+        rotations = [factor.phase_turns * 4 for factor in factors]
+        whole = [x.to_integral_value() for x in rotations]
+        self.start_quarters = _column((motion.quarter0, *(int(x) % 4 for x in whole)))
+        offsets = [motion.offset0, *(x - y for x, y in zip(rotations, whole, strict=True))]
+        self.offset, self.offset_rest = map(
+            _column, zip(*map(double_double, offsets), strict=True))
+        self.drifts = _column(float(factor.drift) for factor in factors)
+        self.stretch = QUARTER * float(motion.stretch) if motion.imaginary else None
+        self._take_series(motion)
+        self.planar_rotation = motion.planar_rotation
+        self.turns0 = 0.0
+        if motion.planar_rotation:
+            self.turns0 = round(self.turns(motion.quarter0, float(motion.offset0),
+                                           0.5 * start_theta))
+
+    def _take_series(self, motion: ThetaMotion) -> None:
+        factors = motion.alpha, motion.beta
+        rows = [[one[part] or NOTHING for one in factor.parts]
+                for part in (0, 1) for factor in factors]
+        signs = [[x.sign] for x in factors] + [[x.sense] for x in factors]
+        self.prefactors = [(even.prefactor, odd.prefactor) for even, odd in rows]
+        self.coefficients = (np.array(signs)[:, :, np.newaxis]
+                             * np.array([_coefficients(row) for row in rows])).transpose(2, 0, 1)
+        self.real = [k for k, factor in enumerate(factors) if not factor.sense]
+        self.zeros = {k: self.prefactors[k].index(SIN_ODD)
+                      for k, factor in enumerate(factors) if factor.crosses}
+        smallest = min(map(_amplitude, ('alpha', 'beta'), factors))
+        self.magnifier = 2.0 ** -math.frexp(smallest)[1] if smallest else 1.0
+        self.u_dot = np.array([in_range("cos(theta)'", x * Decimal(self.magnifier))
+                               for x in motion.u_dot])
+        self.u_dot_coefficients = np.array(_coefficients([motion.u_dot_series])).T
+
+    def turns(self, quarters: Number, offset: Number, half_theta: Number) -> Number:
+        """
+        Return the whole turns to add to `half_theta`, before rounding, in a planar rotation.
+
+        Through both poles theta/2 stays within a quarter turn of (pi/2) (i + j Z).
+        """
+        assert self.planar_rotation is not None
+        i, j = self.planar_rotation
+        steady = QUARTER * (i + j * quarters) + QUARTER * j * offset
+        return (steady - half_theta) / (2.0 * math.pi) - self.turns0
+
+
+class ThetaValues:
+    """The motion at n times, in columns that are computed when they are first asked for."""
+
+    def __init__(self, constants: ThetaFunctions, times: Times) -> None:
+        self._constants = constants
+        self._turned, self._turned_rest = high, rest = constants.rates.products(times)
+        whole = np.rint(high)
+        part = high - whole
+        shift = part + constants.offset
+        shift += rest
+        np.rint(shift, out=shift)
+        # No step rounds where the result is small.
+        half = 0.5 * shift
+        part -= half
+        half -= constants.offset
+        part -= half
+        part += rest + constants.offset_rest
+        self._quarters = whole.astype(np.int64)
+        shift += constants.start_quarters
+        self._quarters += shift.astype(np.int64)
+        self._offset = part[0].copy()
+        part[1:] += constants.drifts * self._offset
+        # Cosine and sine by the tangent of half the angle, which is at most 1.
+        part *= 0.5 * QUARTER
+        tangent = np.tan(part, out=part)
+        square = tangent * tangent
+        self._cos = 1.0 - square
+        square += 1.0
+        self._cos /= square
+        tangent += tangent
+        self._sin = np.divide(tangent, square, out=tangent)
+        self._evaluate()
+
+    def _evaluate(self) -> None:
+        """Compute R and s J of alpha and beta, (2, n) each."""
+        constants, quarters = self._constants, self._quarters[0]
+        if constants.stretch is None:
+            sin, cos = self._sin[0], self._cos[0]
+            xi = sin * sin
+        else:
+            sin = np.sinh(constants.stretch * self._offset)
+            xi = -sin * sin
+            cos = np.sqrt(1.0 - xi)
+        self._parity, self._xi = quarters & 1, xi
+        odd = self._parity.astype(bool)
+        rows = _horner(constants.coefficients.take(self._parity, axis=2), xi)
+        for k in constants.zeros:           # the sign is (-1)^floor(N/2)
+            rows[k] *= 1 - (quarters & 2)
+        self._without_zero = {k: rows[k].copy() for k in constants.zeros}
+        bases = 1.0, cos, sin, sin * cos
+        for k, (one, other) in enumerate(constants.prefactors):
+            rows[k] *= bases[one] if one == other else np.where(odd, bases[other], bases[one])
+        self._real, self._imag = rows[:2], rows[2:]
+        self._sin_cos, self._cos_y = bases[3], cos
+
+    @cached_property
+    def moduli(self) -> Matrix:
+        """|alpha| D and |beta| D, (2, n); signed, not absolute, where s = 0."""
+        # The squares may be too small for a double.
+        moduli: Matrix = np.hypot(self._real, self._imag)
+        for k in self._constants.real:
+            moduli[k] = self._real[k]
+        return moduli
+
+    @cached_property
+    def half_theta(self) -> Matrix:
+        """Cosine and sine of theta/2, (2, n)."""
+        alpha, beta = self.moduli
+        scale: Column = 1.0 / np.sqrt(alpha * alpha + beta * beta)
+        return self.moduli * scale
+
+    @cached_property
+    def _rotations(self) -> tuple[Matrix, Matrix]:
+        """Cosines and sines of r t + c + kappa y of alpha and beta, (2, n)."""
+        place = self._quarters[1:] & 3
+        whole_cos, whole_sin, cos, sin = (
+            COSINES.take(place), SINES.take(place), self._cos[1:], self._sin[1:])
+        return whole_cos * cos - whole_sin * sin, whole_sin * cos + whole_cos * sin
+
+    @cached_property
+    def _alpha_beta(self) -> tuple[Matrix, Matrix]:
+        """Real and imaginary parts of alpha D and beta D, (2, n)."""
+        (cos, sin), real, imag = self._rotations, self._real, self._imag
+        return real * cos - imag * sin, real * sin + imag * cos
+
+    @cached_property
+    def quaternion(self) -> Matrix:
+        """x, y, z, w (4, n)."""
+        real, imag = self._alpha_beta
+        squares = self._real * self._real + self._imag * self._imag
+        scale = 1.0 / np.sqrt(squares[0] + squares[1])
+        found = np.empty((4, len(scale)))
+        np.multiply(real[::-1], scale, out=found[1::2])
+        np.multiply(imag[::-1], scale, out=found[::2])
+        np.negative(found[0], out=found[0])
+        return found
+
+    @cached_property
+    def angles(self) -> Matrix:
+        """
+        phi, theta and psi, continued through the poles [rad], (5, n).
+
+        phi and psi are given in two parts each, as what grows with time and the rest, less their
+        values at t = 0.
+        """
+        (_, alpha, beta), (_, alpha_rest, beta_rest) = self._turned, self._turned_rest
+        arguments = np.arctan2(self._imag, self._real)
+        arguments += (QUARTER * self._constants.drifts) * self._offset
+        arguments[self._constants.real] = 0.0
+        half = np.arctan2(self.moduli[1], self.moduli[0])
+        if self._constants.planar_rotation:
+            half += 2.0 * math.pi * np.rint(self._constants.turns(
+                self._quarters[0], self._offset, half))
+        found = np.empty((5, len(half)))
+        found[0] = QUARTER * ((alpha + beta) + (alpha_rest + beta_rest))
+        found[1] = arguments[0] + arguments[1]
+        found[2] = 2.0 * half
+        found[3] = QUARTER * ((alpha - beta) + (alpha_rest - beta_rest))
+        found[4] = arguments[0] - arguments[1]
+        return found
+
+    @cached_property
+    def theta_dot(self) -> Column:
+        """[rad/s]."""
+        # theta' = -u'/sin(theta), and u' is a theta series of 2y.
+        constants, xi, (alpha, beta) = self._constants, self._xi, self.moduli
+        if not constants.u_dot.any():
+            return np.zeros(len(xi))        # at rest, perhaps at a pole
+        size, prefactor, without = alpha * alpha + beta * beta, self._sin_cos, [alpha, beta]
+        for k, parity in constants.zeros.items():       # there sin y is divided out
+            here = self._parity == parity
+            prefactor = np.where(here, self._cos_y, prefactor)
+            without[k] = np.where(here, self._without_zero[k], without[k])
+        series = prefactor * _horner(constants.u_dot_coefficients, 4.0 * xi * (1.0 - xi))
+        # In this order nothing overflows on the separatrix, where all grow like cosh x.
+        theta_dot: Column = -constants.u_dot.take(self._parity) * (series / size) / (
+            constants.magnifier * without[0] * without[1])
+        return theta_dot
+
+    @cached_property
+    def rates(self) -> Matrix:
+        """The rate of theta [rad/s], and the cosine and sine of psi, (3, n)."""
+        # psi is the argument of alpha less that of beta.
+        real, imag = self._alpha_beta
+        moduli = self.moduli.copy()
+        moduli[self._constants.real] = 1.0  # it may be 0, and its sign is in theta
+        cos, sin = real / moduli, imag / moduli
+        for k in self._constants.real:
+            cos[k], sin[k] = self._rotations[0][k], self._rotations[1][k]
+        return np.stack((self.theta_dot, cos[0] * cos[1] + sin[0] * sin[1],
+                         sin[0] * cos[1] - cos[0] * sin[1]))
+
+
+def in_range(name: str, value: Decimal) -> float:
+    """Return a number as a double.  Raises ValueError where its products would overflow."""
+    if abs(value) > MOST:
+        raise ValueError(f'{name} is {value:.3e}: must be at most {MOST} for doubles to hold '
+                         f'the motion; the constants of the top are too far apart in size')
+    return float(value)
+
+
+def _amplitude(name: str, factor: Factor) -> float:
+    """Return the lesser of the largest coefficients at even and at odd N."""
+    sizes = [[max(map(abs, part.polynomial)) for part in parts if part] for parts in factor.parts]
+    for real, *_ in sizes:
+        if 0 < real < LEAST_AMPLITUDE:
+            raise ValueError(f'the amplitude of {name} is {real:.3e}: the start is too close to a '
+                             f'pole or to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
+    return float(min(map(max, sizes)))
+
+
+def _coefficients(row: Sequence[Series]) -> list[list[float]]:
+    """Return the polynomials' coefficients in doubles, highest power first, (len(row), k)."""
+    return [[0.0] * (MOST_TERMS - len(x.polynomial)) + [*map(float, reversed(x.polynomial))]
+            for x in row]
+
+
+def _column(values: Iterable[float]) -> Matrix:
+    return np.array([[x] for x in values])
+
+
+def _horner(coefficients: Matrix, xi: Column) -> Matrix:
+    """Return the polynomials (..., n) at xi from their coefficients (k, ..., n or 1), k > 1."""
+    value: Matrix = coefficients[0] * xi + coefficients[1]
+    for coefficient in coefficients[2:]:
+        value *= xi
+        value += coefficient
+    return value
