@@ -24,7 +24,7 @@ from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.propagator import propagate
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.simulation import Simulation
+from spinning_top_sim.streams.live import LiveSimulation
 
 TOPS = int(os.environ.get('STRESS_TOPS', '145'))
 
@@ -200,7 +200,7 @@ def test_commands_at_random_times_leave_the_attitude_as_it_is(scene, method):
     """And what follows is the exact motion from there, on the same branch."""
     random = np.random.default_rng(len(scene))
     values = parameters.checked({**scene_parameters(scene), 'solver.method': method})
-    simulation = Simulation(values)
+    simulation = LiveSimulation(values)
     scale = abs(values['spin.l3']) or 1.0
     now = 0
     for _ in range(12):
@@ -237,7 +237,7 @@ def test_a_command_and_the_command_back_are_as_if_nothing_had_been():
     for method in ('rk45', 'exact'):
         values = parameters.checked({**scene_parameters('spherical_pendulum'),
                                      'solver.method': method})
-        commanded, left_alone = Simulation(values), Simulation(values)
+        commanded, left_alone = LiveSimulation(values), LiveSimulation(values)
         for simulation in (commanded, left_alone):
             simulation.advance(1_234_567_891)
         l3, lz = commanded.l3, commanded.lz
@@ -253,7 +253,7 @@ def test_a_command_and_the_command_back_are_as_if_nothing_had_been():
 def test_a_sleeping_top_takes_commands_of_its_pole_only():
     for method in ('rk45', 'exact'):
         values = parameters.checked({**scene_parameters('sleeping'), 'solver.method': method})
-        simulation = Simulation(values)
+        simulation = LiveSimulation(values)
         simulation.advance(777_000_000)
         before = simulation.state()
         with pytest.raises(ValueError, match=r'lz = .*pole'):

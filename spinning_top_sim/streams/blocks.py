@@ -73,3 +73,9 @@ def blocks(path: Path, streams: Sequence[Stream], epoch_ns: int, after_ns: int, 
     if end_ns < until_ns:
         raise IntegrationError(f'the stamp {(epoch_ns + until_ns) / NANOSECONDS:.12g} s: must be '
                                f'< {2 ** 31} s, in January 2038')
+
+
+def span_of(streams: Sequence[Stream], most_bytes: int, longest_ns: int) -> int:
+    """Return the time [ns] in which the messages of streams have so many bytes, or the longest."""
+    bytes_per_ns = sum(stream.size / stream.period_ns for stream in streams)
+    return max(1, int(most_bytes / max(bytes_per_ns, most_bytes / longest_ns)))

@@ -23,7 +23,7 @@ from typing import Any
 
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.blocks import NEVER_NS, Block, blocks
+from spinning_top_sim.streams.blocks import NEVER_NS, Block, blocks, span_of
 from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import ImuIncrements
@@ -31,8 +31,8 @@ from spinning_top_sim.streams.topics import ImuIncrements
 # Samples of the fastest stream in a block.  A command makes what is computed useless, and the next
 # one may come soon: after it, blocks begin small and double.
 LARGEST_BLOCK, SMALLEST_BLOCK = 256, 16
-# Nor does a block reach further ahead than this, or take more integration steps.
-LONGEST_BLOCK_NS, MOST_STEPS = 300_000_000, 256
+# Nor does a block have more bytes, take more integration steps, or reach further ahead.
+MOST_BYTES, MOST_STEPS, LONGEST_AHEAD_NS = 4 << 20, 256, 300_000_000
 
 # A message for a log: number of the stream in the log, stamp [ns], CDR.
 Entry = tuple[int, int, bytes]
@@ -175,7 +175,7 @@ class LiveSimulation(Simulation):
         """
         self._refresh()
         if self._work is None and self.computed_ns < until_ns:
-            ahead_ns = min((self._block - 1) * self._shortest_ns(self._used), LONGEST_BLOCK_NS)
+            ahead_ns = min(self._span_ns(self._used, self._block), LONGEST_AHEAD_NS)
             self._block = min(2 * self._block, LARGEST_BLOCK)
             self._begin_block(self._used, max(until_ns, self.computed_ns + ahead_ns))
         if self._work is None:
@@ -223,14 +223,19 @@ class LiveSimulation(Simulation):
             if self.computed_ns < publish_from_ns - 1:      # nobody takes the others
                 used = [output for output in used if output.log_index is not None]
                 target_ns = min(target_ns, publish_from_ns - 1)
-            self._begin_block(used, min(target_ns, self.computed_ns + (
-                LARGEST_BLOCK - 1) * self._shortest_ns(used)))
+            self._begin_block(used, target_ns)
         self._go_on(None)
 
-    def _shortest_ns(self, used: Sequence[Output]) -> int:
-        return min((output.stream.period_ns for output in used), default=NEVER_NS)
+    @staticmethod
+    def _span_ns(used: Sequence[Output], count: int) -> int:
+        """Return the time of a block with so many samples of the fastest stream [ns]."""
+        streams = [output.stream for output in used]
+        shortest_ns = min((stream.period_ns for stream in streams), default=NEVER_NS)
+        return min((count - 1) * shortest_ns, span_of(streams, MOST_BYTES, NEVER_NS))
 
     def _begin_block(self, used: Sequence[Output], until_ns: int) -> None:
+        """Begin a block up to a time, or the largest one."""
+        until_ns = min(until_ns, self.computed_ns + self._span_ns(used, LARGEST_BLOCK))
         self.path.release(self.now_ns)
         self._work = blocks(self.path, [output.stream for output in used], self.epoch_ns,
                             self.computed_ns, until_ns, span_ns=NEVER_NS, most_steps=MOST_STEPS)

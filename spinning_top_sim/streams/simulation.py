@@ -14,7 +14,7 @@ from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_moment
 from spinning_top_sim.solvers.exact import MOST_TURNS
 from spinning_top_sim.solvers.propagator import propagate
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.blocks import Block, blocks
+from spinning_top_sim.streams.blocks import Block, blocks, span_of
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.intervals import LONGEST_NS
@@ -157,9 +157,7 @@ class Simulation:
         `now_ns` is the end of the block that is yielded.  Raises IntegrationError behind the last
         block if the motion does not go on.
         """
-        bytes_per_ns = sum(stream.size / stream.period_ns for stream in streams)
-        span_ns = max(1, int(OFFLINE_BYTES / max(bytes_per_ns,
-                                                 OFFLINE_BYTES / LONGEST_OFFLINE_NS)),
+        span_ns = max(span_of(streams, OFFLINE_BYTES, LONGEST_OFFLINE_NS),
                       (until_ns - self.now_ns) // MOST_BLOCKS)
         for block in blocks(self.path, streams, self._epoch_ns, self.now_ns, until_ns,
                             span_ns=span_ns, most_steps=OFFLINE_STEPS):
