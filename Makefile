@@ -73,7 +73,8 @@ help:
 	@echo '             programs, attitude filters and the noise of the IMU; two hours'
 	@echo '             and a quarter'
 	@echo 'make performance-check'
-	@echo '             compare the cost with that of the last tag (REF=...); minutes'
+	@echo '             compare the cost with that of the parent commit (BASE=...) and of the'
+	@echo '             last release (REF=...); eight minutes'
 	@echo 'make docs    write the interface page, the plain URDF and the pictures, and'
 	@echo '             build the site of all pages in site/'
 	@echo 'make lint    run ruff and mypy'
@@ -180,10 +181,12 @@ benchmark performance:
 
 # In the environment of the tests: nothing but the package differs.
 REF ?=
+BASE ?=
 performance-check: export OMP_NUM_THREADS ?= 1
 performance-check: export OPENBLAS_NUM_THREADS ?= 1
 performance-check: dependencies
-	'$(VENV)/bin/python' benchmark/regression.py $(REF)
+	'$(VENV)/bin/python' benchmark/regression.py $(if $(REF),--release '$(REF)') \
+	    $(if $(BASE),--parent '$(BASE)')
 
 $(VENV)/.peers: $(wildcard benchmark/requirements*.txt) $(VENV)/.deps-test
 	@echo 'Installing into $(VENV) the programs that the benchmarks compare with'

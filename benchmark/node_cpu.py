@@ -21,18 +21,28 @@ is the difference between the period and the time between two arrivals on a topi
 from __future__ import annotations
 
 import argparse
-import contextlib
 import itertools
 import json
 import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from processes import ROOT, SIM_NODE, Process, load, median, quantile, ros_arguments, script
+from processes import (
+    ROOT,
+    Process,
+    load,
+    median,
+    namespaces,
+    quantile,
+    ros_arguments,
+    script,
+    sim_node,
+    together,
+)
 from report import number, preamble, table, write_section
 
 STREAMS = ('pose', 'joint_states', 'imu')
@@ -70,7 +80,7 @@ def program(kind: str, rate: float, namespace: str, folder: Path) -> list[str]:
                       'record.enabled': records, 'record.uri': str(folder) + '/',
                       **{f'{name}.rate': float(rate) for name in STREAMS},
                       **{f'{name}.enabled': False for name in OTHERS}}
-        return [*SIM_NODE, *ros_arguments(namespace, parameters)]
+        return sim_node(namespace, parameters)
     if kind in (STRAIGHT, EVENTS):
         executor = 'events' if kind == EVENTS else 'single'
         return [*script('straightforward_node.py'),
@@ -79,13 +89,10 @@ def program(kind: str, rate: float, namespace: str, folder: Path) -> list[str]:
             *ros_arguments(namespace, {'rate': float(rate), 'pacing': 'thread'})]
 
 
-_namespaces = itertools.count(1)
-
-
 def measure(kind: str, rate: float, subscribers: int, seconds: float, warm_up: float,
             folder: Path) -> Result | None:
     """Run one node with its subscribers; return None if one did not start."""
-    namespace = f'/n{next(_namespaces)}'
+    namespace = next(namespaces)
     listeners = [Process((*script('listener.py'), namespace), talks=True)
                  for _ in range(subscribers)]
     try:
@@ -170,36 +177,6 @@ def measured(arguments: argparse.Namespace) -> dict:
     return found
 
 
-def together(programs: Mapping[str, Callable[[str], list[str]]], rounds: int, seconds: float,
-             subscribers: int = 0, checkouts: Mapping[str, Path] | None = None
-             ) -> dict[str, list[float]]:
-    """
-    Return the processor time over elapsed time of nodes that run at once, of each in every round.
-
-    So both nodes meet the same load of the machine.  They take turns in starting first.
-    programs: arguments of python for a node, by its namespace;  subscribers: of each node;
-    checkouts: whose package a node runs, if not that of this one
-    """
-    shares: dict[str, list[float]] = {name: [] for name in programs}
-    for number_ in range(rounds):
-        with contextlib.ExitStack() as running:
-            nodes = {}
-            for name in list(programs)[::-1 if number_ % 2 else 1]:
-                namespace = f'/n{next(_namespaces)}'
-                for _ in range(subscribers):
-                    running.enter_context(
-                        Process((*script('listener.py'), namespace), talks=True)).line()
-                nodes[name] = running.enter_context(Process(
-                    programs[name](namespace), checkout=(checkouts or {}).get(name, ROOT)))
-            time.sleep(4.0)
-            begin = {name: (node.cpu_ns(), time.monotonic_ns()) for name, node in nodes.items()}
-            time.sleep(seconds)
-            for name, node in nodes.items():
-                cpu, at = begin[name]
-                shares[name].append((node.cpu_ns() - cpu) / (time.monotonic_ns() - at))
-    return shares
-
-
 def pair_row(shares: dict[str, list[float]]) -> tuple[str, ...]:
     """Return the processor time of two nodes, and the median of their ratios with its range."""
     one, other = shares.values()
@@ -212,9 +189,9 @@ def idle(rounds: int, seconds: float) -> str:
     """Return the table of the cost of streams without subscribers."""
     switches = [f'{name}.enabled' for name in (*STREAMS, 'imu_data', *OTHERS, 'clock')]
 
-    def node(enabled: bool) -> Callable[[str], list[str]]:
-        return lambda namespace: [*SIM_NODE, *ros_arguments(namespace, {
-            'tick_rate': 1000.0, 'status_period': 0.0, **dict.fromkeys(switches, enabled)})]
+    def node(enabled: bool) -> tuple[Callable[[str], list[str]], Path]:
+        return lambda namespace: sim_node(namespace, {
+            'tick_rate': 1000.0, 'status_period': 0.0, **dict.fromkeys(switches, enabled)}), ROOT
 
     return table(
         ('all streams enabled [%]', 'none enabled [%]', 'ratio', 'smallest', 'largest'),
@@ -224,8 +201,8 @@ def idle(rounds: int, seconds: float) -> str:
 def in_pairs(rounds: int, seconds: float) -> str:
     """Return the table of `sim_node` and another node that run at once, at 1 kHz."""
     with tempfile.TemporaryDirectory() as name:
-        def node(kind: str) -> Callable[[str], list[str]]:
-            return lambda namespace: program(kind, 1000, namespace, Path(name))
+        def node(kind: str) -> tuple[Callable[[str], list[str]], Path]:
+            return lambda namespace: program(kind, 1000, namespace, Path(name)), ROOT
 
         return table(
             ('node', 'other', 'node [%]', 'other [%]', 'ratio', 'smallest', 'largest'),
