@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import itertools
 import subprocess
 import sys
 import tempfile
@@ -93,16 +92,18 @@ def in_turns(cost: Callable[[Path, Path], float]) -> Callable[[Checkouts, int], 
 def arrays(job: str) -> Callable[[Checkouts, int], Costs]:
     """Return what measures a job of array_job.py, in new processes every ten rounds."""
     def measure(checkouts: Checkouts, rounds: int) -> Costs:
+        jobs: dict[str, Process] = {}
+
+        def ask(name: str) -> float:
+            jobs[name].tell(job)
+            return float(jobs[name].line())
+
         found: Costs = {name: [] for name in checkouts}
         for _ in range(rounds):
             with contextlib.ExitStack() as running:
-                jobs = {name: running.enter_context(Process(
-                    script('array_job.py'), talks=True, checkout=checkout))
-                    for name, checkout in checkouts.items()}
-
-                def ask(name: str) -> float:
-                    jobs[name].tell(job)
-                    return float(jobs[name].line())
+                for name, checkout in checkouts.items():
+                    jobs[name] = running.enter_context(Process(
+                        script('array_job.py'), talks=True, checkout=checkout))
                 taking_turns(jobs, 2, ask)          # the first ones load what is needed
                 for name, costs in taking_turns(jobs, 10, ask).items():
                     found[name] += costs

@@ -46,7 +46,7 @@ Stamps = NDArray[np.int64]
 
 @dataclass
 class TopicReport:
-    """What is in a topic, in the words of docs/inspect.md."""
+    """What is in a topic, in the words of docs/log_format.md."""
 
     type: str
     stream: str | None = None             # which of our streams it is
