@@ -195,7 +195,7 @@ def simulate(arguments: Sequence[str], checkout: Path = ROOT) -> tuple[float, in
     """
     begin = time.monotonic()
     run = subprocess.run(
-        [sys.executable, '-P', '-c', _SIMULATE, *arguments, '--quiet'], stdout=subprocess.PIPE,
+        [sys.executable, '-P', '-c', _SIMULATE, *arguments], stdout=subprocess.PIPE,
         text=True, env=environment(checkout), timeout=3600.0, check=False)
     taken = time.monotonic() - begin
     if run.returncode:
