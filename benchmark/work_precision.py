@@ -33,10 +33,8 @@ REFERENCE = ('SciPy DOP853', 1e-9)
 # Simulated time [s] and samples a second.
 SPANS = ((10, 512), (1000, 64))
 FEW = grid_ns(1, 1)
-# Number of instants at which the exact solution is compared with extended precision.
-PROBES = 16
-# Time limit of extended precision [s]; beyond it, the error stays unknown.
-LONGEST_TRUTH = 60.0
+PROBES = 16             # instants at which the exact solution is compared with extended precision
+LONGEST_TRUTH = 60.0    # [s]; if that takes longer, the error stays unknown
 # Real time for a run, over the processor time that it is expected to take at most.
 PATIENCE = 20.0
 # Runs shorter than this [s] are repeated RETAKES times where the others have one round.
@@ -209,8 +207,9 @@ def _section(case: Case, duration: int, rate: int, rows: list[Row]) -> str:
 # Okabe & Ito's palette, which the colour-blind can tell apart.
 COLOURS = {'ours': '#D55E00', 'SciPy': '#0072B2', 'heyoka': '#009E73', 'diffrax': '#CC79A7',
            'MuJoCo': '#666666'}
-STYLES = {peer: {'color': COLOURS[peer.family], 'marker': marker, 'label': peer.name}
-          for peer, marker in zip(PEERS, 'PXoo^sv<DDh>d', strict=False)}
+STYLES = {peer: {'color': COLOURS[peer.family] if peer.settings[0] else 'black',
+                 'marker': marker, 'label': peer.name}
+          for peer, marker in zip(PEERS, 'PXop^sv<DDh>', strict=True)}
 
 
 def draw(results: dict[Case, list[Row]], duration: int, rate: int, name: str) -> None:
@@ -232,7 +231,8 @@ def draw(results: dict[Case, list[Row]], duration: int, rate: int, name: str) ->
                        transform=panel.transAxes, va='bottom', fontsize=8, color='#444444')
         panel.set_title(case.title, fontsize=11)
         panel.grid(color='#DDDDDD', linewidth=0.6)
-    figure.supxlabel('time per state [µs]')
+    for panel in panels[-1]:
+        panel.set_xlabel('time per state [µs]')
     figure.supylabel('largest error of the attitude [rad]')
     figure.legend(*panels[0, 0].get_legend_handles_labels(), loc='outside lower center', ncols=6)
     figure.suptitle(f'{duration} s sampled at {rate} Hz: left is faster, lower is more accurate')
