@@ -58,14 +58,7 @@ def main() -> None:
         errors += [np.array(pair) / commanded_of(COMMANDED, KINDS[i // 3][0]) - 1.0
                    for i, pair in enumerate(found)]
         rows += compared(seed, COMMANDED, found)
-    preset = {name: value for name, value in read_scene(
-        ROOT / f'config/imu/{PRESET}.yaml').items() if name.endswith(('_density', '_instability'))}
-    preset_rows = []
-    for seed in seeds:
-        raw, bias = simulate(preset, seed, options.hours)
-        noises = [fit(*allan(axis))[0] for axis in (raw - bias).T]
-        flats = [flat_of(*allan(axis)) for axis in bias.T]
-        preset_rows += compared(seed, preset, list(zip(noises, flats, strict=True)), 'B')
+    preset_rows = from_preset(seeds, options.hours)
     tau, flicker, ends = flicker_over_band(seeds, options.hours)
     assert curves is not None
     draw(curves, options.hours)
@@ -91,6 +84,19 @@ def main() -> None:
         raise SystemExit(f'the bias instability is not flat: {flicker}')
     if worst >= LIMIT:
         raise SystemExit(f'off by {worst:.1%}: more than {LIMIT:.0%}')
+
+
+def from_preset(seeds: Sequence[int], hours: float) -> list[list[str]]:
+    """Return the rows of the preset."""
+    preset = {name: value for name, value in read_scene(
+        ROOT / f'config/imu/{PRESET}.yaml').items() if name.endswith(('_density', '_instability'))}
+    rows = []
+    for seed in seeds:
+        raw, bias = simulate(preset, seed, hours)
+        noises = [fit(*allan(axis))[0] for axis in (raw - bias).T]
+        flats = [flat_of(*allan(axis)) for axis in bias.T]
+        rows += compared(seed, preset, list(zip(noises, flats, strict=True)), 'B')
+    return rows
 
 
 INTRODUCTION = """\

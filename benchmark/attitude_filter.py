@@ -25,7 +25,7 @@ from spinning_top_sim.tools import simulate
 
 DURATION, SETTLE, RATE = 120, 60, 200
 SCENE = ROOT / 'config/wavy.yaml'
-ARMS_CM = (0, 5, 10)
+ARMS_CM, ENDS_CM = (0, 5, 10), (0, 10)
 RATES = (100, 200, 1000)
 PRESETS = ('perfect', 'adis16470', 'icm_42688_p', 'bmi088', 'icm_20948')
 GAINS = (0.033, 0.1, 0.3, 1.0)
@@ -49,33 +49,26 @@ NAMES = tuple(name for name in FILTERS.FILTERS if name not in FILTERS.NINE_AXES)
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        by_arm = {arm: compare(place, arm_cm=arm) for arm in ARMS_CM}
-        by_rate = {rate: compare(place, rate=rate) for rate in RATES if rate != RATE}
-        by_rate[RATE] = by_arm[0]
-        by_preset = {(preset, arm): compare(place, arm_cm=arm, preset=preset)
-                     for preset in PRESETS[1:] for arm in (0, ARMS_CM[-1])}
-        by_preset.update({(PRESETS[0], arm): by_arm[arm] for arm in (0, ARMS_CM[-1])})
-        headings = {(arm, rate): compare(place, arm_cm=arm, rate=rate, names=nine_axes(), mag=True)
-                    for arm in (0, ARMS_CM[-1]) for rate in RATES}
-        gains = {arm: compare(place, arm_cm=arm, names=[gain_name(gain) for gain in GAINS])
-                 for arm in (0, ARMS_CM[-1])}
-    draw(by_arm)
-    ends = 0, ARMS_CM[-1]
+        arms = {f'{arm} cm': compare(place, arm) for arm in ARMS_CM}
+        rates = {f'{rate} Hz': compare(place, rate=rate) for rate in RATES}
+        presets = {f'`{preset}`, {arm} cm': compare(place, arm, preset=preset)
+                   for preset in PRESETS for arm in ENDS_CM}
+        headings = {f'{arm} cm, {rate} Hz': compare(place, arm, rate, names=nine_axes(), mag=True)
+                    for arm in ENDS_CM for rate in RATES}
+        gains = {f'{arm} cm': compare(place, arm, names=[gain_name(gain) for gain in GAINS])
+                 for arm in ENDS_CM}
+    draw(arms)
     report.write('attitude_filter.md', '\n'.join((
         report.preamble('Attitude filters', ('numpy', 'vqf', 'ahrs', 'matplotlib')),
         INTRODUCTION.format(scene=SCENE.stem, duration=DURATION, settle=SETTLE, rate=RATE),
-        '## Lever arm\n', table('lever arm', {f'{arm} cm': by_arm[arm] for arm in ARMS_CM}),
-        '## Rate\n', 'With a perfect IMU at the pivot.\n',
-        table('rate', {f'{rate} Hz': by_rate[rate] for rate in RATES}),
+        '## Lever arm\n', table('lever arm', arms),
+        '## Rate\n', 'With a perfect IMU at the pivot.\n', table('rate', rates),
         '## Nine axes\n', NINE, report.table(
-            ('lever arm, rate', *(f'{one.name} [deg]' for one in headings[0, RATE])),
-            [(f'{arm} cm, {rate} Hz', *(f'{one.summary(SETTLE).heading_max:.2g}' for one in found))
-             for (arm, rate), found in headings.items()]),
-        "## Gain of Madgwick's filter\n",
-        table('lever arm', {f'{arm} cm': gains[arm] for arm in ends}),
-        '## Presets\n', 'With seed 0, not calibrated.\n', table('preset, lever arm', {
-            f'`{preset}`, {arm} cm': by_preset[preset, arm]
-            for preset in PRESETS for arm in ends}))))
+            ('lever arm, rate', *(f'{name} [deg]' for name in nine_axes())),
+            [(label, *(f'{one.summary(SETTLE).heading_max:.2g}' for one in found))
+             for label, found in headings.items()]),
+        "## Gain of Madgwick's filter\n", table('lever arm', gains),
+        '## Presets\n', 'With seed 0, not calibrated.\n', table('preset, lever arm', presets))))
 
 
 INTRODUCTION = """\
@@ -139,14 +132,14 @@ def table(head: str, rows: dict[str, list]) -> str:
     return report.table((head, *(f'{name} [deg]' for name in names)), lines)
 
 
-def draw(by_arm: dict[int, list]) -> None:
+def draw(arms: dict[str, list]) -> None:
     """Draw the tilt errors at the pivot and on the longest lever arm."""
     mpl.use('Agg')
     import matplotlib.pyplot as plt
 
     figure, panels = plt.subplots(1, 2, figsize=(11.0, 4.2), sharey=True)
-    for panel, arm in zip(panels, (0, ARMS_CM[-1]), strict=True):
-        for one in by_arm[arm]:
+    for panel, arm in zip(panels, ENDS_CM, strict=True):
+        for one in arms[f'{arm} cm']:
             FILTERS.draw([panel], one, SETTLE, linewidth=0.9)
         panel.set_title('IMU at the pivot' if arm == 0 else f'IMU {arm} cm off the axis',
                         fontsize=11)

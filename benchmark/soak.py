@@ -151,13 +151,12 @@ def soak(minutes: float, folder: Path) -> dict:
 
 def judge(seen: dict) -> tuple[list[tuple[str, str]], bool]:
     """Return the rows of the report, and whether the run passes."""
-    settled = [size for at, size in seen['memory'] if at >= SETTLED_S]
-    slope = 3600.0 * statistics.linear_regression(
-        [at for at, _ in seen['memory'] if at >= SETTLED_S], settled).slope
+    times, settled = zip(*(one for one in seen['memory'] if one[0] >= SETTLED_S), strict=True)
+    slope = 3600.0 * statistics.linear_regression(times, settled).slope
     first = median(settled[:10])        # a log ends and another begins in that second
     growth = max(settled) - first
-    count = sum(n for log in seen['logs'].values() for n, _ in log.values())
-    missing = sum(n for log in seen['logs'].values() for _, n in log.values())
+    topics = [found for log in seen['logs'].values() for found in log.values()]
+    count, missing = (sum(found[k] for found in topics) for k in (0, 1))
     trouble = [line for line in seen['stderr'].splitlines() if any(t in line for t in TROUBLE)]
     rows = [('resident memory after a minute (median of 10 s) [MB]', f'{first / 1e6:.1f}'),
             ('largest afterwards, relative to that [MB]', f'{growth / 1e6:+.2f}'),
