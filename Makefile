@@ -67,13 +67,14 @@ help:
 	@echo '             more than an hour'
 	@echo 'make performance'
 	@echo '             measure node, start-up, a long run, solvers and simulate, and write'
-	@echo '             docs/performance.md; an hour, in .venv-benchmark'
+	@echo '             docs/measured/performance.md; an hour, in .venv-benchmark'
 	@echo 'make benchmark'
 	@echo '             the same, and compare accuracy, stability and cost with other'
 	@echo '             programs, attitude filters and the noise of the IMU; two hours'
 	@echo '             and a quarter'
 	@echo 'make performance-check'
-	@echo '             compare the cost with that of the last tag (REF=...); minutes'
+	@echo '             compare the cost with that of the parent commit (BASE=...) and of'
+	@echo '             the last release (REF=...); eight minutes'
 	@echo 'make docs    write the interface page, the plain URDF and the pictures, and'
 	@echo '             build the site of all pages in site/'
 	@echo 'make lint    run ruff and mypy'
@@ -164,11 +165,9 @@ stress: dependencies
 
 # The programs to compare with need hundreds of megabytes, so they have their own environment.
 # The exam and the soak come last: they take more than an hour, and the tables of times do not wait.
-PERFORMANCE := node_cpu wake_up startup solvers offline offline_scaling log_compression
-COMPARISONS := heavy_top exact_cost gauge stability work_precision allan increments \
-    attitude_filter ensemble view exam
-offline_options := --hour
-offline_scaling_options := --long
+PERFORMANCE := node_cpu startup solvers offline log_compression
+COMPARISONS := heavy_top gauge stability work_precision allan increments attitude_filter \
+    ensemble view exam
 soak_options := --minutes 30
 benchmark performance: export OMP_NUM_THREADS ?= 1
 benchmark performance: export OPENBLAS_NUM_THREADS ?= 1
@@ -180,16 +179,16 @@ benchmark performance:
 
 # In the environment of the tests: nothing but the package differs.
 REF ?=
+BASE ?=
 performance-check: export OMP_NUM_THREADS ?= 1
 performance-check: export OPENBLAS_NUM_THREADS ?= 1
 performance-check: dependencies
-	'$(VENV)/bin/python' benchmark/regression.py $(REF)
+	'$(VENV)/bin/python' benchmark/regression.py $(if $(REF),--release '$(REF)') \
+	    $(if $(BASE),--parent '$(BASE)')
 
-$(VENV)/.peers: $(wildcard benchmark/requirements*.txt) $(VENV)/.deps-test
+$(VENV)/.peers: benchmark/requirements.txt $(VENV)/.deps-test
 	@echo 'Installing into $(VENV) the programs that the benchmarks compare with'
 	@$(PIP) -r benchmark/requirements.txt
-	@$(PIP) -r benchmark/requirements-built.txt || \
-	    echo 'numbalsoda is left out: its source needs CMake and a Fortran compiler'
 	@touch '$@'
 
 docs: $(VENV)/.deps-plot $(VENV)/.deps-test $(VENV)/.deps-docs $(VENV)/.package

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """
-How well the exam names faults, and the marks of published filters: docs/exam_marks.md.
+Measure how well the exam names faults, and examine published filters.
 
 Every exam has its own seeds, so its own noise and starts.  `named` is the share of the exams of
 a filter with one fault that name this fault; `alone` the share that name it and no other.
@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import re
 import sys
 import time
 from collections import Counter
@@ -73,9 +72,11 @@ def main() -> None:
                   for name in FAULTY}
     table = report.table(HEADS, marks)
     report.write('exam_marks.md', '\n'.join((
-        report.preamble('Marks of published filters', PACKAGES),
+        report.preamble('Results of published filters', PACKAGES),
         'With the settings of their packages, on a calibrated IMU, at level `full`. '
-        '[exam.md](exam.md) defines the columns.\n', table,
+        '[The exam](../exam.md) defines the columns: '
+        '`tilt_rms_deg`, `heading_rms_deg`, `lever_arm_deg`, `integration_error_deg`, '
+        '`bias_error_s`.\n', table,
         f'A quick exam of VQF takes {quick_s:.2g} s.\n',
         '## Faults that are named\n', 'Each exam has seeds of its own.\n',
         report.table(('fault', 'exams', 'named', 'alone'), [
@@ -86,10 +87,6 @@ def main() -> None:
                 f'{fault} {count}' for fault, count in Counter(
                     fault for one in found for fault in one).items()) or '–')
             for name, found in unharmed.items()]))))
-    readme = ROOT / 'README.md'
-    text = re.sub(r'(<!-- exam_marks -->\n).*?(<!-- end -->\n)',
-                  lambda match: match[1] + table + match[2], readme.read_text(), flags=re.DOTALL)
-    readme.write_text(text)
 
 
 if __name__ == '__main__':

@@ -17,7 +17,7 @@ import statistics
 import numpy as np
 import report
 from cases import CUSP, HEAVY_TOP, LOOPING, NEAR_POLE, SLOW, TOY_60, TOY_200, Case, grid_ns
-from peers import angles_between
+from truth import angles_between
 
 from spinning_top_sim.solvers.dormand_prince import Integrator, Interpolants, Step
 from spinning_top_sim.solvers.equations import TransportEquations, Unknowns
@@ -113,15 +113,13 @@ def between_steps(case: Case) -> tuple[float, ...]:
     y0, y1 = (np.array([getattr(step, name) for step in steps]).T for name in ('y0', 'y1'))
     slopes0, slopes1 = (np.array(equations.derivative(*y)) for y in (y0, y1))
     cubic = 0.5 * (y0 + y1) + 0.125 * (ends - begins) * (slopes0 - slopes1)
+
+    def real(y: np.ndarray) -> np.ndarray:          # (6, n) of complex (3, n)
+        return np.stack((y.real, y.imag), axis=1).reshape(6, -1)
     return tuple(
         float(angles_between(attitudes_of(equations, rows, t),
                              case.exact.states_at_seconds(t).quaternion).max())
-        for rows, t in ((real_rows(y1), ends), (quintic, middles), (real_rows(cubic), middles)))
-
-
-def real_rows(y: np.ndarray) -> np.ndarray:
-    """Return rows of real and imaginary parts (6, n) of complex rows (3, n)."""
-    return np.stack((y.real, y.imag), axis=1).reshape(6, -1)
+        for rows, t in ((real(y1), ends), (quintic, middles), (real(cubic), middles)))
 
 
 def attitudes_of(equations: TransportEquations, rows: np.ndarray, t: np.ndarray) -> np.ndarray:

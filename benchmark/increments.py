@@ -13,21 +13,18 @@ own errors are left; with doubles those of the user's sums are added.
 from __future__ import annotations
 
 import argparse
-import math
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
 import report
-import yaml
 from cases import ROOT
+from columns import simulated
 
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.simulation import Simulation
+from spinning_top_sim.tools.scene_file import read_scene
 
 LONG = np.longdouble
 RATE = 200
-BLOCK_NS = 10 ** 10
 # Scene, lever arm [m], mounting [rad].
 CASES = (
     ('cusp', (0.1, -0.2, 0.3), (0.0, 0.0, 0.0)),
@@ -62,20 +59,9 @@ def main() -> None:
         report.preamble(f'A strapdown of the increments, {duration} s at {RATE} Hz',
                         ('numpy', 'scipy')),
         __doc__.split('\n\n')[-1].strip() + '\n', report.table(head, rows),
-        'The increments are doubles. One of angle a has an error of at least a rounding, some a '
-        '2^-54 for each axis, so that the tilt walks randomly by a 2^-54 sqrt(n) in n samples, '
-        'and a tilt that walks moves the position by g t^2/sqrt(20) times its final deviation. '
-        f'At 10 rad/s this is {bound(10.0, duration):.0e} m, at 50 rad/s '
-        f'{bound(50.0, duration):.0e} m: less is not possible with independent roundings.\n\n'
-        'The nutation of fast_gyroscope has more than one radian in a sample: attitude and '
-        'velocity are sums, but no rule finds the position from such samples of the velocity.\n'
+        'The nutation of fast_gyroscope turns by more than a radian in a sample, too much to '
+        'integrate the velocity.\n'
     )))
-
-
-def bound(rate: float, duration: float) -> float:
-    """Return the deviation of the position by the rounding of the increments alone [m]."""
-    tilt = rate / RATE * 2.0 ** -54 * math.sqrt(duration * RATE)
-    return 9.80665 * duration ** 2 / math.sqrt(20.0) * tilt
 
 
 class Run:
@@ -83,26 +69,19 @@ class Run:
 
     def __init__(self, scene: str, arm: tuple[float, ...], rpy: tuple[float, ...],
                  duration: int) -> None:
-        path = Path(ROOT) / 'config' / f'{scene}.yaml'
-        values = parameters.checked({
-            **yaml.safe_load(path.read_text())['/**']['ros__parameters'],
-            'solver.method': 'exact', 'increments.enabled': True, 'imu.rate': float(RATE),
-            'imu.lever_arm': arm, 'imu.rpy': rpy, 'ground_truth_imu_odom.rate': 1.0})
-        self.scene, self.gravity = scene, LONG(values['top.gravity'])
-        simulation = Simulation(values, 10 ** 9)
-        wanted = {one.topic: one for one in simulation.streams
-                  if one.topic in ('imu/dq', 'imu/dv', 'ground_truth/imu_odom')}
-        found: dict[str, list[tuple[np.ndarray, ...]]] = {topic: [] for topic in wanted}
-        simulation.log_to(None, list(wanted.values()))
-        for end_ns in range(BLOCK_NS, duration * 10 ** 9 + 1, BLOCK_NS):
-            simulation.advance_in_blocks(end_ns, lambda one, stamps_ns, rows: found[
-                one.topic].append(tuple(np.array(x) for x in one.template.decode(
-                    rows.tobytes()))))
-        columns = {topic: [np.concatenate(x) for x in zip(*blocks, strict=True)]
-                   for topic, blocks in found.items()}
-        (self.dq,), (self.dv,) = columns['imu/dq'], columns['imu/dv']
-        position, orientation, velocity, rates = columns['ground_truth/imu_odom']
-        self.fastest = float(np.linalg.norm(rates, axis=1).max())
+        scene_file = ROOT / f'config/{scene}.yaml'
+        run = simulated([str(scene_file), {
+            'increments.enabled': True, 'imu.rate': float(RATE), 'imu.lever_arm': list(arm),
+            'imu.rpy': list(rpy), 'ground_truth_imu_odom.rate': 1.0}],
+            ['increments', 'ground_truth_imu_odom'], duration)
+        self.scene = scene
+        self.gravity = LONG(parameters.checked(read_scene(scene_file))['top.gravity'])
+        self.dq, self.dv = run('imu/dq.quaternion', 'xyzw'), run('imu/dv.vector')
+        truth = 'ground_truth/imu_odom'
+        position = run(f'{truth}.pose.pose.position')
+        orientation = run(f'{truth}.pose.pose.orientation', 'xyzw')
+        velocity = run(f'{truth}.twist.twist.linear')
+        self.fastest = float(np.linalg.norm(run(f'{truth}.twist.twist.angular'), axis=1).max())
         self.start, self.end = ((orientation[k], rotate(orientation[k], velocity[k]), position[k])
                                 for k in (0, -1))
 

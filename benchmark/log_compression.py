@@ -30,41 +30,27 @@ from processes import median
 from report import preamble, table, write_section
 
 from spinning_top_sim.recording.chunks import ZSTD_LEVEL
-from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.writer import create_file
-from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.simulation import Simulation
+from spinning_top_sim.tools.simulate import main as simulate
 
 STREAMS = ('pose', 'joint_states', 'imu')
-TOPICS = ('pose', 'joint_states', 'imu/data_raw')
 RATES = (200, 1000, 2000)
 LEVELS = (-3, -1, 1, 2, 3)
-CHUNK_NS = 250_000_000
+CHUNK_S = 0.25              # of the default max_loss
 
 
 def chunks_at(rate: float, count: int) -> list[bytes]:
-    """Return the plain chunks of a recording at this rate [Hz]."""
-    simulation = Simulation(parameters.checked({
-        'imu.gyroscope_noise_density': 1e-3, **{f'{name}.rate': rate for name in STREAMS}}))
-    streams = [stream for stream in simulation.streams if stream.topic in TOPICS]
+    """Return plain messages of a recording at this rate [Hz], in pieces of CHUNK_S."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / 'run.mcap'
-        file = create_file(path, [
-            RecordedTopic(f'/{stream.topic}', stream.type_name) for stream in streams], {},
-            compression='none')
-        taken: list = []
-        simulation.log_to(lambda *messages: taken.append(messages), streams)
-        for k in range(1, count + 1):
-            simulation.advance(k * CHUNK_NS)
-            for indices, stamp_ns, messages, _ in taken:
-                for index, message in zip(indices, messages, strict=True):
-                    file.append(index, stamp_ns, message)
-            file.write_chunk()
-            taken.clear()
-        file.finish()
+        simulate(['-o', str(path), '--duration', str(CHUNK_S * count), '--quiet',
+                  '-p', 'record.compression:=none', '-p', 'imu.gyroscope_noise_density:=1e-3',
+                  '-p', f'record.streams:=[{", ".join(STREAMS)}]',
+                  *(word for name in STREAMS for word in ('-p', f'{name}.rate:={rate:g}.0'))])
         with path.open('rb') as log:
-            return [record.data for record in StreamReader(log, emit_chunks=True).records
-                    if isinstance(record, Chunk)]
+            plain = b''.join(record.data for record in StreamReader(log, emit_chunks=True).records
+                             if isinstance(record, Chunk))
+    size = len(plain) // count
+    return [plain[k * size:(k + 1) * size] for k in range(count)]
 
 
 def compressors() -> dict[str, Callable[[bytes], bytes]]:
@@ -77,11 +63,6 @@ def microseconds(compress: Callable[[bytes], bytes], chunk: bytes) -> float:
     start = time.thread_time_ns()
     compress(chunk)
     return (time.thread_time_ns() - start) / 1e3
-
-
-def memory_mb(compress: Callable[[bytes], bytes]) -> float:
-    """Return what a compressor of zstd holds."""
-    return compress.__self__.memory_size() / 1e6
 
 
 def rows_at(rate: float, count: int) -> list[tuple[str, ...]]:
@@ -102,7 +83,7 @@ def rows_at(rate: float, count: int) -> list[tuple[str, ...]]:
              name + (' (used)' if name == f'zstd {ZSTD_LEVEL}' else ''),
              f'{size[name] / plain:.3f}', f'{size[name] / size[standard]:.2f}',
              f'{median(cold[name]):.0f}', f'{median(warm[name]):.0f}',
-             f'{memory_mb(compress):.2f}' if name.startswith('zstd') else '–')
+             f'{compress.__self__.memory_size() / 1e6:.2f}' if name.startswith('zstd') else '–')
             for name, compress in used.items()]
 
 

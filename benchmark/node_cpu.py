@@ -6,47 +6,51 @@ Measure the processor time of `sim_node`, compared with other nodes.
     python benchmark/node_cpu.py                                # everything, takes 20 minutes
     python benchmark/node_cpu.py --rates 1000 --subscribers 1 --rounds 5 --no-report
 
-Each node publishes three streams (pose, joint_states, imu/data_raw) at the same rate, for 1 and 3
-other processes that subscribe to all of them.  `sim_node` runs with one tick per sample, and with
-its default of 200 ticks per second, where a tick publishes several samples at higher rates.  It
-is compared with `straightforward_node.py` (a timer, SciPy's RK45, message objects), which runs
-under the executor of `rclpy.spin` and under rclpy's EventsExecutor, the best that plain rclpy
-has, and with `bare_node.py` ("floor": constant bytes, one tick per sample, by a thread).  All
-take turns in every round.  The tables have medians of rounds, and of ratios within
-a round.  Processor time is that of the whole process with its DDS threads, relative to the
-elapsed time.  An arrival is the reception of a message by the middleware of a subscriber.  Jitter
-is the difference between the period and the time between two arrivals on a topic.
+Each node publishes pose, joint_states and imu/data_raw at one rate to 1 and to 3 other processes.
+`sim_node` runs with its default of 200 ticks per second and with one tick per sample.  It is
+compared with `straightforward_node.py` (a timer, SciPy's RK45, message objects), under the
+executor of `rclpy.spin` and under rclpy's EventsExecutor, and with `bare_node.py`, the floor:
+constant bytes, one tick per sample, by a thread or by a timer.  All take turns in every round;
+nodes of a pair run at once.  The tables have medians of rounds, and of ratios within a round.
+Processor time is that of the whole process, relative to the elapsed time.  An arrival is the
+reception by the middleware of a subscriber.  Jitter is the difference between the period and the
+time between two arrivals on a topic.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import itertools
 import json
-import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from processes import ROOT, SIM_NODE, Process, load, median, quantile, ros_arguments, script
+from processes import (
+    ROOT,
+    Process,
+    load,
+    median,
+    namespaces,
+    quantile,
+    ros_arguments,
+    script,
+    sim_node,
+    together,
+)
 from report import number, preamble, table, write_section
 
 STREAMS = ('pose', 'joint_states', 'imu')
 OTHERS = ('ground_truth_imu', 'ground_truth_odom', 'invariants')
-RATES = (200, 1000, 2000)
-SUBSCRIBERS = (1, 3)
-KINDS = {
-    'sim_node, 200 ticks, recording': (False, True), 'sim_node, 200 ticks': (False, False),
-    'sim_node, recording': (True, True), 'sim_node': (True, False),
-    'straightforward': None, 'straightforward, EventsExecutor': None, 'floor, thread': None,
-}
-STRAIGHT, EVENTS, FLOOR = 'straightforward', 'straightforward, EventsExecutor', 'floor, thread'
-PAIRS = (('sim_node, 200 ticks, recording', EVENTS), ('sim_node, recording', FLOOR),
-         ('sim_node', FLOOR))
+SIM, SIM_RECORDING = 'sim_node', 'sim_node, recording'
+TICKS_RECORDING = 'sim_node, 200 ticks, recording'
+STRAIGHT, EVENTS = 'straightforward', 'straightforward, EventsExecutor'
+FLOOR, TIMER = 'floor, thread', 'floor, timer'
+KINDS = (TICKS_RECORDING, 'sim_node, 200 ticks', SIM_RECORDING, SIM, STRAIGHT, EVENTS, FLOOR)
+PAIRS = ((TICKS_RECORDING, EVENTS), (SIM_RECORDING, FLOOR), (SIM, FLOOR), (FLOOR, TIMER))
 
 
 @dataclass
@@ -62,50 +66,35 @@ class Result:
 
 def program(kind: str, rate: float, namespace: str, folder: Path) -> list[str]:
     """Return the arguments of python for this kind of node."""
-    ours = KINDS[kind]
-    if ours is not None:
-        tick_a_sample, records = ours
-        parameters = {'status_period': 0.0,
-                      **({'tick_rate': float(rate)} if tick_a_sample else {}),
-                      'record.enabled': records, 'record.uri': str(folder) + '/',
-                      **{f'{name}.rate': float(rate) for name in STREAMS},
-                      **{f'{name}.enabled': False for name in OTHERS}}
-        return [*SIM_NODE, *ros_arguments(namespace, parameters)]
     if kind in (STRAIGHT, EVENTS):
         executor = 'events' if kind == EVENTS else 'single'
         return [*script('straightforward_node.py'),
                 *ros_arguments(namespace, {'rate': float(rate), 'executor': executor})]
-    return [*script('bare_node.py'),
-            *ros_arguments(namespace, {'rate': float(rate), 'pacing': 'thread'})]
+    if kind in (FLOOR, TIMER):
+        return [*script('bare_node.py'), *ros_arguments(
+            namespace, {'rate': float(rate), 'pacing': kind.removeprefix('floor, ')})]
+    return sim_node(namespace, {
+        'status_period': 0.0, **({} if '200 ticks' in kind else {'tick_rate': float(rate)}),
+        'record.enabled': 'recording' in kind, 'record.uri': f'{folder}/',
+        **{f'{name}.rate': float(rate) for name in STREAMS},
+        **{f'{name}.enabled': False for name in OTHERS}})
 
 
-_namespaces = itertools.count(1)
-
-
-def measure(kind: str, rate: float, subscribers: int, seconds: float, warm_up: float,
-            folder: Path) -> Result | None:
-    """Run one node with its subscribers; return None if one did not start."""
-    namespace = f'/n{next(_namespaces)}'
+def measure(kind: str, rate: float, subscribers: int, seconds: float, folder: Path) -> Result:
+    """Run one node with its subscribers."""
+    namespace = next(namespaces)
     listeners = [Process((*script('listener.py'), namespace), talks=True)
                  for _ in range(subscribers)]
     try:
         for listener in listeners:
             listener.line()
         with Process(program(kind, rate, namespace, folder)) as node:
-            if not settled(listeners, warm_up):
-                return None
-            for listener in listeners:
-                listener.tell('report')
-                listener.line()
+            wait_for_all_topics(listeners, kind)
+            ask(listeners)
             cpu, begin = node.cpu_ns(), time.monotonic_ns()
             time.sleep(seconds)
             cpu, taken = node.cpu_ns() - cpu, time.monotonic_ns() - begin
-            for listener in listeners:
-                listener.tell('report')
-            said = [json.loads(listener.line()) for listener in listeners]
-            if not node.alive:
-                return None
-        return result(cpu / taken, said, rate, kind)
+            return result(cpu / taken, ask(listeners), rate)
     finally:
         for listener in listeners:
             listener.end()
@@ -113,23 +102,28 @@ def measure(kind: str, rate: float, subscribers: int, seconds: float, warm_up: f
             path.unlink()
 
 
-def settled(listeners: list[Process], warm_up: float) -> bool:
-    """Wait until every listener has received every topic, and for the warm-up."""
+def ask(listeners: list[Process]) -> list[dict]:
+    """Return what the listeners have received since they were asked last."""
+    for listener in listeners:
+        listener.tell('report')
+    return [json.loads(listener.line()) for listener in listeners]
+
+
+def wait_for_all_topics(listeners: list[Process], kind: str) -> None:
+    """Wait until every listener has received every topic, and a little longer."""
     give_up = time.monotonic() + 30.0
     for listener in listeners:
         heard: set[str] = set()
         while len(heard) < len(STREAMS):
             if time.monotonic() > give_up:
-                return False
+                raise SystemExit(f'{kind} did not start')
             time.sleep(0.05)
-            listener.tell('report')
-            heard |= {topic for topic, got in json.loads(listener.line()).items() if got[0]}
-    time.sleep(warm_up if listeners else 1.5 + warm_up)     # a start takes a second
-    return True
+            heard |= {topic for topic, got in ask([listener])[0].items() if got[0]}
+    time.sleep(1.5)
 
 
-def result(share: float, said: list[dict], rate: float, kind: str) -> Result:
-    """Return the result of the reports of the listeners."""
+def result(share: float, said: list[dict], rate: float) -> Result:
+    """Return the result from the reports of the listeners."""
     found = Result(share)
     period_ns = 1e9 / rate
     for times, numbers, stamps in (got for one in said for got in one.values()):
@@ -139,217 +133,86 @@ def result(share: float, said: list[dict], rate: float, kind: str) -> Result:
         found.rates.append((len(times) - 1) / (times[-1] - times[0]) * 1e9)
         found.jitter_ms += [abs(b - a - period_ns) / 1e6 for a, b in itertools.pairwise(times)]
         found.lost += numbers[-1] - numbers[0] + 1 - len(numbers)
-        if KINDS[kind] is not None:
-            found.gaps += round((stamps[-1] - stamps[0]) / period_ns) + 1 - len(stamps)
+        found.gaps += round((stamps[-1] - stamps[0]) / period_ns) + 1 - len(stamps)
     return found
 
 
-def cases(arguments: argparse.Namespace) -> Iterator[tuple[int, int]]:
-    yield from itertools.product(arguments.rates, arguments.subscribers)
+def in_turns(options: argparse.Namespace) -> str:
+    """Return the table of all kinds of nodes at all rates."""
+    rows = []
+    for rate, subscribers in itertools.product(options.rates, options.subscribers):
+        found: dict[str, list[Result]] = {kind: [] for kind in KINDS}
+        with tempfile.TemporaryDirectory() as folder:
+            for _ in range(options.rounds):
+                for kind, runs in found.items():
+                    runs.append(measure(kind, rate, subscribers, options.seconds, Path(folder)))
+        rows += [(str(rate), str(subscribers), *row(kind, runs, found[EVENTS]))
+                 for kind, runs in found.items()]
+        print(*rows[-len(KINDS):], sep='\n', flush=True)
+    return table(('Hz', 'subscribers', 'node', 'of a core', f'relative to {EVENTS}',
+                  'arrived [Hz]', 'jitter p50 [ms]', 'p99 [ms]', 'max [ms]', 'lost on the way',
+                  'missing in the stamps'), rows)
 
 
-def measured(arguments: argparse.Namespace) -> dict:
-    """Return {(rate, subscribers): {kind: [Result of each round]}}."""
-    found: dict = {case: {kind: [] for kind in arguments.kinds} for case in cases(arguments)}
-    folder = Path(tempfile.mkdtemp(prefix='node_cpu_'))
-    try:
-        for number_ in range(arguments.rounds):
-            for case in cases(arguments):
-                for kind in arguments.kinds:
-                    one = measure(kind, *case, arguments.seconds, arguments.warm_up, folder)
-                    found[case][kind].append(one)
-                    print(f'round {number_ + 1}, {case[0]} Hz, {case[1]} subscribers, {kind}: '
-                          + ('failed' if one is None else
-                             f'{100 * one.share:.1f} %, {mean_rate(one):.0f} Hz')
-                          + f', load {load():.1f}', flush=True)
-    except KeyboardInterrupt:
-        print('interrupted: the tables are incomplete, and are not written')
-        arguments.no_report = True
-    finally:
-        shutil.rmtree(folder)
-    return found
+def row(kind: str, runs: list[Result], others: list[Result]) -> list[str]:
+    """Return the cells of a kind of node."""
+    return [kind, f'{median([run.share for run in runs]):.1%}',
+            number(median([a.share / b.share for a, b in zip(runs, others, strict=True)])),
+            f'{median([sum(run.rates) / len(run.rates) for run in runs]):.1f}',
+            *(f'{median([quantile(run.jitter_ms, share) for run in runs]):.3f}'
+              for share in (0.5, 0.99, 1.0)),
+            str(sum(run.lost for run in runs)),
+            str(sum(run.gaps for run in runs)) if kind.startswith(SIM) else '–']
 
 
-def together(programs: Mapping[str, Callable[[str], list[str]]], rounds: int, seconds: float,
-             subscribers: int = 0, checkouts: Mapping[str, Path] | None = None
-             ) -> dict[str, list[float]]:
-    """
-    Return the processor time over elapsed time of nodes that run at once, of each in every round.
-
-    So both nodes meet the same load of the machine.  They take turns in starting first.
-    programs: arguments of python for a node, by its namespace;  subscribers: of each node;
-    checkouts: whose package a node runs, if not that of this one
-    """
-    shares: dict[str, list[float]] = {name: [] for name in programs}
-    for number_ in range(rounds):
-        with contextlib.ExitStack() as running:
-            nodes = {}
-            for name in list(programs)[::-1 if number_ % 2 else 1]:
-                namespace = f'/n{next(_namespaces)}'
-                for _ in range(subscribers):
-                    running.enter_context(
-                        Process((*script('listener.py'), namespace), talks=True)).line()
-                nodes[name] = running.enter_context(Process(
-                    programs[name](namespace), checkout=(checkouts or {}).get(name, ROOT)))
-            time.sleep(4.0)
-            begin = {name: (node.cpu_ns(), time.monotonic_ns()) for name, node in nodes.items()}
-            time.sleep(seconds)
-            for name, node in nodes.items():
-                cpu, at = begin[name]
-                shares[name].append((node.cpu_ns() - cpu) / (time.monotonic_ns() - at))
-    return shares
-
-
-def pair_row(shares: dict[str, list[float]]) -> tuple[str, ...]:
-    """Return the processor time of two nodes, and the median of their ratios with its range."""
+def in_pairs(programs: Mapping[str, Callable[[str], list[str]]], rounds: int, seconds: float,
+             subscribers: int = 1) -> tuple[str, ...]:
+    """Return the row of two nodes that run at once: their time, and the ratio."""
+    shares = together({name: (program, ROOT) for name, program in programs.items()}, rounds,
+                      seconds, subscribers)
     one, other = shares.values()
     ratios = [a / b for a, b in zip(one, other, strict=True)]
-    return (f'{100 * median(one):.1f}', f'{100 * median(other):.1f}',
-            *(number(value, 3) for value in (median(ratios), min(ratios), max(ratios))))
+    cells = (*programs, f'{median(one):.1%}', f'{median(other):.1%}',
+             *(number(value, 3) for value in (median(ratios), min(ratios), max(ratios))))
+    print(cells, flush=True)
+    return cells
 
 
-def idle(rounds: int, seconds: float) -> str:
-    """Return the table of the cost of streams without subscribers."""
-    switches = [f'{name}.enabled' for name in (*STREAMS, 'imu_data', *OTHERS, 'clock')]
+def all_pairs(rounds: int, seconds: float) -> str:
+    """Return the table of pairs at 1 kHz, and of streams without subscribers."""
+    def idle(enabled: bool) -> Callable[[str], list[str]]:
+        return lambda namespace: sim_node(namespace, {
+            'tick_rate': 1000.0, 'status_period': 0.0, **{
+                f'{name}.enabled': enabled for name in (*STREAMS, 'imu_data', *OTHERS, 'clock')}})
 
-    def node(enabled: bool) -> Callable[[str], list[str]]:
-        return lambda namespace: [*SIM_NODE, *ros_arguments(namespace, {
-            'tick_rate': 1000.0, 'status_period': 0.0, **dict.fromkeys(switches, enabled)})]
-
-    return table(
-        ('all streams enabled [%]', 'none enabled [%]', 'ratio', 'smallest', 'largest'),
-        [pair_row(together({'all': node(True), 'none': node(False)}, rounds, seconds))])
-
-
-def in_pairs(rounds: int, seconds: float) -> str:
-    """Return the table of `sim_node` and another node that run at once, at 1 kHz."""
-    with tempfile.TemporaryDirectory() as name:
+    with tempfile.TemporaryDirectory() as folder:
         def node(kind: str) -> Callable[[str], list[str]]:
-            return lambda namespace: program(kind, 1000, namespace, Path(name))
-
-        return table(
-            ('node', 'other', 'node [%]', 'other [%]', 'ratio', 'smallest', 'largest'),
-            [(kind, other, *pair_row(together({kind: node(kind), other: node(other)}, rounds,
-                                              seconds, subscribers=1)))
-             for kind, other in PAIRS])
-
-
-def mean_rate(one: Result) -> float:
-    return sum(one.rates) / len(one.rates) if one.rates else float('nan')
-
-
-def ratio(runs: dict, kind: str, to: str, per_sample: bool) -> float:
-    """Return the median of the ratios within rounds; NaN where one is missing."""
-    def cost(one: Result) -> float:
-        return one.share / mean_rate(one) if per_sample else one.share
-    return median([cost(a) / cost(b) for a, b in zip(runs[kind], runs[to], strict=True)
-                   if a and b and (not per_sample or (mean_rate(a) and mean_rate(b)))])
-
-
-def share_table(found: dict) -> str:
-    """Return the processor time of every kind in every case."""
-    kinds = list(next(iter(found.values())))
-    rows = [(str(rate), str(subscribers),
-             *(f'{100 * median([run.share for run in runs[kind] if run]):.1f}'
-               for kind in kinds)) for (rate, subscribers), runs in found.items()]
-    return table(('Hz', 'subscribers', *kinds), rows)
-
-
-COMPARED = (*((kind, EVENTS) for kind, ours in KINDS.items() if ours), (STRAIGHT, EVENTS),
-            ('sim_node, recording', FLOOR), ('sim_node', FLOOR))
-
-
-def ratio_table(found: dict, per_sample: bool = False) -> str:
-    """Return the ratios of processor time, of a second or of a sample that arrived."""
-    kinds = next(iter(found.values()))
-    pairs = [pair for pair in COMPARED if set(pair) <= set(kinds)]
-    rows = [(str(rate), str(subscribers), *(number(ratio(runs, *pair, per_sample))
-                                          for pair in pairs))
-            for (rate, subscribers), runs in found.items() if subscribers or not per_sample]
-    return table(('Hz', 'subscribers', *(f'{a} / {b}' for a, b in pairs)), rows)
-
-
-def arrival_table(found: dict) -> str:
-    """Return rate, jitter and loss of the messages of one subscriber."""
-    rows = []
-    for (rate, subscribers), kinds in found.items():
-        for kind, all_runs in kinds.items():
-            runs = [run for run in all_runs if run and run.rates]
-            if not runs:
-                continue
-            rows.append((
-                str(rate), str(subscribers), kind, f'{median([mean_rate(r) for r in runs]):.1f}',
-                *(f'{median([quantile(r.jitter_ms, share) for r in runs]):.3f}'
-                  for share in (0.5, 0.99, 1.0)),
-                str(sum(run.lost for run in runs)),
-                str(sum(run.gaps for run in runs)) if KINDS[kind] else '–'))
-    return table(('Hz', 'subscribers', 'node', 'arrived [Hz]', 'jitter p50 [ms]', 'p99 [ms]',
-                  'max [ms]', 'lost on the way', 'missing in the stamps'), rows)
-
-
-def figure(found: dict, path: Path) -> None:
-    """Draw processor time over rate, a panel for each number of subscribers."""
-    from matplotlib.figure import Figure
-
-    subscribers = sorted({case[1] for case in found})
-    drawing = Figure(figsize=(4.0 * len(subscribers), 3.6), layout='constrained')
-    axes = drawing.subplots(1, len(subscribers), sharey=True, squeeze=False)[0]
-    for panel, count in zip(axes, subscribers, strict=True):
-        rates = [rate for rate, n in found if n == count]
-        for kind in next(iter(found.values())):
-            style = {'floor': ':', STRAIGHT: '--'}.get(kind.split(',')[0], '-')
-            panel.plot(rates, [100 * median([run.share for run in found[rate, count][kind] if run])
-                               for rate in rates], style, marker='.', label=kind)
-        panel.set(xscale='log', yscale='log', xlabel='rate of three streams [Hz]',
-                  title=f'{count} subscribing process{"" if count == 1 else "es"}')
-        panel.set_xticks(rates, [str(rate) for rate in rates])
-        panel.minorticks_off()
-        panel.grid(alpha=0.3)
-    axes[0].set_ylabel('processor time [% of a core]')
-    axes[0].legend(fontsize=7)
-    drawing.savefig(path, dpi=110)
+            return lambda namespace: program(kind, 1000, namespace, Path(folder))
+        rows = [in_pairs({kind: node(kind) for kind in pair}, rounds, seconds) for pair in PAIRS]
+    rows.append(in_pairs({'no subscriber, all streams enabled': idle(True),
+                          'none enabled': idle(False)}, rounds, seconds, subscribers=0))
+    return table(('node', 'other', 'node', 'other', 'ratio', 'smallest', 'largest'), rows)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--rates', type=int, nargs='+', default=RATES, help='Hz')
-    parser.add_argument('--subscribers', type=int, nargs='+', default=SUBSCRIBERS)
-    parser.add_argument('--kinds', nargs='+', default=list(KINDS), choices=KINDS, metavar='KIND',
-                        help=f'of {list(KINDS)}')
-    parser.add_argument('--rounds', type=int, default=3)
+    parser.add_argument('--rates', type=int, nargs='+', default=(200, 1000, 2000), help='Hz')
+    parser.add_argument('--subscribers', type=int, nargs='+', default=(1, 3))
+    parser.add_argument('--rounds', type=int, default=3, help='twice as many of pairs')
     parser.add_argument('--seconds', type=float, default=2.0, help='measured in each run')
-    parser.add_argument('--warm-up', type=float, default=1.5, help='before that')
-    parser.add_argument('--pair-rounds', type=int, default=6,
-                        help='of the tables of nodes that run at once')
     parser.add_argument('--no-report', action='store_true', help='print the tables only')
-    arguments = parser.parse_args()
+    options = parser.parse_args()
     head = preamble('Processor time of the node')        # with the commit that is there now
     at_first = load()
-    unheard = idle(arguments.pair_rounds, 2.0 * arguments.seconds)
-    print(unheard, flush=True)
-    pairs = in_pairs(arguments.pair_rounds, 2.0 * arguments.seconds)
-    print(pairs, flush=True)
-    found = measured(arguments)
+    pairs = all_pairs(2 * options.rounds, 2.0 * options.seconds)
     text = '\n'.join((
-        f'Load average at the start {at_first:.1f}, at the end {load():.1f} (including the '
-        f'benchmark itself); {arguments.rounds} rounds of {arguments.seconds:g} s.\n',
-        '## Processor time [% of a core]\n', share_table(found),
-        '## Ratios of processor time\n', ratio_table(found),
-        '## Ratios of processor time per received sample\n',
-        ratio_table(found, per_sample=True),
-        '## In pairs\n',
-        'Processor time at 1 kHz with one subscriber each.  Both nodes of a pair run at once, so '
-        f'that they meet the same load of the machine; {arguments.pair_rounds} rounds.\n', pairs,
-        '## Streams without subscribers\n',
-        'Processor time at 1000 ticks per second, default rates, no subscriber; both nodes of a '
-        f'pair run at once, {arguments.pair_rounds} rounds.\n', unheard,
-        '## Arrivals\n', arrival_table(found)))
+        f'{options.rounds} rounds of {options.seconds:g} s, twice as many of pairs; load average '
+        f'at the start {at_first:.1f}.\n',
+        '## Pairs at 1 kHz\n', pairs, '## All nodes\n', in_turns(options)))
     print(text)
-    if not arguments.no_report:
-        figure(found, ROOT / 'docs' / 'node_cpu.png')
-        write_section('node_cpu', head, __doc__, '![Processor time over rate](node_cpu.png)\n',
-                      text)
+    if not options.no_report:
+        write_section('node_cpu', head, __doc__, text)
 
 
 if __name__ == '__main__':

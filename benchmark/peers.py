@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-All methods that the benchmarks compare, with one interface.
+The methods that the benchmarks compare, with one interface.
 
-`Peer.ready(case, setting)` does what is done once a model (compiling, loading) and is not timed;
-the runner it returns is asked for attitudes, which is what is timed, or for `Samples`, which hold
-all that can be checked.  Each peer gets what its users would write for it, at its fastest:
-MuJoCo steps in its own C loop, heyoka and diffrax compile, SciPy evaluates its dense output for
-all instants at once.
+`Peer.ready(case, setting)` compiles or loads a model, which is not timed.  The runner that it
+returns computes attitudes, which is timed, or `Samples`, which can be checked.  Each method is
+used at its fastest: MuJoCo steps in its own C loop, heyoka and diffrax compile.
 """
 
 from __future__ import annotations
@@ -16,7 +14,8 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from fractions import Fraction
+from functools import partial
+from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,13 +57,9 @@ class Samples(NamedTuple):
 
 
 class Runner:
-    """
-    One method at one setting on one case.
+    """One method at one setting on one case."""
 
-    work: amount of work of the last run, in `Peer.unit`; None if unknown.
-    """
-
-    work: int | None = None
+    work: int | None = None         # of the last run, in `Peer.unit`
 
     def __init__(self, case: Case, setting: float) -> None:
         self.case, self.setting = case, setting
@@ -89,26 +84,18 @@ class Peer:
     ready: Callable[[Case, float], Runner]
     settings: tuple[float, ...]
     unit: str = 'evaluations'
-    # What a setting is: a tolerance, or steps a second.
-    knob: str = 'tolerance'
     needs: str = ''
 
-    def setting_text(self, setting: float) -> str:
-        if not setting:
-            return ''
-        return f'{1e3 / setting:.3g} ms' if self.knob == 'rate' else f'{setting:.2g}'
+    def label(self, setting: float) -> str:
+        """Return the name with a setting: a tolerance, or steps a second."""
+        text = f'{1e3 / setting:.3g} ms' if setting > 1.0 else f'{setting:.2g}' if setting else ''
+        return f'{self.name} {text}'.strip()
 
     def missing(self) -> str | None:
         """Return why the method cannot be run here, or None."""
-        if self.needs:
-            try:
-                __import__(self.needs)
-            except Exception as error:      # any exception of a package is the reason
-                return f'{type(error).__name__}: {error}'
-        return None
+        absent = self.needs and find_spec(self.needs) is None
+        return f'{self.needs} is not installed' if absent else None
 
-
-# ------------------------------------------------------------------------------------------ ours
 
 class _Ours(Runner):
     def __init__(self, case: Case, setting: float, **options: Any) -> None:
@@ -117,19 +104,17 @@ class _Ours(Runner):
         if setting:
             self._options |= {'rtol': setting, 'atol': 0.1 * setting}
 
-    def _propagator(self):
-        return propagate(self.case.top, self.case.start, **self._options)
-
-    def attitudes(self, ns):
-        propagator = self._propagator()
-        result = propagator.states(ns).quaternion
-        self.work = propagator.evaluations or None
-        return result
-
-    def samples(self, ns):
-        propagator = self._propagator()
+    def _states(self, ns):
+        propagator = propagate(self.case.top, self.case.start, **self._options)
         states = propagator.states(ns)
         self.work = propagator.evaluations or None
+        return states
+
+    def attitudes(self, ns):
+        return self._states(ns).quaternion
+
+    def samples(self, ns):
+        states = self._states(ns)
         return Samples(states.quaternion, states.angular_velocity, states.phi, states.psi)
 
 
@@ -138,16 +123,6 @@ class _ExactGrid(Runner):
         solution = ExactSolution(self.case.top, self.case.start)
         return solution.states(range(0, int(ns[1]) * len(ns), int(ns[1]))).quaternion
 
-
-def _exact(case: Case, setting: float) -> Runner:
-    return _Ours(case, setting, method='exact')
-
-
-def _rk45(equations: str) -> Callable[[Case, float], Runner]:
-    return lambda case, setting: _Ours(case, setting, method='rk45', equations=equations)
-
-
-# ------------------------------------------------------------------------- the literal equations
 
 def literal_rates(case: Case, y: Any, sin: Callable, cos: Callable) -> tuple[Any, ...]:
     """Return eqs. (29)-(32) of the paper, written literally."""
@@ -244,8 +219,6 @@ class _HeyokaLiteral(_Literal):
     def angles(self, ns):
         return _heyoka_grid(self, literal_start(self.case), ns).T
 
-
-# ----------------------------------------------------------------------- the quadratic equations
 
 def quadratic_rates(y: Any, half_over_lambda1: Any, torque: Any, lz: Any) -> tuple[Any, ...]:
     """
@@ -369,44 +342,6 @@ class _Diffrax(_Quadratic):
         return np.asarray(states)
 
 
-class _Numbalsoda(_Quadratic):
-    """A method of numbalsoda, its right-hand side compiled by numba."""
-
-    def __init__(self, case: Case, setting: float, method: str) -> None:
-        super().__init__(case, setting)
-        import numbalsoda
-        self._solve, self._rates = getattr(numbalsoda, method), _compiled_rates()
-        self._constants = np.array((0.5 / case.top.lambda1, case.top.gravity_torque,
-                                    case.start.lz))
-
-    def compile(self, ns):
-        self.states(ns[:2])
-
-    def states(self, ns):
-        states, succeeded = self._solve(
-            self._rates, np.array(quadratic_start(self.case)), ns / 1e9, data=self._constants,
-            rtol=self.setting, atol=0.1 * self.setting)
-        if not succeeded:
-            raise FailedError('not successful')
-        return states
-
-
-@functools.cache
-def _compiled_rates() -> int:
-    """Return the address of `quadratic_rates` as numbalsoda calls it."""
-    import numba
-    from numbalsoda import lsoda_sig
-    rates = numba.njit(quadratic_rates)
-
-    @numba.cfunc(lsoda_sig)
-    def called(t, y, y_dot, constants):
-        y_dot[0], y_dot[1], y_dot[2], y_dot[3], y_dot[4], y_dot[5] = rates(
-            (y[0], y[1], y[2], y[3], y[4], y[5]), constants[0], constants[1], constants[2])
-    return called.address
-
-
-# ---------------------------------------------------------------------------------------- MuJoCo
-
 class _MuJoCo(Runner):
     """A body on a ball joint at the pivot; setting: steps a second, a multiple of 512."""
 
@@ -458,101 +393,25 @@ class _MuJoCo(Runner):
         return Samples(states[:, [1, 2, 3, 0]], states[:, 4:])
 
 
-def _scipy(method: str) -> Callable[[Case, float], Runner]:
-    return lambda case, setting: _SciPy(case, setting, method)
-
-
-def _numbalsoda(method: str) -> Callable[[Case, float], Runner]:
-    return lambda case, setting: _Numbalsoda(case, setting, method)
-
-
-def _mujoco(integrator: str) -> Callable[[Case, float], Runner]:
-    return lambda case, setting: _MuJoCo(case, setting, integrator)
-
-
-TAYLOR = (1e-6, 1e-9, 1e-12, 2.0 ** -52)
+RTOL = 1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13
+SCIPY = 1e-6, 1e-9, 1e-12
+TAYLOR = *SCIPY, 2.0 ** -52
+RATES = 512.0, 2048.0, 8192.0
 PEERS = (
-    Peer('exact, any times', 'ours', _exact, (0.0,), unit=''),
+    Peer('exact, any times', 'ours', partial(_Ours, method='exact'), (0.0,), unit=''),
     Peer('exact, grid', 'ours', _ExactGrid, (0.0,), unit=''),
-    Peer('rk45 transport', 'ours', _rk45('transport'), (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)),
-    Peer('rk45 euler', 'ours', _rk45('euler'), (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)),
-    Peer('SciPy RK45', 'SciPy', _scipy('RK45'), (1e-3, 1e-6, 1e-9), needs='scipy'),
-    Peer('SciPy DOP853', 'SciPy', _scipy('DOP853'), (1e-6, 1e-9, 1e-12), needs='scipy'),
-    Peer('SciPy LSODA', 'SciPy', _scipy('LSODA'), (1e-6, 1e-9, 1e-12), needs='scipy'),
+    *(Peer(f'rk45 {equations}', 'ours', partial(_Ours, method='rk45', equations=equations), RTOL)
+      for equations in ('transport', 'euler')),
+    Peer('SciPy RK45', 'SciPy', partial(_SciPy, method='RK45'), (1e-3, 1e-6, 1e-9)),
+    Peer('SciPy DOP853', 'SciPy', partial(_SciPy, method='DOP853'), SCIPY),
+    Peer('SciPy LSODA', 'SciPy', partial(_SciPy, method='LSODA'), SCIPY),
     Peer('heyoka Euler', 'heyoka', _HeyokaLiteral, TAYLOR, unit='steps', needs='heyoka'),
     Peer('heyoka quadratic', 'heyoka', _HeyokaQuadratic, TAYLOR, unit='steps', needs='heyoka'),
-    Peer('diffrax Dopri8 quadratic', 'diffrax', _Diffrax, (1e-6, 1e-9, 1e-12), unit='steps',
-         needs='diffrax'),
-    Peer('numbalsoda LSODA quadratic', 'numbalsoda', _numbalsoda('lsoda'), (1e-6, 1e-9, 1e-12),
-         unit='', needs='numbalsoda'),
-    Peer('numbalsoda DOP853 quadratic', 'numbalsoda', _numbalsoda('dop853'),
-         (1e-6, 1e-9, 1e-12), unit='', needs='numbalsoda'),
-    Peer('MuJoCo RK4', 'MuJoCo', _mujoco('RK4'), (512.0, 2048.0, 8192.0), unit='steps',
-         knob='rate', needs='mujoco'),
-    Peer('MuJoCo implicit', 'MuJoCo', _mujoco('implicit'), (512.0, 2048.0, 8192.0),
-         unit='steps', knob='rate', needs='mujoco'),
+    Peer('diffrax Dopri8 quadratic', 'diffrax', _Diffrax, SCIPY, unit='steps', needs='diffrax'),
+    *(Peer(f'MuJoCo {integrator}', 'MuJoCo', partial(_MuJoCo, integrator=integrator), RATES,
+           unit='steps', needs='mujoco') for integrator in ('RK4', 'implicit')),
 )
 
 
 def peer(name: str) -> Peer:
     return next(p for p in PEERS if p.name == name)
-
-
-# ----------------------------------------------------------------------------------------- truth
-
-def angles_between(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """
-    Return the rotation angle [rad] between attitudes (n, 4): q and -q are the same one.
-
-    Quaternions are normalized first, so that a drift of |q| does not count.
-    """
-    p = p / np.linalg.norm(p, axis=1, keepdims=True)
-    q = q / np.linalg.norm(q, axis=1, keepdims=True)
-    apart, opposite = (np.linalg.norm(p - q, axis=1), np.linalg.norm(p + q, axis=1))
-    return 4.0 * np.arctan2(np.minimum(apart, opposite), np.maximum(apart, opposite))
-
-
-def long_attitudes(case: Case, ns: np.ndarray) -> np.ndarray:
-    """
-    Return (n, 4) x, y, z, w from heyoka in BITS-bit arithmetic: an independent truth.
-
-    The constants are taken as `ExactSolution` takes them: doubles, their products exact.
-    """
-    import heyoka as hy
-
-    def real(value: Fraction | float) -> Any:
-        exact = Fraction(value)
-        return (hy.real(str(exact.numerator), BITS) / hy.real(str(exact.denominator), BITS))
-
-    top, start = case.top, case.start
-    theta, l3, lz = real(start.theta), real(start.l3), real(start.lz)
-    lambda1, zero, half = real(top.lambda1), real(0), real(Fraction(1, 2))
-    torque = real(Fraction(top.mass) * Fraction(top.gravity) * Fraction(top.com_distance))
-    sine, cosine = np.sin(theta), np.cos(theta)
-    phi_dot = (lz - l3 * cosine) / (lambda1 * sine * sine) if start.theta else zero
-    across, along = sine * (l3 - lambda1 * phi_dot * cosine), lambda1 * real(start.theta_dot)
-    phi, psi = real(start.phi), real(start.psi)
-    c, s = np.cos(half * theta), np.sin(half * theta)
-    plus, minus = half * (phi + psi), half * (phi - psi)
-    state = [c * np.cos(plus), -s * np.sin(minus), s * np.cos(minus), c * np.sin(plus),
-             across * np.cos(phi) - along * np.sin(phi),
-             across * np.sin(phi) + along * np.cos(phi)]
-    unknowns = hy.make_vars('w', 'x', 'y', 'z', 'lx', 'ly')
-    rates = quadratic_rates([hy.expression(u) if isinstance(u, str) else u for u in unknowns],
-                            half / lambda1, torque, lz)
-    integrator = hy.taylor_adaptive(list(zip(unknowns, rates, strict=True)), np.array(state),
-                                    fp_type=hy.real)
-    spin = half * real(Fraction(start.l3) / Fraction(top.lambda3)
-                       - Fraction(start.l3) / Fraction(top.lambda1))
-    rows = []
-    for n in ns.tolist():
-        t = real(Fraction(n, 10 ** 9))
-        integrator.propagate_until(t)
-        w, x, y, z = integrator.state[:4]
-        c, s = np.cos(spin * t), np.sin(spin * t)
-        rows.append([float(v) for v in (x * c + y * s, y * c - x * s, z * c + w * s,
-                                        w * c - z * s)])
-    return np.array(rows)
-
-
-BITS = 160

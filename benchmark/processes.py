@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
+import resource
 import select
 import signal
 import statistics
@@ -13,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -35,6 +37,11 @@ def ros_arguments(namespace: str, parameters: Mapping[str, Any]) -> list[str]:
 
 # -P: of this checkout, by PYTHONPATH, and not of whatever lies in the working directory.
 SIM_NODE = ('-P', '-m', 'spinning_top_sim.nodes.sim_node')
+
+
+def sim_node(namespace: str, parameters: Mapping[str, Any]) -> list[str]:
+    """Return what python is given to run `sim_node`."""
+    return [*SIM_NODE, *ros_arguments(namespace, parameters)]
 
 
 def script(name: str) -> tuple[str]:
@@ -119,6 +126,56 @@ class Process:
             return self._process.wait()
 
 
+def children_cpu() -> float:
+    """Return the processor time of all processes that have ended [s], with their own children."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def run_module(module: str, arguments: Sequence[str], checkout: Path = ROOT) -> float:
+    """Run a module to its end; return its processor time [s].  Raises SystemExit if it fails."""
+    before = children_cpu()
+    run = subprocess.run([sys.executable, '-P', '-m', module, *arguments], check=False,
+                         env=environment(checkout), stdout=subprocess.DEVNULL, timeout=3600.0)
+    if run.returncode:
+        raise SystemExit(f'{module} of {checkout} ended with exit code {run.returncode}')
+    return children_cpu() - before
+
+
+namespaces = (f'/n{k}' for k in itertools.count(1))
+
+
+def together(programs: Mapping[str, tuple[Callable[[str], Sequence[str]], Path]], rounds: int,
+             seconds: float, subscribers: int = 0) -> dict[str, list[float]]:
+    """
+    Return the processor time over elapsed time of nodes that run at once, for each round.
+
+    All nodes meet the same load of the machine; another one starts first each time.
+
+    programs: by name, the arguments of python for a namespace, and the checkout
+    """
+    shares: dict[str, list[float]] = {name: [] for name in programs}
+    for first in range(rounds):
+        with contextlib.ExitStack() as running:
+            nodes = {}
+            for k in range(len(programs)):
+                name = list(programs)[(first + k) % len(programs)]
+                program, checkout = programs[name]
+                namespace = next(namespaces)
+                for _ in range(subscribers):
+                    running.enter_context(
+                        Process((*script('listener.py'), namespace), talks=True)).line()
+                nodes[name] = running.enter_context(
+                    Process(program(namespace), checkout=checkout))
+            time.sleep(4.0)
+            begin = {name: (node.cpu_ns(), time.monotonic_ns()) for name, node in nodes.items()}
+            time.sleep(seconds)
+            for name, node in nodes.items():
+                cpu, at = begin[name]
+                shares[name].append((node.cpu_ns() - cpu) / (time.monotonic_ns() - at))
+    return shares
+
+
 # Runs `simulate` and says what it has held at most.  The rusage of a child counts what its parent
 # held when it was started, too.
 _SIMULATE = """
@@ -138,7 +195,7 @@ def simulate(arguments: Sequence[str], checkout: Path = ROOT) -> tuple[float, in
     """
     begin = time.monotonic()
     run = subprocess.run(
-        [sys.executable, '-P', '-c', _SIMULATE, *arguments, '--quiet'], stdout=subprocess.PIPE,
+        [sys.executable, '-P', '-c', _SIMULATE, *arguments], stdout=subprocess.PIPE,
         text=True, env=environment(checkout), timeout=3600.0, check=False)
     taken = time.monotonic() - begin
     if run.returncode:

@@ -12,10 +12,12 @@ import subprocess
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 from cases import ROOT
 
-PACKAGES = ('numpy', 'scipy', 'heyoka', 'mujoco', 'jax', 'diffrax', 'numbalsoda', 'matplotlib')
+MEASURED = ROOT / 'docs/measured'
+PACKAGES = 'numpy', 'scipy', 'heyoka', 'mujoco', 'jax', 'diffrax', 'matplotlib'
 
 
 def preamble(title: str, packages: Sequence[str] = PACKAGES) -> str:
@@ -50,25 +52,31 @@ def number(value: float | None, digits: int = 2) -> str:
 
 
 def write(name: str, text: str) -> None:
-    """Write docs/<name> and say so."""
-    path = ROOT / 'docs' / name
-    path.write_text(text)
-    print(f'wrote {path.relative_to(ROOT)}')
+    """Write docs/measured/<name>."""
+    (MEASURED / name).write_text(text)
+    print(f'wrote docs/measured/{name}')
 
 
-# Sections of docs/performance.md in their order; each benchmark writes one of them.
-SECTIONS = ('node_cpu', 'wake_up', 'startup', 'solvers', 'offline', 'offline_scaling',
-            'compression', 'soak')
+def save(figure: Any, name: str) -> None:
+    """Write a picture docs/measured/<name>."""
+    if figure.get_layout_engine() is None:
+        figure.tight_layout()
+    figure.savefig(MEASURED / name, dpi=110)
+    print(f'wrote docs/measured/{name}')
+
+
+# Sections of performance.md in their order; each benchmark writes one of them.
+SECTIONS = 'node_cpu', 'startup', 'solvers', 'offline', 'compression', 'soak'
 
 
 def write_section(name: str, head: str, description: str, *texts: str) -> None:
     """
-    Replace one of the SECTIONS of docs/performance.md by a page.
+    Replace one of the SECTIONS of docs/measured/performance.md by a page.
 
     description: a docstring; its last paragraph follows the head
     """
     page = '\n'.join((head, description.strip().split('\n\n')[-1] + '\n', *texts))
-    path = ROOT / 'docs' / 'performance.md'
+    path = MEASURED / 'performance.md'
     before = path.read_text() if path.exists() else ''
     sections = dict(re.findall(r'<!-- (\w+) -->\n(.*?)<!-- end -->\n', before, re.DOTALL))
     sections[name] = re.sub('^#', '##', page, flags=re.MULTILINE).strip() + '\n'

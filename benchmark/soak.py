@@ -34,6 +34,7 @@ STREAMS = ('pose', 'joint_states', 'imu')
 GROWTH_BYTES = 2_000_000
 GROWTH_BYTES_PER_HOUR = 4_000_000
 SETTLED_S = 60.0
+LOG_EVERY_S, LISTEN_EVERY_S = 60.0, 15.0        # between start and end of a subscriber
 TROUBLE = ('Traceback', '[ERROR]', 'Error', 'not recording')
 
 
@@ -101,7 +102,7 @@ def missing_in(path: Path) -> dict[str, tuple[int, int]]:
             if topic.endswith(('/pose', '/joint_states', '/imu/data_raw'))}
 
 
-def soak(minutes: float, log_every: float, listen_every: float, folder: Path) -> dict:
+def soak(minutes: float, folder: Path) -> dict:
     """Run the node; return the observations."""
     namespace = '/soak'
     parameters = {'tick_rate': RATE, 'status_period': 0.0,
@@ -123,9 +124,9 @@ def soak(minutes: float, log_every: float, listen_every: float, folder: Path) ->
                 if recording:
                     client.record(False)
                 client.record(True)
-                recording, next_log = True, now + log_every
+                recording, next_log = True, now + LOG_EVERY_S
             if now >= next_listener:
-                next_listener = now + listen_every
+                next_listener = now + LISTEN_EVERY_S
                 if listener is None:
                     listener = Process((*script('listener.py'), namespace), talks=True)
                     listener.line()
@@ -150,17 +151,15 @@ def soak(minutes: float, log_every: float, listen_every: float, folder: Path) ->
 
 def judge(seen: dict) -> tuple[list[tuple[str, str]], bool]:
     """Return the rows of the report, and whether the run passes."""
-    settled = [size for at, size in seen['memory'] if at >= SETTLED_S]
-    slope = 3600.0 * statistics.linear_regression(
-        [at for at, _ in seen['memory'] if at >= SETTLED_S], settled).slope
+    times, settled = zip(*(one for one in seen['memory'] if one[0] >= SETTLED_S), strict=True)
+    slope = 3600.0 * statistics.linear_regression(times, settled).slope
     first = median(settled[:10])        # a log ends and another begins in that second
     growth = max(settled) - first
-    count = sum(n for log in seen['logs'].values() for n, _ in log.values())
-    missing = sum(n for log in seen['logs'].values() for _, n in log.values())
+    topics = [found for log in seen['logs'].values() for found in log.values()]
+    count, missing = (sum(found[k] for found in topics) for k in (0, 1))
     trouble = [line for line in seen['stderr'].splitlines() if any(t in line for t in TROUBLE)]
     rows = [('resident memory after a minute (median of 10 s) [MB]', f'{first / 1e6:.1f}'),
             ('largest afterwards, relative to that [MB]', f'{growth / 1e6:+.2f}'),
-            ('smallest afterwards, relative to that [MB]', f'{(min(settled) - first) / 1e6:+.2f}'),
             ('at the end, relative to that [MB]', f'{(settled[-1] - first) / 1e6:+.2f}'),
             ('rate of growth after the first minute [MB/h]', f'{slope / 1e6:+.2f}'),
             ('logs', str(len(seen['logs']))), ('samples in them', str(count)),
@@ -176,18 +175,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--minutes', type=float, default=10.0, help='more than 1')
-    parser.add_argument('--log-every', type=float, default=60.0, help='s')
-    parser.add_argument('--listen-every', type=float, default=15.0,
-                        help='s, between start and end of a subscriber')
     parser.add_argument('--no-report', action='store_true', help='print only')
     arguments = parser.parse_args()
     if arguments.minutes <= 1.0:
         parser.error(f'--minutes {arguments.minutes:g}: must be more than 1')
     head = preamble('A long run')        # with the commit that is there now
     with tempfile.TemporaryDirectory() as name:
-        seen = soak(arguments.minutes, arguments.log_every, arguments.listen_every, Path(name))
-    print('resident memory, every 10 s [MB]:',
-          *(f'{size / 1e6:.1f}' for _, size in seen['memory'][::10]))
+        seen = soak(arguments.minutes, Path(name))
     rows, fine = judge(seen)
     text = '\n'.join((f'{arguments.minutes:g} minutes; load average at the end {load():.1f}.\n',
                       table(('', ''), rows)))

@@ -22,9 +22,10 @@ from collections.abc import Callable
 
 import numpy as np
 from cases import FINEST_NS, WORK_PRECISION, Case
-from peers import FailedError, Peer, Runner, angles_between, peer
+from peers import FailedError, Peer, Runner, peer
 from report import number, preamble, table, write_section
 from timing import TimeUpError, interleaved, one_thread, seconds_of, time_limit
+from truth import angles_between
 
 from spinning_top_sim.solvers.exact import ExactSolution
 
@@ -32,20 +33,17 @@ COUNTS = (2, 100, 100_000)
 CHOSEN = (('exact, any times', 0.0), ('exact, grid', 0.0),
           ('rk45 transport', 1e-9), ('rk45 transport', 1e-11), ('SciPy RK45', 1e-9),
           ('SciPy DOP853', 1e-12), ('heyoka quadratic', 1e-12), ('heyoka quadratic', 2.0 ** -52),
-          ('numbalsoda LSODA quadratic', 1e-12), ('numbalsoda DOP853 quadratic', 1e-12),
           ('diffrax Dopri8 quadratic', 1e-12), ('MuJoCo RK4', 2048.0))
 LONGEST_S = 20.0
 
 
 class _Prepared(Runner):
-    """The exact solution, after its set-up."""
+    """The exact solution after its set-up; the times are in random order."""
 
     def __init__(self, case: Case, setting: float) -> None:
         super().__init__(case, setting)
         self.solution = ExactSolution(case.top, case.start)
 
-
-class _PreparedArray(_Prepared):
     def attitudes(self, ns):
         shuffled = np.random.default_rng(1).permutation(len(ns))
         result = np.empty((len(ns), 4))
@@ -58,19 +56,8 @@ class _PreparedGrid(_Prepared):
         return self.solution.states(range(0, int(ns[1]) * len(ns), int(ns[1]))).quaternion
 
 
-PREPARED = (Peer('exact, prepared, any times', 'ours', _PreparedArray, (0.0,)),
+PREPARED = (Peer('exact, prepared, any times', 'ours', _Prepared, (0.0,)),
             Peer('exact, prepared, grid', 'ours', _PreparedGrid, (0.0,)))
-
-
-def absent() -> list[str]:
-    """Return the methods that cannot be compared, and why."""
-    found = {}
-    for name, _ in CHOSEN:
-        one = peer(name)
-        reason = one.missing()
-        if reason:
-            found[one.family] = reason
-    return [f'- {name}: {reason}' for name, reason in found.items()]
 
 
 def measure(case: Case, count: int, rounds: int) -> dict[str, tuple[float, float] | str]:
@@ -81,7 +68,7 @@ def measure(case: Case, count: int, rounds: int) -> dict[str, tuple[float, float
     runs: dict[object, Callable[[], object]] = {}
     errors = {}
     for one, setting in [*((p, 0.0) for p in PREPARED), *((peer(n), s) for n, s in CHOSEN)]:
-        name = f'{one.name} {one.setting_text(setting)}'.strip()
+        name = one.label(setting)
         if one.missing():
             found[name] = 'absent'
             continue
@@ -122,10 +109,7 @@ def main() -> None:
         rows.append(cells)
     heads = ['method', *(head for count in COUNTS
                          for head in (f'{count} states: µs a state', 'error [rad]'))]
-    missing = absent()
-    text = '\n'.join((
-        f'{case.title}; {arguments.rounds} rounds.\n', table(heads, rows),
-        'Not compared:\n' if missing else 'No method is missing.', *missing, ''))
+    text = f'{case.title}; {arguments.rounds} rounds.\n\n' + table(heads, rows)
     print(text)
     if not arguments.no_report:
         write_section('solvers', head, __doc__, text)

@@ -28,7 +28,6 @@ import report
 from cases import (
     CUSP,
     HEAVY_TOP,
-    ROOT,
     TOY_200,
     WHEEL,
     Case,
@@ -36,13 +35,8 @@ from cases import (
     near_pole,
     scene,
 )
-from peers import (
-    FailedError,
-    angles_between,
-    literal_start,
-    long_attitudes,
-    peer,
-)
+from peers import FailedError, peer
+from truth import angles_between, long_attitudes
 
 from spinning_top_sim import State
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
@@ -107,41 +101,29 @@ def main() -> None:
         duration=DURATION, rate=RATE, limit=options.limit, attitude=LOST_ATTITUDE,
         angle=LOST_ANGLE)]
     overview = []
-    details = []
     for case in SITUATIONS:
         outcomes = [in_child(meet, (case, name, setting), options.limit)
                     for name, setting in METHODS]
         overview.append([case.title, *(outcome.verdict.split(':')[0] for outcome in outcomes)])
-        details.append(f'### {case.title}\n\n{_describe(case)}\n\n' + report.table(
-            ('method', 'verdict', 'attitude [rad]', 'phi [rad]', 'psi [rad]', 'work', 'time [s]'),
-            [_row(*method, outcome) for method, outcome in zip(METHODS, outcomes, strict=True)]))
         print(case.title, [outcome.verdict[:40] for outcome in outcomes], flush=True)
-    labels = [_label(*method) for method in METHODS]
+    labels = [peer(name).label(setting) for name, setting in METHODS]
     text += ['## Overview\n', report.table(('situation', *labels), overview)]
     text += ['## An hour of cusps\n', hour(options.hour_limit)]
     text += ['## Where errors grow exponentially\n', sensitivity()]
-    text += ['## Each situation\n', *details]
     report.write('stability.md', '\n'.join(text))
 
 
 INTRODUCTION = """
-Every situation is {duration} s long with samples at {rate} Hz. A run has at most {limit:g} s of
+Every situation is {duration} s long with samples at {rate} Hz; a run has at most {limit:g} s of
 processor time.
 
-- **right**: the attitude is within {attitude:g} rad at all times, and phi and psi, if the method
-  has them, are within {angle:g} rad
-- **angles lost**: no error message and the right attitude, but the error of phi or psi exceeds
-  {angle:g} rad, because a step has passed over the pole.  Where the axis rests at a pole, only
-  phi + psi (phi - psi at the bottom) is defined and compared
-- **wrong**: no error message, but the error of the attitude exceeds that bound
-- **refused**: stopped with an error message;  **hung**: not finished within the time limit
-- **NaN**: returned NaN
-
-Only `exact`, `rk45` and the methods in Euler angles compute phi and psi.
+- **right**: the attitude is within {attitude:g} rad at all times, and phi and psi are within
+  {angle:g} rad, as far as the method has them and they are defined
+- **angles lost**: the right attitude, but phi or psi is off by more, without an error message
+- **wrong**: the attitude is off by more, without an error message
+- **refused**: stopped with an error message;  **hung**: not finished in time;  **NaN**: all NaN
 """
 
-
-# ------------------------------------------------------------------------------------ situations
 
 def meet(case: Case, name: str, setting: float) -> Outcome:
     """Let a method meet a situation."""
@@ -209,26 +191,6 @@ def in_child(run: Callable[..., Any], arguments: tuple[Any, ...], limit: float) 
     return Outcome(f'hung: not done in {limit:g} s')
 
 
-def _describe(case: Case) -> str:
-    exact = case.exact
-    return (f'theta from {exact.theta_min:.9g} to {exact.theta_max:.9g} rad, '
-            f'L3²/(4 λ1 P) = {case.swiftness:.3g}, m1 = {exact.m1:.2g}; starts from theta, '
-            f'theta\', phi, psi = {", ".join(f"{value:.9g}" for value in literal_start(case))}')
-
-
-def _label(name: str, setting: float) -> str:
-    return f'{name} {peer(name).setting_text(setting)}'.strip()
-
-
-def _row(name: str, setting: float, outcome: Outcome) -> tuple[str, ...]:
-    return (_label(name, setting), outcome.verdict.replace('|', '/').replace('\n', ' '),
-            *(report.number(error) for error in (outcome.attitude, outcome.phi, outcome.psi)),
-            f'{outcome.work} {peer(name).unit}' if outcome.work else '–',
-            report.number(outcome.seconds))
-
-
-# ----------------------------------------------------------------------------------- sensitivity
-
 def sensitivity() -> str:
     """Return the table of errors of rk45, and of the effect of one rounding of the start."""
     ns = grid_ns(SENSITIVITY_SPANS[-1], RATE)
@@ -239,7 +201,7 @@ def sensitivity() -> str:
         start = dataclasses.replace(case.start, theta=math.nextafter(case.start.theta, math.inf))
         curves = [('theta one double up, exact',
                    Case(case.title, case.top, start).exact.states(ns).quaternion)]
-        curves += [(_label('rk45 transport', rtol),
+        curves += [(peer('rk45 transport').label(rtol),
                     peer('rk45 transport').ready(case, rtol).attitudes(ns))
                    for rtol in (1e-9, 1e-11, 1e-13)]
         for label, attitudes in curves:
@@ -250,8 +212,6 @@ def sensitivity() -> str:
             'distance from the separatrix.\n\n' + report.table(
                 ('motion', 'm1', 'what', *(f'{span} s' for span in SENSITIVITY_SPANS)), lines))
 
-
-# ------------------------------------------------------------------------------------------ hour
 
 def follow(case: Case, name: str, setting: float) -> tuple[np.ndarray, ...] | Outcome:
     """Return the errors of the attitude, E, L3 and Lz over an hour, the last three relative."""
@@ -271,82 +231,41 @@ def hour(limit: float) -> str:
     for name, setting in RUNNERS:
         begin = time.perf_counter()
         result = in_child(follow, (CUSP, name, setting), limit)
-        print(_label(name, setting), f'{time.perf_counter() - begin:.0f} s', flush=True)
+        print(peer(name).label(setting), f'{time.perf_counter() - begin:.0f} s', flush=True)
         if isinstance(result, Outcome):
-            lines.append((_label(name, setting), result.verdict, *['–'] * 6))
+            lines.append((peer(name).label(setting), result.verdict, *['–'] * 6))
             continue
         curves[name, setting] = result
         reached = [np.maximum.accumulate(values)[[t * HOUR_RATE for t in CHECKPOINTS]]
                    for values in result]
-        lines.append((_label(name, setting), *(report.number(value) for value in reached[0]),
+        lines.append((peer(name).label(setting), *(report.number(value) for value in reached[0]),
                       *(report.number(values[-1]) for values in reached[1:])))
     draw(curves)
     heads = ('method', *(f'attitude, {t} s [rad]' for t in CHECKPOINTS), 'E/P', 'L3', 'Lz')
     return (f'The scene `cusp` at {HOUR_RATE} Hz; the last three columns are relative and over '
-            'the whole hour.  The row of the exact solution compares two evaluations of it, '
-            'at any times and\non a grid; the tables of work and precision have its error '
-            'against others.\n\n' + report.table(heads, lines)
+            'the whole hour.\n\n' + report.table(heads, lines)
             + '\n![Errors over an hour](stability.png)\n')
-
-
-COLOURS = {'exact, any times': '#000000', 'rk45 transport': '#D55E00', 'rk45 euler': '#E69F00',
-           'SciPy RK45': '#56B4E9', 'SciPy DOP853': '#0072B2', 'heyoka Euler': '#009E73',
-           'heyoka quadratic': '#009E73', 'MuJoCo RK4': '#666666'}
-DASHED = ('heyoka Euler', ('rk45 transport', 1e-13), ('SciPy DOP853', 1e-12))
 
 
 def draw(curves: dict[tuple[str, float], tuple[np.ndarray, ...]]) -> None:
     """Draw error and energy over time, with the slopes of the theory."""
     mpl.use('Agg')
-    figure, panels = plt.subplots(1, 2, figsize=(13.5, 6.4))
+    figure, panels = plt.subplots(1, 2, figsize=(13.5, 5.4))
     t = grid_ns(HOUR, HOUR_RATE)[1:] / 1e9
     at = np.unique(np.geomspace(1, len(t), 300).round().astype(int)) - 1
-    for panel, column, title in zip(
-            panels, (0, 1), ('error of the attitude [rad]', 'error of the energy, of P'),
-            strict=True):
-        ends = []
-        for key, result in curves.items():
+    slopes = ((2.0, 3e-8, 't²'), (1.0, 1e-12, 't')), ((1.0, 3e-9, 't'), (0.5, 3e-16, '√t'))
+    titles = 'error of the attitude [rad]', 'error of the energy, of P'
+    for column, (panel, lines) in enumerate(zip(panels, slopes, strict=True)):
+        for number, ((name, setting), result) in enumerate(curves.items()):
             worst = np.maximum(np.maximum.accumulate(result[column][1:]), 1e-17)[at]
-            panel.plot(t[at], worst, color=COLOURS[key[0]], linewidth=1.6, linestyle='--'
-                       if key[0] in DASHED or key in DASHED else '-')
-            ends.append((math.log10(worst[-1]), _label(*key), COLOURS[key[0]]))
-        _label_ends(panel, ends)
-        panel.set_xscale('log')
-        panel.set_yscale('log')
-        panel.set_xlim(0.1, 3600)
-        panel.set_title(title, fontsize=11)
-        panel.set_xlabel('simulated time [s]')
-        panel.grid(which='major', color='#DDDDDD', linewidth=0.6)
-        panel.set_axisbelow(True)
-    _slopes(panels[0], ((2.0, 3e-8, 't²'), (1.0, 1e-12, 't')))
-    _slopes(panels[1], ((1.0, 3e-9, 't'), (0.5, 3e-16, '√t')))
-    figure.suptitle('An hour of the scene `cusp`: largest error so far; thin lines: slopes',
-                    fontsize=12)
-    figure.tight_layout()
-    path = ROOT / 'docs/stability.png'
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
-    print(f'wrote {path.relative_to(ROOT)}')
-
-
-def _slopes(panel: plt.Axes, slopes: tuple[tuple[float, float, str], ...]) -> None:
-    t = np.array([1.0, 3600.0])
-    for power, start, text in slopes:
-        panel.plot(t, start * t ** power, color='#888888', linewidth=0.8, linestyle=':')
-        panel.text(t[0], start, f'{text} ', ha='right', va='center', color='#666666', fontsize=10)
-
-
-def _label_ends(panel: plt.Axes, ends: list[tuple[float, str, str]]) -> None:
-    """Write each curve's name at its right end, apart from its neighbours."""
-    low, high = min(y for y, _, _ in ends) - 1.0, max(y for y, _, _ in ends) + 1.0
-    gap, last = (high - low) / 26.0, -math.inf
-    for y, text, colour in sorted(ends):
-        place = max(y, last + gap)
-        last = place
-        panel.annotate(text, (3600.0, 10.0 ** y), xytext=(1.03, (place - low) / (high - low)),
-                       textcoords='axes fraction', va='center', fontsize=9, color=colour,
-                       arrowprops={'arrowstyle': '-', 'color': colour, 'linewidth': 0.5})
-    panel.set_ylim(10.0 ** low, 10.0 ** high)
+            panel.loglog(t[at], worst, label=peer(name).label(setting), color=f'C{number}')
+        for power, start, text in lines:
+            panel.loglog(t[[0, -1]], start * t[[0, -1]] ** power, ':', color='#888888')
+            panel.text(t[-1], start * t[-1] ** power, f' {text}', color='#666666')
+        panel.set(title=titles[column], xlabel='simulated time [s]')
+        panel.grid(color='#DDDDDD', linewidth=0.6)
+    panels[0].legend(fontsize=8, ncols=2)
+    report.save(figure, 'stability.png')
 
 
 if __name__ == '__main__':

@@ -4,7 +4,6 @@
 Measure the time from the start of a process to its first message.
 
     python benchmark/startup.py                 # two minutes
-    python benchmark/startup.py --imports 30    # also the 30 slowest imports
 
 `sim_node` runs with its defaults and with recording.  It is compared with `bare_node.py` with the
 same publishers, subscription, services and parameters (including descriptions and ranges), and
@@ -19,16 +18,20 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import re
-import resource
-import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
-from processes import ROOT, SIM_NODE, Process, load, median, quantile, ros_arguments, script
+from processes import (
+    Process,
+    children_cpu,
+    load,
+    median,
+    ros_arguments,
+    script,
+    sim_node,
+)
 from report import preamble, table, write_section
 
 from spinning_top_sim.streams import parameters
@@ -56,26 +59,23 @@ def parameter_file(path: Path) -> None:
 def program(kind: str, namespace: str, folder: Path, once: bool) -> list[str]:
     """Return the arguments of python for this kind of node, for ever or to its first sample."""
     if kind in (OURS, RECORDING):
-        return [*SIM_NODE, *ros_arguments(namespace, {
+        return sim_node(namespace, {
             'record.enabled': kind == RECORDING, 'duration': 0.001 if once else 0.0,
-            'record.uri': f'{folder}{namespace}{"_once" if once else ""}.mcap'})]
+            'record.uri': f'{folder}{namespace}{"_once" if once else ""}.mcap'})
     like = {'like': str(folder / 'parameters.json')} if kind == LIKE else {}
     return [*script('bare_node.py'),
             *ros_arguments(namespace, {'rate': 100.0, 'once': once, **like})]
 
 
-def one_sample(kind: str, namespace: str, folder: Path, checkout: Path = ROOT
-               ) -> tuple[float, float]:
+def one_sample(kind: str, namespace: str, folder: Path) -> tuple[float, float]:
     """Return wall and processor time [s] of a run that ends itself at its first sample."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    begin = time.monotonic()
-    with Process(program(kind, namespace, folder, once=True), checkout=checkout) as node:
+    before, begin = children_cpu(), time.monotonic()
+    with Process(program(kind, namespace, folder, once=True)) as node:
         code = node.wait(30.0)
         wall = time.monotonic() - begin
     if code:
         raise SystemExit(f'{kind} ended with exit code {code}')
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return wall, children_cpu() - before
 
 
 def seconds_to_first(kind: str, namespace: str, folder: Path) -> float:
@@ -98,35 +98,13 @@ def seconds_to_first(kind: str, namespace: str, folder: Path) -> float:
         listener.end()
 
 
-def import_times(count: int) -> str:
-    """Return the slowest imports of `sim_node` by their own time, from -X importtime."""
-    program_ = ('import sys; from spinning_top_sim.nodes import sim_node; '
-                'import spinning_top_sim.nodes.simulator')
-    run = subprocess.run([sys.executable, '-P', '-X', 'importtime', '-c', program_], check=True,
-                         capture_output=True, text=True, timeout=60,
-                         env={**os.environ, 'PYTHONPATH': str(ROOT)})
-    own: dict[str, int] = {}
-    for line in run.stderr.splitlines():
-        found = re.match(r'import time:\s+(\d+) \|\s+\d+ \|\s+(\S+)', line)
-        if found:
-            root = found.group(2).split('.')[0]
-            own[root] = own.get(root, 0) + int(found.group(1))
-    rows = sorted(own.items(), key=lambda item: -item[1])
-    total = sum(own.values())
-    return table(('package', 'import [ms]'),
-                 [('all', f'{total / 1e3:.1f}'),
-                  *((f'`{name}`', f'{time_ / 1e3:.1f}') for name, time_ in rows[:count])])
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--rounds', type=int, default=11)
-    parser.add_argument('--imports', type=int, default=10, help='how many to list')
     parser.add_argument('--no-report', action='store_true', help='print only')
     arguments = parser.parse_args()
     head = preamble('Start-up')        # with the commit that is there now
-    at_first = load()
     found: dict[str, list[tuple[float, float, float]]] = {kind: [] for kind in KINDS}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -137,9 +115,7 @@ def main() -> None:
                 one = (*one_sample(kind, namespace, folder),
                        seconds_to_first(kind, namespace, folder))
                 found[kind].append(one)
-                print(f'round {number + 1}, {kind}: one sample {one[0]:.3f} s, processor '
-                      f'{one[1]:.3f} s; received after {one[2]:.3f} s, load {load():.1f}',
-                      flush=True)
+                print(kind, *(f'{seconds:.3f} s' for seconds in one), flush=True)
     rows = []
     for kind, runs in found.items():
         cells = [kind]
@@ -147,18 +123,12 @@ def main() -> None:
             values = [run[i] for run in runs]
             ratio = median([a[i] / b[i] for a, b in zip(runs, found[LIKE], strict=True)])
             cells += [f'{median(values):.3f}', f'{ratio:.2f}']
-        received = [run[2] for run in runs]
-        rows.append((*cells, *(f'{quantile(received, share):.3f}' for share in (0.0, 0.25, 1.0))))
+        rows.append(cells)
     text = '\n'.join((
-        f'{arguments.rounds} rounds; load average at the start {at_first:.1f}, at the end '
-        f'{load():.1f}.\n',
+        f'{arguments.rounds} rounds; load average at the end {load():.1f}.\n',
         table(('node', 'start to exit [s]', 'ratio', 'its processor time [s]', 'ratio',
-               'first message received after [s]', 'ratio', 'smallest', '25 % within',
-               'all within'), rows),
-        f'Ratios are relative to "{LIKE}".\n',
-        '## Imports of `sim_node`\n',
-        'Own time of the modules of each package, from one run of `python -X importtime`.\n',
-        import_times(arguments.imports)))
+               'first message received after [s]', 'ratio'), rows),
+        f'Ratios are relative to "{LIKE}".\n'))
     print(text)
     if not arguments.no_report:
         write_section('startup', head, __doc__, text)

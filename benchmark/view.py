@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """
-What the page costs: `python benchmark/view.py` (extras `ros` and `view`) writes docs/view_cost.md.
+Measure what the page in the browser costs the node: `python benchmark/view.py`.
 
 Two sim_nodes record at 200 Hz, each in a domain of its own.  In turn one has the page, which has
 one client that counts the attitudes that arrive, and the other has not.  Both are measured at the

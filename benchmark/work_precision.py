@@ -2,7 +2,7 @@
 """
 Compare error and time per state of all methods over their tolerances: `make benchmark` or
 
-    PYTHONPATH=. python benchmark/work_precision.py [--quick] [--output FOLDER]
+    PYTHONPATH=. python benchmark/work_precision.py [--only 10]
 
 Each case runs for 10 s and for 1000 s.  The error is the largest rotation angle to the truth over
 all samples.  The truth is the exact solution, which is itself compared with heyoka in BITS-bit
@@ -16,16 +16,15 @@ import argparse
 import functools
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import report
-from cases import ROOT, TOY_200, WORK_PRECISION, Case, grid_ns
-from matplotlib.lines import Line2D
-from peers import BITS, PEERS, FailedError, Peer, Runner, angles_between, long_attitudes
+from cases import TOY_200, WORK_PRECISION, Case, grid_ns
+from peers import PEERS, FailedError, Peer, Runner
 from timing import TimeUpError, interleaved, one_thread, seconds_of, time_limit
+from truth import BITS, angles_between, long_attitudes
 
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 
@@ -34,10 +33,8 @@ REFERENCE = ('SciPy DOP853', 1e-9)
 # Simulated time [s] and samples a second.
 SPANS = ((10, 512), (1000, 64))
 FEW = grid_ns(1, 1)
-# Number of instants at which the exact solution is compared with extended precision.
-PROBES = 16
-# Time limit of extended precision [s]; beyond it, the error stays unknown.
-LONGEST_TRUTH = 60.0
+PROBES = 16             # instants at which the exact solution is compared with extended precision
+LONGEST_TRUTH = 60.0    # [s]; if that takes longer, the error stays unknown
 # Real time for a run, over the processor time that it is expected to take at most.
 PATIENCE = 20.0
 # Runs shorter than this [s] are repeated RETAKES times where the others have one round.
@@ -60,24 +57,18 @@ class Row:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
-    parser.add_argument('--quick', action='store_true', help='10 s only, three rounds')
     parser.add_argument('--only', type=int, choices=[span for span, _ in SPANS],
                         help='simulated time [s]; default all')
-    parser.add_argument('--output', type=Path, help='folder; default docs, quick: build/benchmark')
     parser.add_argument('--longest', type=float, default=4.0,
                         help='leave out methods that take longer than this for one run [s]')
     options = parser.parse_args()
     one_thread()
-    folder = options.output or ROOT / ('build/benchmark' if options.quick else 'docs')
-    folder.mkdir(parents=True, exist_ok=True)
-    rounds = 3 if options.quick else 5
-    for duration, rate in SPANS[:1 if options.quick else 2]:
+    for duration, rate in SPANS:
         if options.only in (None, duration):
-            compare(duration, rate, rounds if duration == SPANS[0][0] else 1, options.longest,
-                    folder)
+            compare(duration, rate, 5 if duration == SPANS[0][0] else 1, options.longest)
 
 
-def compare(duration: int, rate: int, rounds: int, longest: float, folder: Path) -> None:
+def compare(duration: int, rate: int, rounds: int, longest: float) -> None:
     """Measure every case over one time span, and write its page and its figure."""
     results = {}
     for case in CASES:
@@ -85,32 +76,25 @@ def compare(duration: int, rate: int, rounds: int, longest: float, folder: Path)
         results[case] = measure(case, duration, rate, rounds, longest)
         print(f'{duration} s of {case.title}: {time.perf_counter() - begin:.0f} s', flush=True)
     name = 'work_precision' + ('' if duration == SPANS[0][0] else f'_{duration}s')
-    page = [report.preamble(f'Work and precision over {duration} s'),
-            INTRODUCTION.format(reference=REFERENCE[0], tolerance=REFERENCE[1], longest=longest,
-                                bits=BITS, rounds=rounds,
-                                retakes=RETAKES, short=SHORT), _missing()]
+    page = [report.preamble(f'Work and precision over {duration} s'), INTRODUCTION.format(
+        reference=REFERENCE[0], tolerance=REFERENCE[1], longest=longest, bits=BITS,
+        probes=PROBES, rounds=rounds, retakes=RETAKES, short=SHORT), _missing()]
     page += [_section(case, duration, rate, rows) for case, rows in results.items()]
-    draw(results, duration, rate, folder / f'{name}.png')
-    (folder / f'{name}.md').write_text('\n'.join(page))
-    print(f'wrote {name}.md and {name}.png in {folder}', flush=True)
+    draw(results, duration, rate, f'{name}.png')
+    report.write(f'{name}.md', '\n'.join(page))
 
 
 INTRODUCTION = """
 The error is the largest rotation angle [rad] between an attitude and the true one over all
-samples.  The truth is `method='exact'`; its own error is measured at some of the instants against
-heyoka in {bits}-bit arithmetic.  The time is the processor time of a whole call that returns all
-attitudes, over their number.  It contains the set-up of the exact solution, some milliseconds.
-The compilation or loading of a model has its own column, where a later setting may use the cache
-of an earlier one.  Ratios are relative to {reference} at {tolerance:g}, if that ran.  Times are
-medians over interleaved rounds in one process, {rounds} here (where 1, at least {retakes} for
-runs below {short:g} s).  A method whose run would take more than {longest:g} s is left out and
-marked.  SciPy, heyoka Euler and `rk45 euler` solve equations (29)-(32) of the paper; heyoka
-quadratic and diffrax solve quaternion equations without poles.  The setting of MuJoCo is its
-fixed step.
-
-Limits of the comparison: the number of samples per step determines the share of dense output in
-the time, which is largest for methods with few steps.  The right-hand sides of `rk45` and of
-SciPy are Python and are not compiled.  Every method has one thread.
+samples.  The truth is `exact`; its own error is that at {probes} instants against heyoka in
+{bits}-bit arithmetic.  The time is the processor time of a whole call over the number of
+attitudes, with the set-up of the exact solution; compilation and loading have a column of their
+own.  Ratios are relative to {reference} at {tolerance:g}.  Times are medians over {rounds}
+interleaved rounds (where 1, over {retakes} for runs below {short:g} s).  A method whose run would
+take more than {longest:g} s is left out.  SciPy, heyoka Euler and `rk45 euler` solve equations
+(29)-(32) of the paper, heyoka quadratic and diffrax quaternion equations without poles.  The
+setting of MuJoCo is its step.  The right-hand sides of `rk45` and SciPy are Python.  Every method
+has one thread.
 """
 
 
@@ -203,7 +187,7 @@ def _section(case: Case, duration: int, rate: int, rows: list[Row]) -> str:
                  if (row.peer.name, row.setting) == REFERENCE and row.seconds), None)
     lines = []
     for row in rows:
-        name = f'{row.peer.name} {row.peer.setting_text(row.setting)}'.strip()
+        name = row.peer.label(row.setting)
         if row.failure:
             lines.append((name, '–', '–', '–', '–', row.failure.replace('|', '/')))
             continue
@@ -220,61 +204,39 @@ def _section(case: Case, duration: int, rate: int, rows: list[Row]) -> str:
                             'work, or what happened'), lines))
 
 
-# Okabe & Ito's palette, which the colour-blind can tell apart; a colour is a family.
+# Okabe & Ito's palette, which the colour-blind can tell apart.
 COLOURS = {'ours': '#D55E00', 'SciPy': '#0072B2', 'heyoka': '#009E73', 'diffrax': '#CC79A7',
-           'numbalsoda': '#56B4E9', 'MuJoCo': '#666666'}
-EXACT = '#000000'
-STYLES = {'exact, any times': ('P', '-'), 'exact, grid': ('X', '-'),
-          'rk45 transport': ('o', '-'), 'rk45 euler': ('o', ':'),
-          'SciPy RK45': ('s', '-'), 'SciPy DOP853': ('^', '-'), 'SciPy LSODA': ('v', '-'),
-          'heyoka Euler': ('D', ':'), 'heyoka quadratic': ('D', '-'),
-          'diffrax Dopri8 quadratic': ('h', '-'), 'numbalsoda LSODA quadratic': ('v', ':'),
-          'numbalsoda DOP853 quadratic': ('^', ':'), 'MuJoCo RK4': ('<', '-'),
-          'MuJoCo implicit': ('>', ':')}
+           'MuJoCo': '#666666'}
+STYLES = {peer: {'color': COLOURS[peer.family] if peer.settings[0] else 'black',
+                 'marker': marker, 'label': peer.name}
+          for peer, marker in zip(PEERS, 'PXop^sv<DDh>', strict=True)}
 
 
-def draw(results: dict[Case, list[Row]], duration: int, rate: int, path: Path) -> None:
+def draw(results: dict[Case, list[Row]], duration: int, rate: int, name: str) -> None:
     """Draw error over time per state, a panel for each case, a line for each method."""
     mpl.use('Agg')
     states = duration * rate + 1
-    figure, panels = plt.subplots(2, 3, figsize=(13.5, 8.6), sharex=True, sharey=True)
+    figure, panels = plt.subplots(2, 3, figsize=(13.5, 8.6), sharex=True, sharey=True,
+                                  layout='constrained')
     for panel, (case, rows) in zip(panels.flat, results.items(), strict=True):
-        for peer in PEERS:
+        for peer, style in STYLES.items():
             points = [(1e6 * row.seconds / states, max(row.error, 1e-16)) for row in rows
                       if row.peer is peer and row.error is not None]
             if points:
-                panel.plot(*zip(*points, strict=True), **_style(peer))
-        absent = sorted({row.peer.name for row in rows if row.failure
-                         and row.peer.name not in
-                         {other.peer.name for other in rows if other.error is not None}})
-        panel.set_title(case.title, fontsize=11)
+                panel.loglog(*zip(*points, strict=True), **style)
+        absent = sorted({row.peer.name for row in rows if row.failure}
+                        - {row.peer.name for row in rows if row.error is not None})
         if absent:
             panel.text(0.98, 0.12, 'fails, or takes too long:\n' + '\n'.join(absent), ha='right',
                        transform=panel.transAxes, va='bottom', fontsize=8, color='#444444')
-        panel.set_xscale('log')
-        panel.set_yscale('log')
-        panel.grid(which='major', color='#DDDDDD', linewidth=0.6)
-        panel.set_axisbelow(True)
+        panel.set_title(case.title, fontsize=11)
+        panel.grid(color='#DDDDDD', linewidth=0.6)
     for panel in panels[-1]:
         panel.set_xlabel('time per state [µs]')
-    for panel in panels[:, 0]:
-        panel.set_ylabel('largest error of the attitude [rad]')
-    handles = [Line2D([], [], **_style(peer), label=peer.name) for peer in PEERS
-               if not peer.missing()]
-    figure.legend(handles=handles, loc='lower center', ncols=5, frameon=False, fontsize=9.5)
-    figure.suptitle(f'{duration} s sampled at {rate} Hz: left is faster, lower is more accurate',
-                    fontsize=12)
-    figure.tight_layout(rect=(0.0, 0.1, 1.0, 1.0))
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
-
-
-def _style(peer: Peer) -> dict[str, object]:
-    marker, line = STYLES[peer.name]
-    exact = peer.name.startswith('exact')
-    return {'color': EXACT if exact else COLOURS[peer.family], 'marker': marker,
-            'linestyle': line, 'markersize': 9 if exact else 5.5,
-            'linewidth': 2.0 if peer.family == 'ours' else 1.2}
+    figure.supylabel('largest error of the attitude [rad]')
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc='outside lower center', ncols=6)
+    figure.suptitle(f'{duration} s sampled at {rate} Hz: left is faster, lower is more accurate')
+    report.save(figure, name)
 
 
 if __name__ == '__main__':

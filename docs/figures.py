@@ -1,11 +1,10 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """
-Draw the pictures of the README and of docs/explanation: `python docs/figures.py` (extra `plot`).
+Draw the pictures of README and docs/: `python docs/figures.py` (extra `plot`).
 
-docs/motions.png shows three motions; docs/inspect_cusp.png is a page of `inspect --plot`.
-docs/explanation/cubic.png shows the cubic of the same motions, and poles.png what SciPy's steps
-make of the angles where the axis passes the vertical.
+motions.png shows three motions, cubic.png their cubics, poles.png the angles of SciPy's steps
+where the axis passes the vertical, inspect.png a page of `inspect --plot`.
 """
 
 import tempfile
@@ -123,9 +122,9 @@ def poles(path):
 def main():
     """Draw all pictures."""
     motions(HERE / 'motions.png')
-    page_about_a_log(HERE / 'inspect_cusp.png')
-    cubic(HERE / 'explanation/cubic.png')
-    poles(HERE / 'explanation/poles.png')
+    page_about_a_log(HERE / 'inspect.png')
+    cubic(HERE / 'cubic.png')
+    poles(HERE / 'poles.png')
 
 
 if __name__ == '__main__':

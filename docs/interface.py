@@ -11,7 +11,7 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING, all_streams
 
 HEAD = """<!-- Written by docs/interface.py from the code. -->
-# Interface of sim_node
+# Interface and commands
 
 The name of the node is `spinning_top`. All names are relative unless they begin with `/`; `~` is the
 name of the node.
@@ -82,6 +82,13 @@ recording, or only at the start of the node (read-only).
 |---|---|---|---|---|---|
 """
 
+COMMANDS = 'sim_node', 'replay_node', 'simulate', 'inspect', 'recover', 'examine', 'ensemble', 'view'
+AFTER_PARAMETERS = """
+## Commands
+
+The help of each executable, in the site. `ros2 run spinning_top_sim NAME` runs the same.
+"""
+
 EFFECTS = {parameters.Effect.NOW: 'at once', parameters.Effect.RESET: 'reset',
            parameters.Effect.RECORDING: 'next recording', parameters.Effect.START: 'start'}
 
@@ -111,6 +118,8 @@ def page() -> str:
         allowed = parameter.allowed.removeprefix('must be ')
         lines.append(f'| `{parameter.name}` | {shown} | {parameter.unit} | {allowed} | '
                      f'{EFFECTS[parameter.effect]} | {parameter.text} |\n')
+    lines.append(AFTER_PARAMETERS)
+    lines += (f'\n### {name}\n\n```{{help-of}} {name}\n```\n' for name in COMMANDS)
     return ''.join(lines)
 
 

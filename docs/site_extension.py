@@ -3,8 +3,8 @@
 What the site needs of Sphinx beyond its own extensions.
 
 - `{help-of} NAME` is what the command says with `--help`.
-- Files at the top of the repository, as the changelog, get a page in docs/project/, to which the
-  links of other pages lead.
+- Files at the top of the repository, such as the changelog, get a page docs/top_*; links of other
+  pages lead to it.
 """
 
 import os
@@ -50,17 +50,15 @@ def write_pages(app):
     """Write a page for each file of PAGES that there is."""
     root = app.config.site_root
     for name in PAGES:
-        page = Path(app.srcdir) / 'project' / f'top_{name.lower()}'
+        page = Path(app.srcdir) / f'top_{name.lower()}'
         if not (root / name).is_file():
             page.unlink(missing_ok=True)
             continue
         text = (root / name).read_text(encoding='utf-8')
         if name.endswith('.md'):        # links from the top
-            text = re.sub(r'\]\((?:docs/?|README\.md(?:#[^)]*)?)\)', '](../index.rst)', text)
-            text = re.sub(r'\]\(docs/', '](../', text)
-            text = re.sub(r'\]\((?![a-z]+:|#|\.\./)', '](../../', text)
-            for other in PAGES:
-                text = text.replace(f'](../../{other}', f'](top_{other.lower()}')
+            text = re.sub(r'\]\((?:docs/?|README\.md(?:#[^)]*)?)\)', '](index.rst)', text)
+            text = re.sub(r'\]\((?!docs/|index\.rst|[a-z]+:|#)', '](../', text)
+            text = text.replace('](docs/', '](')
         if not page.exists() or page.read_text(encoding='utf-8') != text:
             page.write_text(text, encoding='utf-8')
 
@@ -68,8 +66,7 @@ def write_pages(app):
 def lead_to_pages(app, name, source):
     """Turn links to the files of PAGES into links to their pages."""
     for page in PAGES:
-        source[0] = re.sub(rf'\]\((?:\.\./)+{re.escape(page)}', f'](/project/top_{page.lower()}',
-                           source[0])
+        source[0] = source[0].replace(f'](../{page}', f'](top_{page.lower()}')
 
 
 def setup(app):

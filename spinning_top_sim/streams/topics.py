@@ -209,7 +209,7 @@ class GroundTruthImu(ImuStream):
 
 
 class ImuIncrements(ImuRaw):
-    """What the sensor measures over the interval that ends with a sample: docs/increments.md."""
+    """What the sensor measures over the interval that ends with a sample: docs/sensor.md."""
 
     parameter, rate_parameter = 'increments', 'imu.rate'
 

@@ -9,7 +9,7 @@ exit codes:
        could not compute the run, or a picture could not be drawn
   2    wrong arguments
   130  interrupted
-The keys of --json are in docs/inspect.md.
+The keys of --json are in docs/log_format.md.
 """
 
 import argparse
@@ -127,7 +127,7 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> bool:
 
 
 def _as_json(found: Survey, verdict: Verdict | None) -> object:
-    """Return the findings for JSON; docs/inspect.md has the keys."""
+    """Return the findings for JSON; docs/log_format.md has the keys."""
     damage, run = found.damage, found.run
     content: dict[str, object] = {
         'file': str(found.path), 'whole': found.whole,

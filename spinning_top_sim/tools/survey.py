@@ -45,7 +45,7 @@ Rows = NDArray[np.float64]
 
 @dataclass
 class TopicReport:
-    """The findings about a topic, with the keys of docs/inspect.md."""
+    """The findings about a topic, with the keys of docs/log_format.md."""
 
     type: str
     stream: str | None = None             # topic of the stream of this package
@@ -211,7 +211,7 @@ def _follow_run(found: Survey, run: RunDescription) -> None:
 
 def _source(run: RunDescription, streams: Mapping[str, Stream],
             exact: Description | None) -> str | None:
-    """Return the topic that a motion is measured from, as docs/inspect.md says."""
+    """Return the topic that a motion is measured from, as docs/log_format.md says."""
     period_ns = ((exact and exact.nutation_period) or math.inf) * NANOSECONDS
     return max((run.topics[name] for name in SOURCES if name in run.topics), default=None,
                key=lambda name: min(period_ns / streams[name].period_ns, ENOUGH_SAMPLES))

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The code blocks of a page of the documentation, and what runs them.
+The code blocks of a page of the documentation, and a runner for them.
 
-A page runs from its first block to its last in one empty folder, and in one Python namespace.
+The blocks of a page run in order, in one empty folder and one Python namespace.
 
-- `python` blocks are executed, unless their first line is a comment with the name of a file, as
-  `# my_filter.py`: then they are that file.  So are `yaml` blocks.
+- `python` blocks are executed, unless their first line is a comment with the name of a file, such
+  as `# my_filter.py`: then they are written to that file.  So are `yaml` blocks.
 - `bash` blocks are run by bash.  `<!-- background -->` in the line before keeps one running until
   the page ends; `<!-- not run: REASON -->` leaves one out, and fails where REASON is not known.
-- A `text` block right behind a block that ran is its output.  Numbers agree within 2 %, and a line
-  `...` stands for any lines.
+- A `text` block right behind a block that ran is its output.  Integers are equal, other numbers
+  agree within 2 %, and a line `...` stands for any lines.
 """
 
 import contextlib
@@ -69,8 +69,9 @@ def same(expected, actual):
     """Return whether two lines are the same but for the last digits of numbers."""
     if NUMBER.sub('#', ' '.join(expected.split())) != NUMBER.sub('#', ' '.join(actual.split())):
         return False
-    return all(math.isclose(float(one), float(other), rel_tol=0.02) for one, other in
-               zip(NUMBER.findall(expected), NUMBER.findall(actual), strict=True))
+    return all(one == other or (not one.isdecimal() and math.isclose(
+        float(one), float(other), rel_tol=0.02)) for one, other in
+        zip(NUMBER.findall(expected), NUMBER.findall(actual), strict=True))
 
 
 def agrees(expected, actual):
