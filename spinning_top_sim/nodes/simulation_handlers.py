@@ -316,9 +316,8 @@ class SimulationHandlers:
 
     def _filled(self, message: Any, world: World) -> Any:
         """Return a WorldResource that describes a world."""
-        message.name, message.description = world.name, world.description
-        _resource_of(message).uri = world.uri
-        _resource_of(message).resource_string = '' if world.uri else world.text
+        message.name, message.world_resource.uri = world.name, world.uri
+        message.world_resource.resource_string = '' if world.uri else world.text
         return message
 
     def _get_available_worlds(self, request: Any, response: Any) -> None:
@@ -329,7 +328,7 @@ class SimulationHandlers:
             response.worlds.append(self._filled(self._messages.WorldResource(), world))
 
     def _load_world(self, request: Any, response: Any) -> str:
-        resource = _resource_of(request)
+        resource = request.world_resource
         if not (resource.uri or resource.resource_string):
             raise RefusedError(response.NO_RESOURCE, 'uri and resource_string are empty: one of '
                                'them must be a world')
@@ -356,11 +355,6 @@ class SimulationHandlers:
     def _get_current_world(self, _: Any, response: Any) -> None:
         self._filled(response.world,
                          worlds.present_world(self._simulation.values, self._world))
-
-
-def _resource_of(message: Any) -> Any:
-    """Return the Resource of a message; before version 2.1 it has another name."""
-    return getattr(message, 'world_resource', None) or message.level_resource
 
 
 @types.coroutine

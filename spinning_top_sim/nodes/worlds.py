@@ -103,17 +103,6 @@ class World:
             return False
         return all(values[name] == value for name, value in wanted.items())
 
-    @property
-    def description(self) -> str:
-        """The comment at the head of the file, in one line."""
-        lines = []
-        for line in self.text.splitlines():
-            if not line.startswith('#'):
-                break
-            if 'SPDX-License-Identifier' not in line:
-                lines.append(line.lstrip('# ').rstrip())
-        return ' '.join(lines)
-
 
 def scenes() -> Iterator[World]:
     """Yield the installed scenes that can be read."""
