@@ -31,7 +31,7 @@ from helpers.node_logs import (
 )
 from helpers.own_node import OwnNode
 
-from spinning_top_sim.nodes import reports
+from spinning_top_sim.nodes import executable, reports
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
@@ -207,6 +207,16 @@ def test_a_reader_of_the_terminal_who_goes_away_does_not_end_the_motion(monkeypa
         terminal = reports.Terminal()
         terminal.show('one')
         terminal.show('two')
+
+
+def test_a_signal_that_is_ignored_stays_ignored():
+    """As nohup has it."""
+    ordinary = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        executable._handle(signal.SIGHUP, print)
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, ordinary)
 
 
 HUNG_DISK = """

@@ -283,6 +283,8 @@ def test_streams_can_be_switched_off_and_on_and_only_subscribers_make_work(node)
     wait_for('a subscriber', node.node._outputs.by_topic['pose'].get_subscription_count)
     node.step(5)
     assert encoded and pose.publish is not None
+    assert node.set(pose__enabled=False).successful
+    assert pose.publish is None
     node.node.destroy_subscription(subscription)
     del pose.encode
 

@@ -343,6 +343,15 @@ def test_a_world_that_does_not_go_with_the_present_parameters_is_not_the_current
     assert top.done('GetCurrentWorld').world.world_resource.resource_string != text
 
 
+def test_a_world_is_refused_that_does_not_go_with_what_is_being_recorded(top, tmp_path):
+    assert top.set(increments__enabled=True, record__uri=str(tmp_path / 'run.mcap')).successful
+    assert top.switch('record', True).success
+    assert top.set(increments__enabled=False).successful
+    text = '/**: {ros__parameters: {top.mass: 2.0, imu.rate: 0.5}}'
+    code, reason = top.refused('LoadWorld', **load(top, text=text))
+    assert (code, 'imu.rate = 0.5: must be >= 1' in reason) == (FAILED, True)
+
+
 def test_the_current_world_is_known_by_its_start(top):
     assert top.done('GetCurrentWorld').world.name == 'cusp', 'the default'
     assert top.set(top__mass=2.25).successful
