@@ -230,9 +230,11 @@ runpy.run_module('spinning_top_sim.nodes.sim_node', run_name='__main__')
 def test_with_a_hung_disk_the_node_ends_all_the_same(peer, tmp_path):
     with SimNode(tmp_path, {**QUIET, 'record.enabled': True, 'record.max_loss': 0.1},
                  program=('-c', HUNG_DISK)) as node:
-        pose = peer.listen(node.topic('pose'), PoseStamped).wait(20)
+        pose = peer.listen(node.topic('pose'), PoseStamped).wait(50)
+        # A disk that hangs while the log is being opened holds up the start, and the end with it.
+        wait_for('an open log', lambda: 'recording to' in node.err)
         (node.folder / 'hung').touch()
-        pose.wait_more(50)                 # the motion goes on meanwhile
+        pose.wait_more(100)                 # the motion goes on meanwhile
         os.killpg(node.process.pid, signal.SIGINT)
         assert node.wait(60.0) == 0, node.err
         peer.stop_listening(pose)
@@ -319,7 +321,8 @@ def test_an_error_that_nobody_expects_stops_the_motion_loudly_until_a_reset(
                 for timer in node.node.timers:
                     timer.callback()
             wait_for('an error', lambda: node.loop.failure)
-        node.node._session.stop()           # waits for the thread that is closing the log
+        wait_for('the end of the recording', lambda: node.node._session.error)
+        node.node._session.stop()           # waits until the log is closed
         level, message, _ = node.diagnostics()
         reason = 'unexpected ZeroDivisionError: nobody expected this'
         assert (level, message) == (2, f'recording: {reason}')
