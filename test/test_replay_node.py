@@ -530,7 +530,7 @@ def test_what_cannot_be_played_is_one_line_and_exit_code_2(tmp_path, strangers_l
     text.write_text('no log')
     path, _ = strangers_log
     late = tmp_path / 'late.mcap'
-    file = create_file(late, [RecordedTopic('/chatter', 'std_msgs/msg/String')], {},
+    file = create_file(late, [RecordedTopic('/late', 'std_msgs/msg/String')], {},
                        compression='none')
     file.append(0, 2 ** 63, string('late'))
     file.write_chunk()
@@ -614,8 +614,10 @@ def test_a_strangers_log_is_played_over_dds_with_its_qos_or_another(peer, tmp_pa
         clock = peer.listen(names[2], message_class('rosgraph_msgs/msg/Clock')).wait(2)
         reliabilities = {}
         for name in names[:2]:
-            wait_for(name, lambda name=name: peer.node.get_publishers_info_by_topic(name))
-            (info,) = peer.node.get_publishers_info_by_topic(name)
+            # Nodes of earlier tests stay in the graph for a while.
+            (info,) = wait_for(f'one publisher of {name}', lambda name=name: [
+                found for found in [peer.node.get_publishers_info_by_topic(name)]
+                if len(found) == 1])[0]
             reliabilities[name] = info.qos_profile.reliability.name
         assert reliabilities == {'/chatter': 'RELIABLE', '/elsewhere/vel': 'BEST_EFFORT'}
         assert peer.switch(node, 'set_pause', False).success
