@@ -71,6 +71,7 @@ setup(
             'coverage>=7.10,<8',        # make coverage
             'distributed>=2024.5,<2028',
             'docutils>=0.20,<1',
+            'google-re2>=1.1,<2',
             'hypothesis>=6.98,<7',
             'imufusion>=1.3,<2',
             'ipykernel>=6.20,<8',       # with nbclient: runs examples/tour.ipynb
@@ -89,6 +90,8 @@ setup(
         ],
         'parquet': ['pyarrow>=14,<30'],
         'plot': ['matplotlib>=3.6,<4'],     # inspect --plot, docs/figures.py
+        # Name filters of clients, where ROS has simulation_interfaces.
+        'simulation_interfaces': ['google-re2>=1.1,<2'],
         'view': ['viser>=1.1.1,<1.2'],      # a narrow range: the page uses much of it
         # examples/attitude_filter.py
         'examples': ['ahrs>=0.4,<0.5', 'matplotlib>=3.6,<4', 'rosbags>=0.10.11,<0.12',

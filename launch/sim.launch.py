@@ -73,37 +73,23 @@ def _nodes(context: LaunchContext) -> list:
         'use_sim_time', 'tf', 'rviz', 'view', 'markers')}
     namespace = given['namespace'].strip('/')
     files = [_scene_file(given['scene']), *filter(None, [given['params_file']])]
-    scene, *second = map(read_scene, files)
     asked = dict(map(parse_assignment, shlex.split(given['set'])))
     of_ros = {name: asked.pop(name) for name in list(asked) if is_of_ros(name)}
     if 'use_sim_time' in of_ros:
         raise ValueError(f'set = {given["set"]!r}: use_sim_time is an argument of its own, '
                          'use_sim_time:=true')
-    for values in second:
-        asked = {**values, **asked}
-    values = parameters.checked({**scene, **asked})
-    prefix = given['frame_prefix']
-    if prefix == 'auto':
-        prefix = f'{namespace}/' if namespace else ''
-    asked |= {name: prefix + values[name] for name in ('body_frame', 'imu.frame_id')}
-    if on['markers']:
-        asked['markers.enabled'] = True
-    if given['record'] != 'false':
-        asked['record.enabled'] = True
-        if given['record'] != 'true':
-            asked['record.uri'] = given['record']
-    values = parameters.checked({**scene, **asked})
+    changes, values = _parameters(given, namespace, files, asked)
 
-    # As `-p` too: that wins also over an integer in a file, which hides a double of a later one.
-    node = Node(package='spinning_top_sim', executable='sim_node', namespace=namespace,
-                output='screen', sigterm_timeout='15',
-                on_exit=Shutdown(reason='it has ended'), parameters=[*map(str, files), {
-                    **{name: list(value) if isinstance(value, tuple) else value
-                       for name, value in asked.items()},
-                    **of_ros, 'use_sim_time': on['use_sim_time']}],
-                ros_arguments=[word for name in asked for word in (
-                    '-p', f'{name}:={json.dumps(values[name])}')])
-    actions = [node]
+    # Also as `-p`: these override an integer in a file, which hides a double of a later file.
+    actions = [Node(
+        package='spinning_top_sim', executable='sim_node', namespace=namespace, output='screen',
+        sigterm_timeout='15', on_exit=Shutdown(reason='it has ended'),
+        parameters=[*map(str, files), {
+            **{name: list(value) if isinstance(value, tuple) else value
+               for name, value in changes.items()},
+            **of_ros, 'use_sim_time': on['use_sim_time']}],
+        ros_arguments=[word for name in changes for word in (
+            '-p', f'{name}:={json.dumps(values[name])}')])]
     if on['tf']:
         actions += launch_helpers.state_publisher(
             SHARE, values, namespace, resolve_topic('joint_states', namespace),
@@ -115,6 +101,24 @@ def _nodes(context: LaunchContext) -> list:
         actions += launch_helpers.rviz(SHARE, values['world_frame'], namespace,
                                        on['use_sim_time'])
     return actions
+
+
+def _parameters(given: dict, namespace: str, files: list, asked: dict) -> tuple[dict, dict]:
+    """Return what changes the parameters of the scene, and all parameters with these changes."""
+    scene, *second = map(read_scene, files)
+    changes = {name: value for source in (*second, asked) for name, value in source.items()}
+    values = parameters.checked({**scene, **changes})
+    prefix = given['frame_prefix']
+    if prefix == 'auto':
+        prefix = f'{namespace}/' if namespace else ''
+    changes |= {name: prefix + values[name] for name in ('body_frame', 'imu.frame_id')}
+    if given['markers'] == 'true':
+        changes['markers.enabled'] = True
+    if given['record'] != 'false':
+        changes['record.enabled'] = True
+        if given['record'] != 'true':
+            changes['record.uri'] = given['record']
+    return changes, parameters.checked({**scene, **changes})
 
 
 def _scene_file(scene: str) -> Path:

@@ -349,7 +349,7 @@ def test_swing_contains_every_reference_tilt():
 
 @pytest.mark.parametrize(('name', 'value'), [
     ('top.lambda1', 0.0), ('top.lambda1', 'big'), ('pose.rate', -5.0), ('pose.rate', 1e5),
-    ('solver.method', 'rk4'), ('pacing', 'often'), ('imu.lever_arm', (1.0, 2.0)),
+    ('solver.method', 'rk4'), ('imu.sampling', 'often'), ('imu.lever_arm', (1.0, 2.0)),
     ('seed', 1.5), ('seed', 10 ** 400), ('pose.enabled', 1), ('spin.l3', None),
     ('record.streams', ('pose', 'poses')),
     ('step.count', 0), ('initial.theta', 3.2), ('tick_rate', math.nan), ('no.such', 1.0)])

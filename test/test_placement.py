@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.placement import POLE, Box, rotation_matrix, state_of
+from spinning_top_sim.physics.placement import POLE, Box, state_of
 from spinning_top_sim.physics.top import Shape, State, Top
 from spinning_top_sim.solvers.propagator import propagate
 
@@ -65,16 +65,6 @@ def test_just_beside_a_pole_the_motion_is_still_what_was_asked_for():
     assert np.allclose(found, rates, rtol=0.0, atol=1e-7)
 
 
-def test_the_matrix_turns_as_the_quaternion():
-    q = np.array([0.1, -0.5, 0.3, 0.8])
-    q /= np.linalg.norm(q)
-    matrix, vector = rotation_matrix(q), np.array([0.2, -1.0, 3.0])
-    assert np.allclose(matrix.T @ matrix, np.eye(3), atol=1e-15)
-    columns = tuple(np.array([part]) for part in q)
-    assert np.allclose(matrix @ vector,
-                       np.concatenate(attitude.in_world(columns, tuple(vector))), atol=1e-15)
-
-
 @pytest.mark.parametrize('distance', [0.15, 0.0, -0.4])
 def test_the_box_holds_the_body_the_pivot_and_the_tip(distance):
     top = Top(lambda1=0.5, lambda3=0.15, mass=2.0, com_distance=distance, gravity=9.8)
@@ -86,33 +76,3 @@ def test_the_box_holds_the_body_the_pivot_and_the_tip(distance):
     assert {*box.lower, *box.upper} <= {
         -shape.radius, shape.radius, 0.0, shape.tip, shape.centre - shape.height / 2,
         shape.centre + shape.height / 2}
-
-
-def nearest_points(box, rotation, inside):
-    """Return the smallest distance of samples of the box from what `inside` measures."""
-    grid = np.stack(np.meshgrid(*(np.linspace(low, high, 21) for low, high in zip(
-        box.lower, box.upper, strict=True)), indexing='ij'), axis=-1).reshape(-1, 3)
-    return inside(grid @ rotation.T).min()
-
-
-@pytest.mark.parametrize('seed', range(40))
-def test_overlaps_are_those_of_sampled_points(seed):
-    """What samples of the box are inside of overlaps; what is well away from all does not."""
-    rng = np.random.default_rng(seed)
-    box = Box(-rng.uniform(0.1, 1.0, 3), rng.uniform(0.1, 1.0, 3))
-    q = rng.normal(size=4)
-    rotation = rotation_matrix(q / np.linalg.norm(q))
-    centre, radius = rng.uniform(-2.0, 2.0, 3), rng.uniform(0.1, 1.0)
-    half = rng.uniform(0.05, 0.8, 3)
-    other = Box(centre - half, centre + half)
-    to_sphere = nearest_points(box, rotation,
-                               lambda at: np.linalg.norm(at - centre, axis=1) - radius)
-    to_box = nearest_points(box, rotation, lambda at: np.linalg.norm(
-        np.maximum(np.abs(at - centre) - half, 0.0), axis=1))
-    spacing = 0.1 * math.sqrt(3.0)          # a point of the box is this near to a sample
-    for found, distance in ((box.overlaps_sphere(rotation, centre, radius), to_sphere),
-                            (box.overlaps_box(rotation, other), to_box)):
-        if distance <= 0.0:
-            assert found
-        elif distance > spacing:
-            assert not found

@@ -16,7 +16,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from helpers.node_harness import LIFETIME_S, SimNode
+from helpers.node_harness import LIFETIME_S, SimNode, wait_for
 from helpers.node_logs import (
     GRAVITY,
     KINDS,
@@ -28,6 +28,7 @@ from helpers.node_logs import (
     assert_clean_end,
     assert_received_from,
     assert_steps,
+    commands_in,
     conjugate,
     difference,
     in_common,
@@ -41,20 +42,22 @@ from helpers.node_logs import (
     xyz,
     xyzw,
 )
+from visualization_msgs.msg import MarkerArray
 
-WATCHED_S = 10
+WATCHED_S = 3
 
 RUNS = {
     'plain': {},
     'mounted': {'imu.lever_arm': [0.1, -0.05, 0.3], 'imu.rpy': [0.3, -0.2, 1.1],
                'initial.theta': 0.8, 'initial.theta_dot': 0.4, 'spin.l3': 1.2, 'spin.lz': 0.5,
-               'imu.frame_id': 'sensor', 'world_frame': 'map', 'body_frame': 'wheel'},
+               'imu.frame_id': 'sensor', 'world_frame': 'map', 'body_frame': 'wheel',
+               'markers.enabled': True},
 }
 
 
 @pytest.fixture(scope='module')
 def both_runs(peer, diagnostics, tmp_path_factory):
-    """Two nodes side by side in namespaces of their own, recorded, watched, and ended."""
+    """Two nodes side by side in namespaces of their own, recorded, watched, told, and ended."""
     folder = tmp_path_factory.mktemp('runs')
     runs = {}
     with (SimNode(folder, {**RUNS['plain'], 'record.enabled': True}, namespace='/plain') as one,
@@ -63,12 +66,23 @@ def both_runs(peer, diagnostics, tmp_path_factory):
         for node in (one, two):
             topics = {name: peer.listen(node.topic(name), kind) for name, kind in KINDS.items()}
             runs[node.namespace[1:]] = SimpleNamespace(node=node, topics=topics)
+        runs['mounted'].topics['markers'] = peer.listen(two.topic('markers'), MarkerArray)
         for run in runs.values():
             for name, topic in run.topics.items():
-                topic.wait(WATCHED_S * SECOND // PERIODS_NS[name])
+                topic.wait(WATCHED_S * SECOND // PERIODS_NS.get(name, 50_000_000))
             for topic in run.topics.values():
                 peer.stop_listening(topic)
             run.said = diagnostics.next(run.node)
+        # What is said to one, after what is watched, and does not reach the other.
+        peer.introduce(one, diagnostics)
+        peer.send_command(one, 2.0, 1.5)
+        wait_for('the command', lambda: peer.get(one, 'spin.l3', 'spin.lz') == [2.0, 1.5])
+        assert peer.set_together(one, seed=99, pose__rate=50.0).successful
+        assert peer.switch(one, 'set_pause', True).success
+        said = diagnostics.next(two)
+        assert [said[key] for key in ('state', 'commands', 'rejected commands')] == [
+            'running', '0', '0']
+        assert peer.get(two, 'spin.l3', 'spin.lz', 'seed', 'pose.rate') == [1.2, 0.5, 0, 100.0]
         runs['plain'].code = one.end(signal.SIGINT)
         runs['mounted'].code = two.end(signal.SIGTERM)
     for run in runs.values():
@@ -81,11 +95,11 @@ def run(request, both_runs):
     return both_runs[request.param]
 
 
-@pytest.mark.parametrize('name', KINDS)
-def test_consecutive_stamps_differ_by_exactly_the_period(run, name):
-    stamps = stamps_of(run.topics[name])
-    assert set(stamps % PERIODS_NS[name]) == {0}
-    assert_steps(stamps, PERIODS_NS[name], run.said['skipped samples'])
+def test_consecutive_stamps_differ_by_exactly_the_period(run):
+    for name in KINDS:
+        stamps = stamps_of(run.topics[name])
+        assert set(stamps % PERIODS_NS[name]) == {0}
+        assert_steps(stamps, PERIODS_NS[name], run.said['skipped samples'])
 
 
 def test_pose_is_the_zyz_quaternion_of_the_joints(run):
@@ -211,8 +225,9 @@ def test_the_log_is_what_the_subscribers_got(run):
     """The same bytes, in order, with nothing missing between the first and the last."""
     for name, topic in run.topics.items():
         logged = [data for _, data in run.log[run.node.topic(name)]]
-        assert [stamp for stamp, _ in run.log[run.node.topic(name)]] == [
-            stamp_of(data) for data in logged]
+        if name in KINDS:
+            assert [stamp for stamp, _ in run.log[run.node.topic(name)]] == [
+                stamp_of(data) for data in logged]
         first = logged.index(topic.raw[0])
         if int(run.said['skipped samples']) == 0:
             assert logged[first:first + len(topic.raw)] == topic.raw, name
@@ -225,12 +240,12 @@ def test_the_log_is_the_run_computed_offline(run):
     until = max(time for rows in run.log.values() for time, _ in rows)
     epoch = int(run.metadata['spinning_top_sim']['epoch_ns'])
     expected = simulated(run.log, run.metadata, until - epoch)
-    for stream in ('pose', 'joint_states', 'imu/data_raw', 'ground_truth/imu',
-                   'ground_truth/odom', '~/invariants'):
+    for stream in (*KINDS, '~/invariants', *(['markers'] if 'markers' in run.topics else [])):
         rows = run.log[run.node.topic(stream)]
         assert len(rows) > 0
         assert rows == expected[stream][:len(rows)], stream
         assert len(rows) >= len(expected[stream]) - 1, stream
+    assert len(commands_in(run.log)) == (run.node.namespace == '/plain')
 
 
 def test_the_log_begins_at_the_first_sample_and_is_on_the_grid(run):
@@ -238,7 +253,8 @@ def test_the_log_begins_at_the_first_sample_and_is_on_the_grid(run):
     for name, period in PERIODS_NS.items():
         times = np.array([time for time, _ in run.log[run.node.topic(name)]])
         assert times[0] == epoch
-        assert set(np.diff(times)) == {period}
+        watched = times[times < epoch + WATCHED_S * SECOND]
+        assert set(np.diff(watched)) == {period}
 
 
 def test_every_message_of_a_log_is_near_the_date(run):
@@ -257,6 +273,11 @@ def test_two_nodes_in_two_namespaces_do_not_disturb_each_other(both_runs):
         assert not got & {data for rows in both_runs[other].log.values() for _, data in rows}
 
 
+def test_markers_are_in_the_world_frame_with_the_whole_trace(both_runs):
+    for message in both_runs['mounted'].topics['markers'].messages():
+        assert [marker.header.frame_id for marker in message.markers] == 3 * ['map']
+        assert len(message.markers[2].points) == 201
+
+
 def test_sigint_and_sigterm_end_a_node_properly(run):
     assert_clean_end(run.node, run.code)
-    print(f'ended within {run.node.seconds_to_end:.2f} s')

@@ -1,105 +1,125 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a user of the node meets first: arguments, overrides, what it says, and clocks."""
+"""The start of a node: arguments, values given twice, refusals, and what a run of it says."""
 
 import shlex
 import shutil
+import sys
 
 import pytest
 
 pytest.importorskip('rclpy')
 
-from geometry_msgs.msg import PoseStamped
-from helpers.node_harness import DrivenClock, SimNode, wait_for
-from helpers.node_logs import QUIET, TRACEBACK, assert_clean_end, stamp_of, the_log
-from rcl_interfaces.msg import Log
-from rclpy.qos import DurabilityPolicy, QoSProfile
+import rclpy
+import yaml
+from helpers.node_harness import SimNode
+from helpers.node_logs import TRACEBACK, log_of, the_log
+from helpers.own_node import OwnNode, as_a_process, run_main
+from rclpy.executors import SingleThreadedExecutor
 
+from spinning_top_sim.nodes import executable, replay_node, sim_node
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import simulate
 from spinning_top_sim.tools.recorded_run import read_run_description
 
-MODULE = ('-m', 'spinning_top_sim.nodes.sim_node')
-
-
 FORM = 'is not expected here; the form is: sim_node --ros-args -p NAME:=VALUE --params-file FILE'
 
 
-@pytest.mark.parametrize('stray', [
-    ['config/wavy.yaml'], ['-p', 'seed:=7'], ['seed:=7', 'a.yaml'], ['--params-file', 'a.yaml'],
-    ['run'], ['--verbose']])
-def test_arguments_that_ros_does_not_take_are_refused_with_the_right_form(tmp_path, stray):
-    for program, arguments in (((*MODULE, *stray), ()), (MODULE, ('--', *stray))):
-        with SimNode(tmp_path, program=program, arguments=arguments) as node:
-            assert node.wait() == 2
-        assert node.err == f"sim_node: cannot start: '{' '.join(stray)}' {FORM}\n"
+@pytest.fixture
+def main(capfd):
+    """Run `sim_node` with these arguments; return its exit code and what it has printed."""
+    return lambda *arguments: run_main(sim_node.main, capfd, *arguments)
 
 
-@pytest.mark.parametrize('stray', ['a.yaml', '--verbose'])
-def test_what_stands_behind_ros_args_and_rcl_does_not_know_is_refused_too(tmp_path, stray):
-    with SimNode(tmp_path, arguments=[stray]) as node:
-        assert node.wait() == 2
-    assert stray in node.err and node.err.endswith(f'{FORM}\n')
-    assert len(node.err.splitlines()) == 1
+@pytest.mark.parametrize('given', [
+    ['config/wavy.yaml'], ['-p', 'seed:=7'], ['--', 'a.yaml', '--verbose'],
+    ['--ros-args', '--', '--params-file', 'a.yaml'], ['--ros-args', 'a.yaml']])
+def test_arguments_that_ros_does_not_take_are_refused_with_the_right_form(main, given):
+    run = main(*given)
+    assert run.code == 2
+    (line,) = run.err.splitlines()
+    assert line.startswith('sim_node: cannot start: ') and line.endswith(FORM)
+    assert given[-1] in line
 
 
-def test_the_version_and_the_help_are_printed_and_nothing_runs(tmp_path):
-    for expected in ('sim_node', 'replay_node'):
-        program = ('-m', f'spinning_top_sim.nodes.{expected}', '--version')
-        with SimNode(tmp_path, program=program) as node:
-            assert node.wait() == 0
-        name, version = node.out.split()
-        assert name == expected and version[0].isdigit()
-    with SimNode(tmp_path, program=(*MODULE, '--help')) as node:
-        assert node.wait() == 0
-    for said in ('~/commands', '~/set_pause', '~/record', '~/step', '~/reset', '/diagnostics',
+def test_the_version_and_the_help_are_printed_and_nothing_runs(main, capfd):
+    for module in (sim_node, replay_node):
+        run = run_main(module.main, capfd, '--version')
+        name, version = run.out.split()
+        assert (run.code, name) == (0, module.__name__.rpartition('.')[2]) and version[0].isdigit()
+        run = run_main(module.main, capfd, '--help')
+        assert run.code == 0
+        assert [line for line in run.out.splitlines() if len(line) > 80] == []
+    said = main('--help').out
+    for name in ('~/commands', '~/set_pause', '~/record', '~/step', '~/reset', '/diagnostics',
                  'imu/data_raw', '~/invariants', '/clock', *parameters.BY_NAME):
-        assert said in node.out
-    assert 'effect fixed' not in node.out
+        assert name in said
 
 
-def write_scene(path, **values):
-    path.write_text('/**:\n  ros__parameters:\n' + ''.join(
-        f'    {name.replace("__", ".")}: {value}\n' for name, value in values.items()))
-    return str(path)
+STARTS_REFUSED = {
+    'negative inertia': (['-p', 'top.lambda1:=-1.0'], ('top.lambda1', '-1.0', '> 0')),
+    'string for a double': (['-p', 'spin.l3:=fast'], ('spin.l3', 'fast', 'a number')),
+    'nan': (['-p', 'spin.l3:=.nan'], ('spin.l3', 'nan', 'a number')),
+    'unknown solver': (['-p', 'solver.method:=magic'], ('solver.method', 'magic', 'rk45')),
+    'pole': (['-p', 'initial.theta:=0.0', '-p', 'spin.lz:=1.0'], ('lz', '1.0', '1.6')),
+    'too fast': (['-p', 'spin.l3:=1.0e20'], ('l3', '1e+20')),
+    'missing file': (['--params-file', 'nowhere.yaml'], ('nowhere.yaml', 'Error opening YAML')),
+    'no YAML': (['--params-file', 'bad.yaml'], ('bad.yaml', 'Error at line 1')),
+    'no parameters': (['--params-file', 'list.yaml'], ('list.yaml',)),
+    'use_sim_time': (['-p', 'use_sim_time:=perhaps'], ('use_sim_time', 'perhaps')),
+    'no stream': (['-p', 'record.streams:=[poise]'], ('record.streams', 'poise')),
+    'too many digits': (['-p', f'seed:={400 * "7"}'], ('seed', '7777', 'an integer')),
+    'too many digits in a file': (['--params-file', 'digits.yaml'], ('top.mass', 'a number')),
+    'bad remapping': (['-r', 'pose:='], ('pose:=',)),
+    'bad qos': (['-p', 'qos_overrides./pose.publisher.reliability:=often'], ('often',)),
+}
 
 
-def test_the_last_value_wins_whatever_the_types_and_as_in_simulate(peer, tmp_path):
-    """Of one name, rclpy takes an integer rather than a double that comes later."""
-    file = write_scene(tmp_path / 'a.yaml', spin__l3=3, max_error=1, time_scale=2, imu__rate=250,
-                       imu__lever_arm='[1, 2, 3]')
-    given = ['spin.l3:=2.25', 'max_error:=1e-7', 'imu.rate:=0.4e3', 'top.mass:=1e0',
-             'imu.lever_arm:=[0, 0, 1]']
-    options = [word for rule in given for word in ('-p', rule)]
-    assert simulate.main(['-o', str(tmp_path / 'ours.mcap'), '--quiet', '--duration', '0.1',
-                          '--params', file, *options]) == 0
-    with LogReader(tmp_path / 'ours.mcap') as log:
-        ours = read_run_description(log).values_at_recording
-    names = ('spin.l3', 'max_error', 'imu.rate', 'top.mass', 'time_scale')
-    for arguments, expected in (
-            (['--params-file', file, *options], [2.25, 1e-7, 400.0, 1.0, 2.0, (0.0, 0.0, 1.0)]),
-            ([*options, '--params-file', file], [3.0, 1.0, 250.0, 1.0, 2.0, (1.0, 2.0, 3.0)])):
-        with SimNode(tmp_path, QUIET, arguments=arguments) as node:
-            found = peer.get(node, *names)
-            (lever_arm,) = peer.get(node, 'imu.lever_arm')
-            assert_clean_end(node, node.end())
-        assert [*found, tuple(lever_arm)] == expected
-        if arguments[0] == '--params-file':
-            assert found == [ours[name] for name in names]
-            assert tuple(ours['imu.lever_arm']) == tuple(lever_arm)
+@pytest.mark.parametrize('case', STARTS_REFUSED)
+def test_what_cannot_be_started_is_said_in_one_line_with_exit_code_2(
+        main, monkeypatch, tmp_path, case):
+    arguments, named = STARTS_REFUSED[case]
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'bad.yaml').write_text('a: [1, 2\n  : {{{\n')
+    (tmp_path / 'list.yaml').write_text('- 1\n- 2\n')
+    (tmp_path / 'digits.yaml').write_text(
+        f'/**:\n  ros__parameters:\n    top.mass: {400 * "7"}\n')
+    run = main('--ros-args', *arguments)
+    assert (run.code, run.out) == (2, '')
+    # rcl and rclpy have lines of their own for arguments that they do not understand.
+    lines = [line for line in run.err.splitlines() if '[rcl]: Failed to parse global' not in line
+             and "Invalid type for parameter 'use_sim_time'" not in line]
+    assert len(lines) == 1 and lines[0].startswith('sim_node: cannot start:'), run.err
+    for text in named:
+        assert text in lines[0], (text, lines[0])
+    assert 'is not expected here' not in run.err
 
 
-def test_of_several_files_the_last_that_is_for_the_node_wins(peer, tmp_path):
-    one, two = (write_scene(tmp_path / f'{l3}.yaml', spin__l3=l3) for l3 in (2, 1.5))
-    other = tmp_path / 'other.yaml'
-    other.write_text('/last/other:\n  ros__parameters:\n    spin:\n      l3: 9\n'
-                     '/*/spinning_top:\n  ros__parameters:\n    spin:\n      l3: 7\n')
-    for given, expected in (((one, two), 1.5), ((two, one), 2.0), ((one, two, str(other)), 7.0),
-                            ((str(other), one, two), 1.5)):
-        arguments = [word for file in given for word in ('--params-file', file)]
-        with SimNode(tmp_path, QUIET, namespace='/last', arguments=arguments) as node:
-            assert peer.get(node, 'spin.l3') == [expected]
-            assert_clean_end(node, node.end())
+def test_a_short_run_warns_of_what_is_odd_and_ends_with_code_0(main):
+    run = main('--ros-args', '-p', 'spin.l33:=1.0', '-p', 'top.lambda3:=0.5', '-p',
+               'duration:=0.01')
+    assert (run.code, TRACEBACK in run.err) == (0, False)
+    assert 'there is no parameter spin.l33: ignored; did you mean spin.l3?' in run.err
+    assert 'top.lambda3 = 0.5 kg m^2: no rigid body' in run.err
+
+
+def test_a_run_tells_where_its_log_is_and_what_to_do_next(main, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, 'rclpy.experimental', None)
+    kinds, ordinary = [], executable._executor
+    monkeypatch.setattr(executable, '_executor', lambda node: (
+        kinds.append(ordinary(node)) or kinds[0]))
+    run = main('--ros-args', '-p', 'record.enabled:=true', '-p', 'duration:=0.3', '-p',
+               'status_period:=0.1')
+    assert run.code == 0
+    assert isinstance(kinds[0], SingleThreadedExecutor), 'there is no other one'
+    path = the_log(tmp_path)
+    assert len(log_of(path)[0]['/pose']) == 31
+    assert f'recording to {path}' in run.err and 'the motion:\n  cusp' in run.err
+    assert ' | cusps | theta' in run.out and '\x1b' not in run.out and '\r' not in run.out
+    next_step = run.out.splitlines()[-1]
+    assert next_step.endswith(f'inspect {path} --plot top.png')
+    assert shutil.which(shlex.split(next_step.removeprefix('next: '))[0])
 
 
 def test_a_node_runs_where_the_shell_has_closed_its_standard_streams(tmp_path):
@@ -111,142 +131,86 @@ def test_a_node_runs_where_the_shell_has_closed_its_standard_streams(tmp_path):
         assert log.whole
 
 
-def test_the_help_fits_80_columns(tmp_path):
-    for name in ('sim_node', 'replay_node'):
-        with SimNode(tmp_path, program=('-m', f'spinning_top_sim.nodes.{name}', '--help')) as node:
-            assert node.wait() == 0
-        assert [line for line in node.out.splitlines() if len(line) > 80] == []
+# ----------------------------------------------------------- values that are given twice
+
+def write_scene(path, **values):
+    path.write_text('/**:\n  ros__parameters:\n' + ''.join(
+        f'    {name.replace("__", ".")}: {value}\n' for name, value in values.items()))
+    return str(path)
 
 
-@pytest.fixture(scope='module')
-def node(peer, tmp_path_factory):
-    with SimNode(tmp_path_factory.mktemp('start'), QUIET) as node:
-        yield node
-        assert_clean_end(node, node.end())
+def start_values(*arguments):
+    """Return the values that a node starts with in the namespace /last."""
+    argv = ['sim_node', '--ros-args', '-r', '__ns:=/last', *arguments]
+    with as_a_process():
+        rclpy.init(args=argv)
+        node = sim_node._prepare(argv)()
+        values = node.start_values
+        node.stop()
+        node.destroy_node()
+    return values
 
 
-def test_texts_that_are_numbers_are_taken_as_ros2_param_sends_them(peer, node):
-    """YAML 1.1 takes 1e-9 for a text, and so do `ros2 param set` and `ros2 param load`."""
-    for result in peer.set_each(node, max_error='1e-9', imu__gyroscope_noise_density='5e-5',
-                                duration=0, imu__lever_arm=['1e-2', '0', '2e0']):
-        assert result.successful, result.reason
-    assert peer.get(node, 'max_error', 'imu.gyroscope_noise_density', 'duration') == [
-        1e-9, 5e-5, 0.0]
-    assert list(peer.get(node, 'imu.lever_arm')[0]) == [0.01, 0.0, 2.0]
-    for value in ('1e-9x', '', 'nan', '-1e-9'):
-        (result,) = peer.set_each(node, max_error=value)
-        assert not result.successful
-        assert 'max_error' in result.reason
-    assert peer.set_together(node, imu__lever_arm=[0, 0, 0]).successful
-    refused = peer.set_together(node, imu__lever_arm=[0.0, 1.5])
-    assert 'imu.lever_arm = [0.0, 1.5]: must be' in refused.reason
+def test_the_last_value_wins_whatever_the_types_and_as_in_simulate(tmp_path):
+    """Of one name, rclpy takes an integer rather than a double that comes later."""
+    file = write_scene(tmp_path / 'a.yaml', spin__l3=3, max_error=1, time_scale=2, imu__rate=250,
+                       imu__lever_arm='[1, 2, 3]')
+    given = ['spin.l3:=2.25', 'max_error:=1e-7', 'imu.rate:=0.4e3', 'top.mass:=1e0',
+             'imu.lever_arm:=[0, 0, 1]']
+    options = [word for rule in given for word in ('-p', rule)]
+    assert simulate.main(['-o', str(tmp_path / 'ours.mcap'), '--quiet', '--duration', '0.1',
+                          '--params', file, *options]) == 0
+    with LogReader(tmp_path / 'ours.mcap') as log:
+        ours = read_run_description(log).values_at_recording
+    names = ('spin.l3', 'max_error', 'imu.rate', 'top.mass', 'time_scale', 'imu.lever_arm')
+    found = start_values('--params-file', file, *options)
+    assert [found[name] for name in names] == [2.25, 1e-7, 400.0, 1.0, 2.0, (0.0, 0.0, 1.0)]
+    assert [found[name] for name in names] == [ours[name] for name in names]
+    found = start_values(*options, '--params-file', file)
+    assert [found[name] for name in names] == [3.0, 1.0, 250.0, 1.0, 2.0, (1.0, 2.0, 3.0)]
+    assert start_values('-p', 'spin.l3:=2', '-p', 'spin.l3:=1.5')['spin.l3'] == 1.5
 
 
-def test_what_waits_for_a_reset_or_a_recording_is_said_when_it_is_set(peer, node):
-    assert peer.set_together(node, top__mass=2.5, initial__phi=1.0, pose__rate=50.0).successful
-    wait_for('a line', lambda: 'initial.phi, top.mass: a change takes effect at the next ~/reset'
-             in node.err)
-    assert peer.set_together(node, record__max_loss=1.0).successful
-    wait_for('a line', lambda: 'record.max_loss: a change takes effect at the next start of a '
-             'recording' in node.err)
-    assert peer.set_together(node, top__mass=2.5, imu__lever_arm=[0.0, 0.0, 1.0]).successful
-    wait_for('a line', lambda: ': imu.lever_arm: a change takes' in node.err)
-    assert 'pose.rate' not in node.err
+def test_of_several_files_the_last_that_is_for_the_node_wins(tmp_path):
+    one, two = (write_scene(tmp_path / f'{l3}.yaml', spin__l3=l3) for l3 in (2, 1.5))
+    other = tmp_path / 'other.yaml'
+    other.write_text('/last/other:\n  ros__parameters:\n    spin:\n      l3: 9\n'
+                     '/*/spinning_top:\n  ros__parameters:\n    spin:\n      l3: 7\n')
+    for given, expected in (((one, two), 1.5), ((two, one), 2.0), ((one, two, other), 7.0),
+                            ((other, one, two), 1.5)):
+        arguments = [word for file in given for word in ('--params-file', file)]
+        assert start_values(*map(str, arguments))['spin.l3'] == expected
 
 
-def test_the_source_of_time_is_not_changed_while_the_node_runs(peer, node):
-    result = peer.set_together(node, use_sim_time=True)
-    assert not result.successful
-    assert 'use_sim_time = True: cannot be changed' in result.reason
-    assert peer.set_together(node, use_sim_time=False).successful
-    peer.listen(node.topic('pose'), PoseStamped).wait(3)
+def test_a_dump_of_the_parameters_gives_the_same_start(tmp_path):
+    """With lz unset, lists, integers, and what was changed meanwhile."""
+    with OwnNode(tmp_path, seed=7, pose__rate=37.5, imu__lever_arm=[0.1, 0.0, 0.02],
+                 imu__frame_id='sensor', ground_truth_odom__enabled=False, start_paused=True,
+                 record__streams=['pose', 'imu'], initial__theta=0.7) as node:
+        assert node.set(solver__rtol=1e-10, seed=8).successful
+        dumped = {name: one.value for name, one in node.node.get_parameters_by_prefix('').items()}
+        expected = {**node.node.start_values, 'spin.lz': node.simulation.lz}
+    for name, value in dumped.items():      # as ros2 param dump does
+        if hasattr(value, 'tolist'):
+            dumped[name] = value.tolist()
+    file = tmp_path / 'dump.yaml'
+    file.write_text(yaml.dump({'/**': {'ros__parameters': dumped}}))
+    assert start_values('--params-file', str(file)) == expected
 
 
-def test_a_second_node_of_the_same_name_is_warned_about(peer, tmp_path):
-    with (SimNode(tmp_path / 'one', namespace='/twins') as one,
-          SimNode(tmp_path / 'two', namespace='/twins') as two):
-        for node in (one, two):
-            wait_for('a warning', lambda node=node:
-                     'there is another node /twins/spinning_top' in node.err)
-        for node in (one, two):
-            assert_clean_end(node, node.end())
+# ---------------------------------------------------------------------- names and QoS
 
-
-def test_what_is_said_at_the_start_is_on_rosout_and_at_the_end_what_to_do_next(peer, tmp_path):
-    heard = []
-    subscription = peer.node.create_subscription(
-        Log, '/rosout', heard.append,
-        QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL))
-    with SimNode(tmp_path, {'record.enabled': True}, namespace='/said') as node:
-        for text in ('recording to ', 'cusp'):
-            wait_for(text, lambda text=text: any(
-                log.name == 'said.spinning_top' and text in log.msg for log in heard))
-            assert text in node.err
-        wait_for('a status line', lambda: ' log ' in node.out)
-        assert_clean_end(node, node.end())
-    assert subscription.topic_name == '/rosout'
-    path = the_log(node.folder)
-    next_step = node.out.splitlines()[-1]
-    assert next_step.endswith(f'inspect {path} --plot top.png')
-    inspect = shlex.split(next_step.removeprefix('next: '))
-    assert shutil.which(inspect[0])
-    assert '\x1b' not in node.out and '\r' not in node.out
-
-
-def test_times_that_no_stamp_can_have_are_not_followed(peer, tmp_path):
-    clock = DrivenClock(peer, 1_000_000_000_000)
-    with SimNode(tmp_path, {**QUIET, 'use_sim_time': True}) as node:
-        pose = peer.listen(node.topic('pose'), PoseStamped)
-        # It would follow itself.
-        assert 'follows another /clock' in peer.set_together(node, clock__enabled=True).reason
-
-        def warned():       # -1 is no time to rclpy
-            for seconds in (-1, 2 ** 31 - 1):
-                clock.publish(seconds)
-            return 'stamps cannot be later than 2038' in node.err
-
-        wait_for('a warning', warned)
-        clock.publish(-1)
-        clock.drive('the motion', lambda: len(pose.raw) > 50)
-        clock.publish(-1)
-        clock.drive('more', lambda: len(pose.raw) > 100)
-        assert_clean_end(node, node.end())
-        peer.stop_listening(pose)
-    assert TRACEBACK not in node.err
-    clock.stop()
-
-
-def test_a_clock_that_has_not_begun_or_has_stopped_is_waited_for_aloud(
-        peer, diagnostics, tmp_path):
-    clock = DrivenClock(peer, 1_000_000_000_000)
-
-    def waits():
-        status = diagnostics.wait_for(node, 'a warning', lambda s: s.level == b'\x01')
-        assert status.message == 'waiting for /clock'
-        wait_for('the status line', lambda: ' s waiting for /clock | ' in
-                 node.out.splitlines()[-1])
-        return node.err.count('[WARN]') == node.err.count('waiting for /clock')
-
-    with SimNode(tmp_path, {'use_sim_time': True, 'status_period': 0.2}) as node:
-        assert waits()
-        assert node.err.count('waiting for /clock') == 1
-        refused = peer.set_together(node, spin__l3=2.0)     # it would send t = 0 to nobody
-        assert not refused.successful and 'waiting for /clock' in refused.reason
-        pose = peer.listen(node.topic('pose'), PoseStamped)
-        clock.now_ns += 3_000_000           # not on the grid of the stamps
-
-        def is_ahead():
-            assert all(stamp_of(data) <= clock.now_ns for data in pose.raw[-1:])
-            return len(pose.raw) > 50 and '/clock goes on' in node.err
-
-        clock.drive('the motion', is_ahead)
-        clock.drive('no warning', lambda: diagnostics.statuses(node)[-1].level == b'\x00')
-        assert waits()
-        assert node.err.count('waiting for /clock') == 2
-        count = len(pose.raw)
-        clock.drive('the motion', lambda: (
-            len(pose.raw) > count + 50 and node.err.count('/clock goes on') == 2))
-        assert_clean_end(node, node.end())
-    assert TRACEBACK not in node.err
-    peer.stop_listening(pose)
-    clock.stop()
+def test_remapping_and_qos_overrides_work(tmp_path):
+    arguments = ['-r', '__ns:=/ns', '-r', 'pose:=attitude', '-p',
+                 'qos_overrides./ns/attitude.publisher.reliability:=best_effort', '-p',
+                 'qos_overrides./ns/imu/data_raw.publisher.depth:=3']
+    with OwnNode(tmp_path, *arguments, record__enabled=True) as node:
+        pose, imu = (node.node._outputs.by_topic[name] for name in ('pose', 'imu/data_raw'))
+        assert (pose.topic_name, pose.qos_profile.reliability.name) == (
+            '/ns/attitude', 'BEST_EFFORT')
+        assert (imu.qos_profile.depth, imu.qos_profile.reliability.name) == (3, 'RELIABLE')
+    with LogReader(tmp_path / 'run.mcap') as reader:
+        offered = {topic.name: topic.qos[0] for topic in reader.topics if topic.qos}
+    assert '/ns/pose' not in offered
+    assert offered['/ns/attitude']['reliability'] == 2
+    assert offered['/ns/imu/data_raw']['depth'] == 3

@@ -7,20 +7,17 @@ installed ones where there are some.  test_simulation_interfaces_dds.py calls se
 """
 
 import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 pytest.importorskip('rclpy')
 
+import rclpy
 from helpers import standard_types
 from helpers.node_harness import wait_for
 from helpers.standard_node import INSTALLED, KINDS, StandardNode, finished, types_of
-from rclpy.parameter import Parameter
 
 from spinning_top_sim.nodes import worlds
 from spinning_top_sim.nodes.simulation_standard import FEATURES, SERVICES, service_name
@@ -35,10 +32,16 @@ ALREADY, TRANSITION_ERROR, INCORRECT_TRANSITION = 101, 102, 103
 BAD_FORMAT, NO_RESOURCE, PARSE_ERROR, BAD_ELEMENTS = 101, 102, 103, 106
 
 
-@pytest.fixture(params=KINDS)
-def top(request, monkeypatch, tmp_path):
-    with StandardNode(request.param, monkeypatch, tmp_path) as node:
+@pytest.fixture(scope='module', params=KINDS)
+def node(request, tmp_path_factory):
+    with StandardNode(tmp_path_factory.mktemp('node'), request.param) as node:
         yield node
+
+
+@pytest.fixture
+def top(node):
+    node.renew()
+    return node
 
 
 @pytest.mark.skipif(not INSTALLED, reason='simulation_interfaces is not installed')
@@ -75,7 +78,7 @@ def test_features_are_those_of_the_services(top):
              and getattr(known, name) in list(features.features)}
     assert names == {name for row in FEATURES.values() for name in row}
     assert not {'SPAWNING', 'SPAWNING_ENTITIES', 'DELETING', 'SIMULATION_RESET_TIME', 'WORLD_TAGS',
-                'WORLD_UNLOADING', 'ENTITY_BOUNDS_CONVEX', 'ENTITY_INFO_SETTING'} & names
+                'WORLD_UNLOADING', 'ENTITY_BOUNDS_BOX', 'ENTITY_INFO_SETTING'} & names
     assert not features.spawn_formats
 
 
@@ -110,12 +113,11 @@ def test_play_pause_stop(top):
     assert top.set_state('PLAYING') == OK
 
 
-@pytest.mark.parametrize('state', [NO_WORLD, 5, 77])
-def test_other_states_are_refused_by_name(top, state):
+def test_other_states_are_refused_by_name(top):
     code, text = top.refused('SetSimulationState',
-                             state=top.messages.SimulationState(state=state))
+                             state=top.messages.SimulationState(state=NO_WORLD))
     assert code == INCORRECT_TRANSITION
-    assert f'state = {state}: must be 0 (STOPPED), 1 (PLAYING), 2 (PAUSED), 3 (QUITTING)' == text
+    assert text == 'state = 4: must be 0 (STOPPED), 1 (PLAYING), 2 (PAUSED), 3 (QUITTING)'
 
 
 def test_quitting_ends_the_node(top):
@@ -127,13 +129,12 @@ def test_quitting_ends_the_node(top):
     assert top.refused('ResetSimulation', scope=0) == (
         INCORRECT_STATE, 'the simulator is quitting')
     assert not top.node.finished.done(), 'the response goes out first'
-    import rclpy
     wait_for('the end', lambda: rclpy.spin_once(top.node, timeout_sec=0.1)
              or top.node.finished.done())
     assert top.node.finished.result() is None       # exit code 0
 
 
-def test_a_failed_motion_is_paused_until_it_is_stopped(top, monkeypatch):
+def test_a_failed_motion_is_paused_until_it_is_stopped(top):
     top.pause()
     top.loop.fail('the equations end')
     response = top.done('GetSimulationState')
@@ -150,26 +151,12 @@ def test_a_failed_motion_is_paused_until_it_is_stopped(top, monkeypatch):
 
 def test_a_start_that_has_no_motion_is_a_transition_error(top):
     top.pause().done('StepSimulation', steps=3)
-    assert top.node.set_parameters([Parameter('top.lambda3', value=1e-25)])[0].successful
+    assert top.set(top__lambda3=1e-25).successful
     code, text = top.refused('SetSimulationState',
                              state=top.messages.SimulationState(state=STOPPED))
     assert code == TRANSITION_ERROR
     assert 'it turns too fast' in text
     assert (top.state, top.simulation.now_ns) == (PAUSED, 30_000_000)
-
-
-def test_before_the_clock_nothing_can_be_set(monkeypatch, tmp_path):
-    with StandardNode('stand-in', monkeypatch, tmp_path, use_sim_time=True) as top:
-        assert top.state == STOPPED
-        for name in ('PLAYING', 'PAUSED'):
-            assert top.set_state(name) == TRANSITION_ERROR
-        for expected, name, request in (
-                (FAILED, 'StepSimulation', {'steps': 1}),
-                (INCORRECT_STATE, 'ResetSimulation', {'scope': 0}),
-                (INCORRECT_STATE, 'LoadWorld', load(top, 'looping')),
-                (INCORRECT_STATE, 'SetEntityState', {'entity': 'spinning_top'})):
-            code, text = top.refused(name, **request)
-            assert (code, text) == (expected, 'waiting for /clock (use_sim_time is set)')
 
 
 # ------------------------------------------------------------------------------------- steps
@@ -184,32 +171,22 @@ def test_steps_only_while_paused(top):
     assert top.refused('StepSimulation', steps=0) == (FAILED, 'steps = 0: must be >= 1')
 
 
-def test_steps_are_whole_nanoseconds_however_they_are_divided(monkeypatch, tmp_path):
-    with StandardNode('stand-in', monkeypatch, tmp_path, step__dt=1.0 / 3.0) as top:
-        top.pause().done('StepSimulation', steps=1)
-        assert top.simulation.now_ns == 333_333_333
-        top.done('StepSimulation', steps=5)
-        assert top.simulation.now_ns == 6 * 333_333_333
-        goal, coroutine = top.steps(3)
-        assert finished(coroutine).result.result == OK
-        assert top.simulation.now_ns == 9 * 333_333_333
-        assert (goal.end, goal.feedback) == ('succeeded', [(1, 2), (2, 1), (3, 0)])
-        assert top.state == PAUSED
+def test_steps_are_whole_nanoseconds_however_they_are_divided(top):
+    assert top.set(step__dt=1.0 / 3.0).successful
+    top.pause().done('StepSimulation', steps=6)
+    assert top.simulation.now_ns == 6 * 333_333_333
+    goal, coroutine = top.steps(3)
+    assert finished(coroutine).result.result == OK
+    assert top.simulation.now_ns == 9 * 333_333_333
+    assert (goal.end, goal.feedback) == ('succeeded', [(1, 2), (2, 1), (3, 0)])
+    assert top.state == PAUSED
 
 
-def test_many_steps_are_exact_beyond_the_whole_numbers_of_doubles(monkeypatch, tmp_path):
-    with StandardNode('stand-in', monkeypatch, tmp_path, step__dt=1.0 / 3.0,
-                      solver__method='exact') as top:
-        top.pause().done('StepSimulation', steps=30_000_001)
-        assert top.simulation.now_ns == 30_000_001 * 333_333_333 > 2 ** 53
-
-
-def test_steps_beyond_the_duration_say_so(monkeypatch, tmp_path):
-    with StandardNode('stand-in', monkeypatch, tmp_path, duration=0.05) as top:
-        code, text = top.pause().refused('StepSimulation', steps=6)
-        assert code == FAILED
-        assert text == 'at t = 0.050000000 s: `duration` ends before the steps do'
-        assert top.state == QUITTING
+def test_many_steps_are_exact_beyond_the_whole_numbers_of_doubles(top):
+    assert top.set(step__dt=1.0 / 3.0, solver__method='exact').successful
+    top.done('ResetSimulation', scope=0)
+    top.pause().done('StepSimulation', steps=30_000_001)
+    assert top.simulation.now_ns == 30_000_001 * 333_333_333 > 2 ** 53
 
 
 def test_a_step_that_fails_says_why(top, monkeypatch):
@@ -231,7 +208,7 @@ def test_simulate_steps_ends_as_it_is_told_to(top):
     coroutine.send(None)
     coroutine.send(None)
     other, second = top.steps(1)
-    assert 'another' in finished(second).result.error_message
+    assert 'SimulateSteps is stepping' in finished(second).result.error_message
     assert other.end == 'aborted'
     assert 'SimulateSteps' in top.refused('StepSimulation', steps=1)[1]
     goal.is_cancel_requested = True
@@ -242,47 +219,34 @@ def test_simulate_steps_ends_as_it_is_told_to(top):
     top.done('StepSimulation', steps=1)         # the next ones may begin
 
 
-def test_simulate_steps_says_that_the_duration_ends_or_the_motion_fails(monkeypatch, tmp_path):
-    with StandardNode('stand-in', monkeypatch, tmp_path, duration=0.02) as top:
-        goal, coroutine = top.pause().steps(3)
-        assert finished(coroutine).result.error_message == (
-            'interrupted after 2 of 3 steps: `duration` ends before the steps do')
-        assert goal.end == 'aborted'
-    with StandardNode('stand-in', monkeypatch, tmp_path) as top:
-        _, coroutine = top.pause().steps(3)
-        coroutine.send(None)
-        top.loop.fail('the equations end')
-        assert finished(coroutine).result.error_message == (
-            'interrupted after 1 of 3 steps: the equations end')
-
-
-@pytest.mark.parametrize('how', ['reset', 'play', 'stop', 'quit'])
-def test_a_reset_or_another_state_ends_the_steps(top, how):
+@pytest.mark.parametrize(('how', 'why'), [
+    (lambda top: top.done('ResetSimulation', scope=0), 'was reset'),
+    (lambda top: top.set_state('PLAYING'), 'its state set'),
+    (lambda top: top.loop.fail('the equations end'), 'the equations end'),
+    (lambda top: top.set_state('QUITTING'), 'its state set')])
+def test_a_reset_another_state_or_a_failure_ends_the_steps(top, how, why):
     top.pause()
     goal, coroutine = top.steps(10 ** 18)
     coroutine.send(None)
-    if how == 'reset':
-        top.done('ResetSimulation', scope=0)
-    else:
-        name = {'play': 'PLAYING', 'stop': 'STOPPED', 'quit': 'QUITTING'}[how]
-        assert top.set_state(name) == OK
+    how(top)
     result = finished(coroutine).result
+    assert why in result.error_message
     assert (goal.end, goal.feedback) == ('aborted', [(1, 10 ** 18 - 1)])
     assert 'interrupted after 1 of' in result.error_message
 
 
 # ------------------------------------------------------------------------------------ resets
 
-@pytest.mark.parametrize('scope', [0, 3, 255])
+@pytest.mark.parametrize('scope', [0, 3])
 def test_a_reset_of_time_and_state_is_that_of_the_node(top, scope):
     start = top.simulation.segment.start
     top.pause().done('StepSimulation', steps=5)
-    assert top.node.set_parameters([Parameter('spin.l3', value=2.5)])[0].successful
-    assert top.parameter('spin.l3') == 2.5
+    assert top.set(spin__l3=2.5).successful
+    assert top.get('spin.l3') == [2.5]
     top.done('ResetSimulation', scope=scope)
     assert top.simulation.now_ns == -1
     assert top.simulation.segment.start == start
-    assert top.parameter('spin.l3') == start.l3
+    assert top.get('spin.l3') == [start.l3]
     assert top.state == STOPPED, 'a pause stays'
 
 
@@ -296,7 +260,7 @@ def test_a_reset_of_the_state_lets_time_go_on(top):
     top.done('StepSimulation', steps=1)
 
 
-@pytest.mark.parametrize('scope', [1, 4, 6, 8, 128])
+@pytest.mark.parametrize('scope', [1, 4])
 def test_other_scopes_are_not_supported(top, scope):
     top.pause().done('StepSimulation', steps=2)
     code, text = top.refused('ResetSimulation', scope=scope)
@@ -314,39 +278,22 @@ def test_scenes_are_worlds(top):
     for world, scene in zip(found, scenes, strict=True):
         assert Path(world.world_resource.uri).read_bytes() == scene.read_bytes()
         assert not world.world_resource.resource_string
-        assert len(world.description) > 50
-        assert 'SPDX' not in world.description
 
 
-def test_sources_of_worlds(top, tmp_path):
-    folder = tmp_path / 'more worlds'
-    folder.mkdir()
-    (folder / 'mine.yaml').write_text('/**: {ros__parameters: {top.mass: 3.0}}')
-    (folder / 'other.yaml').write_text('/**: {ros__parameters: {imu.rate: 3.0}}')
-    (folder / 'broken.yaml').write_text('{')
-    # No message can hold this name.
-    (folder / os.fsdecode(b'\xff.yaml')).write_bytes((folder / 'mine.yaml').read_bytes())
-    for source in (str(folder), folder.as_uri(), str(folder / 'mine.yaml')):
-        found = top.done('GetAvailableWorlds', additional_sources=[source]).worlds
-        assert found[-1].name == 'mine'
-        assert len(found) == len(list(ROOT.glob('config/*.yaml'))) + 1
-    for source in (str(tmp_path / 'none'), 'https://example.org/worlds', '~nosuchuser/x',
-                   str(folder / 'broken.yaml')):
-        code, text = top.refused('GetAvailableWorlds', additional_sources=[source])
-        assert code == FAILED
-        assert source in text
-        response = top.done('GetAvailableWorlds', additional_sources=[source],
-                            continue_on_error=True)
-        assert source in response.result.error_message
-        assert len(response.worlds) == len(list(ROOT.glob('config/*.yaml')))
-    tags = top.messages.TagsFilter(tags=['indoor'])
-    assert top.refused('GetAvailableWorlds', filter=tags)[0] == UNSUPPORTED
+@pytest.mark.parametrize('given', [{'additional_sources': ['/tmp']}, {'tags': True}])
+def test_other_sources_and_tags_of_worlds_are_not_supported(top, given):
+    if 'tags' in given:
+        given = {'filter': top.messages.TagsFilter(tags=['indoor'])}
+    code, text = top.refused('GetAvailableWorlds', **given)
+    assert (code, 'must be empty' in text) == (UNSUPPORTED, True)
 
 
-def test_without_scenes_the_default_sources_have_failed(top, monkeypatch):
-    monkeypatch.setattr(worlds, 'scene_files', dict)
-    code, text = top.refused('GetAvailableWorlds')
-    assert (code, text) == (101, 'no scene is installed')
+def test_a_scene_that_somebody_has_broken_is_left_out(top, monkeypatch, tmp_path):
+    (tmp_path / 'broken.yaml').write_text('{')
+    (tmp_path / 'mine.yaml').write_text('/**: {ros__parameters: {top.mass: 3.0}}')
+    monkeypatch.setattr(worlds, 'scene_files', lambda: {
+        path.stem: path for path in sorted(tmp_path.iterdir())})
+    assert [world.name for world in top.done('GetAvailableWorlds').worlds] == ['mine']
     assert top.done('GetCurrentWorld').world.world_resource.resource_string
 
 
@@ -354,17 +301,14 @@ def load(top, uri='', text='', **more):
     return {'world_resource': top.messages.Resource(uri=uri, resource_string=text), **more}
 
 
-@pytest.mark.parametrize('paused', [True, False])
-@pytest.mark.parametrize('as_what', ['name', 'path', 'uri', 'text'])
+@pytest.mark.parametrize(('as_what', 'paused'), [
+    ('name', True), ('path', False), ('uri', True), ('text', False)])
 def test_a_world_is_loaded_with_all_of_its_parameters(top, as_what, paused):
     path = ROOT / 'config/looping.yaml'
     given = {'name': {'uri': 'looping'}, 'path': {'uri': str(path)}, 'uri': {'uri': path.as_uri()},
              'text': {'text': path.read_text()}}[as_what]
     # What the world does not set gets its default if it belongs to the top.
-    results = top.node.set_parameters([
-        Parameter('initial.phi', value=0.7), Parameter('solver.method', value='exact'),
-        Parameter('imu.rate', value=320.0)])
-    assert all(result.successful for result in results), results
+    assert top.set(initial__phi=0.7, solver__method='exact', imu__rate=320.0).successful
     top.done('ResetSimulation', scope=0)
     if not paused:
         top.set_state('PLAYING')
@@ -375,9 +319,8 @@ def test_a_world_is_loaded_with_all_of_its_parameters(top, as_what, paused):
     assert top.simulation.values == expected
     assert top.simulation.segment.start == parameters.start_state(expected)
     assert (top.state, top.simulation.now_ns) == (STOPPED, -1)
-    assert top.parameter('imu.rate') == 320.0
-    for name in ('initial.phi', 'spin.l3', 'spin.lz', 'top.mass', 'solver.method'):
-        assert top.parameter(name) == expected[name], name
+    names = ('initial.phi', 'spin.l3', 'spin.lz', 'top.mass', 'solver.method')
+    assert top.get('imu.rate', *names) == [320.0, *(expected[name] for name in names)]
     current = top.done('GetCurrentWorld').world
     for world in (response.world, current):
         resource = world.world_resource
@@ -395,49 +338,23 @@ def test_a_world_that_does_not_go_with_the_present_parameters_is_not_the_current
     text = '/**: {ros__parameters: {top.mass: 2.0, imu.rate: 0.5}}'
     top.done('LoadWorld', **load(top, text=text))
     assert top.done('GetCurrentWorld').world.world_resource.resource_string == text
-    for name, value in (('imu.rate', 100.0), ('increments.enabled', True)):
-        assert top.node.set_parameters([Parameter(name, value=value)])[0].successful
+    assert top.set(imu__rate=100.0, increments__enabled=True).successful
     top.done('ResetSimulation', scope=0)
     assert top.done('GetCurrentWorld').world.world_resource.resource_string != text
 
 
-def refusal_of(top, name, value):
-    (result,) = top.node.set_parameters([Parameter(name, value=value)])
-    assert not result.successful
-    return result.reason
-
-
-def test_means_that_are_taken_keep_the_imu_at_a_hertz(top):
-    assert all(result.successful for result in top.node.set_parameters([
-        Parameter('imu.sampling', value='mean')]))
-    top.done('ResetSimulation', scope=0)
-    assert top.node.set_parameters([Parameter('imu.sampling', value='instant')])[0].successful
-    assert 'imu.rate = 0.5: must be >= 1 while means' in refusal_of(top, 'imu.rate', 0.5)
-    top.done('ResetSimulation', scope=0)
-    assert top.node.set_parameters([Parameter('imu.rate', value=0.5)])[0].successful
-
-
-def test_increments_that_are_recorded_keep_the_imu_at_a_hertz(top):
-    assert top.node.set_parameters([Parameter('increments.enabled', value=True)])[0].successful
-    top.node._session.start(top.node.values)()
-    assert top.node.set_parameters([Parameter('increments.enabled', value=False)])[0].successful
-    assert 'must be >= 1 while' in refusal_of(top, 'imu.rate', 0.5)
+def test_a_world_is_refused_that_does_not_go_with_what_is_being_recorded(top, tmp_path):
+    assert top.set(increments__enabled=True, record__uri=str(tmp_path / 'run.mcap')).successful
+    assert top.switch('record', True).success
+    assert top.set(increments__enabled=False).successful
     text = '/**: {ros__parameters: {top.mass: 2.0, imu.rate: 0.5}}'
-    assert 'imu.rate = 0.5: must be >= 1' in top.refused('LoadWorld', **load(top, text=text))[1]
-    top.node._session.stop()
-    assert top.node.set_parameters([Parameter('imu.rate', value=0.5)])[0].successful
-
-
-def test_a_world_in_another_encoding_is_named(top, tmp_path):
-    path = tmp_path / 'latin.yaml'
-    path.write_bytes(b'# \xe9t\xe9\n')
-    code, text = top.refused('LoadWorld', **load(top, str(path)))
-    assert code == BAD_FORMAT and f'{path}: must be in UTF-8' in text
+    code, reason = top.refused('LoadWorld', **load(top, text=text))
+    assert (code, 'imu.rate = 0.5: must be >= 1' in reason) == (FAILED, True)
 
 
 def test_the_current_world_is_known_by_its_start(top):
     assert top.done('GetCurrentWorld').world.name == 'cusp', 'the default'
-    assert top.node.set_parameters([Parameter('top.mass', value=2.25)])[0].successful
+    assert top.set(top__mass=2.25).successful
     assert top.done('GetCurrentWorld').world.name == 'cusp', 'until the reset'
     top.done('ResetSimulation', scope=0)
     world = top.done('GetCurrentWorld').world
@@ -451,19 +368,14 @@ def test_the_current_world_is_known_by_its_start(top):
 BAD_WORLDS = [
     ({}, NO_RESOURCE, 'must be a world'),
     ({'uri': 'no_scene'}, NOT_FOUND, 'there are the scenes cusp, '),
-    ({'uri': '/nowhere/x.yaml'}, NOT_FOUND, 'there is no such file'),
     ({'uri': 'https://example.org/x.yaml'}, BAD_FORMAT, 'file:// URI'),
-    ({'uri': '~nosuchuser/x.yaml'}, BAD_FORMAT, 'there is no such user'),
-    ({'uri': 'a\0b'}, BAD_FORMAT, 'file:// URI'),
+    ({'uri': 'a\0b'}, NOT_FOUND, 'there is no such'),
     ({'uri': str(ROOT / 'README.md')}, BAD_FORMAT, '*.yaml'),
     ({'uri': str(ROOT / 'config/imu/bmi088.yaml')}, PARSE_ERROR, 'is no world'),
     ({'text': '{'}, PARSE_ERROR, 'is not YAML'),
-    ({'text': '#' * 1_000_001}, BAD_FORMAT, '1000001 characters; must be at most 1000000'),
-    ({'text': '/**: {ros__parameters: {top.mass: !!bool maybe}}'}, PARSE_ERROR, 'bool: must be'),
+    ({'text': '#' * 1_000_001}, BAD_FORMAT, 'must have at most 1000000 characters'),
     ({'text': 'x: 1'}, PARSE_ERROR, 'ros__parameters'),
     ({'text': '/**: {ros__parameters: {top.mass: -1.0}}'}, PARSE_ERROR, 'top.mass = -1.0'),
-    ({'text': '/**: {ros__parameters: {top.mass: }}'}, PARSE_ERROR, 'has no value'),
-    ({'text': '/**: {ros__parameters: {top.mass: 3.0, imu.rate: x}}'}, PARSE_ERROR, 'imu.rate'),
     ({'text': '/**: {ros__parameters: {initial.theta: 0.0, spin.lz: 0.5}}'}, PARSE_ERROR, 'pole'),
     ({'text': '/**: {ros__parameters: {spin.l3: 1.0e+300}}'}, FAILED, 'no motion'),
     ({'text': '/**: {ros__parameters: {top.mass: 3.0, top.size: 1}}',
@@ -486,81 +398,47 @@ def test_a_bad_world_changes_nothing(top, given, code, text):
     top.wait_until(top.simulation.now_ns + 20_000_000)
 
 
-def test_an_element_that_no_message_can_hold_is_named_too(top):
-    text = '/**: {ros__parameters: {top.mass: 3.0, "top.\\ud800": 1}}'
-    response = top.done('LoadWorld', **load(top, text=text))
-    assert response.result.error_message.endswith(': top.\\ud800')
-    assert response.result.error_message.isascii()
-
-
 def test_unsupported_elements_are_named(top):
     text = ('/**: {ros__parameters: {top.mass: 3.0, top.size: 1, use_sim_time: true, '
-            'pacing: timer}}')
+            'body_frame: b, "top.\\ud800": 1}}')       # which no message can hold
     response = top.done('LoadWorld', **load(top, text=text))
-    assert response.result.error_message.endswith(': top.size, pacing')
+    assert response.result.error_message.endswith(': top.size, body_frame, top.\\ud800')
+    assert response.result.error_message.isascii()
     assert top.simulation.top.mass == 3.0
 
 
 # --------------------------------------------------------------------------------- recording
 
 @pytest.mark.parametrize('method', ['rk45', 'exact'])
-def test_a_log_of_all_this_verifies(monkeypatch, tmp_path, capsys, method):
+def test_a_log_of_all_this_verifies(top, tmp_path, capsys, method):
     """States, resets and worlds are in the journal: the run can be computed again."""
-    with StandardNode(
-            'stand-in', monkeypatch, tmp_path, solver__method=method, increments__enabled=True,
-            markers__enabled=True, mag__enabled=True, imu__lever_arm=[0.1, 0.0, 0.02],
-            imu__gyroscope_noise_density=1e-3, imu__gyroscope_bias_stddev=0.1) as top:
-        state = top.messages.EntityState()
-        state.twist.angular.x, state.pose.orientation.w = 0.5, 1.0
-        state.twist.angular.z = 11.0
-        top.pause().done('StepSimulation', steps=3)
-        top.done('SetEntityState', entity='spinning_top', state=state, set_twist=True)
-        top.done('StepSimulation', steps=3)
-        top.node._session.start(top.node.values)()
-        top.done('StepSimulation', steps=7)
-        top.done('SetEntityState', entity='spinning_top', state=state, set_pose=True,
-                 set_twist=True)
-        top.done('StepSimulation', steps=11)
-        top.done('ResetSimulation', scope=2)
-        top.done('StepSimulation', steps=5)
-        top.done('LoadWorld', **load(top, 'waking_sleeper'))
-        top.pause().done('StepSimulation', steps=20)
-        top.done('SetEntityState', entity='spinning_top', state=state, set_pose=True)
-        top.done('StepSimulation', steps=13)
-        top.node._session.stop()
-    code = inspect.main([f'{tmp_path}/run.mcap', '--verify', '--json'])
+    path = str(tmp_path / 'run.mcap')
+    assert top.set(
+        solver__method=method, increments__enabled=True, markers__enabled=True, mag__enabled=True,
+        imu__lever_arm=[0.1, 0.0, 0.02], imu__gyroscope_noise_density=1e-3,
+        imu__gyroscope_bias_stddev=0.1, record__uri=path).successful
+    top.done('ResetSimulation', scope=0)
+    state = top.messages.EntityState()
+    state.twist.angular.x, state.pose.orientation.w = 0.5, 1.0
+    state.twist.angular.z = 11.0
+    top.pause().done('StepSimulation', steps=3)
+    top.done('SetEntityState', entity='spinning_top', state=state, set_twist=True)
+    top.done('StepSimulation', steps=3)
+    assert top.switch('record', True).success
+    top.done('StepSimulation', steps=7)
+    top.done('SetEntityState', entity='spinning_top', state=state, set_pose=True, set_twist=True)
+    top.done('StepSimulation', steps=11)
+    top.done('ResetSimulation', scope=2)
+    top.done('StepSimulation', steps=5)
+    top.done('LoadWorld', **load(top, 'waking_sleeper'))
+    top.pause().done('StepSimulation', steps=20)
+    top.done('SetEntityState', entity='spinning_top', state=state, set_pose=True)
+    top.done('StepSimulation', steps=13)
+    assert top.switch('record', False).success
+    code = inspect.main([path, '--verify', '--json'])
     content = json.loads(capsys.readouterr().out)
     assert (code, content['verify']['identical']) == (0, True), content['verify']
     assert [motion['cause'] for motion in content['motions']] == [
         'start', 'state', 'state', 'reset', 'state']
-    assert inspect.main([f'{tmp_path}/run.mcap']) == 0
+    assert inspect.main([path]) == 0
     assert re.search('1 resets, .*, 3 states set', capsys.readouterr().out)
-
-
-# ------------------------------------------------------------------------- where it is absent
-
-START = """
-import importlib.util, sys, rclpy
-
-def find_spec(name, found=importlib.util.find_spec):
-    return {spec} if name == 'simulation_interfaces' else found(name)
-
-importlib.util.find_spec = find_spec
-from spinning_top_sim.nodes.simulator import Simulator
-rclpy.init(args=['sim_node', '--ros-args', '-p', 'simulation_interfaces:={offered}'])
-node = Simulator()
-print(sorted(name for name in sys.modules if name in (
-    'rclpy.action.server', 'simulation_interfaces') or name.startswith(
-    ('spinning_top_sim.nodes.simulation_', 'spinning_top_sim.tools.'))))
-node.stop()
-node.destroy_node()
-rclpy.try_shutdown()
-"""
-
-
-@pytest.mark.parametrize(('spec', 'offered'), [('None', 'true'), ('object()', 'false')])
-def test_without_the_package_or_switched_off_nothing_is_imported(spec, offered):
-    done = subprocess.run(
-        [sys.executable, '-c', START.format(spec=spec, offered=offered)], capture_output=True,
-        text=True, timeout=120, check=True)
-    assert done.stdout == '[]\n', done.stderr

@@ -16,7 +16,6 @@ pytest.importorskip('simulation_interfaces')
 import simulation_interfaces.action
 import simulation_interfaces.msg
 import simulation_interfaces.srv
-from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import PATIENCE_S, SimNode, wait_for
 from helpers.node_logs import (
     QUIET,
@@ -44,7 +43,6 @@ def served(peer, tmp_path_factory):
     with SimNode(folder, {**QUIET, 'start_paused': True}, namespace='/standard') as node:
         yield SimpleNamespace(node=node, odom=peer.listen(
             node.topic('ground_truth/odom'), Odometry))
-        assert_clean_end(node, node.end())
 
 
 @pytest.fixture(scope='module')
@@ -142,7 +140,7 @@ def test_simulate_steps_can_be_canceled_and_the_node_answers_meanwhile(peer, ser
     assert call(peer, served, 'StepSimulation', steps=1).result.result == OK
 
 
-def test_play_and_load_a_world(peer, served):
+def test_play_load_a_world_and_quit(peer, served):
     assert set_state(peer, served, PLAYING) == OK
     served.odom.wait_more(20)
     response = call(peer, served, 'LoadWorld', world_resource=simulation_interfaces.msg.Resource(
@@ -156,15 +154,8 @@ def test_play_and_load_a_world(peer, served):
     served.odom.wait(count + 20)
     assert stamp_of(served.odom.raw[count]) > stamp_of(served.odom.raw[count - 1])
     assert call(peer, served, 'ResetSimulation', scope=4).result.result == UNSUPPORTED
-
-
-def test_quitting_answers_and_ends_with_a_whole_log(peer, tmp_path):
-    with SimNode(tmp_path, {**QUIET, 'record.enabled': True, 'record.min_free_bytes': 0},
-                 namespace='/quits') as node:
-        peer.listen(node.topic('pose'), PoseStamped).wait(10)
-        assert set_state(peer, SimpleNamespace(node=node), QUITTING) == OK
-        assert_clean_end(node, node.wait())
-        assert 'messages' in node.err + node.out
+    assert set_state(peer, served, QUITTING) == OK
+    assert_clean_end(served.node, served.node.wait())
 
 
 def test_a_signal_ends_the_steps_and_the_node(peer, tmp_path):
@@ -180,16 +171,3 @@ def test_a_signal_ends_the_steps_and_the_node(peer, tmp_path):
         wait_for('feedback', lambda: feedback)
         assert_clean_end(node, node.end())
         assert inspect.main([str(the_log(node.folder)), '--verify']) == 0
-
-
-def test_the_parameter_switches_it_off(peer, tmp_path):
-    with SimNode(tmp_path, {**QUIET, 'simulation_interfaces': False}, namespace='/off') as node:
-        peer.listen(node.topic('pose'), PoseStamped).wait(3)
-
-        def names():
-            return {name for name, _ in peer.node.get_service_names_and_types()
-                    if name.startswith('/off/')}
-        # Services are discovered in the order of their creation; this one is the last.
-        wait_for('a service', lambda: '/off/spinning_top/record' in names())
-        assert not {name for name in names() if name.count('/') == 2}
-        assert_clean_end(node, node.end())

@@ -6,24 +6,20 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Vector3
+from numpy.typing import NDArray
 
-from spinning_top_sim.nodes.name_filter import is_found
+from spinning_top_sim.nodes.simulation_standard import UnsupportedError
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.placement import Box, Reals, rotation_matrix, state_of
+from spinning_top_sim.physics.placement import Box, state_of
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.streams.cdr import NANOSECONDS
 
-# Message packages have no types.
-Message = Any
+Message = Any           # message packages have no types
 TAGS = ('spinning_top', 'heavy_symmetric_top', 'imu')
-# How far the pivot may be from the origin [m], how fast it may move [m/s], and by how much the
-# length of a quaternion may differ from 1: what a client's rounding makes.
+# Tolerances for the rounding of a client: distance of the pivot from the origin [m], its velocity
+# [m/s], and the difference of a quaternion's length from 1.
 SMALLEST_LENGTH, SMALLEST_SPEED, LENGTH_ERROR = 1e-6, 1e-6, 1e-3
-
-
-class UnsupportedError(ValueError):
-    """What is asked for is possible in the standard, and not here."""
 
 
 class PoseError(ValueError):
@@ -31,7 +27,7 @@ class PoseError(ValueError):
 
 
 def fill_state(message: Message, states: States, stamp_ns: int, frame: str) -> None:
-    """Put the state (n = 1) into an EntityState, in the world frame; the pivot is at rest."""
+    """Write a state (n = 1) into an EntityState, in the world frame; the pivot is at rest."""
     seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
     message.header.stamp.sec, message.header.stamp.nanosec = seconds, nanoseconds
     message.header.frame_id = frame
@@ -48,9 +44,10 @@ def fill_state(message: Message, states: States, stamp_ns: int, frame: str) -> N
 
 def changed_state(request: Message, top: Top, frame: str) -> Callable[[States], State]:
     """
-    Return what makes the state that a SetEntityState request asks for from the present one.
+    Return a function that computes the state a SetEntityState request asks for.
 
-    Raises PoseError, UnsupportedError or ValueError, which name what is wrong with it.
+    The function takes the present state (n = 1), which holds for what the request does not set.
+    Raises PoseError, UnsupportedError or ValueError, which name the value and what is allowed.
     """
     wanted, asked_frame = request.state, request.state.header.frame_id
     # Older versions of the message have no flags, and set both.
@@ -80,7 +77,7 @@ def changed_state(request: Message, top: Top, frame: str) -> Callable[[States], 
     return change
 
 
-def _check_pose(position: Reals, rotation: Reals) -> None:
+def _check_pose(position: NDArray[np.float64], rotation: NDArray[np.float64]) -> None:
     if not np.all(np.abs(position) <= SMALLEST_LENGTH):
         raise PoseError(f'pose.position = {position.tolist()} m: must be the pivot, [0, 0, 0] '
                         f'(within {SMALLEST_LENGTH:g})')
@@ -90,50 +87,50 @@ def _check_pose(position: Reals, rotation: Reals) -> None:
                         f'(within {LENGTH_ERROR:g})')
 
 
-def is_chosen(filters: Message, name: str, category: int, top: Top,
-              present: Callable[[], States]) -> bool:
+def is_chosen(filters: Message, name: str, category: int) -> bool:
     """
-    Return whether EntityFilters choose the top.
-
-    present : returns its state (n = 1)
+    Return whether EntityFilters choose an entity with this name, this category and TAGS.
 
     Raises UnsupportedError or ValueError for filters that cannot be applied.
     """
-    chosen = is_found(filters.filter, name)
-    if filters.categories:
-        chosen &= category in [one.category for one in filters.categories]
-    if filters.tags.tags:
-        modes = {filters.tags.FILTER_MODE_ANY: any, filters.tags.FILTER_MODE_ALL: all}
-        mode = filters.tags.filter_mode
-        if mode not in modes:
-            raise ValueError(f'tags.filter_mode = {mode}: must be '
-                             f'{" or ".join(map(str, modes))}')
-        chosen &= modes[mode](tag in TAGS for tag in filters.tags.tags)
     if filters.bounds.type != filters.bounds.TYPE_EMPTY:
-        chosen &= _overlaps(filters.bounds, top, present)
-    return bool(chosen)
+        raise UnsupportedError(f'bounds.type = {filters.bounds.type}: must be '
+                               f'{filters.bounds.TYPE_EMPTY} (none); filtering by bounds is not '
+                               'supported')
+    modes = {filters.tags.FILTER_MODE_ANY: any, filters.tags.FILTER_MODE_ALL: all}
+    if filters.tags.tags and filters.tags.filter_mode not in modes:
+        raise ValueError(f'tags.filter_mode = {filters.tags.filter_mode}: must be '
+                         f'{" or ".join(map(str, modes))}')
+    return (is_found(filters.filter, name)
+            and (not filters.categories
+                 or category in [one.category for one in filters.categories])
+            and (not filters.tags.tags or modes[filters.tags.filter_mode](
+                tag in TAGS for tag in filters.tags.tags)))
 
 
-def _overlaps(bounds: Message, top: Top, present: Callable[[], States]) -> bool:
-    """Return whether Bounds, in the world frame, and the box of the top have common points."""
-    points = np.array([_numbers(point, 'xyz') for point in bounds.points])
-    if bounds.type not in (bounds.TYPE_SPHERE, bounds.TYPE_BOX):
-        raise UnsupportedError(f'bounds.type = {bounds.type}: must be {bounds.TYPE_EMPTY} (none), '
-                               f'{bounds.TYPE_BOX} (box) or {bounds.TYPE_SPHERE} (sphere)')
-    if len(points) != 2 or not np.all(np.isfinite(points)):
-        raise ValueError(f'bounds.points = {points.tolist()}: must be two finite points')
-    box = Box.of(top)
-    rotation = rotation_matrix(np.concatenate(present().rows_quaternion))
-    if bounds.type == bounds.TYPE_BOX:
-        return box.overlaps_box(rotation, Box(points.min(axis=0), points.max(axis=0)))
-    radius = float(points[1, 0])
-    if radius < 0.0:
-        raise ValueError(f'bounds.points[1].x = {radius!r} m: the radius must be >= 0')
-    return box.overlaps_sphere(rotation, points[0], radius)
+def is_found(expression: str, name: str) -> bool:
+    """Return whether a regular expression matches a part of a name.  Raises ValueError."""
+    if not expression:
+        return True
+    try:
+        # Its time is linear in the text; some expressions take `re` exponential time.
+        from re2 import Options, error, search  # noqa: PLC0415
+    except ImportError as missing:
+        raise UnsupportedError(f'filter = {expression!r}: must be empty, because the Python '
+                               'package google-re2 is not installed') from missing
+    options = Options()
+    options.log_errors = False
+    try:
+        return search(expression, name, options=options) is not None
+    except (error, UnicodeError) as wrong:
+        reason = wrong.args[0]
+        raise ValueError(
+            f'filter = {expression!r}: must be a POSIX extended regular expression: '
+            f'{reason.decode() if isinstance(reason, bytes) else wrong}') from wrong
 
 
 def fill_bounds(bounds: Message, top: Top) -> None:
-    """Put the box of the top into Bounds, in the body frame: upper corner, lower corner."""
+    """Write the box around the top into Bounds, in the body frame: upper corner, lower corner."""
     box = Box.of(top)
     bounds.type = bounds.TYPE_BOX
     bounds.points = [Vector3(**dict(zip('xyz', corner.tolist(), strict=True)))
@@ -141,11 +138,11 @@ def fill_bounds(bounds: Message, top: Top) -> None:
 
 
 def describe(top: Top) -> str:
-    """Return the top in words."""
+    """Return a description of the top in words."""
     return (f'heavy symmetric top on a fixed pivot: mass {top.mass:g} kg, centre of mass '
             f'{top.com_distance:g} m from the pivot, moments of inertia {top.lambda1:g} and '
             f'{top.lambda3:g} kg m^2')
 
 
-def _numbers(message: Message, names: Sequence[str]) -> Reals:
+def _numbers(message: Message, names: Sequence[str]) -> NDArray[np.float64]:
     return np.array([getattr(message, name) for name in names], float)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class RunnableNode(Protocol):
-    """A node: `start` is called before the executor spins, `stop` afterwards in any case."""
+    """A node.  `start` is called before the executor spins, and `stop` afterwards in any case."""
 
     finished: Future                # completes with the exit code, None for 0
 
@@ -35,11 +35,11 @@ class RunnableNode(Protocol):
 def run(name: str, argv: list[str],
         prepare: Callable[[list[str]], Callable[[], RunnableNode] | None]) -> int:
     """
-    Run a node; return 0 after an ordinary end, 2 if it cannot be started, and say why.
+    Run a node; return 0 after an ordinary end, or 2 with one line that says why it cannot start.
 
     prepare : takes the arguments; returns what makes the node, or None if there is nothing to run
     """
-    # Nothing is open yet, and a KeyboardInterrupt in the midst of imports is easily lost.
+    # Nothing is open yet, and a KeyboardInterrupt is easily lost during imports.
     _handle(signal.SIGINT, lambda *_: _exit(130))
     _open_standard_streams()
     try:
@@ -51,7 +51,7 @@ def run(name: str, argv: list[str],
         if make_node is None:
             return 0
         import rclpy  # noqa: PLC0415
-        # rclpy shuts the context down at SIGINT and SIGTERM, from `init` on; a launched node gets
+        # From `init` on, rclpy shuts the context down at SIGINT and SIGTERM.  A launched node gets
         # SIGINT twice, from the terminal and from launch.
         interrupts: list[int] = []
         _handle(signal.SIGINT, lambda number, _: interrupts.append(number))
@@ -66,12 +66,12 @@ def run(name: str, argv: list[str],
         executor = _executor(node)
         node.start()
         started = True
-        # Python answers signals between waits; without a timeout, Jazzy's EventsExecutor hangs.
+        # Python handles signals between waits; without a timeout, Jazzy's EventsExecutor hangs.
         while rclpy.ok() and not interrupts and not node.finished.done():
             executor.spin_once(0.5)
         return (node.finished.result() or 0) if node.finished.done() else 0
     except Exception as error:
-        # A call that the end of the context interrupts may raise anything.
+        # A call may raise anything when the context ends.
         if rclpy.ok() and started:
             raise
         return _cannot_start(name, error) if rclpy.ok() else 0
@@ -81,11 +81,11 @@ def run(name: str, argv: list[str],
             node.stop()
             node.destroy_node()
         rclpy.try_shutdown()
-        _ignore_signals()       # rclpy has put back the handler that it had found
+        _ignore_signals()       # rclpy has restored the handler that it found
 
 
 def _open_standard_streams() -> None:
-    """Open what the shell has closed (2>&-): else the next file that is opened gets its number."""
+    """Open the streams that the shell has closed (2>&-); otherwise a log gets their number."""
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(descriptor)
@@ -105,7 +105,6 @@ def _ignore_signals() -> None:
 
 
 def _cannot_start(name: str, error: Exception) -> int:
-    """Say why in one line; return the exit code."""
     kind = type(error).__name__
     expected = (isinstance(error, ValueError | RuntimeError | OSError | LogError)
                 or kind.startswith('Invalid'))
@@ -115,31 +114,31 @@ def _cannot_start(name: str, error: Exception) -> int:
 
 
 def one_line(text: object) -> str:
-    """Return a text as one line: no control characters, no places in the sources of rcl."""
+    """Return a text as one line, without control characters and positions in the code of rcl."""
     line = ' '.join(re.sub(r',\s*at \S+:\d+', '', str(text)).split())
     line = ''.join(char if char.isprintable() else ascii(char)[1:-1] for char in line)
     return line if len(line) <= 600 else f'{line[:300]} ... {line[-300:]}'
 
 
 def _executor(node: RunnableNode) -> Executor:
-    """Return an executor that has the node, with little for the garbage collector to do."""
-    try:                    # this one takes least processor time
+    """Return an executor with the node; leave little to the garbage collector."""
+    try:                    # this executor takes the least processor time
         from rclpy.experimental import EventsExecutor as Executor  # noqa: PLC0415
     except ImportError:
         from rclpy.executors import SingleThreadedExecutor as Executor  # noqa: PLC0415
     executor = Executor()
     executor.add_node(cast('Node', node))
-    # A task ends `spin_once` at once, as `wake` does not.
+    # A task ends `spin_once` at once; `wake` does not.
     node.finished.add_done_callback(lambda _: executor.create_task(lambda: None))
     gc.collect()
-    gc.freeze()             # no full collection goes through what is there from the start
-    gc.collect()            # finds nothing, so that the next full one comes soon
+    gc.freeze()             # a full collection then skips all objects of the start
+    gc.collect()            # finds nothing, so that the next full collection comes soon
     return executor
 
 
 def wait_for_all_acked(publishers: Iterable[Publisher], seconds: float,
                        stopped: Callable[[], bool] = lambda: False) -> None:
-    """Wait until all subscribers have the last messages, until stopped, and at most so long."""
+    """Wait until all subscribers have acknowledged, `stopped` returns True, or time is over."""
     from rclpy.duration import Duration  # noqa: PLC0415
     end = time.monotonic() + seconds
     for publisher in list(publishers):      # the node may close some meanwhile

@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When ticks and recorded messages are due, without ROS: clocks, a fair lock, threads."""
+"""When ticks and recorded messages are due, without ROS: a clock, a fair lock, threads."""
 
-import contextlib
 import itertools
 import math
-import queue
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 
-Message = tuple[int, Callable[[bytes], object], bytes]      # time [ns], what sends it, CDR
+Message = tuple[int, Callable[[bytes], object], bytes]      # time [ns], its publish function, CDR
 
-SLOWEST, FASTEST = 1e-6, 1e9    # of a playback: recorded over real time
+SLOWEST, FASTEST = 1e-6, 1e9    # rates of a playback: recorded time over real time
 RATES = f'a number in [{SLOWEST:g}, {FASTEST:g}]'
 ROUND_GAP_NS = 10_000_000       # from the end of a round to the first message of the next
-LATE_NS = 10_000_000            # a message sent later than this is counted
+LATE_NS = 10_000_000            # a message that is sent later than this is counted
 BATCH_BYTES, BATCH_MESSAGES, BATCHES = 256_000, 512, 16     # read ahead
 
 
@@ -52,7 +52,7 @@ class SimulatedClock:
 
 
 class FairLock:
-    """A lock that goes to a thread that waits, before the one that has it can take it again."""
+    """A lock that a thread cannot take again before a thread that waits for it."""
 
     def __init__(self) -> None:
         self._lock, self._next = threading.Lock(), threading.Lock()
@@ -67,17 +67,17 @@ class FairLock:
 
 class DeadlineThread(threading.Thread):
     """
-    Calls `tick` at absolute deadlines until it is stopped; where that returns True, then `idle`.
+    Calls `tick` at absolute deadlines until it is stopped; if that returns True, calls `idle`.
 
     A late tick comes at once, and deadlines that have passed are skipped.
 
-    grid : returns a deadline on the monotonic clock and the time between two [s]
-    failed : takes an error that one of these raises; the thread goes on
+    grid : returns a deadline on the monotonic clock and the time between two deadlines [s]
+    failed : takes an error that a call raises; the thread goes on
     """
 
     LONGEST_SLEEP = 0.05    # [s], so that `stop` is quick
-    # The thread sleeps for this share of the period between `tick` and `idle`: the threads that
-    # send, which a tick wakes up, often run on the same core and would wait for `idle`.
+    # Share of the period to sleep between `tick` and `idle`.  A tick wakes threads that send; they
+    # often run on the same core and would wait for `idle`.
     NAP = 0.15
     SHORTEST_NAP = 1e-4     # [s]
 
@@ -89,7 +89,7 @@ class DeadlineThread(threading.Thread):
         self._stopped = False
 
     def run(self) -> None:
-        grid, newest = None, 0          # `newest`: number of the deadline of the newest tick
+        grid, newest = None, 0          # `newest`: number of the last deadline that had a tick
         while not self._stopped:
             try:
                 before, grid = grid, self._grid()
@@ -106,7 +106,7 @@ class DeadlineThread(threading.Thread):
                 time.sleep(self.LONGEST_SLEEP)
 
     def _sleep_until(self, deadline: float, grid: tuple[float, float]) -> bool:
-        """Return True at the deadline, and False if it is stopped or the grid changes before."""
+        """Return True at the deadline, or False when stopped or when the grid changes before."""
         while (left := deadline - time.monotonic()) > 0.0:
             if self._stopped or (left > self.LONGEST_SLEEP and self._grid() != grid):
                 return False
@@ -130,53 +130,39 @@ def rounds(read: Callable[[], Iterable[Message]], span_ns: int, loop: bool) -> I
             return
 
 
-class ReadAhead:
-    """Iterates over messages that a thread reads ahead; raises its error behind the last one."""
-
-    def __init__(self, messages: Iterable[Message]) -> None:
-        # Behind the batches comes the error, or None.
-        self._batches: queue.Queue[list[Message] | Exception | None] = queue.Queue(BATCHES)
-        self._stopped = False
-        self._thread = threading.Thread(target=self._read, args=(messages,), name='read ahead',
-                                        daemon=True)
-        self._thread.start()
-
-    def __iter__(self) -> Iterator[Message]:
-        while isinstance(batch := self._batches.get(), list):
-            yield from batch
-        if batch is not None:
-            raise batch
-
-    def stop(self) -> None:
-        """End both the reading and the iterating."""
-        self._stopped = True
-        # The thread that reads may wait for room, and the one that iterates for a batch.
-        with contextlib.suppress(queue.Empty):
-            while True:
-                self._batches.get_nowait()
-        self._batches.put(None)
-        self._thread.join(1.0)
-
-    def _read(self, messages: Iterable[Message]) -> None:
-        batch: list[Message] = []
-        end, size = None, 0
+def read_ahead(messages: Iterable[Message]) -> Generator[Message]:
+    """Yield messages that a thread reads ahead; raise its error after the last one."""
+    batches = _batches(messages)
+    with ThreadPoolExecutor(1) as reader:
+        ahead: deque[Future[list[Message]]] = deque(
+            reader.submit(next, batches, []) for _ in range(BATCHES))
         try:
-            for message in messages:
-                if self._stopped:
-                    return
-                batch.append(message)
-                size += len(message[2])
-                if size >= BATCH_BYTES or len(batch) >= BATCH_MESSAGES:
-                    self._batches.put(batch)
-                    batch, size = [], 0
-        except Exception as error:
-            end = error
-        self._batches.put(batch)
-        self._batches.put(end)
+            while batch := ahead.popleft().result():
+                ahead.append(reader.submit(next, batches, []))
+                yield from batch
+        finally:
+            reader.shutdown(wait=False, cancel_futures=True)
+
+
+def _batches(messages: Iterable[Message]) -> Iterator[list[Message]]:
+    batch: list[Message] = []
+    size = 0
+    try:
+        for message in messages:
+            batch.append(message)
+            size += len(message[2])
+            if size >= BATCH_BYTES or len(batch) >= BATCH_MESSAGES:
+                yield batch
+                batch, size = [], 0
+    except Exception:
+        if batch:
+            yield batch
+        raise
+    yield batch
 
 
 class Playback:
-    """Sends messages at their times, late ones at once; can be paused, and has a rate."""
+    """Sends messages at their times, late ones at once; has a rate and can be paused."""
 
     def __init__(self, begin_ns: int, paused: bool = False) -> None:
         self._clock = SimulatedClock(time.monotonic_ns, 1.0)
@@ -184,14 +170,14 @@ class Playback:
         self._sent_until = begin_ns         # all messages before this time are sent
         self._stopped = False
         self._changed = threading.Event()   # wakes the thread that plays
-        self._lock = FairLock()             # the clock, and sending
+        self._lock = FairLock()             # held while sending, and for the clock
         self.paused = paused
         self.sent = self.late = 0
 
     def run(self, messages: Iterable[Message]) -> None:
         """Play messages in the order of their times, to the end or until stopped."""
         for at_ns, send, data in messages:
-            if not self.sent:           # reading the first message may have taken a while
+            if not self.sent:           # reading the first message takes a while
                 with self._lock:
                     self._clock.set(self._sent_until, not self.paused)
             self._sent_until = at_ns
@@ -220,7 +206,7 @@ class Playback:
             return min(self._clock.now(), self._sent_until)
 
     def pause(self, paused: bool) -> None:
-        """Pause, or go on without catching up; once paused, no message is sent any more."""
+        """Pause, or go on without catching up.  No message is sent once this has paused."""
         with self._lock:
             self.paused = paused
             self._go_on_from_sent(not paused)
@@ -233,7 +219,7 @@ class Playback:
         self._changed.set()
 
     def _go_on_from_sent(self, running: bool) -> None:
-        # The clock is ahead of what is sent where that cannot keep up.
+        # The clock is ahead if sending is too slow.
         self._clock.set(min(self._clock.now(), self._sent_until), running)
 
     def stop(self) -> None:

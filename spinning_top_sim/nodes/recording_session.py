@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recording of a running simulation: opens the log, feeds it, watches it, closes it."""
+"""The recording of a running simulation: opens the log, feeds it, checks it, closes it."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.live import Entry, LiveSimulation, Write
 from spinning_top_sim.streams.stream import Stream
 
-# Opening a log imports and loads libraries, so that is done where a log is opened.
+# Importing these takes long, so that is left to the opening of a log.
 if TYPE_CHECKING:
     from spinning_top_sim.recording.writer import McapRecorder
 
-MOST_PENDING = 20_000       # stamps whose messages wait for the file that is being opened
+MOST_PENDING = 20_000       # stamps whose messages wait while a file is being opened
 
 Topic = tuple[str, str, dict[str, int]]     # full name, type, and offered QoS
 
@@ -28,30 +28,29 @@ class RecordingSession:
     """
     Records a simulation into one log at a time.
 
-    While a log is being opened, its messages are kept in memory: nothing waits for the disk while
-    it holds the simulation's lock.
+    While a log is being opened, its messages are kept in memory, so that nothing waits for the
+    disk while it holds the lock of the simulation.
 
-    topics : returns the topics of these streams, and behind them those of the journal
+    topics : returns the topics of streams, and after them those of the journal
     """
 
     def __init__(self, simulation: LiveSimulation, lock: FairLock,
                  topics: Callable[[Sequence[Stream]], list[Topic]]) -> None:
-        self.error: str | None = None       # why the newest one stopped early or could not start
-        self.path = Path()                  # of the newest one
+        self.error: str | None = None       # why the last recording stopped early or did not start
+        self.path = Path()                  # of the last recording
         self._simulation, self._lock, self._topics = simulation, lock, topics
         self._recorder: McapRecorder | None = None
         self._pending: list[tuple[Sequence[Entry], int]] = []   # while a log is being opened
-        self._write: Write | None = None                        # into the recorder, or `_pending`
-        self._journal_index = 0                 # number of the journal's first topic in the log
-        self._file_lock = threading.Lock()      # one opens or closes at a time
+        self._write: Write | None = None        # writes into the recorder, or into `_pending`
+        self._journal_index = 0                 # index of the journal's first topic in the log
+        self._file_lock = threading.Lock()      # held while a log is opened or closed
 
     def start(self, values: Mapping[str, Any]) -> Callable[[], str]:
         """
-        Begin to record into memory; return a function that opens the log and moves it there.
+        Begin to record into memory; return a function that opens the log.
 
         The function returns a text with the path, or raises RecordingError and records nothing.
-        One start at a time: the executor, which alone calls this, runs the function before the
-        next one.
+        It must run before the next start.
         """
         if self._recorder is not None:
             path = self._recorder.path
@@ -64,7 +63,6 @@ class RecordingSession:
                    'begun_ns': simulation.now_ns, 'history': tuple(simulation.history),
                    'values_at_recording': values}
             self._journal_index = len(streams)
-            self._pending = []
             self._feed(lambda *messages: self._pending.append(messages), streams)
             self.write_event('start')
         return lambda: self._open(streams, topics, run)
@@ -83,16 +81,15 @@ class RecordingSession:
                     recorder.write_all(*messages)
                 self._recorder, self.path, self.error = recorder, recorder.path, None
                 self._feed(recorder.write_all, streams)
-                self._pending = []
         return f'recording to {recorder.path}'
 
     def _feed(self, write: Write | None, streams: Sequence[Stream] = ()) -> None:
         """Record these streams, commands and events with `write` from now on."""
-        self._write = write
+        self._pending, self._write = [], write
         self._simulation.log_to(write, streams)
 
     def stop(self, error: str | None = None) -> str | None:
-        """Close the log, for this reason; return what it holds, or None if there is none."""
+        """Close the log and return a summary, or None if there is no log."""
         with self._file_lock:
             with self._lock:
                 recorder, self._recorder = self._recorder, None
@@ -113,19 +110,13 @@ class RecordingSession:
         self.stop(recorder.error)
         return recorder.error
 
-    @property
-    def warning(self) -> str | None:
-        """What to tell the user while the disk does not keep `record.max_loss`."""
-        recorder = self._recorder
-        return None if recorder is None else recorder.warning
-
     def write_command(self, l3: float, lz: float) -> None:
-        """Record a command applied now, both as a message and as an event."""
+        """Record a command that is applied now, as a message and as an event."""
         self.write_event('command', l3=l3, lz=lz)
         self._write_now(journal.COMMANDS, journal.command(l3, lz))
 
     def write_event(self, event: str, sent_ns: int | None = None, **details: object) -> None:
-        """Record what happened to the motion now; see `journal.event`."""
+        """Record what happens to the motion now; see `journal.event`."""
         now_ns = self._simulation.now_ns
         self._write_now(journal.EVENTS, journal.event(
             event, max(now_ns, 0), now_ns if sent_ns is None else sent_ns, **details))
@@ -146,13 +137,19 @@ class RecordingSession:
             self._recorder.wait_for_room(0.1)
 
     @property
+    def warning(self) -> str | None:
+        """A text for the user while the disk is too slow for `record.max_loss`."""
+        recorder = self._recorder
+        return None if recorder is None else recorder.warning
+
+    @property
     def size(self) -> str:
-        """Size of the log for the user, empty without one."""
+        """Size of the log for the user, empty without a log."""
         recorder = self._recorder
         return '' if recorder is None else f'{recorder.counters.bytes / 1e6:.1f} MB'
 
     def numbers(self) -> dict[str, object]:
-        """Return what /diagnostics says about the recording."""
+        """Return the values for /diagnostics."""
         recorder = self._recorder
         if recorder is None:
             return {'recorder': 'failed' if self.error else 'off'}
@@ -165,7 +162,7 @@ class RecordingSession:
 
 
 def _open_log(topics: Sequence[Topic], run: Mapping[str, Any]) -> McapRecorder:
-    """Open the log that `record.uri` asks for, under the first name that is free in a folder."""
+    """Open the log that `record.uri` names; in a folder, under the first free name."""
     from spinning_top_sim.recording.provenance import provenance  # noqa: PLC0415
     from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
     from spinning_top_sim.recording.writer import McapRecorder  # noqa: PLC0415
@@ -186,7 +183,7 @@ def _open_log(topics: Sequence[Topic], run: Mapping[str, Any]) -> McapRecorder:
                 compression=values['record.compression'],
                 min_free_bytes=values['record.min_free_bytes'])
         except RecordingError as error:
-            # Another node may take a name at any time: only opening shows whether it is free.
+            # Another node may take a name at any time, so only opening shows whether it is free.
             if named or not isinstance(error.__cause__, FileExistsError):
                 raise
         number += 1

@@ -37,7 +37,7 @@ exit code: 0 played (also in part: topics left out, ended by a signal),
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the node; return its exit code, as `run` does."""
+    """Run the node; return its exit code."""
     return run('replay_node', sys.argv if argv is None else argv, _prepare)
 
 

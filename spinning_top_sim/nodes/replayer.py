@@ -37,7 +37,7 @@ from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 
 
 class Replayer(Node):
-    """The node: plays a log once it is started.  Raises ValueError if nothing can be played."""
+    """The node.  It plays a log after `start`.  Raises ValueError if nothing can be played."""
 
     def __init__(self, log: LogReader, options: argparse.Namespace) -> None:
         given = [] if options.rate is None else [Parameter('rate', value=options.rate)]
@@ -72,7 +72,6 @@ class Replayer(Node):
         self.create_service(SetBool, '~/set_pause', self._on_pause)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._play, name='playback', daemon=True)
-        self._ahead = pacing.ReadAhead(pacing.rounds(self._messages, self._span_ns, options.loop))
 
     def _open_publishers(self) -> dict[int, Publisher]:
         """Return a publisher for each channel; warn of the topics that cannot be played."""
@@ -90,7 +89,7 @@ class Replayer(Node):
         for (name, _), alike in channels.items():
             try:
                 outputs |= dict.fromkeys([one.channel_id for one in alike], self._publisher(alike))
-            except Exception as error:      # whatever a log may ask for: the others are played
+            except Exception as error:      # a log may ask for anything; the others are played
                 self.get_logger().warning(one_line(f'{name} is not played: {error}'))
         if wanted and not outputs and not self._options.clock:
             raise ValueError('none of the topics can be played; the log has '
@@ -133,32 +132,33 @@ class Replayer(Node):
         return SetParametersResult(successful=True)
 
     def start(self) -> None:
-        # The thread that sends gets Python's lock this soon from the one that reads ahead [s].
+        # The thread that reads ahead releases the interpreter this soon [s] to the one that sends.
         sys.setswitchinterval(0.0005)
         self._thread.start()
 
     def stop(self) -> None:
-        """End playing, whatever state the context is in."""
+        """End playing, whether the context is valid or not."""
         self._stopping.set()
         self._playback.stop()
-        self._ahead.stop()
         if self._thread.is_alive():
             self._thread.join(1.0)
         self._reader.close()
         self._terminal.end()
 
     def _play(self) -> None:
-        """Wait for subscribers and the delay, then play all; runs beside the executor's thread."""
+        """Wait for subscribers and the delay, then play the log; runs in a thread of its own."""
         begin = time.monotonic() + self._options.delay
         try:
             while not self._stopping.wait(0.02) and (time.monotonic() < begin or sum(
                     publisher.get_subscription_count() for publisher in self._senders
                     ) < self._options.wait_for_subscribers):
                 pass
-            self._playback.run(self._ahead)
-            # For subscribers that acknowledge nothing: shared memory goes with its sender.
+            with contextlib.closing(pacing.read_ahead(pacing.rounds(
+                    self._messages, self._span_ns, self._options.loop))) as messages:
+                self._playback.run(messages)
+            # Best-effort subscribers read shared memory, which ends with its sender.
             self._stopping.wait(0.3)
-            # Fast DDS asks every 3 s whether messages are acknowledged.
+            # Fast DDS asks every 3 s for acknowledgements.
             wait_for_all_acked(self._senders, 5.0, self._stopping.is_set)
             code = 2 if self._tell_damage() else 0
         except Exception as error:
@@ -175,10 +175,9 @@ class Replayer(Node):
     def _messages(self) -> Iterator[pacing.Message]:
         names = {channel.name for channel in self._reader.topics
                  if channel.channel_id in self._outputs}
-        # A reader that is told where to start takes the index's word for it.
         start = self._begin_ns if self._options.start else None
         for message in self._reader.messages(names, start):
-            at_ns = message.log_time or self._begin_ns      # 0: recorded before there was a time
+            at_ns = message.log_time or self._begin_ns      # 0: before the first /clock
             if not self._log_begin_ns <= at_ns <= self._end_ns:
                 raise ValueError(f'the index of {self._reader.path} does not fit its messages: '
                                  '`recover` makes a log with a right one')
@@ -216,7 +215,7 @@ class Replayer(Node):
 
 
 def open_log(path: Path, partial: bool) -> LogReader:
-    """Open a log.  Raises LogError, or ValueError for a torn one unless `partial`."""
+    """Open a log.  Raises LogError, and without `partial` ValueError for a torn log."""
     log = LogReader(path)
     torn = not log.whole and (log.damage.truncated or log.damage.losses)
     if torn and not partial:
@@ -229,20 +228,17 @@ def open_log(path: Path, partial: bool) -> LogReader:
 
 
 def message_class(type_name: str) -> type:
-    """Return a message class of an installed ROS package.  Raises LookupError for all else."""
+    """Return a message class of an installed ROS package.  Raises LookupError for any other."""
     # REP-144 and the ROS 2 interface names.
     match = re.fullmatch(r'([a-z][a-z0-9_]*)/(?:msg/)?([A-Z][A-Za-z0-9_]*)', type_name)
-    if match is None:
-        raise LookupError(f'{type_name!r} is not the name of a message type')
-    package, name = match.groups()
-    prefixes = [*filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)),
-                sys.prefix]
-    if any(Path(prefix, 'share/ament_index/resource_index/packages', package).is_file()
-           for prefix in prefixes):
-        with contextlib.suppress(ImportError, AttributeError):
-            kind = getattr(importlib.import_module(f'{package}.msg'), name)
-            if hasattr(kind, 'get_fields_and_field_types'):
-                return kind
+    if match:
+        package, name = match.groups()
+        prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
+        # Other Python packages must not be imported because a log names them.
+        if any(Path(prefix, 'share/ament_index/resource_index/packages', package).is_file()
+               for prefix in prefixes):
+            with contextlib.suppress(ImportError, AttributeError):
+                return getattr(importlib.import_module(f'{package}.msg'), name)
     raise LookupError(f'{type_name} is not installed')
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the nodes say about themselves: /diagnostics, and the status line on the terminal."""
+"""What the nodes report: /diagnostics, and the status line on the terminal."""
 
 import math
 import os
@@ -26,18 +26,17 @@ class MotionReport:
     def __init__(self, simulation: LiveSimulation, loop: TickLoop,
                  session: RecordingSession) -> None:
         self._simulation, self._loop, self._session = simulation, loop, session
-        self._speed = math.nan                  # simulated over real time, at the last reading
+        self._speed = math.nan                  # simulated time over real time
         self._read_at, self._read_ns = time.monotonic(), 0
-        self._interruptions = -1, 0             # at the last reading but one, and at the last
         self._described: object = None          # the motion that `_regime` names
         self._regime = ''
-        self.waits_for_clock = False            # whether /clock has stopped, or not begun
+        self.waits_for_clock = False            # whether /clock has not begun, or has stopped
 
     def diagnostics(self, stamp: Time, name: str, max_error: float) -> DiagnosticArray:
-        """Return the message for /diagnostics; without a `max_error` no error is computed."""
+        """Return the message for /diagnostics; `max_error` = 0 leaves out the error."""
         simulation, loop, session = self._simulation, self._loop, self._session
         error = simulation.orientation_error if max_error else math.nan
-        states = (      # whether it is so, how bad that is, and what is said of it
+        states = (      # whether it holds, its level, its message
             (True, DiagnosticStatus.OK, 'paused' if loop.paused else 'running'),
             (self.waits_for_clock, DiagnosticStatus.WARN, 'waiting for /clock'),
             (self.overloaded, DiagnosticStatus.WARN, 'this machine cannot keep up'),
@@ -71,24 +70,23 @@ class MotionReport:
 
     @property
     def overloaded(self) -> bool:
-        """Whether samples have come too late to be published, or the clock has slipped."""
+        """Whether samples were too late to be published, or the clock has slipped."""
         return self._loop.slipped_ns > 0 or self._total('skipped') > 0
 
     def _total(self, count: str) -> int:
         return sum(getattr(output, count) for output in self._simulation.outputs)
 
     def _measure_speed(self, now_ns: int) -> float:
-        """Return simulated over real time since the reading before, or since a reset."""
+        """Return simulated time over real time since the previous call, or since a reset."""
         elapsed = time.monotonic() - self._read_at
-        if elapsed > 0.1:       # reports that were held up follow each other at once
+        if elapsed > 0.1:       # delayed calls follow each other at once
             since_ns = self._read_ns if self._read_ns <= now_ns else 0
             self._speed = (now_ns - since_ns) / NANOSECONDS / elapsed
             self._read_at, self._read_ns = self._read_at + elapsed, now_ns
-            self._interruptions = self._interruptions[1], self._loop.interruptions
         return self._speed
 
     def new_motion(self) -> str | None:
-        """Return the present motion in numbers if that was not said yet."""
+        """Return a description of the present motion, once for each motion."""
         simulation = self._simulation
         if simulation.segment is self._described:
             return None
@@ -104,18 +102,17 @@ class MotionReport:
         theta, sent = math.degrees(float(simulation.state().theta[0])), self._total('sent')
         flag = (' FAILED' if loop.failure else ' waiting for /clock' if self.waits_for_clock
                 else ' paused' if loop.paused else '')
-        # The speed of an interval in which the motion ran all the time, as it still does.
-        runs = self._interruptions[0] == loop.interruptions and loop.state is LoopState.RUNNING
-        # The most important first: a terminal shows as many as fit.
+        is_running = loop.state is LoopState.RUNNING and not math.isnan(self._speed)
+        # The most important parts come first: a terminal shows as many as fit.
         return ' | '.join(filter(None, (
             f't {loop.now_ns / NANOSECONDS:9.2f} s{flag}', self._regime, f'theta {theta:6.2f} deg',
-            f'x{self._speed:.2f}' if runs else '', f'log {size}' if size else '',
+            f'x{self._speed:.2f}' if is_running else '', f'log {size}' if size else '',
             f'L3 {simulation.l3:.4g} Lz {simulation.lz:.4g}', f'{sent} messages' if sent
             else 'no subscribers yet', f'dE/E {simulation.energy_drift:+.0e}')))
 
 
 def inspect_command(log: Path) -> str:
-    """Return the command that inspects a log, to be pasted into this user's terminal."""
+    """Return the command that inspects a log, as this user can paste it into the terminal."""
     beside = Path(sys.executable).with_name('inspect')
     program = ['inspect'] if shutil.which('inspect') else [str(beside)] if beside.exists() else [
         'ros2', 'run', 'spinning_top_sim', 'inspect']
@@ -123,16 +120,16 @@ def inspect_command(log: Path) -> str:
 
 
 class Terminal:
-    """Shows a status line; on a terminal each one overwrites the one before."""
+    """Shows a status line; on a terminal each line overwrites the previous one."""
 
     def __init__(self) -> None:
-        self._open = False              # the cursor stands behind a line
+        self._open = False              # whether the cursor is at the end of a status line
 
     def show(self, line: str) -> None:
-        """Show the newest line, on a terminal as many of its parts as fit."""
+        """Show a status line, on a terminal as many of its parts as fit."""
         try:
             columns = os.get_terminal_size(1).columns if sys.stdout.isatty() else 0
-        except (AttributeError, OSError):       # the shell has closed it, or the terminal is gone
+        except (AttributeError, OSError):       # standard output or the terminal is closed
             columns = 0
         if not columns:
             self._write(f'{line}\n')
@@ -148,7 +145,7 @@ class Terminal:
         self._write(f'{line}\n')
 
     def end(self) -> None:
-        """Leave the cursor on a fresh line."""
+        """Move the cursor to a new line."""
         if self._open:
             self._open = False
             self._write('\n')
@@ -158,7 +155,7 @@ class Terminal:
         try:
             print(text, end='', flush=True)
         except OSError:
-            # The reader has gone, as in `sim_node | head`: the motion goes on unread.
+            # Nobody reads any more, as in `sim_node | head`; the motion goes on.
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, sys.stdout.fileno())
             os.close(nowhere)

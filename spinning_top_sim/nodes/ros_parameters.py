@@ -5,7 +5,6 @@ import array
 import contextlib
 import difflib
 import re
-from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -21,71 +20,12 @@ from spinning_top_sim.streams.parameters import Parameter
 SPIN = ('spin.l3', 'spin.lz')
 
 
-def _given_twice(argv: Sequence[str], node_name: str) -> dict[str, object]:
-    """
-    Return the last value of each parameter that a command line gives to a node more than once.
-
-    rcl keeps the last value of each type; of these, rclpy takes an integer rather than a double.
-    """
-    names = [text.partition(':=')[0].rpartition(':')[2] for flag, text in pairwise(argv)
-             if flag in {'-p', '--param'}]
-    if '--params-file' not in argv and len(set(names)) == len(names):
-        return {}
-    import yaml  # noqa: PLC0415 - it takes 10 ms
-
-    given = defaultdict(list)
-    for flag, text in pairwise(argv):
-        tree: Any = {}
-        if flag == '--params-file':
-            tree = yaml.safe_load(Path(text).read_bytes())
-        elif flag in {'-p', '--param'}:
-            rule, _, shown = text.partition(':=')
-            node, _, name = rule.rpartition(':')
-            tree = {node or '/**': {'ros__parameters': {name: yaml.safe_load(shown)}}}
-        for path, value in _leaves(tree):
-            nodes, _, name = path.partition('/ros__parameters/')
-            pattern = re.escape(nodes).replace(r'/\*\*', r'(/\w+)*').replace(r'\*', r'\w+')
-            if re.fullmatch(pattern, node_name):
-                given[name.replace('/', '.')].append(value)
-    return {name: values[-1] for name, values in given.items() if len(values) > 1}
-
-
-def _leaves(tree: object, path: str = '') -> Iterator[tuple[str, object]]:
-    if isinstance(tree, Mapping):
-        for key, below in tree.items():
-            yield from _leaves(below, f'{path}/{str(key).strip("/")}')
-    else:
-        yield path, tree
-
-
-def _descriptor(parameter: Parameter) -> ParameterDescriptor:
-    """Return what `ros2 param describe` shows; dynamic types, as `Parameter.check` decides."""
-    result = ParameterDescriptor(
-        name=parameter.name, description=parameter.describe(range_too=False), dynamic_typing=True,
-        read_only=parameter.effect is parameters.Effect.START)
-    lowest = parameter.minimum if parameter.above is None else parameter.above
-    if lowest is None or parameter.maximum is None:
-        result.additional_constraints = parameter.allowed
-        return result
-    if parameter.above is not None:
-        result.additional_constraints = f'must be > {parameter.above:g}'
-    elif parameter.smallest is not None:
-        result.additional_constraints = f'must be 0 or >= {parameter.smallest:g}'
-    if isinstance(parameter.default, int):
-        result.integer_range = [IntegerRange(
-            from_value=int(lowest), to_value=int(parameter.maximum))]
-    else:               # a list of numbers has the range of each
-        result.floating_point_range = [FloatingPointRange(
-            from_value=float(lowest), to_value=float(parameter.maximum))]
-    return result
-
-
 def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
     """
-    Declare the table, warn of unknown parameters; return the start values or raise ValueError.
+    Declare the table and return the start values.  Raises ValueError for a bad value.
 
-    The node was made with `automatically_declare_parameters_from_overrides`, the public way to
-    learn of overrides that nobody declares.
+    Unknown parameters are warned about.  The node must have been made with
+    `automatically_declare_parameters_from_overrides`, the public way to learn of them.
     """
     given, given_twice = {}, _given_twice(argv, node.get_fully_qualified_name())
     for name in node.get_parameters_by_prefix(''):
@@ -100,7 +40,7 @@ def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
             near = difflib.get_close_matches(name, parameters.BY_NAME, 1)
             hint = f'; did you mean {near[0]}?' if near else ''
             node.get_logger().warning(f'there is no parameter {name}: ignored{hint}')
-        # It is declared with its descriptor, below or by `create_publisher`.
+        # It is declared with its descriptor below, or by `create_publisher`.
         node.undeclare_parameter(name)
     values = parameters.checked(given)
     shown = {**values, 'spin.lz': parameters.start_state(values).lz}
@@ -111,8 +51,70 @@ def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
     return values
 
 
+def _given_twice(argv: Sequence[str], node_name: str) -> dict[str, object]:
+    """
+    Return the last value of each parameter that the command line gives to a node more than once.
+
+    rcl keeps the last value of each type, and of these rclpy prefers an integer to a double.
+    """
+    names = [text.partition(':=')[0].rpartition(':')[2] for flag, text in pairwise(argv)
+             if flag in {'-p', '--param'}]
+    if '--params-file' not in argv and len(set(names)) == len(names):
+        return {}
+    import yaml  # noqa: PLC0415 - it takes 10 ms
+
+    last: dict[str, object] = {}
+    twice = set()
+    for flag, text in pairwise(argv):
+        tree: Any = {}
+        if flag == '--params-file':
+            tree = yaml.safe_load(Path(text).read_bytes())
+        elif flag in {'-p', '--param'}:
+            rule, _, shown = text.partition(':=')
+            node, _, name = rule.rpartition(':')
+            tree = {node or '/**': {'ros__parameters': {name: yaml.safe_load(shown)}}}
+        for path, value in _leaves(tree):
+            nodes, _, name = path.partition('/ros__parameters/')
+            pattern = re.escape(nodes).replace(r'/\*\*', r'(/\w+)*').replace(r'\*', r'\w+')
+            if re.fullmatch(pattern, node_name):
+                name = name.replace('/', '.')
+                twice |= {name} & last.keys()
+                last[name] = value
+    return {name: last[name] for name in twice}
+
+
+def _leaves(tree: object, path: str = '') -> Iterator[tuple[str, object]]:
+    if isinstance(tree, Mapping):
+        for key, below in tree.items():
+            yield from _leaves(below, f'{path}/{str(key).strip("/")}')
+    else:
+        yield path, tree
+
+
+def _descriptor(parameter: Parameter) -> ParameterDescriptor:
+    """Return what `ros2 param describe` shows.  Types are dynamic: `Parameter.check` decides."""
+    result = ParameterDescriptor(
+        name=parameter.name, description=parameter.describe(range_too=False), dynamic_typing=True,
+        read_only=parameter.effect is parameters.Effect.START)
+    lowest = parameter.minimum if parameter.above is None else parameter.above
+    if lowest is None or parameter.maximum is None:
+        result.additional_constraints = parameter.allowed
+        return result
+    if parameter.above is not None:
+        result.additional_constraints = f'must be > {parameter.above:g}'
+    elif parameter.smallest is not None:
+        result.additional_constraints = f'must be 0 or >= {parameter.smallest:g}'
+    if isinstance(parameter.default, int):
+        result.integer_range = [IntegerRange(
+            from_value=int(lowest), to_value=int(parameter.maximum))]
+    else:               # in a list, the range of each number
+        result.floating_point_range = [FloatingPointRange(
+            from_value=float(lowest), to_value=float(parameter.maximum))]
+    return result
+
+
 def with_doubles(given: Sequence[RosParameter]) -> list[RosParameter]:
-    """Make doubles where the table has some: of integers, and of texts, as YAML 1.1 has 1e-9."""
+    """Return parameters with doubles made from integers and, as 1e-9 is in YAML 1.1, strings."""
     return [RosParameter(one.name, value=_as_doubles(parameters.BY_NAME[one.name], one.value))
             if one.name in parameters.BY_NAME else one for one in given]
 
@@ -132,26 +134,22 @@ def _as_double(value: object) -> object:
 
 
 def is_command(changes: Mapping[str, Any]) -> bool:
-    """Return whether changes let the spin jump: with `initial.*` it is that of the next start."""
+    """Return whether changes command the spin; beside `initial.*` it is that of the next start."""
     return not changes.keys().isdisjoint(SPIN) and not any(
         name.startswith('initial.') for name in changes)
 
 
 def changed(values: Mapping[str, Any], changes: Mapping[str, Any],
             start_spin: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """
-    Return the values, and the spin of the next start, with changes put in, all validated.
-
-    Raises ValueError.
-    """
+    """Return the changed values and the spin of the next start.  Raises ValueError."""
     for name, value in changes.items():
         if value is None:
             raise ValueError(f'{name}: cannot be unset while the node runs')
     spin = {name: value for name, value in changes.items() if name in SPIN}
     present, start = {name: values[name] for name in SPIN}, dict(start_spin)
     (present if is_command(changes) else start).update(spin)
-    # `start` is checked, as a reset combines it with the other parameters.  The present spin goes
-    # with the present state; `TickLoop.command` refuses one that is not possible there.
+    # A reset combines `start` with the other parameters, so they are checked together.  The
+    # present spin belongs to the present state, and `TickLoop.command` checks it.
     checked = parameters.checked({**values, **changes, **start})
     return ({**checked, **{name: parameters.BY_NAME[name].check(present[name]) for name in SPIN}},
             {name: checked[name] for name in SPIN})

@@ -4,6 +4,7 @@
 import sys
 import textwrap
 from collections.abc import Callable
+from importlib.util import find_spec
 
 from spinning_top_sim.nodes.executable import RunnableNode, one_line, run
 
@@ -29,7 +30,7 @@ Publishes, where enabled:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the node; return its exit code, as `run` does."""
+    """Run the node; return its exit code."""
     return run('sim_node', sys.argv if argv is None else argv, _prepare)
 
 
@@ -57,7 +58,15 @@ def _prepare(argv: list[str]) -> Callable[[], RunnableNode] | None:
         raise ValueError(f'{stray!r} is not expected here; the form is: sim_node --ros-args '
                          '-p NAME:=VALUE --params-file FILE')
     from spinning_top_sim.nodes.simulator import Simulator  # noqa: PLC0415
-    return lambda: Simulator(argv)
+
+    def make_node() -> RunnableNode:
+        node = Simulator(argv)
+        if node.values['simulation_interfaces'] and find_spec('simulation_interfaces'):
+            from spinning_top_sim.nodes import simulation_handlers  # noqa: PLC0415
+            simulation_handlers.offer(node)
+        return node
+
+    return make_node
 
 
 if __name__ == '__main__':

@@ -1,69 +1,90 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What the services and the action of simulation_interfaces do; no executor and no DDS.
+Offers simulation_interfaces, the standard of ROS 2 for simulators.
 
-The handler of GetEntities is `_get_entities`: it takes a request and fills its response, or raises
-RefusedError with a code, or ValueError or RuntimeError, which mean RESULT_OPERATION_FAILED.
+The handler of GetEntities is `_get_entities`.  A handler takes a request, fills the response, and
+may return a text for `error_message`.  RefusedError has the result code of a refusal; ValueError,
+RuntimeError and OSError mean RESULT_OPERATION_FAILED.
 """
 
+import importlib
 import types
-from collections.abc import Callable, Coroutine, Generator
+from collections.abc import Callable, Generator
+from functools import partial
 from typing import Any
 
+from rclpy.action import ActionServer, CancelResponse
+
 from spinning_top_sim.nodes import entity, worlds
-from spinning_top_sim.nodes.pacing import FairLock
 from spinning_top_sim.nodes.simulation_standard import (
+    ACTION,
     FEATURES,
-    Node,
+    SERVICES,
     RefusedError,
+    UnsupportedError,
     service_name,
 )
-from spinning_top_sim.nodes.tick_loop import LoopState, TickLoop
+from spinning_top_sim.nodes.simulator import Simulator
+from spinning_top_sim.nodes.tick_loop import LoopState
 from spinning_top_sim.nodes.worlds import World
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.simulation import Simulation
+
+
+def offer(node: Simulator) -> None:
+    """
+    Create the services and the action server, in the namespace of the node.
+
+    Services that the installed version of simulation_interfaces lacks are left out.
+    """
+    messages, services, actions = (importlib.import_module(f'simulation_interfaces.{kind}')
+                                   for kind in ('msg', 'srv', 'action'))
+    handlers = SimulationHandlers(node, messages, actions)
+    for name in SERVICES:
+        if hasattr(services, name):
+            node.create_service(getattr(services, name), service_name(name),
+                                partial(handlers.serve, name))
+    # The node keeps the action server.
+    ActionServer(node, getattr(actions, ACTION), service_name(ACTION), handlers.simulate_steps,
+                 cancel_callback=lambda _: CancelResponse.ACCEPT)
 
 
 class SimulationHandlers:
     """
-    The handlers of one simulation.
+    The handlers of one node.
 
     messages, actions : the modules simulation_interfaces.msg and .action
-    name, frame : of the entity, and of the world
     """
 
-    def __init__(self, node: Node, loop: TickLoop, simulation: Simulation, lock: FairLock,
-                 messages: types.ModuleType, actions: types.ModuleType, name: str,
-                 frame: str) -> None:
-        self._node, self._loop, self._simulation, self._lock = node, loop, simulation, lock
+    def __init__(self, node: Simulator, messages: types.ModuleType,
+                 actions: types.ModuleType) -> None:
+        self._node, self._lock = node, node.lock
+        self._loop, self._simulation = node.loop, node.simulation
         self._messages, self._actions = messages, actions
-        self._name, self._frame = name, frame
         self._results, self._states = messages.Result, messages.SimulationState
+        self._name = node.get_name()            # of the entity
         self._category = messages.EntityCategory.CATEGORY_ROBOT
-        self._world: World | None = None        # the one loaded last
-        self._pause_at_start = -1               # `interruptions` when one was asked for at t = 0
+        self._world: World | None = None        # the world that was loaded last
+        self._pause_at_start = -1               # `loop.interruptions` when PAUSED was set at t = 0
         self._quits = self._steps = False
 
     def serve(self, name: str, request: object, response: object) -> object:
-        """Fill a response, its result too; unexpected errors stop the motion."""
+        """Handle a request for the service of this type; return the response."""
         result: Any = getattr(response, 'result', None)
         act = getattr(self, f'_{service_name(name)}')
         code, text = self._outcome(lambda: act(request, response))
         if result is not None:
-            # YAML can name what UTF-8 cannot: such a response would end the executor.
+            # A request in YAML can hold text that UTF-8 cannot; sending it would raise an error.
             result.result = code
             result.error_message = text.encode(errors='backslashreplace').decode()
         return response
 
     def _outcome(self, act: Callable[[], str | None]) -> tuple[int, str]:
-        """Return the code of what `act` does, and what is to say about it."""
+        """Return the result code and the text of an action; unexpected errors stop the motion."""
         try:
             return self._results.RESULT_OK, act() or ''
         except RefusedError as error:
             return error.code, str(error)
-        except entity.UnsupportedError as error:
-            return self._results.RESULT_FEATURE_UNSUPPORTED, str(error)
         except (ValueError, RuntimeError, OSError) as error:
             return self._results.RESULT_OPERATION_FAILED, str(error)
         except Exception as error:
@@ -78,10 +99,8 @@ class SimulationHandlers:
         response.features.custom_info = (
             'spinning_top_sim, docs/simulation_interfaces.md; a step is the parameter step.dt')
 
-    # The state of the simulation.
-
     def _state(self) -> int:
-        """Return the constant of SimulationState; the caller has the lock."""
+        """Return the constant of SimulationState; the caller holds the lock."""
         loop, states = self._loop, self._states
         if self._quits or loop.state is LoopState.ENDED:
             return states.STATE_QUITTING
@@ -89,7 +108,7 @@ class SimulationHandlers:
             return states.STATE_STOPPED
         if loop.state is LoopState.RUNNING:
             return states.STATE_PLAYING
-        # A motion that has failed is paused, too.
+        # A failed motion is PAUSED, too.
         is_at_start = (loop.state is LoopState.PAUSED and self._simulation.now_ns < 0
                        and loop.interruptions != self._pause_at_start)
         return states.STATE_STOPPED if is_at_start else states.STATE_PAUSED
@@ -100,52 +119,56 @@ class SimulationHandlers:
             return self._loop.failure or ''
 
     def _set_simulation_state(self, request: Any, response: Any) -> None:
-        states, loop, target = self._states, self._loop, request.state.state
-        allowed = {states.STATE_STOPPED: 'STOPPED', states.STATE_PLAYING: 'PLAYING',
-                   states.STATE_PAUSED: 'PAUSED', states.STATE_QUITTING: 'QUITTING'}
-        if target not in allowed:
+        states, target = self._states, request.state.state
+        changes = {states.STATE_STOPPED: ('STOPPED', self._stop),
+                   states.STATE_PLAYING: ('PLAYING', self._play),
+                   states.STATE_PAUSED: ('PAUSED', self._pause),
+                   states.STATE_QUITTING: ('QUITTING', self._quit)}
+        if target not in changes:
             raise RefusedError(response.INCORRECT_TRANSITION, f'state = {target}: must be ' + (
-                ', '.join(f'{number} ({name})' for number, name in allowed.items())))
+                ', '.join(f'{number} ({name})' for number, (name, _) in changes.items())))
+        name, change = changes[target]
         with self._lock:
-            present, failure = self._state(), loop.failure
-        if target == present and not (failure and target == states.STATE_PAUSED
-                                      and not loop.paused):
+            present = self._state()
+        if target == present:
             raise RefusedError(response.ALREADY_IN_TARGET_STATE,
-                               f'the simulation is {allowed[present]} already')
+                               f'the simulation is {name} already')
         if present == states.STATE_QUITTING:
             raise RefusedError(response.INCORRECT_TRANSITION, 'the simulator is quitting')
-        if target == states.STATE_QUITTING:
-            with self._lock:
-                loop.pause()
-                self._quits = True
-            self._node.finish()
-            return
         try:
-            self._node.check_started()
-            if target == states.STATE_STOPPED:
-                self._node.start_again(paused=True)
-                return
-            with self._lock:
-                if failure and target == states.STATE_PLAYING:
-                    raise RuntimeError(f'the motion stands still: {failure}; STATE_STOPPED '
-                                       'resets it')
-                if target == states.STATE_PLAYING:
-                    loop.resume()
-                elif present == states.STATE_STOPPED:
-                    self._pause_at_start = loop.interruptions
-                else:
-                    loop.pause()
-                if loop.failure and not failure:
-                    raise RuntimeError(loop.failure)
+            change()
         except (ValueError, RuntimeError) as error:
             raise RefusedError(response.STATE_TRANSITION_ERROR, error) from error
 
-    # Steps and resets.
+    def _stop(self) -> None:
+        self._node.start_again(paused=True)
+
+    def _play(self) -> None:
+        self._node.check_started()
+        with self._lock:
+            if self._loop.failure:
+                raise RuntimeError(f'the motion stands still: {self._loop.failure}; '
+                                   'STATE_STOPPED resets it')
+            self._loop.resume()
+
+    def _pause(self) -> None:
+        self._node.check_started()
+        with self._lock:
+            if self._state() == self._states.STATE_STOPPED:
+                self._pause_at_start = self._loop.interruptions
+                return
+            self._loop.pause()
+            if self._loop.failure:
+                raise RuntimeError(self._loop.failure)
+
+    def _quit(self) -> None:
+        with self._lock:
+            self._loop.pause()
+            self._quits = True
+        self._node.finish()
 
     def _step_simulation(self, request: Any, _: Any) -> None:
         self._check_steps(request.steps)
-        if self._steps:
-            raise RuntimeError('SimulateSteps is stepping: wait for its end, or cancel it')
         self._step(request.steps)
 
     def _check_steps(self, steps: int) -> None:
@@ -156,16 +179,63 @@ class SimulationHandlers:
             if self._state() != self._states.STATE_PAUSED:
                 raise RuntimeError('the simulation is not paused: SetSimulationState must set '
                                    'STATE_PAUSED first')
+        if self._steps:
+            raise RuntimeError('SimulateSteps is stepping: wait for its end, or cancel it')
 
     def _step(self, count: int) -> None:
         loop = self._loop
-        # A step is a whole number of nanoseconds: n steps are n times one step.
+        # A step is a whole number of nanoseconds, so that n steps are n times one step.
         step_ns = round(self._node.values['step.dt'] * NANOSECONDS)
         with self._lock:
             target_ns = loop.now_ns + count * step_ns
             loop.step_by(count * step_ns)
             if loop.now_ns < target_ns:
                 raise RuntimeError(f'{loop.time_text}: `duration` ends before the steps do')
+
+    async def simulate_steps(self, goal_handle: object) -> object:
+        """Execute a goal of the action; between two steps the executor has its turn."""
+        goal: Any = goal_handle
+        action, context = self._actions.SimulateSteps, self._node.context
+        result, feedback = action.Result(), action.Feedback()
+        steps, done, ok = goal.request.steps, 0, self._results.RESULT_OK
+        code, text = self._outcome(lambda: self._check_steps(steps))
+        accepted = code == ok
+        self._steps |= accepted
+        interruptions = self._loop.interruptions
+        while code == ok and done < steps and not goal.is_cancel_requested and context.ok():
+            progress = f'after {done} of {steps} steps'
+            code, text = self._outcome(partial(self._next_step, interruptions, progress))
+            if code == ok:
+                done += 1
+                feedback.completed_steps, feedback.remaining_steps = done, steps - done
+                try:
+                    goal.publish_feedback(feedback)
+                except Exception:
+                    if context.ok():
+                        raise
+            await _turn()
+        self._steps &= not accepted
+        while not context.ok():     # a signal ends the process soon, and nothing can be sent
+            await _turn()
+        if code != ok:
+            goal.abort()
+        elif done < steps:
+            goal.canceled()
+            code, text = (self._results.RESULT_OPERATION_FAILED,
+                          f'canceled after {done} of {steps} steps')
+        else:
+            goal.succeed()
+        result.result.result, result.result.error_message = code, text
+        return result
+
+    def _next_step(self, interruptions: int, progress: str) -> None:
+        """Step once, or raise RuntimeError if the motion was interrupted meanwhile."""
+        loop = self._loop
+        if self._quits or loop.interruptions != interruptions:
+            why = ('`duration` ends before the steps do' if loop.state is LoopState.ENDED else
+                   loop.failure or 'the simulation was reset, or its state set')
+            raise RuntimeError(f'interrupted {progress}: {why}')
+        self._step(1)
 
     def _check_runs(self) -> None:
         """Raise RefusedError before the motion begins, and when the process ends."""
@@ -178,76 +248,6 @@ class SimulationHandlers:
         except RuntimeError as error:
             raise RefusedError(self._results.RESULT_INCORRECT_STATE, error) from error
 
-    @property
-    def steps_action(self) -> Callable[[object], Coroutine[None, None, object]]:
-        """The coroutine function of SimulateSteps, for an action server."""
-        return self._simulate_steps
-
-    async def _simulate_steps(self, goal: Any) -> Any:
-        try:
-            return await self._step_one_by_one(goal)
-        except Exception:
-            if self._node.can_send():
-                raise
-        # A signal has ended the context.  To tell the goal so would crash the executor, which is
-        # about to end and does not come back here.
-        while True:
-            await _turn()
-
-    def _check_context(self) -> None:
-        if not self._node.can_send():
-            raise RuntimeError('the context has ended')
-
-    async def _step_one_by_one(self, goal: Any) -> Any:
-        """Step up to the goal; between two steps the executor has its turn."""
-        action = self._actions.SimulateSteps
-        steps, done = goal.request.steps, 0
-        result, feedback = action.Result(), action.Feedback()
-        mine = False
-
-        def begin() -> None:
-            nonlocal mine
-            self._check_steps(steps)
-            if self._steps:
-                raise RuntimeError('another SimulateSteps is stepping')
-            self._steps = mine = True
-
-        code, text = self._outcome(begin)
-        interruptions = self._loop.interruptions
-
-        def step() -> None:
-            loop = self._loop
-            if self._quits or loop.interruptions != interruptions:
-                why = ('`duration` ends before the steps do' if loop.state is LoopState.ENDED else
-                       loop.failure or 'the simulation was reset, or its state set')
-                raise RuntimeError(f'interrupted after {done} of {steps} steps: {why}')
-            self._step(1)
-
-        try:
-            while code == self._results.RESULT_OK and done < steps:
-                self._check_context()
-                if goal.is_cancel_requested:
-                    goal.canceled()
-                    result.result.result = self._results.RESULT_OPERATION_FAILED
-                    result.result.error_message = f'canceled after {done} of {steps} steps'
-                    return result
-                code, text = self._outcome(step)
-                if code == self._results.RESULT_OK:
-                    done += 1
-                    feedback.completed_steps, feedback.remaining_steps = done, steps - done
-                    goal.publish_feedback(feedback)
-                await _turn()
-        finally:
-            if mine:
-                self._steps = False
-        self._check_context()
-        result.result.result, result.result.error_message = code, text
-        if code == self._results.RESULT_OK:
-            goal.succeed()
-        else:
-            goal.abort()
-        return result
-
     def _reset_simulation(self, request: Any, _: Any) -> None:
         time_and_state = request.SCOPE_TIME | request.SCOPE_STATE
         self._check_runs()
@@ -259,53 +259,43 @@ class SimulationHandlers:
                 self._loop.set_state(lambda _: parameters.start_state(values))
             self._node.show_spin()
         else:
-            raise RefusedError(
-                self._results.RESULT_FEATURE_UNSUPPORTED,
+            raise UnsupportedError(
                 f'scope = {request.scope}: must be {request.SCOPE_DEFAULT} or '
                 f'{request.SCOPE_ALL} (all), {request.SCOPE_STATE} (state) or {time_and_state} '
                 '(time and state): time goes back with the state only, and nothing is spawned')
-
-    # The entity.
 
     def _check_entity(self, name: str) -> None:
         if name != self._name:
             raise RefusedError(self._results.RESULT_NOT_FOUND,
                                f'entity = {name!r}: there is {self._name!r} only')
 
-    def _chosen(self, filters: Any) -> list[str]:
-        """Return the entities that filters choose; the caller has the lock."""
-        chosen = entity.is_chosen(filters, self._name, self._category, self._simulation.top,
-                                  self._simulation.state)
-        return [self._name] if chosen else []
-
     def _fill_state(self, message: Any) -> None:
-        """Put the present state into an EntityState; the caller has the lock."""
         simulation = self._simulation
-        entity.fill_state(message, simulation.state(), simulation.epoch_ns + self._loop.now_ns,
-                          self._frame)
+        with self._lock:
+            entity.fill_state(message, simulation.state(),
+                              simulation.epoch_ns + self._loop.now_ns,
+                              self._node.values['world_frame'])
 
     def _get_entities(self, request: Any, response: Any) -> None:
-        with self._lock:
-            response.entities = self._chosen(request.filters)
+        if entity.is_chosen(request.filters, self._name, self._category):
+            response.entities = [self._name]
 
     def _get_entities_states(self, request: Any, response: Any) -> None:
-        with self._lock:
-            chosen = self._chosen(request.filters)
-            states = [self._messages.EntityState() for _ in chosen]
-            for message in states:
-                self._fill_state(message)
-        response.entities, response.states = chosen, states
+        self._get_entities(request, response)
+        response.states = [self._messages.EntityState() for _ in response.entities]
+        for message in response.states:
+            self._fill_state(message)
 
     def _get_entity_state(self, request: Any, response: Any) -> None:
         self._check_entity(request.entity)
-        with self._lock:
-            self._fill_state(response.state)
+        self._fill_state(response.state)
 
     def _set_entity_state(self, request: Any, response: Any) -> str:
         self._check_entity(request.entity)
         self._check_runs()
         try:
-            change = entity.changed_state(request, self._simulation.top, self._frame)
+            change = entity.changed_state(request, self._simulation.top,
+                                          self._node.values['world_frame'])
         except entity.PoseError as error:
             raise RefusedError(response.INVALID_POSE, error) from error
         with self._lock:
@@ -324,42 +314,21 @@ class SimulationHandlers:
         self._check_entity(request.entity)
         entity.fill_bounds(response.bounds, self._simulation.top)
 
-    # Worlds.
+    def _filled(self, message: Any, world: World) -> Any:
+        """Return a WorldResource that describes a world."""
+        message.name, message.world_resource.uri = world.name, world.uri
+        message.world_resource.resource_string = '' if world.uri else world.text
+        return message
 
-    def _fill_world(self, message: Any, world: World) -> None:
-        resource = _resource_of(message)
-        message.name, message.description = world.name, world.description
-        resource.uri, resource.resource_string = world.uri, '' if world.uri else world.text
-
-    def _get_available_worlds(self, request: Any, response: Any) -> str:
-        if request.filter.tags:
-            raise RefusedError(self._results.RESULT_FEATURE_UNSUPPORTED,
-                               f'filter.tags = {list(request.filter.tags)}: must be empty, as '
-                               'worlds have no tags')
-        found: dict[str, World] = {}
-        errors: list[str] = []
-        scenes = worlds.scene_files()
-        for source in (*map(str, scenes.values()), *request.additional_sources):
-            try:
-                found |= {world.uri: world for world in worlds.worlds_in(source)}
-            except (OSError, ValueError) as error:
-                errors.append(f'{source}: {error}')
-                is_default = source not in request.additional_sources
-                if not request.continue_on_error:
-                    raise RefusedError(
-                        response.DEFAULT_SOURCES_FAILED if is_default
-                        else self._results.RESULT_OPERATION_FAILED, errors[0]) from error
-        if not (scenes or request.continue_on_error):
-            raise RefusedError(response.DEFAULT_SOURCES_FAILED, 'no scene is installed')
-        if not found:
-            raise RuntimeError('; '.join(errors) or 'there is no world')
-        response.worlds = [self._messages.WorldResource() for _ in found]
-        for message, world in zip(response.worlds, found.values(), strict=True):
-            self._fill_world(message, world)
-        return '; '.join(errors)
+    def _get_available_worlds(self, request: Any, response: Any) -> None:
+        if request.filter.tags or request.additional_sources:
+            raise UnsupportedError('filter.tags and additional_sources must be empty: worlds have '
+                                   'no tags, and load_world takes the path of any other world')
+        for world in worlds.scenes():
+            response.worlds.append(self._filled(self._messages.WorldResource(), world))
 
     def _load_world(self, request: Any, response: Any) -> str:
-        resource = _resource_of(request)
+        resource = request.world_resource
         if not (resource.uri or resource.resource_string):
             raise RefusedError(response.NO_RESOURCE, 'uri and resource_string are empty: one of '
                                'them must be a world')
@@ -380,20 +349,15 @@ class SimulationHandlers:
         self._check_runs()
         self._node.start_again(values, paused=True)
         self._world = world
-        self._fill_world(response.world, world)
+        self._filled(response.world, world)
         return ignored
 
     def _get_current_world(self, _: Any, response: Any) -> None:
-        self._fill_world(response.world,
+        self._filled(response.world,
                          worlds.present_world(self._simulation.values, self._world))
-
-
-def _resource_of(message: Any) -> Any:
-    """Return the Resource of a message; before version 2.1 it has another name."""
-    return getattr(message, 'world_resource', None) or message.level_resource
 
 
 @types.coroutine
 def _turn() -> Generator[None, None, None]:
-    """Let the executor do what else is to do; it resumes a task that yields nothing."""
+    """Let the executor do other work; it resumes a task that yields nothing."""
     yield

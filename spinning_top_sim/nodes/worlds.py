@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenes as worlds: parameter files that a running node can start again with."""
+"""Scenes as worlds: parameter files with which a running node can start again."""
 
 import contextlib
-import re
+import itertools
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -16,13 +16,13 @@ from ament_index_python.packages import PackageNotFoundError, get_package_share_
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.scene_file import is_of_ros, known, parse_scene
 
-# What a world sets: a parameter of these that it does not have gets its default.
+# The parameters of a world.  Those of them that a file does not set get their defaults.
 OF_A_WORLD = ('top.', 'initial.', 'spin.', 'solver.')
-LARGEST_FILE = 1_000_000        # [bytes], and characters of a text
+LONGEST_TEXT = 1_000_000        # characters: parsing more would stop the node for minutes
 
 
 class FormatError(ValueError):
-    """A resource is no parameter file."""
+    """A resource is not a parameter file."""
 
 
 def scene_files() -> dict[str, Path]:
@@ -38,12 +38,12 @@ def scene_files() -> dict[str, Path]:
 @dataclass(frozen=True)
 class World:
     """
-    A top and the start of its motion, as a parameter file has it.
+    A top and the start of its motion, as a parameter file describes them.
 
     name, uri : the stem of the file and its path, both '' without a file
-    text : what the file says
+    text : the content of the file
     given : its parameters, by name
-    ignored : names in it that are no parameters of a running node
+    ignored : names in it that are not parameters of a running node
     """
 
     name: str
@@ -54,10 +54,10 @@ class World:
 
     @classmethod
     def parse(cls, text: str, uri: str = '') -> Self:
-        """Return the world of a text.  Raises ValueError, which says what is wrong with it."""
+        """Return the world that a text describes.  Raises ValueError for any other text."""
         source = uri or 'resource_string'
-        if len(text) > LARGEST_FILE:
-            raise FormatError(f'{source}: {len(text)} characters; must be at most {LARGEST_FILE}')
+        if len(text) > LONGEST_TEXT:
+            raise FormatError(f'{source}: must have at most {LONGEST_TEXT} characters')
         found = parse_scene(text, source)
         usable = {name: value for name, value in found.items() if name in parameters.BY_NAME
                   and parameters.BY_NAME[name].effect is not parameters.Effect.START}
@@ -74,29 +74,20 @@ class World:
         """
         Return the world of a scene's name, a path or a file URI.
 
-        Raises FileNotFoundError, FormatError for what is no parameter file, and OSError or
-        ValueError where it cannot be read.
+        Raises FileNotFoundError, FormatError for what is not a parameter file, OSError, or
+        ValueError for a file with another content.
         """
-        path = local_path(uri)
-        if re.search('[\ud800-\udfff]', str(path.absolute())):      # no message can hold these
-            raise FormatError(f'{uri!r}: must be a path in UTF-8')
-        if uri in (scenes := scene_files()):
-            path = scenes[uri]
-        if path.suffix not in ('.yaml', '.yml') and not path.is_file():
+        scenes = scene_files()
+        path = scenes.get(uri) or local_path(uri)
+        if not path.is_file():
             raise FileNotFoundError(f'{uri}: there is no such scene or file; there are the scenes '
                                     f'{", ".join(scenes)}')
         if path.suffix not in ('.yaml', '.yml'):
             raise FormatError(f'{uri}: must be a parameter file of ROS 2, *.yaml')
-        if not path.is_file():
-            raise FileNotFoundError(f'{uri}: there is no such file')
-        if path.stat().st_size > LARGEST_FILE:
-            raise FormatError(f'{uri}: {path.stat().st_size} bytes; must be at most '
-                              f'{LARGEST_FILE}')
-        try:
-            text = path.read_text(encoding='utf-8')
-        except UnicodeDecodeError as error:
-            raise FormatError(f'{uri}: must be in UTF-8: {error}') from error
-        return cls.parse(text, str(path.absolute()))
+        name = str(path.absolute())
+        name.encode()           # raises ValueError for a name that no message can hold
+        with path.open(encoding='utf-8') as file:
+            return cls.parse(file.read(LONGEST_TEXT + 1), name)
 
     def values(self, present: Mapping[str, Any]) -> dict[str, Any]:
         """Return the present parameters with those of the world.  Raises ValueError."""
@@ -108,60 +99,35 @@ class World:
         """Return whether a motion with these parameters starts as this world does."""
         try:
             wanted = self.values(values)
-        except ValueError:      # its parameters do not go with those outside of a world
+        except ValueError:      # it contradicts parameters that are not part of a world
             return False
         return all(values[name] == value for name, value in wanted.items())
 
-    @property
-    def description(self) -> str:
-        """The comment at the head of the file, in one line."""
-        lines = []
-        for line in self.text.splitlines():
-            if not line.startswith('#'):
-                break
-            if 'SPDX-License-Identifier' not in line:
-                lines.append(line.lstrip('# ').rstrip())
-        return ' '.join(lines)
+
+def scenes() -> Iterator[World]:
+    """Yield the installed scenes that can be read."""
+    for path in scene_files().values():
+        with contextlib.suppress(OSError, ValueError):      # somebody has changed the file
+            yield World.read(str(path))
 
 
 def present_world(values: Mapping[str, Any], loaded: World | None) -> World:
     """
-    Return the world whose start these parameters are.
+    Return the world that starts with these parameters.
 
-    It is the one loaded last or an installed scene, or else a text of the parameters.
+    It is the world that was loaded last, an installed scene, or a text with the parameters.
     """
-    if loaded is not None and loaded.is_that_of(values):
-        return loaded
-    for path in scene_files().values():
-        # A file that somebody has put there or changed may be anything.
-        with contextlib.suppress(OSError, ValueError):
-            if (scene := World.read(str(path))).is_that_of(values):
-                return scene
+    for world in itertools.chain([loaded] if loaded else [], scenes()):
+        if world.is_that_of(values):
+            return world
     given = {name: value for name, value in values.items()
              if name.startswith(OF_A_WORLD) and value is not None}
     return World.parse(yaml.safe_dump({'/**': {'ros__parameters': given}}))
 
 
-def worlds_in(source: str) -> list[World]:
-    """Return the worlds of a file or folder.  Raises OSError or ValueError if it is none."""
-    path = local_path(source)
-    if not path.is_dir():
-        return [World.read(source)]
-    found = []
-    for file in sorted(path.glob('*.yaml')):
-        with contextlib.suppress(OSError, ValueError):      # other files of the folder
-            found.append(World.read(str(file)))
-    return found
-
-
 def local_path(uri: str) -> Path:
-    """Return the path of a file URI, or of a path.  Raises FormatError for others."""
+    """Return the path of a file URI, or of a path.  Raises FormatError for other URIs."""
     parts = urlsplit(uri)
-    if '\0' in uri or (parts.scheme and not (parts.scheme == 'file'
-                                             and parts.netloc in ('', 'localhost'))):
+    if parts.scheme and not (parts.scheme == 'file' and parts.netloc in ('', 'localhost')):
         raise FormatError(f'{uri!r}: must be the name of a scene, a path or a file:// URI')
-    path = Path(unquote(parts.path) if parts.scheme else uri)
-    try:
-        return path.expanduser()
-    except RuntimeError as error:
-        raise FormatError(f'{uri!r}: there is no such user') from error
+    return Path(unquote(parts.path) if parts.scheme else uri)

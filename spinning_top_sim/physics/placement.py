@@ -77,41 +77,6 @@ class Box:
         return cls(np.array([-shape.radius, -shape.radius, min(heights)]),
                    np.array([shape.radius, shape.radius, max(heights)]))
 
-    @property
-    def centre(self) -> Reals:
-        """(3,) [m]."""
-        return 0.5 * (self.lower + self.upper)
-
-    def overlaps_sphere(self, rotation: Reals, centre: Reals, radius: float) -> bool:
-        """
-        Return whether the box and a sphere have a point in common.
-
-        rotation : (3, 3) from the frame of the box to that of the sphere, with the same origin
-        """
-        inside = rotation.T @ centre
-        nearest = np.clip(inside, self.lower, self.upper)
-        return bool(np.linalg.norm(inside - nearest) <= radius)
-
-    def overlaps_box(self, rotation: Reals, other: 'Box') -> bool:
-        """
-        Return whether two boxes have a point in common, by the separating axis theorem.
-
-        rotation : (3, 3) from the frame of this box to that of the other, with the same origin
-        """
-        ours, theirs = 0.5 * (self.upper - self.lower), 0.5 * (other.upper - other.lower)
-        apart = other.centre - rotation @ self.centre
-        axes = [*np.eye(3), *rotation.T,
-                *(np.cross(one, two) for one in np.eye(3) for two in rotation.T)]
-        return all(abs(apart @ axis) <= np.abs(rotation.T @ axis) @ ours + np.abs(axis) @ theirs
-                   for axis in axes)
-
-
-def rotation_matrix(quaternion: Reals) -> Reals:
-    """Return the matrix (3, 3) from the body to the world of a unit quaternion x, y, z, w."""
-    columns = _columns(quaternion)
-    return np.stack([np.concatenate(attitude.in_world(columns, unit)) for unit in (
-        (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))], axis=-1)
-
 
 def _columns(quaternion: Reals) -> attitude.Quaternion:
     x, y, z, w = quaternion.reshape(4, 1)

@@ -197,8 +197,6 @@ TABLE: tuple[Parameter, ...] = (
     _at_reset('solver.atol', 1e-12, 'rk45: absolute tolerance of a step', '', 0.0, 1e-2),
     _at_once('max_error', 1e-6, 'rk45: warn in /diagnostics when the orientation is further '
               'from the exact solution; 0 = do not look', 'rad', 0.0, 1e6),
-    _at_start('pacing', 'timer', 'Without effect, and accepted for older files: a thread with '
-              'absolute deadlines makes the ticks', choices=('timer', 'thread')),
     _at_once('tick_rate', 200.0, 'How often due samples are sent; 4 Hz at least', 'Hz', 1e-2,
              HIGHEST_RATE),
     _at_once('time_scale', 1.0, 'Simulated over real time', '', 1e-6, 1e6),
@@ -276,6 +274,8 @@ def checked(values: Mapping[str, Value]) -> dict[str, Value]:
     """Return the defaults with these values put in.  Raises ValueError for what is not allowed."""
     result = {parameter.name: parameter.default for parameter in TABLE}
     for name, value in values.items():
+        if name == 'pacing':        # in logs of 1.0; it had no effect
+            continue
         if name not in BY_NAME:
             raise ValueError(f'{name} = {shown(value)}: there is no such parameter')
         result[name] = BY_NAME[name].check(value)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What tests of running nodes need: a node in a process of its own, and a peer who talks to it.
+Helpers for tests of running nodes: a node in a process of its own, and a peer that talks to it.
 
-Nodes and peer are in the domain of own_domain.  Whatever a test waits for, it waits for its
-arrival, PATIENCE_S long: how fast this machine is decides nothing.
+Nodes and peer use the domain of own_domain.  A test waits for an event, at most PATIENCE_S: the
+speed of the machine decides nothing.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ LIFETIME_S = 300.0          # a node that is still there is killed
 
 
 def wait_for(what, condition, timeout=PATIENCE_S):
-    """Wait until the condition holds, and return what it returned; fail saying what did not."""
+    """Wait until a condition holds, and return its value; fail with `what` after the timeout."""
     end = time.monotonic() + timeout
     while not (result := condition()):
         assert time.monotonic() < end, f'{timeout:g} s and still not: {what}'
@@ -57,16 +57,16 @@ def wait_for(what, condition, timeout=PATIENCE_S):
     return result
 
 
-# Where the test process is itself killed, its nodes shall not live on.
+# Nodes end with the test process, also if that is killed.
 DIE_WITH_PARENT = ['setpriv', '--pdeathsig', 'KILL'] if shutil.which('setpriv') else []
 
 
 class SimNode:
     """
-    A sim_node in its own process group; ends with the `with` at the latest.
+    A sim_node in its own process group; it ends with the `with` at the latest.
 
-    parameters: by name;  arguments: more of --ros-args;  program: what python is given instead of
-    the module;  out, err: what it has printed.
+    parameters: by name;  arguments: more of --ros-args;  program: arguments of python instead of
+    the module;  out, err: its output so far
     """
 
     _number = itertools.count(1)
@@ -84,7 +84,6 @@ class SimNode:
             *DIE_WITH_PARENT, sys.executable,
             *(program or ('-m', 'spinning_top_sim.nodes.sim_node')),
             '--ros-args', '-r', f'__ns:={namespace}', *options, *arguments]
-        self.seconds_to_end = None
 
     def __enter__(self):
         source = str(Path(spinning_top_sim.__file__).parents[1])
@@ -106,7 +105,7 @@ class SimNode:
         self._killer.cancel()
 
     def kill(self):
-        """Kill the group for good, if it is there."""
+        """Kill the process group, if it is there."""
         if self.process.poll() is None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.process.pid, signal.SIGKILL)
@@ -125,7 +124,7 @@ class SimNode:
         return self.process.poll() is None
 
     def wait(self, timeout=PATIENCE_S):
-        """Wait for the end by itself; return the exit code (-9: it had to be killed)."""
+        """Wait until the node ends; return its exit code (-9: it had to be killed)."""
         try:
             return self.process.wait(timeout)
         except subprocess.TimeoutExpired:
@@ -133,16 +132,13 @@ class SimNode:
             return -signal.SIGKILL
 
     def end(self, number=signal.SIGINT, times=1, gap=0.0):
-        """Signal the group, wait, and return the exit code; `seconds_to_end` says how long."""
-        begun = time.monotonic()
+        """Signal the process group, wait, and return the exit code."""
         for _ in range(times):
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.process.pid, number)
             if times > 1:
                 time.sleep(gap)
-        code = self.wait(10.0)
-        self.seconds_to_end = time.monotonic() - begun
-        return code
+        return self.wait(10.0)
 
     def memory(self):
         """Return the resident set [bytes]."""
@@ -164,7 +160,7 @@ def as_yaml(value):
 
 
 class Topic:
-    """What has arrived on one topic, serialized, in order."""
+    """The messages that have arrived on one topic, serialized, in order."""
 
     def __init__(self, kind):
         self.kind = kind
@@ -176,17 +172,17 @@ class Topic:
             self.raw.append(data)
 
     def wait(self, count, timeout=PATIENCE_S):
-        """Wait until so many have arrived in all."""
+        """Wait until `count` messages have arrived in all."""
         wait_for(f'{count} messages of {self.kind.__name__} (there are {len(self.raw)})',
                  lambda: len(self.raw) >= count, timeout)
         return self
 
     def wait_more(self, count, timeout=PATIENCE_S):
-        """Wait until so many more have arrived."""
+        """Wait until `count` more messages have arrived."""
         return self.wait(len(self.raw) + count, timeout)
 
     def messages(self, start=0):
-        """Return what has arrived, deserialized."""
+        """Return the messages from `start` on, deserialized."""
         return [deserialize_message(data, self.kind) for data in self.raw[start:]]
 
     def last(self):
@@ -237,7 +233,7 @@ class Peer:
         self.close()
 
     def listen(self, name, kind, reliability=ReliabilityPolicy.RELIABLE):
-        """Subscribe; the queue holds whatever may come."""
+        """Subscribe with a queue that is long enough for any test."""
         topic = Topic(kind)
         self.node.create_subscription(
             kind, name, topic.receive, QoSProfile(depth=20_000, reliability=reliability),
@@ -245,24 +241,23 @@ class Peer:
         return topic
 
     def stop_listening(self, topic):
-        """Let what comes from now on go by; rclpy cannot destroy what its executor waits for."""
+        """Ignore further messages; rclpy cannot destroy a subscription that is waited for."""
         topic.muted = True
 
     def call(self, kind, name, request, timeout=PATIENCE_S, again=False):
         """
         Call a service and return its answer.
 
-        again: ask once more if there is no answer; for what does the same twice as once.  A node
-        that has ended may be in the graph for seconds, above all of Kilted; until the one that
-        takes its place is found, requests are lost.
+        again: repeat the request if there is no answer; only for idempotent requests.  A node that
+        has ended stays in the graph for seconds, and requests to it are lost.
         """
         new = name not in self._clients
         if new:
             self._clients[name] = self.node.create_client(kind, name)
         client = self._clients[name]
         assert client.wait_for_service(timeout), f'no service {name}'
-        # A server that has not heard of a new client yet gives up its answer after 0.1 s, with
-        # "client will not receive response" (rmw_fastrtps); such a client asks once more.
+        # A server that has not discovered a new client drops its answer after 0.1 s
+        # ("client will not receive response", rmw_fastrtps).
         for patience in (timeout / 10, timeout) if new or again else (timeout,):
             done = threading.Event()
             future = client.call_async(request)
@@ -339,7 +334,7 @@ class Diagnostics:
         self._topic = peer.listen('/diagnostics', DiagnosticArray)
 
     def statuses(self, node):
-        """Return all that the node has said."""
+        """Return all statuses of a node."""
         return [status for message in self._topic.messages() for status in message.status
                 if status.name == node.name.lstrip('/')]
 
@@ -351,7 +346,7 @@ class Diagnostics:
         return wait_for(f'/diagnostics with {what}', newest)
 
     def next(self, node):
-        """Return the numbers of the next status but one: all of it is of later than now."""
+        """Return the numbers of the next status but one, which is measured entirely after now."""
         count = len(self.statuses(node))
         wait_for('two /diagnostics', lambda: len(self.statuses(node)) >= count + 2)
         return numbers(self.statuses(node)[-1])
@@ -362,7 +357,7 @@ class Diagnostics:
 
 
 class DrivenClock:
-    """A /clock [ns] that goes on by 5 ms with every look at what is waited for."""
+    """A /clock [ns] that advances by 5 ms with each check of a condition."""
 
     def __init__(self, peer, now_ns):
         self._peer, self.now_ns = peer, now_ns

@@ -194,10 +194,6 @@ def decoded(path):
     return counts[0]
 
 
-def by_topic_command(peer, node, l3, lz):
-    peer.send_command(node, l3, lz)
-
-
 def by_parameters(peer, node, l3, lz):
     result = peer.set_together(node, spin__l3=l3, spin__lz=lz)
     assert result.successful, result.reason

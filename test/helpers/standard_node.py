@@ -3,16 +3,10 @@
 
 import importlib
 import importlib.util
-import sys
-from types import ModuleType, SimpleNamespace
-
-import rclpy
 
 from helpers import standard_types
-from helpers.node_harness import as_yaml, wait_for
-from spinning_top_sim.nodes import simulation_services
+from helpers.own_node import OwnNode
 from spinning_top_sim.nodes.simulation_handlers import SimulationHandlers
-from spinning_top_sim.nodes.simulator import Simulator
 
 INSTALLED = importlib.util.find_spec('simulation_interfaces') is not None
 KINDS = ('stand-in', 'installed') if INSTALLED else ('stand-in',)
@@ -26,40 +20,27 @@ def types_of(kind):
             for part in ('msg', 'srv', 'action')]
 
 
-class StandardNode:
+class StandardNode(OwnNode):
     """
     The node; `call` calls a handler as the executor calls it, `steps` is an action's coroutine.
 
-    The node starts paused, unless told otherwise.
+    The node starts paused.
     """
 
-    def __init__(self, kind, monkeypatch, folder, **values):
+    def __init__(self, folder, kind='stand-in', **values):
+        super().__init__(folder, start_paused=True, **values)
         self.messages, self.services, self.actions = types_of(kind)
-        package = ModuleType('simulation_interfaces')
-        package.__spec__ = SimpleNamespace()
-        monkeypatch.setitem(sys.modules, 'simulation_interfaces', package)
-        monkeypatch.setattr(simulation_services, 'offer', self._offer)
-        given = {'start_paused': True, 'status_period': 0.0, 'record.uri': f'{folder}/run.mcap',
-                 'record.min_free_bytes': 0,
-                 **{name.replace('__', '.'): value for name, value in values.items()}}
-        options = [item for name, value in given.items()
-                   for item in ('-p', f'{name}:={as_yaml(value)}')]
-        rclpy.init(args=['sim_node', '--ros-args', *options])
-        self.node = Simulator()
+        self._first_values = dict(self.node.start_values)
+        self._forget()
 
-    def _offer(self, node, control, loop, simulation, lock, frame):
-        self.loop, self.simulation = loop, simulation
-        self.handlers = SimulationHandlers(control, loop, simulation, lock, self.messages,
-                                           self.actions, node.get_name(), frame)
+    def _forget(self):
+        self.handlers = SimulationHandlers(self.node, self.messages, self.actions)
 
-    def __enter__(self):
-        self.node.start()
-        return self
-
-    def __exit__(self, *_):
-        self.node.stop()
-        self.node.destroy_node()
-        rclpy.try_shutdown()
+    def renew(self):
+        """Go back to the state after the start."""
+        self.node._session.stop()
+        self.node.start_again(self._first_values, paused=True)
+        self._forget()
 
     def call(self, name, **request):
         """Return the response to a request with these fields."""
@@ -95,16 +76,10 @@ class StandardNode:
         assert self.set_state('PAUSED') == self.messages.Result.RESULT_OK
         return self
 
-    def wait_until(self, t_ns):
-        wait_for(f't = {t_ns} ns', lambda: self.simulation.now_ns >= t_ns)
-
     def steps(self, count):
         """Return a goal of SimulateSteps, and the coroutine that executes it."""
         goal = Goal(self.actions.SimulateSteps.Goal(steps=count))
-        return goal, self.handlers.steps_action(goal)
-
-    def parameter(self, name):
-        return self.node.get_parameter(name).value
+        return goal, self.handlers.simulate_steps(goal)
 
 
 class Goal:

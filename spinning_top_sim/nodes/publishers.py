@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The publishers of the streams of a simulation."""
+
+import importlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+
+from spinning_top_sim.nodes.recording_session import Topic
+from spinning_top_sim.nodes.throttle import TOPICS, Throttle
+from spinning_top_sim.streams import journal
+from spinning_top_sim.streams.live import Output
+from spinning_top_sim.streams.stream import Stream
+
+
+class StreamPublishers:
+    """Holds a publisher for each enabled stream, and a throttle for the topics that have one."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self.by_topic: dict[str, Publisher] = {}
+        self._throttles: dict[str, Throttle] = {}       # by the topic of the stream
+
+    def create(self, message_class: type, topic: str) -> Publisher:
+        """Return a new publisher, whose QoS parameters can override."""
+        return self._node.create_publisher(
+            message_class, topic, QoSProfile(depth=10),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+
+    def open(self, outputs: Sequence[Output], values: Mapping[str, Any]) -> None:
+        """Create the publishers of enabled streams, and destroy those of disabled ones."""
+        for output in outputs:
+            stream = output.stream
+            topic, enabled = stream.topic, journal.is_enabled(stream.parameter, values)
+            if enabled and topic not in self.by_topic:
+                package, _, name = stream.type_name.split('/')
+                message_class = getattr(importlib.import_module(f'{package}.msg'), name)
+                self.by_topic[topic] = self.create(message_class, topic)
+                if topic in TOPICS:
+                    self._throttles[topic] = Throttle(self.create(message_class, TOPICS[topic]))
+            elif topic in self.by_topic and not enabled:
+                output.publish = None
+                self._node.destroy_publisher(self.by_topic.pop(topic))
+                if topic in TOPICS:
+                    self._node.destroy_publisher(self._throttles.pop(topic).publisher)
+
+    def update_subscribers(self, outputs: Sequence[Output]) -> None:
+        """Connect the outputs that have subscribers; a stream without any computes nothing."""
+        for output in outputs:
+            publisher = self.by_topic.get(output.stream.topic)
+            if publisher is not None:
+                sink = publisher.publish if publisher.get_subscription_count() else None
+                throttle = self._throttles.get(output.stream.topic)
+                output.publish = throttle.sink(sink) if throttle else sink
+
+    def flush(self, at_once: bool) -> None:
+        """Publish what throttles hold back, when their rate allows it or at once."""
+        for throttle in self._throttles.values():
+            throttle.flush(at_once)
+
+    def topics_to_record(self, streams: Sequence[Stream]) -> list[Topic]:
+        """Return name, type and QoS of the topics of these streams, then those of the journal."""
+        topics: list[Topic] = []
+        for stream in streams:
+            publisher = self.by_topic[stream.topic]
+            topics.append((publisher.topic_name, stream.type_name, {
+                name: int(getattr(publisher.qos_profile, name)) for name in (
+                    'history', 'depth', 'reliability', 'durability', 'liveliness')}))
+        return topics + [(self._node.resolve_topic_name(name), type_name, {})
+                         for name, type_name in journal.TOPICS]

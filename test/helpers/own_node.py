@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A sim_node in this process without an executor: a test calls what the executor would call."""
+
+import contextlib
+import gc
+import re
+import signal
+import sys
+from types import SimpleNamespace
+
+import rclpy
+from rclpy.parameter import Parameter
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import SetBool, Trigger
+
+from helpers.node_harness import as_yaml, numbers, wait_for
+from spinning_top_sim.nodes.simulator import Simulator
+
+
+class OwnNode:
+    """
+    The node; it runs within the `with`.  In keywords `__` stands for a dot.
+
+    arguments: more of --ros-args;  heard: messages by topic, of those that `listen` names
+    """
+
+    def __init__(self, folder, *arguments, **values):
+        given = {'status_period': 0.0, 'record.uri': f'{folder}/run.mcap',
+                 'record.min_free_bytes': 0, **dotted(values)}
+        options = [item for name, value in given.items()
+                   for item in ('-p', f'{name}:={as_yaml(value)}')]
+        argv = ['sim_node', '--ros-args', *options, *arguments]
+        rclpy.init(args=argv)
+        self.node = Simulator(argv)
+        self.loop, self.simulation = self.node.loop, self.node.simulation
+        self.heard, self._diagnosed = {}, []
+        self.node._diagnostics = SimpleNamespace(publish=self._diagnosed.append)
+
+    def __enter__(self):
+        self.node.start()
+        return self
+
+    def __exit__(self, *_):
+        self.node.stop()
+        self.node.destroy_node()
+        rclpy.try_shutdown()
+
+    def listen(self, *topics):
+        """Let these streams, and no others, have a subscriber."""
+        self.heard |= {topic: [] for topic in topics}
+        self.node._outputs.update_subscribers = lambda streams: [
+            setattr(one, 'publish', self.heard[one.topic].append)
+            for one in streams if one.topic in self.heard]
+        return self
+
+    def set(self, **values):
+        """Set parameters all or none; return the result."""
+        return self.node.set_parameters_atomically([
+            Parameter(name, value=value) for name, value in dotted(values).items()])
+
+    def get(self, *names):
+        return [self.node.get_parameter(name).value for name in names]
+
+    def command(self, *data):
+        self.node._on_command(Float64MultiArray(data=[float(one) for one in data]))
+
+    def switch(self, name, on):
+        return self._serve(SetBool, name, data=on)
+
+    def trigger(self, name):
+        return self._serve(Trigger, name)
+
+    def _serve(self, kind, name, **request):
+        return self.node._serve(getattr(self.node, f'_{name}'), kind.Request(**request),
+                                kind.Response())
+
+    def step(self, count):
+        """Step a paused motion, by 10 ms each; the samples are sent afterwards."""
+        assert self.set(step__count=count).successful
+        answer = self.trigger('step')
+        assert answer.success, answer.message
+
+    def diagnostics(self):
+        """Return level, message and values of a new report."""
+        self.node._publish_diagnostics()
+        (status,) = self._diagnosed[-1].status
+        return status.level[0], status.message, numbers(status)
+
+    def wait_until(self, t_ns):
+        wait_for(f't = {t_ns} ns', lambda: self.simulation.now_ns >= t_ns)
+
+
+def dotted(values):
+    return {name.replace('__', '.'): value for name, value in values.items()}
+
+
+@contextlib.contextmanager
+def as_a_process():
+    """Restore what the `main` of a node changes for all of its process."""
+    handlers = {number: signal.getsignal(number) for number in (
+        signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)}
+    interval = sys.getswitchinterval()
+    try:
+        yield
+    finally:
+        rclpy.try_shutdown()
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        sys.setswitchinterval(interval)
+        gc.unfreeze()
+
+
+def run_main(main, capfd, *arguments):
+    """Run the `main` of a node; return its exit code, and what it has printed."""
+    capfd.readouterr()
+    with as_a_process():
+        try:
+            code = main(['program', *map(str, arguments)])
+        except SystemExit as error:         # of argparse
+            code = error.code
+    printed = capfd.readouterr()
+    return SimpleNamespace(code=code, out=printed.out,
+                           err=re.sub(r'\x1b\[\d*m', '', printed.err))

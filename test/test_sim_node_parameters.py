@@ -1,0 +1,312 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands and parameters of a node: what they do, what is refused, and what the user is told."""
+
+import math
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy')
+
+from helpers.node_harness import wait_for
+from helpers.node_logs import GRAVITY, SECOND, commands_in, log_of, simulated
+from helpers.own_node import OwnNode
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import JointState
+
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.topics import INVARIANTS
+from spinning_top_sim.tools.recorded_run import read_run_description
+
+PERIOD_NS = 10_000_000
+LAMBDA1, LAMBDA3 = 0.123, parameters.checked({})['top.lambda3']
+TORQUE = 2.0 * 0.15 * GRAVITY
+
+
+@pytest.fixture(scope='module')
+def shared(tmp_path_factory):
+    with OwnNode(tmp_path_factory.mktemp('node'), start_paused=True) as node:
+        node.first_values = node.node.start_values
+        yield node
+
+
+@pytest.fixture
+def node(shared, tmp_path):
+    """A paused node at its start."""
+    shared.node._session.stop()
+    shared.node.start_again({**shared.first_values, 'record.uri': str(tmp_path / 'run.mcap')},
+                            paused=True)
+    return shared
+
+
+def recorded(node):
+    """Stop the recording; return the log, and the run computed from its metadata alone."""
+    assert node.switch('record', False).success
+    path = node.get('record.uri')[0]
+    log, metadata = log_of(path)
+    until = max(time for rows in log.values() for time, _ in rows)
+    return log, simulated(log, metadata, until - int(metadata['spinning_top_sim']['epoch_ns']))
+
+
+# ------------------------------------------------------------------------------- commands
+
+def euler(start, l3, lz, span):
+    """Follow (phi, theta, psi, theta') by eqs. (29)-(32) with classical Runge-Kutta."""
+    def rates(y):
+        _, theta, _, theta_dot = y
+        sine, cosine = math.sin(theta), math.cos(theta)
+        phi_dot = (lz - l3 * cosine) / (LAMBDA1 * sine * sine)
+        bend = sine / LAMBDA1 * (LAMBDA1 * phi_dot * phi_dot * cosine - l3 * phi_dot + TORQUE)
+        return np.array([phi_dot, theta_dot, l3 / LAMBDA3 - phi_dot * cosine, bend])
+
+    steps = 200
+    h, y = span / steps, start
+    for _ in range(steps):
+        k1 = rates(y)
+        k2 = rates(y + 0.5 * h * k1)
+        k3 = rates(y + 0.5 * h * k2)
+        k4 = rates(y + h * k3)
+        y = y + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+    return y
+
+
+def as_message(node, l3, lz):
+    node.command(l3, lz)
+
+
+def as_parameters(node, l3, lz):
+    assert node.set(spin__l3=l3, spin__lz=lz).successful
+
+
+@pytest.mark.parametrize(('command', 'l3', 'lz'), [
+    (as_message, 1.25, 0.75), (as_parameters, 2, 0)])
+def test_a_command_sets_the_momenta_and_nothing_jumps(node, command, l3, lz):
+    """An impulsive torque: attitude and nutation rate go on, L3 and Lz are the commanded ones."""
+    assert node.switch('record', True).success
+    node.step(50)
+    at_ns = node.simulation.epoch_ns + node.simulation.now_ns
+    command(node, l3, lz)
+    assert node.get('spin.l3', 'spin.lz') == [l3, lz]
+    node.step(50)
+    log, computed = recorded(node)
+    assert [momenta for _, *momenta in commands_in(log)] == [[l3, lz]]
+    for topic in ('pose', 'joint_states', 'ground_truth/odom'):
+        assert log[f'/{topic}'] == computed[topic][:len(log[f'/{topic}'])]
+        assert len(log[f'/{topic}']) == 101
+    joints = [deserialize_message(data, JointState) for _, data in log['/joint_states']]
+    position = np.array([m.position for m in joints])
+    velocity = np.array([m.velocity for m in joints])
+    # Before the command is the state at t = 0.5 s; equations (29)-(32) lead on from there.
+    before = np.array([*position[50], velocity[50, 1]])
+    assert log['/joint_states'][50][0] == at_ns
+    after = np.array([*position[51], velocity[51, 1]])
+    assert np.abs(euler(before, l3, lz, PERIOD_NS / SECOND) - after).max() < 1e-9
+    # phi' and psi' follow eq. (31) with the old momenta up to the command, then with the new.
+    for rows, momenta in ((slice(51), (1.6, 1.6 * math.cos(math.pi / 6))), (slice(51, 101),
+                                                                          (l3, lz))):
+        theta = position[rows, 1]
+        phi_dot = (momenta[1] - momenta[0] * np.cos(theta)) / (LAMBDA1 * np.sin(theta) ** 2)
+        assert np.abs(velocity[rows, 0] - phi_dot).max() < 1e-8
+        psi_dot = momenta[0] / LAMBDA3 - phi_dot * np.cos(theta)
+        assert np.abs(velocity[rows, 2] - psi_dot).max() < 1e-8
+    q = np.array([np.frombuffer(data[-32:], '<f8') for _, data in log['/pose']])
+    assert (np.sum(q[1:] * q[:-1], axis=1) > 0.99).all()
+    invariants = np.frombuffer(log['/spinning_top/invariants'][-1][1][-8 * len(INVARIANTS):])
+    assert np.abs(invariants[1:3] - (l3, lz)).max() < 1e-11
+
+
+REFUSED_COMMANDS = {
+    (): '0 values', (1.0, 1.0, 1.0): '3 values', (math.nan, 1.0): 'nan', (1.0, -math.inf): 'inf',
+    (1e300, 1e300): '1e+300', (1e20, 1.0): '1e+20', (-1e150, 1e15): '1e+150'}
+REFUSED_PARAMETERS = [
+    ({'spin__l3': math.nan}, 'nan'), ({'spin__l3': 1e20, 'spin__lz': 1.0}, '1e+20'),
+    ({'spin__l3': 'fast'}, 'fast'), ({'spin__l3': True}, 'True'), ({'pose__enabled': 1}, '1'),
+    ({'top__lambda1': 0.0}, '0.0'), ({'top__lambda3': -2}, '-2.0'),
+    ({'top__mass': 1e300, 'top__gravity': 1e300}, '1e+300'), ({'imu__rate': 1e5}, '1000'),
+    ({'time_scale': math.inf}, 'inf'), ({'solver__method': 'magic'}, 'magic'),
+    ({'imu__lever_arm': [0.0, 1.5]}, 'imu.lever_arm = [0.0, 1.5]: must be'),
+    ({'record__streams': ['pose', 'poise']}, 'poise'), ({'step__count': 1.5}, '1.5'),
+    ({'max_error': '1e-9x'}, '1e-9x'), ({'initial__theta': 4.0, 'pose__rate': 50.0}, '4.0'),
+    ({'use_sim_time': True}, 'use_sim_time = True: cannot be changed')]
+
+
+def test_refused_commands_and_parameters_change_nothing(node, capfd):
+    """Each is refused with the value named; the motion is to the bit the undisturbed one."""
+    assert node.switch('record', True).success
+    node.step(10)
+    before, rejected = (node.node.values, node.loop.commands), node.loop.rejected_commands
+    for data, named in REFUSED_COMMANDS.items():
+        node.command(*data)
+        assert named in capfd.readouterr().err, data
+    assert node.loop.rejected_commands == rejected + len(REFUSED_COMMANDS)
+    for given, named in REFUSED_PARAMETERS:
+        result = node.set(**given)
+        assert not result.successful, given
+        assert named in result.reason, (given, result.reason)
+        assert next(iter(given)).split('__')[-1] in result.reason, (given, result.reason)
+    assert not node.set(world_frame='map').successful, 'read-only'
+    spins = sum(any('spin__' in key for key in given) for given, _ in REFUSED_PARAMETERS)
+    assert node.loop.rejected_commands == rejected + len(REFUSED_COMMANDS) + spins
+    assert (node.node.values, node.loop.commands) == before
+    node.step(10)
+    log, computed = recorded(node)
+    assert commands_in(log) == []
+    assert log['/joint_states'] == computed['joint_states']
+
+
+def test_at_a_pole_only_the_possible_commands_are_taken(node, capfd):
+    assert node.set(initial__theta=0.0, spin__l3=3.0, spin__lz=3.0).successful
+    assert node.trigger('reset').success
+    before, segment = node.loop.rejected_commands, node.simulation.segment
+    for l3, lz in ((3.0, 2.0), (-3.0, 3.0)):
+        node.command(l3, lz)
+        result = node.set(spin__l3=l3, spin__lz=lz)
+        assert not result.successful and 'pole' in result.reason and repr(lz) in result.reason
+    alone = node.set(spin__l3=2.0)
+    assert 'ros2 topic pub --once /spinning_top/commands' in alone.reason
+    assert '/spinning_top/set_parameters_atomically' in alone.reason
+    assert node.loop.rejected_commands == before + 5
+    assert node.simulation.segment is segment
+    node.command(2.0, 2.0)
+    assert (node.simulation.l3, node.simulation.lz) == (2.0, 2.0)
+
+
+# ------------------------------------------------------------------ the spin and the start
+
+def test_parameters_are_checked_where_the_top_is_now_not_where_it_began(node):
+    """Begun upright but falling: off the pole Lz is free, and other parameters go on changing."""
+    assert node.set(initial__theta=0.0, initial__theta_dot=1.0, spin__l3=0.5,
+                    spin__lz=0.5).successful
+    assert node.trigger('reset').success
+    node.step(30)
+    as_parameters(node, 2.0, 0.3)
+    assert node.get('spin.l3', 'spin.lz') == [2.0, 0.3]
+    assert node.set(pose__rate=50.0).successful
+    assert node.trigger('reset').success
+    assert node.get('spin.l3', 'spin.lz') == [0.5, 0.5]
+
+
+def test_an_unset_lz_is_the_cusp_of_the_tilt_at_the_reset(node):
+    for theta in (1.0, 0.0):
+        assert node.set(initial__theta=theta).successful
+        assert node.trigger('reset').success
+        assert node.get('spin.lz') == [1.6 * math.cos(theta)]
+
+
+def test_a_spin_with_the_initial_state_is_that_of_the_next_start(node):
+    commands = node.loop.commands
+    # Upright, where the present Lz is impossible; and away from the pole, where 2.0 is now.
+    for theta, l3, lz in ((0.0, 2.0, 2.0), (0.5, 1.0, 0.4)):
+        result = node.set(initial__theta=theta, spin__l3=l3, spin__lz=lz)
+        assert result.successful, result.reason
+        assert node.trigger('reset').success
+        assert node.get('initial.theta', 'spin.l3', 'spin.lz') == [theta, l3, lz]
+    assert 'pole' in node.set(initial__theta=0.0, spin__l3=1.0).reason
+    assert node.loop.commands == commands
+    as_parameters(node, 2.0, 0.3)         # without `initial.*`, a command
+    assert node.loop.commands == commands + 1
+    assert node.trigger('reset').success
+    assert node.get('spin.l3', 'spin.lz') == [1.0, 0.4]
+
+
+def test_a_log_can_be_read_that_begins_between_a_new_start_and_its_reset(node):
+    # Upright; what moves now has an Lz that is not possible there.
+    assert node.set(initial__theta=0.0).successful
+    assert node.switch('record', True).success
+    assert node.trigger('reset').success
+    assert node.switch('record', False).success
+    with LogReader(node.get('record.uri')[0]) as reader:
+        assert read_run_description(reader).values_at_recording['initial.theta'] == 0.0
+
+
+# ------------------------------------------------------------------------ other parameters
+
+def test_a_new_rate_holds_on_its_grid_at_once(node):
+    assert node.switch('record', True).success
+    node.step(7)
+    assert node.set(pose__rate=25).successful           # an integer for a double
+    assert node.get('pose.rate') == [25.0]
+    node.step(13)
+    log, _ = recorded(node)
+    times = [time - node.simulation.epoch_ns for time, _ in log['/pose']]
+    assert times == [*range(0, 70_000_001, PERIOD_NS), 80_000_000, 120_000_000, 160_000_000,
+                     200_000_000]
+
+
+def test_texts_that_are_numbers_are_taken_as_ros2_param_sends_them(node):
+    """YAML 1.1 takes 1e-9 for a text, and so do `ros2 param set` and `ros2 param load`."""
+    assert node.set(max_error='1e-9', imu__gyroscope_noise_density='5e-5', duration=0,
+                    imu__lever_arm=['1e-2', '0', '2e0']).successful
+    assert node.get('max_error', 'imu.gyroscope_noise_density', 'duration') == [1e-9, 5e-5, 0.0]
+    assert list(node.get('imu.lever_arm')[0]) == [0.01, 0.0, 2.0]
+
+
+def test_what_waits_for_a_reset_or_a_recording_is_said_when_it_is_set(node, capfd):
+    assert node.set(top__mass=2.5, initial__phi=1.0, pose__rate=50.0,
+                    record__max_loss=1.0).successful
+    said = capfd.readouterr().err
+    assert 'initial.phi, top.mass: a change takes effect at the next ~/reset' in said
+    assert 'record.max_loss: a change takes effect at the next start of a recording' in said
+    assert 'pose.rate' not in said
+    assert node.set(top__mass=2.5, imu__lever_arm=[0.0, 0.0, 1.0]).successful
+    assert ': imu.lever_arm: a change takes' in capfd.readouterr().err, 'mass is not new'
+
+
+def test_means_or_increments_in_use_keep_the_imu_at_a_hertz(node):
+    for before, after in (({'imu__sampling': 'mean'}, {'imu__sampling': 'instant'}),
+                          ({'increments__enabled': True}, {'increments__enabled': False})):
+        assert node.set(**before).successful
+        assert node.trigger('reset').success
+        assert node.switch('record', True).success
+        assert node.set(**after).successful
+        assert 'imu.rate = 0.5: must be >= 1 while means' in node.set(imu__rate=0.5).reason
+        assert node.switch('record', False).success
+        assert node.set(record__uri=node.get('record.uri')[0] + '.2').successful
+        assert node.trigger('reset').success
+        assert node.set(imu__rate=0.5).successful
+        assert node.set(imu__rate=200.0).successful
+
+
+def test_streams_can_be_switched_off_and_on_and_only_subscribers_make_work(node):
+    assert node.set(pose__enabled=False).successful
+    assert '/pose' not in {name for name, _ in node.node.get_publisher_names_and_types_by_node(
+        'spinning_top', '/')}
+    assert node.set(pose__enabled=True).successful
+    pose = next(one for one in node.simulation.streams if one.topic == 'pose')
+    encoded, encode = [], pose.encode
+    pose.encode = lambda *given: encoded.append(given) or encode(*given)
+    node.step(5)
+    assert encoded == [] and pose.publish is None
+    kind = type(node.node._outputs.by_topic['pose'].msg_type())
+    subscription = node.node.create_subscription(kind, 'pose', print, 10)
+    wait_for('a subscriber', node.node._outputs.by_topic['pose'].get_subscription_count)
+    node.step(5)
+    assert encoded and pose.publish is not None
+    assert node.set(pose__enabled=False).successful
+    assert pose.publish is None
+    node.node.destroy_subscription(subscription)
+    del pose.encode
+
+
+def test_parameters_are_described(node):
+    """What `ros2 param describe` shows: text with unit, range and effect, and what is allowed."""
+    names = list(parameters.BY_NAME)
+    found = node.node.describe_parameters(names)
+    assert [descriptor.name for descriptor in found] == names
+    for descriptor, parameter in zip(found, parameters.TABLE, strict=True):
+        assert parameter.text in descriptor.description
+        assert f'[{parameter.unit}]' in descriptor.description or not parameter.unit
+        assert parameter.effect.value in descriptor.description
+        assert 'must' not in descriptor.description, 'what is allowed is a constraint'
+        assert descriptor.read_only == (parameter.effect is parameters.Effect.START)
+        bounded = [bound for bound in (parameter.minimum, parameter.above, parameter.maximum)
+                   if bound is not None]
+        ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
+        assert len(ranges) == (len(bounded) == 2), parameter.name
+        for limits in ranges:
+            assert [limits.from_value, limits.to_value] == bounded, parameter.name
+        said = descriptor.additional_constraints
+        assert said == (parameter.allowed if not ranges else f'must be > {parameter.above:g}'
+                        if parameter.above is not None else
+                        f'must be 0 or >= {parameter.smallest:g}' if parameter.smallest else '')

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""simulation_interfaces of nodes that end, or that have not begun; and where it is offered."""
+
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip('rclpy')
+
+from helpers.own_node import as_a_process
+from helpers.standard_node import StandardNode, finished
+
+from spinning_top_sim.nodes import sim_node, simulation_handlers
+
+FAILED, INCORRECT_STATE, STOPPED, QUITTING, TRANSITION_ERROR = 4, 3, 0, 3, 102
+ENDS = '`duration` ends before the steps do'
+
+
+def test_before_the_clock_nothing_can_be_set(tmp_path):
+    with StandardNode(tmp_path, use_sim_time=True) as top:
+        assert top.state == STOPPED
+        for name in ('PLAYING', 'PAUSED'):
+            assert top.set_state(name) == TRANSITION_ERROR
+        world = top.messages.Resource(uri='looping')
+        for expected, name, request in (
+                (FAILED, 'StepSimulation', {'steps': 1}),
+                (INCORRECT_STATE, 'ResetSimulation', {'scope': 0}),
+                (INCORRECT_STATE, 'LoadWorld', {'world_resource': world}),
+                (INCORRECT_STATE, 'SetEntityState', {'entity': 'spinning_top'})):
+            code, text = top.refused(name, **request)
+            assert (code, text) == (expected, 'waiting for /clock (use_sim_time is set)')
+
+
+def test_steps_beyond_the_duration_say_so(tmp_path):
+    with StandardNode(tmp_path, duration=0.05) as top:
+        goal, coroutine = top.pause().steps(9)
+        assert finished(coroutine).result.error_message == (
+            f'interrupted after 5 of 9 steps: {ENDS}')
+        assert (goal.end, top.state) == ('aborted', QUITTING)
+    with StandardNode(tmp_path, duration=0.05) as top:
+        assert top.pause().refused('StepSimulation', steps=6) == (
+            FAILED, f'at t = 0.050000000 s: {ENDS}')
+
+
+@pytest.mark.parametrize(('installed', 'wanted'), [(True, True), (False, True), (True, False)])
+def test_it_is_offered_where_it_is_installed_and_not_switched_off(
+        monkeypatch, installed, wanted):
+    offered = []
+    monkeypatch.setattr(sim_node, 'find_spec', lambda name: installed or None)
+    monkeypatch.setattr(simulation_handlers, 'offer', offered.append)
+    argv = ['sim_node', '--ros-args', '-p', f'simulation_interfaces:={str(wanted).lower()}']
+    with as_a_process():
+        import rclpy
+        rclpy.init(args=argv)
+        node = sim_node._prepare(argv)()
+        assert offered == ([node] if installed and wanted else [])
+        node.stop()
+        node.destroy_node()
+
+
+def test_services_and_action_are_created_as_far_as_the_package_has_them(monkeypatch):
+    """An older version lacks some services."""
+    created, servers = [], []
+    package = {f'simulation_interfaces.{part}': SimpleNamespace(**content) for part, content in {
+        'msg': {}, 'srv': {'GetEntities': 'kind', 'StepSimulation': 'kind'},
+        'action': {'SimulateSteps': 'kind'}}.items()}
+    monkeypatch.setattr(simulation_handlers.importlib, 'import_module', package.__getitem__)
+    monkeypatch.setattr(simulation_handlers, 'SimulationHandlers', lambda *_: SimpleNamespace(
+        serve=lambda name, *_: name, simulate_steps='steps'))
+    monkeypatch.setattr(simulation_handlers, 'ActionServer', lambda *given, **_: servers.append(
+        given))
+    node = SimpleNamespace(create_service=lambda *given: created.append(given))
+    simulation_handlers.offer(node)
+    assert [(name, serve(None, None)) for _, name, serve in created] == [
+        ('step_simulation', 'StepSimulation'), ('get_entities', 'GetEntities')]
+    assert servers == [(node, 'kind', 'simulate_steps', 'steps')]
