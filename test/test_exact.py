@@ -122,7 +122,7 @@ def test_phases_do_not_drift_in_ten_years(case):
 
 def decimal_quaternion(motion, t):
     """Evaluate the solution at t seconds in long decimals; x, y, z, w."""
-    with precision(motion.digits):
+    with precision(60):
         phase = motion.quarter0 + motion.offset0 + motion.quarter_rate * t
         quarters = int(phase.to_integral_value())
         y = (phase - quarters) * pi() / 2
@@ -136,10 +136,9 @@ def decimal_quaternion(motion, t):
         values = []
         for factor in (motion.alpha, motion.beta):
             real, imag = factor.parts[quarters % 2]
-            real = factor.sign * real.at(*point)
+            real, imag = real.at(*point), imag.at(*point)
             if factor.crosses and quarters % 4 >= 2:
                 real = -real
-            imag = factor.sense * imag.at(*point) if imag else Decimal(0)
             angle = factor.rate * t + 2 * pi() * factor.phase_turns + factor.drift * y
             s, c = sin_cos(angle)
             values.append((real * c - imag * s, real * s + imag * c))

@@ -13,6 +13,7 @@ from functools import lru_cache
 
 ZERO, ONE = Decimal(0), Decimal(1)
 HALVINGS = 8
+SMALL = Decimal('1e-9')
 
 
 def precision(digits: int) -> AbstractContextManager[Context]:
@@ -65,10 +66,16 @@ def atan2(y: Decimal, x: Decimal) -> Decimal:
     return guess + rest + rest ** 3 / 6 + 3 * rest ** 5 / 40
 
 
-def reduced_turns(radians: Decimal) -> Decimal:
-    """Return an angle of any size in turns, less its whole turns: in [-1/2, 1/2]."""
-    with localcontext(prec=getcontext().prec + max(0, radians.adjusted())):
-        rest = (radians / (2 * pi())).remainder_near(ONE)
+def asinh(x: Decimal) -> Decimal:
+    """Return the inverse of sinh for x >= 0, to 30 digits of 40."""
+    return x - x ** 3 / 6 if x < SMALL else (x + (x * x + 1).sqrt()).ln()
+
+
+def half_turns(radians: float) -> Decimal:
+    """Return half an angle of any size in turns, less whole turns: in [-1/2, 1/2]."""
+    exact = Decimal(radians)
+    with localcontext(prec=getcontext().prec + max(0, exact.adjusted())):
+        rest = (exact / (4 * pi())).remainder_near(ONE)
     return +rest
 
 

@@ -19,7 +19,7 @@ from spinning_top_sim.physics.regimes import Description, axis_rests, precession
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.decimal_math import pi, precision
-from spinning_top_sim.solvers.theta_setup import ThetaMotion, set_up
+from spinning_top_sim.solvers.theta_setup import DIGITS, ThetaMotion, set_up
 from spinning_top_sim.solvers.theta_values import MOST, ThetaFunctions, ThetaValues, in_range
 from spinning_top_sim.solvers.times import LARGEST_NS, Times
 
@@ -83,7 +83,7 @@ class ExactSolution:
             theta_dot=-start.theta_dot if self._mirrored else start.theta_dot,
             phi=start.phi + half_turn, psi=start.psi - half_turn, l3=start.l3, lz=start.lz)
         motion = set_up(top, start)
-        with precision(motion.digits):
+        with precision(DIGITS):
             self._take_constants(motion)
         self._check_start()
 
@@ -101,15 +101,13 @@ class ExactSolution:
         in_range('the rate of (phi - psi)/2', beta.rate)
         self.mean_precession_rate = in_range('mean precession rate', alpha.rate + beta.rate)
         self.mean_spin_rate = in_range('mean spin rate', alpha.rate - beta.rate)
-        self.theta_min, self.theta_max = (
-            2.0 * math.atan2(sine, cosine) for sine, cosine in motion.half_angles)
-
         l3, lz = Decimal(start.l3), Decimal(start.lz)
         two_lambda1, two_pi = 2 * Decimal(top.lambda1), 2 * pi()
         self._bottom_rate = in_range('(lz + l3)/(2 lambda1)', (lz + l3) / two_lambda1)
         self._top_rate = in_range('(lz - l3)/(2 lambda1)', (lz - l3) / two_lambda1)
         in_range('l3/lambda3', l3 / Decimal(top.lambda3))
         self._theta = ThetaFunctions(motion, start.theta)
+        self.theta_min, self.theta_max = self._theta.bounds.tolist()
         # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
         self._phi_phase = float(Decimal(start.phi) - alpha.start_argument - beta.start_argument)
         self._psi_phase = float(Decimal(start.psi) - alpha.start_argument + beta.start_argument)
