@@ -96,23 +96,21 @@ class ExactSolution:
         # 2 K/w, two quarter periods
         self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
         alpha, beta = motion.alpha, motion.beta
-        in_range('the rate of the nutation', motion.quarter_rate)
-        in_range('the rate of (phi + psi)/2', alpha.rate)
-        in_range('the rate of (phi - psi)/2', beta.rate)
-        self.mean_precession_rate = in_range('mean precession rate', alpha.rate + beta.rate)
-        self.mean_spin_rate = in_range('mean spin rate', alpha.rate - beta.rate)
-        l3, lz = Decimal(start.l3), Decimal(start.lz)
-        two_lambda1, two_pi = 2 * Decimal(top.lambda1), 2 * pi()
-        self._bottom_rate = in_range('(lz + l3)/(2 lambda1)', (lz + l3) / two_lambda1)
-        self._top_rate = in_range('(lz - l3)/(2 lambda1)', (lz - l3) / two_lambda1)
-        in_range('l3/lambda3', l3 / Decimal(top.lambda3))
+        l3, lz, two_lambda1 = Decimal(start.l3), Decimal(start.lz), 2 * Decimal(top.lambda1)
+        bottom_rate, top_rate = (lz + l3) / two_lambda1, (lz - l3) / two_lambda1
+        in_range('the fastest rate', max(map(abs, (
+            motion.quarter_rate, alpha.rate, beta.rate, bottom_rate, top_rate,
+            l3 / Decimal(top.lambda3)))))
+        self.mean_precession_rate = float(alpha.rate + beta.rate)
+        self.mean_spin_rate = float(alpha.rate - beta.rate)
+        self._bottom_rate, self._top_rate = float(bottom_rate), float(top_rate)
         self._theta = ThetaFunctions(motion, start.theta)
         self.theta_min, self.theta_max = self._theta.bounds.tolist()
         # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
         self._phi_phase = float(Decimal(start.phi) - alpha.start_argument - beta.start_argument)
         self._psi_phase = float(Decimal(start.psi) - alpha.start_argument + beta.start_argument)
-        fastest = max(abs(motion.quarter_rate), abs(alpha.rate / two_pi), abs(beta.rate / two_pi),
-                      Decimal('1e-300'))
+        fastest = max(abs(motion.quarter_rate), abs(alpha.rate) / (2 * pi()),
+                      abs(beta.rate) / (2 * pi()), Decimal('1e-300'))
         limit = min(Decimal(MOST_TURNS) / fastest, MOST)
         self.time_limit, self.ns_limit = float(limit), min(int(limit * 10 ** 9), LARGEST_NS)
 

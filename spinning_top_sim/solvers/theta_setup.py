@@ -179,7 +179,7 @@ def _set_up(top: Top, start: State) -> ThetaMotion:
              _Side(lz - l3, -spin, phi - psi, sin_half, cos_half * theta_dot))
     f0, f1, f2, f3 = nutation_cubic(lambda1, torque, l3, lz, theta_dot, sin_half, cos_half)
     if not f0 and not f1:
-        return ThetaMotion(*(_resting(side, lambda1) for side in sides))
+        return ThetaMotion(_resting(sides[0], lambda1), _resting(sides[1], lambda1))
     # theta -> pi - theta leaves P >= 0, and exchanges alpha and beta.
     sense = -1 if torque < 0 else 1
     return _nutating(sides[::sense], lambda1, sense, (
@@ -199,8 +199,7 @@ def _nutating(sides: Sides, lambda1: Decimal, sense: int,
               cubic: tuple[Decimal, Decimal, Decimal, Decimal], falling: bool) -> ThetaMotion:
     """Return a motion with P >= 0; with sense -1 that of which this is the mirror image."""
     roots, f3 = cubic_roots(*cubic), cubic[3]
-    y1, y2, y3, gap21, gap32 = roots
-    gap31 = y3 - y1
+    gap21, gap31, gap32 = roots.gap21, roots.gap31, roots.gap32
     imaginary = gap21 > gap32
     poles = _poles(sides, roots, lambda1 ** 2 * f3, imaginary)
     with precision(DIGITS):
@@ -221,8 +220,9 @@ def _nutating(sides: Sides, lambda1: Decimal, sense: int,
                                    (direction * sin, cos, xi)))
         scale = sense * (f3 * gap31).sqrt() / 2 * gap21         # w (u2 - u1)
         even, odd = form.slopes_of_sn2()
+        alpha, beta = factors[::sense]
         return ThetaMotion(
-            *factors[::sense], imaginary=imaginary, stretch=stretch,
+            alpha, beta, imaginary=imaginary, stretch=stretch,
             # w/K, where w = sqrt(f3 (u3 - u1))/2 and K = (pi/2) sqrt(u3 - u1)/M
             quarter_rate=f3.sqrt() * mean.mean / pi(), quarter0=quarter0, offset0=y0 * 2 / pi(),
             u_dot=(scale * even, scale * odd), u_dot_series=form.theta1,
@@ -313,7 +313,11 @@ def _factor(form: ThetaForm, side: _Side, pole: _Pole, rate: Decimal, quarters: 
     # alpha is largest at u2, where N is odd, and beta at u1: both at the centre of theta2.
     scale *= (form.theta4 if pole.is_beta else form.theta3).leading / second[0].leading
     first_scale = scale * form.odd_over_even if pole.is_beta else scale
-    parts = (tuple(part.scaled(first_scale) for part in first),
-             tuple(part.scaled(scale) for part in second))
+    parts = (_scaled(first, first_scale), _scaled(second, scale))
     return Factor(rate, side.turns - argument / (2 * pi()), drift,
                   parts[::-1] if pole.is_beta else parts, sense, crosses, argument)
+
+
+def _scaled(parts: Parts, scale: Decimal) -> Parts:
+    real, imag = parts
+    return real.scaled(scale), imag.scaled(scale)

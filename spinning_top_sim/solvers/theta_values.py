@@ -57,12 +57,10 @@ class ThetaFunctions:
     def __init__(self, motion: ThetaMotion, start_theta: float) -> None:
         factors = motion.alpha, motion.beta
         self.rates = Rates([motion.quarter_rate, *(x.rate / pi() for x in factors)])
-        rotations = [factor.phase_turns * 2 for factor in factors]
-        whole = [x.to_integral_value() for x in rotations]
-        self.start_whole = _column((motion.quarter0, *(int(x) % 2 for x in whole)))
-        offsets = [motion.offset0, *(x - y for x, y in zip(rotations, whole, strict=True))]
-        self.offset, self.offset_rest = map(
-            _column, zip(*map(double_double, offsets), strict=True))
+        whole = [motion.quarter0, *(round(2 * x.phase_turns) for x in factors)]
+        rest = [motion.offset0, *(2 * x.phase_turns - round(2 * x.phase_turns) for x in factors)]
+        self.start_whole = _column(whole)
+        self.offset, self.offset_rest = map(_column, zip(*map(double_double, rest), strict=True))
         self.drifts = _column(0.5 * float(factor.drift) for factor in factors)
         self.stretch = QUARTER * float(motion.stretch) if motion.imaginary else None
         rows = [[one[part] for one in factor.parts] for part in (0, 1) for factor in factors]
@@ -77,12 +75,14 @@ class ThetaFunctions:
                                for x in motion.u_dot])
         self.u_dot_coefficients = _coefficients([[motion.u_dot_series]])[:, 0]
         # The rows where y = 0, at N = 0 and N = 1.
-        rows = np.where(np.array(self.prefactors) < SIN_ODD, self.coefficients[-1], 0.0)
-        self.bounds = np.sort(2.0 * np.arctan2(np.hypot(rows[1], rows[3]),
-                                               np.hypot(rows[0], rows[2])))
-        self.planar_rotation, self.turns0 = None, 0.0
+        alpha, beta, alpha_imag, beta_imag = np.where(
+            np.array(self.prefactors) < SIN_ODD, self.coefficients[-1], 0.0)
+        self.bounds = np.sort(2.0 * np.arctan2(np.hypot(beta, beta_imag),
+                                               np.hypot(alpha, alpha_imag)))
+        self.planar_rotation: tuple[float, float] | None = None
+        self.turns0 = 0.0
         if len(self.zeros) == 2:
-            first, second = np.arctan2(rows[1], rows[0]) / QUARTER
+            first, second = (np.arctan2(beta, alpha) / QUARTER).tolist()
             self.planar_rotation = first, (second - first + 2.0) % 4.0 - 2.0
             self.turns0 = round(self.turns(motion.quarter0, float(motion.offset0),
                                            0.5 * start_theta))
@@ -93,6 +93,7 @@ class ThetaFunctions:
 
         Through both poles theta/2 stays within a quarter turn of (pi/2) (i + j Z).
         """
+        assert self.planar_rotation is not None
         i, j = self.planar_rotation
         steady = QUARTER * (i + j * quarters) + QUARTER * j * offset
         return (steady - half_theta) / (2.0 * math.pi) - self.turns0
