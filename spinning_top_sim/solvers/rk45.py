@@ -16,7 +16,13 @@ from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers import dormand_prince
 from spinning_top_sim.solvers.dormand_prince import Equations, IntegrationError, Rows
-from spinning_top_sim.solvers.equations import EulerEquations, TransportEquations, Unknowns
+from spinning_top_sim.solvers.equations import (
+    POLE_SHARE,
+    EulerEquations,
+    TransportEquations,
+    Unknowns,
+    half_axis,
+)
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.times import NANOSECONDS, Times
 from spinning_top_sim.solvers.unwrap import PhaseUnwrapper
@@ -204,27 +210,28 @@ class _TransportStates(States):
     @cached_property
     def _projected(self) -> Unknowns:
         """The unknowns on the invariants, in the body's own frame."""
-        equations = self._equations
-        if self._of_alpha.crosses or self._of_beta.crosses:
-            projected = equations.project_through_poles(self._stepped, *self._moduli_and_phases(
-                self._stepped, equations.uniform_rates[0]))
-        else:
-            projected = equations.project_columns(self._stepped)
-        a, b, c, d, m_real, m_imag = projected
+        equations, y, pole_share = self._equations, self._stepped, POLE_SHARE
+        if self._of_alpha.crosses or self._of_beta.crosses:     # the meridian of the axis is known
+            y, pole_share = self._on_lines(y, equations.uniform_rates[0] * self.t), 0.0
+        a, b, c, d, m_real, m_imag = equations.project_columns(y, pole_share)
         spin = 0.5 * equations.spin_rate * self.t
         cosine, sine = np.cos(spin), np.sin(spin)
         return Unknowns(a * cosine - b * sine, b * cosine + a * sine,
                         c * cosine + d * sine, d * cosine - c * sine, m_real, m_imag)
 
-    def _moduli_and_phases(self, y: Unknowns, uniform_rate: float,
-                           ) -> tuple[Column, Column, Column, Column]:
-        """Return signed moduli and phases of alpha and beta in a frame of this uniform rate."""
-        uniform = uniform_rate * self.t
-        of_alpha = y.alpha_real, y.alpha_imag, uniform
-        of_beta = y.beta_real, y.beta_imag, -uniform
-        return (self._of_alpha.modulus(*of_alpha), self._of_beta.modulus(*of_beta),
-                self._of_alpha.at(*of_alpha, self._begins[0]),
-                self._of_beta.at(*of_beta, self._begins[1]))
+    def _on_lines(self, y: Unknowns, uniform: Column) -> Unknowns:
+        """Return y with alpha or beta moved onto the line through zero, and m turned with them."""
+        moved = (*self._of_alpha.on_line(*y[:2], uniform),
+                 *self._of_beta.on_line(*y[2:4], -uniform))
+        x, z = half_axis(*y[:4])
+        u, v = half_axis(*moved)
+        # Next to the pole m is known better than the axis.
+        away = x * x + z * z > POLE_SHARE
+        scale = np.where(away, np.hypot(x, z) * np.hypot(u, v), 1.0)
+        cosine = np.where(away, (x * u + z * v) / scale, 1.0)
+        sine = np.where(away, (x * v - z * u) / scale, 0.0)
+        return Unknowns(*moved, y.m_real * cosine - y.m_imag * sine,
+                        y.m_real * sine + y.m_imag * cosine)
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:
@@ -238,9 +245,12 @@ class _TransportStates(States):
 
     @cached_property
     def angles(self) -> tuple[Column, Column, Column]:
-        cosine, sine, half_sum, half_difference = self._moduli_and_phases(
-            self._projected, self._equations.uniform_rates[1])
-        half = np.arctan2(sine, cosine)
+        y, uniform = self._projected, self._equations.uniform_rates[1] * self.t
+        of_alpha = y.alpha_real, y.alpha_imag, uniform
+        of_beta = y.beta_real, y.beta_imag, -uniform
+        half_sum = self._of_alpha.at(*of_alpha, self._begins[0])
+        half_difference = self._of_beta.at(*of_beta, self._begins[1])
+        half = np.arctan2(self._of_beta.modulus(*of_beta), self._of_alpha.modulus(*of_alpha))
         # theta/2 turns by less than half a turn within a step.
         half = half + math.tau * np.rint((self._begins[2] - half) / math.tau)
         return half_sum + half_difference, 2.0 * half, half_sum - half_difference

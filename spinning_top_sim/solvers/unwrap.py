@@ -32,12 +32,8 @@ def turns_to_follow(phase: Column, before: Column, momentum: float) -> Column:
     In the sense of `momentum` it then lies within (-pi/2, 3 pi/2) from there: backwards by
     rounding at most.  Without a sense (momentum 0) it is the nearest.
     """
-    turned = phase - before
-    if momentum > 0.0:
-        return 0.0 - np.floor((turned + 0.5 * math.pi) / math.tau)
-    if momentum < 0.0:
-        return 0.0 - np.ceil((turned - 0.5 * math.pi) / math.tau)
-    return 0.0 - np.rint(turned / math.tau)
+    ahead = 0.5 * math.pi * ((momentum > 0.0) - (momentum < 0.0))
+    return 0.0 - np.rint((phase - before - ahead) / math.tau)
 
 
 def unwrap(phases: Column, before: float, momentum: float) -> Column:
@@ -73,6 +69,13 @@ class Phase:
             phase = self.start + uniform
             return real * np.cos(phase) + imag * np.sin(phase)
         return self.sign * np.hypot(real, imag)
+
+    def on_line(self, real: Column, imag: Column, uniform: Column) -> tuple[Column, Column]:
+        """Return both parts of a parameter that crosses zero, moved onto its line."""
+        if not self.crosses:
+            return real, imag
+        modulus, phase = self.modulus(real, imag, uniform), self.start + uniform
+        return modulus * np.cos(phase), modulus * np.sin(phase)
 
     def at(self, real: Column, imag: Column, uniform: Column, begin: Column) -> Column:
         """Return the phase [rad]; begin: that at the begin of the step, less its uniform part."""
