@@ -96,7 +96,8 @@ class States:
     @cached_property
     def half_angle_squares(self) -> tuple[Column, Column]:
         """cos^2 and sin^2 of theta/2."""
-        raise NotImplementedError
+        x, y, z, w = self.rows_quaternion
+        return w * w + z * z, x * x + y * y
 
     @cached_property
     def transverse_velocity(self) -> tuple[Column, Column]:

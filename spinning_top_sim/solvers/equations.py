@@ -3,8 +3,8 @@
 
 import cmath
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -22,16 +22,8 @@ SMALLEST_SINE = math.sqrt(2.0 ** -53 / 1e-6)
 ADVICE = "use the regular equations (equations = 'transport') or method = 'exact'"
 
 
-class Unknowns(NamedTuple):
-    """Real and imaginary parts of alpha, beta and m, columns of shape (n,)."""
-
-    alpha_real: Column
-    alpha_imag: Column
-    beta_real: Column
-    beta_imag: Column
-    m_real: Column
-    m_imag: Column
-
+# Real and imaginary parts of alpha, beta and m.
+Parts = Sequence[Column]
 
 # The functions sqrt, copysign and where of the projection, for columns and for one state, where
 # numpy would take ten times as long.
@@ -61,9 +53,6 @@ class TransportEquations(Equations):
 
     rtol, atol : tolerated error of a step; the unknowns are scaled to 1, so the two add up
     carried_share : c/L3
-
-    Attributes
-    ----------
     spin_rate : chi [rad/s]
     uniform_rates : rate of the uniform part of alpha's phase (see `unwrap`), in the frame that is
         stepped and in the body [rad/s].  They differ by chi/2.  Those of beta have the other sign.
@@ -142,11 +131,11 @@ class TransportEquations(Equations):
                                   ONE_STATE, POLE_SHARE)
         return complex(*projected[:2]), complex(*projected[2:4]), complex(*projected[4:])
 
-    def project_columns(self, y: Unknowns, pole_share: float = POLE_SHARE) -> Unknowns:
+    def project_columns(self, y: Parts, pole_share: float = POLE_SHARE) -> Parts:
         """Return y with |q| = 1, then L.e3 = L3, then the energy restored along theta'."""
-        return Unknowns(*self._project(y, COLUMNS, pole_share))
+        return self._project(y, COLUMNS, pole_share)
 
-    def _project(self, y: tuple[Any, ...], functions: tuple[Callable[..., Any], ...],
+    def _project(self, y: Sequence[Any], functions: tuple[Callable[..., Any], ...],
                  pole_share: float) -> tuple[Any, ...]:
         # m conj(alpha beta) = u + i v, where v carries L.e3 and u the nutation rate: v follows
         # from L3 and Lz, and u^2 from |u + i v|^2, which the energy tells.

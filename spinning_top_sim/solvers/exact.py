@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.attitude import Column, Quaternion
+from spinning_top_sim.physics.attitude import Column, Number, Quaternion
 from spinning_top_sim.physics.regimes import Description, axis_rests, precession_extremes, regime
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
@@ -39,33 +39,15 @@ class ExactSolution:
     unwrapped, the quaternion's sign is continuous.  On every motion each of them is within 5e-15,
     relative to the value or to its start where these are larger than 1.
 
-    Parameters
-    ----------
-    top : Top
-        What moves.
-    start : State
-        The state at t = 0; of a `ContinuedState` theta may be any number.
+    start : the state at t = 0, with theta in [0, pi]; that of a `ContinuedState` may be any number
+    nutation_period : period of theta [s], None if it is constant
+    mean_precession_rate, mean_spin_rate : means over a nutation [rad/s]
+    theta_min, theta_max : bounds of theta folded into [0, pi] [rad]
+    m, m1 : parameter of the elliptic functions and m1 = 1 - m, which is 0 on the separatrix
+    time_limit, ns_limit : the farthest time either way [s], [ns]
 
-    Attributes
-    ----------
-    start : State
-        The same with theta in [0, pi].
-    nutation_period : float or None
-        Period of theta [s], None if it is constant.
-    mean_precession_rate, mean_spin_rate : float
-        Means over a nutation [rad/s].
-    theta_min, theta_max : float
-        Bounds of theta folded into [0, pi] [rad].
-    m, m1 : float
-        Parameter of the elliptic functions and m1 = 1 - m, which is 0 on the separatrix.
-    time_limit, ns_limit : float, int
-        The farthest time either way [s], [ns].
-
-    Raises
-    ------
-    ValueError
-        For motions whose constants doubles cannot hold, and, from every evaluation, for times that
-        are not of the kind that it takes or beyond the limits.
+    Raises ValueError for motions whose constants doubles cannot hold, and, from every evaluation,
+    for times that are not of the kind that it takes or beyond the limits.
     """
 
     steps = evaluations = 0
@@ -75,14 +57,13 @@ class ExactSolution:
         self.top = top
         self._turns = round(start.theta / math.tau)
         theta = start.theta - self._turns * math.tau
-        self._mirrored = theta < 0.0
         # A state continued through a pole is solved from the same attitude with theta in [0, pi].
-        half_turn = math.pi if self._mirrored else 0.0
-        self.start = start = State(
-            theta=min(abs(theta), math.pi),
-            theta_dot=-start.theta_dot if self._mirrored else start.theta_dot,
-            phi=start.phi + half_turn, psi=start.psi - half_turn, l3=start.l3, lz=start.lz)
-        motion = set_up(top, start)
+        self._sign, self._half_turn = (-1.0, math.pi) if theta < 0.0 else (1.0, 0.0)
+        self.start = State(
+            theta=min(abs(theta), math.pi), theta_dot=self._sign * start.theta_dot,
+            phi=start.phi + self._half_turn, psi=start.psi - self._half_turn,
+            l3=start.l3, lz=start.lz)
+        motion = set_up(top, self.start)
         with precision(DIGITS):
             self._take_constants(motion)
         self._check_start()
@@ -107,8 +88,10 @@ class ExactSolution:
         self._theta = ThetaFunctions(motion, start.theta)
         self.theta_min, self.theta_max = self._theta.bounds.tolist()
         # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
-        self._phi_phase = float(Decimal(start.phi) - alpha.start_argument - beta.start_argument)
-        self._psi_phase = float(Decimal(start.psi) - alpha.start_argument + beta.start_argument)
+        self._phi_phase = float(
+            Decimal(start.phi) - alpha.start_argument - beta.start_argument) - self._half_turn
+        self._psi_phase = float(
+            Decimal(start.psi) - alpha.start_argument + beta.start_argument) + self._half_turn
         fastest = max(abs(motion.quarter_rate), abs(alpha.rate) / (2 * pi()),
                       abs(beta.rate) / (2 * pi()), Decimal('1e-300'))
         limit = min(Decimal(MOST_TURNS) / fastest, MOST)
@@ -120,8 +103,7 @@ class ExactSolution:
         alpha, beta, theta_dot = (float(x[0]) for x in (*first.moduli, first.theta_dot))
         cosine, sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
         # Relative to the distance from either pole, and to a small velocity of the axis.
-        across = ((self._bottom_rate * (sine / cosine) if self._bottom_rate else 0.0)
-                  + (self._top_rate * (cosine / sine) if self._top_rate else 0.0))
+        across = self._across(cosine, sine)
         for name, error, size in (
                 ('theta', beta * cosine - alpha * sine, alpha * sine),
                 ('theta_dot', theta_dot - start.theta_dot,
@@ -131,15 +113,21 @@ class ExactSolution:
                                  f'the constants of {self.top} and {start} are too far apart in '
                                  'size')
 
-    def describe(self) -> Description:
+    def _across(self, cosine: Number, sine: Number) -> Number:
         """
-        Return the motion in the numbers that a physicist asks for.
+        Return phi' sin(theta) = (Lz - L3 cos(theta))/(lambda1 sin(theta)) in half angles [rad/s].
 
-        Returns
-        -------
-        Description
-            Name, bounds, period and mean rates.
+        Nothing cancels, and at a pole that can be reached the singular term is absent.
         """
+        across = 0.0 * cosine
+        if self._bottom_rate:
+            across = across + self._bottom_rate * (sine / cosine)
+        if self._top_rate:
+            across = across + self._top_rate * (cosine / sine)
+        return across
+
+    def describe(self) -> Description:
+        """Return the motion in the numbers that a physicist asks for."""
         top, start = self.top, self.start
         rests = axis_rests(top, start)
         low, high = 2 * (start.theta,) if rests else (self.theta_min, self.theta_max)
@@ -214,16 +202,15 @@ class _ExactStates(States):
     @cached_property
     def angles(self) -> tuple[Column, Column, Column]:
         solution = self._solution
-        half_turn = math.pi if solution._mirrored else 0.0
         precession, phi, theta, spin, psi = self._rows('angles')
-        return (precession + (phi + (solution._phi_phase - half_turn)),
-                (-theta if solution._mirrored else theta) + solution._turns * math.tau,
-                spin + (psi + (solution._psi_phase + half_turn)))
+        return (precession + (phi + solution._phi_phase),
+                solution._sign * theta + solution._turns * math.tau,
+                spin + (psi + solution._psi_phase))
 
     @cached_property
     def theta_dot(self) -> Column:
-        theta_dot: Column = self._axis_rates[0]
-        return -theta_dot if self._solution._mirrored else theta_dot
+        theta_dot: Column = self._solution._sign * self._axis_rates[0]
+        return theta_dot
 
     @cached_property
     def _axis_rates(self) -> NDArray[np.float64]:
@@ -232,19 +219,7 @@ class _ExactStates(States):
 
     @cached_property
     def transverse_velocity(self) -> tuple[Column, Column]:
-        """
-        omega_1 and omega_2 [rad/s], eq. (4) of "Analysis of Symmetric Spinning Top".
-
-        phi' sin(theta) is Lz - L3 cos(theta) over lambda1 sin(theta), in half angles: nothing
-        cancels, and at a pole that can be reached the singular term is absent.
-        """
-        solution = self._solution
+        """omega_1 and omega_2 [rad/s], eq. (4) of "Analysis of Symmetric Spinning Top"."""
         theta_dot, cos_psi, sin_psi = self._axis_rates
-        cosine, sine = self._rows('half_theta')
-        precession = 0.0 * cosine
-        if solution._bottom_rate:
-            precession = precession + solution._bottom_rate * (sine / cosine)
-        if solution._top_rate:
-            precession = precession + solution._top_rate * (cosine / sine)
-        return (theta_dot * sin_psi - precession * cos_psi,
-                theta_dot * cos_psi + precession * sin_psi)
+        across = self._solution._across(*self._rows('half_theta'))
+        return theta_dot * sin_psi - across * cos_psi, theta_dot * cos_psi + across * sin_psi

@@ -16,7 +16,7 @@ through zero, and its modulus changes sign where the axis passes that pole.
 """
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +42,7 @@ def unwrap(phases: Column, before: float, momentum: float) -> Column:
     return phases + math.tau * np.cumsum(turns_to_follow(phases, previous, momentum))
 
 
-@dataclass(frozen=True)
-class Phase:
+class Phase(NamedTuple):
     """
     The phase and the signed modulus of alpha or beta.
 
@@ -70,28 +69,26 @@ class Phase:
             return real * np.cos(phase) + imag * np.sin(phase)
         return self.sign * np.hypot(real, imag)
 
-    def on_line(self, real: Column, imag: Column, uniform: Column) -> tuple[Column, Column]:
-        """Return both parts of a parameter that crosses zero, moved onto its line."""
-        if not self.crosses:
-            return real, imag
-        modulus, phase = self.modulus(real, imag, uniform), self.start + uniform
-        return modulus * np.cos(phase), modulus * np.sin(phase)
-
     def at(self, real: Column, imag: Column, uniform: Column, begin: Column) -> Column:
         """Return the phase [rad]; begin: that at the begin of the step, less its uniform part."""
         if self.crosses:
             return self.start + uniform
-        argument = self._argument(real, imag)
+        argument = np.arctan2(self.sign * imag, self.sign * real)
         return argument + math.tau * turns_to_follow(argument, begin + uniform, self.momentum)
 
     def at_begins(self, real: Column, imag: Column, uniform: Column, before: float) -> Column:
         """Return the phases at the begins of steps after `before`, less their uniform parts."""
         if self.crosses:
             return np.full(len(real), self.start)
-        return unwrap(self._argument(real, imag) - uniform, before, self.momentum)
+        argument = np.arctan2(self.sign * imag, self.sign * real)
+        return unwrap(argument - uniform, before, self.momentum)
 
-    def _argument(self, real: Column, imag: Column) -> Column:
-        return np.arctan2(self.sign * imag, self.sign * real)
+    def on_line(self, real: Column, imag: Column, uniform: Column) -> tuple[Column, Column]:
+        """Return both parts; those of a parameter that crosses zero are moved onto its line."""
+        if not self.crosses:
+            return real, imag
+        modulus, phase = self.modulus(real, imag, uniform), self.start + uniform
+        return modulus * np.cos(phase), modulus * np.sin(phase)
 
 
 class PhaseUnwrapper:
