@@ -23,13 +23,13 @@ from helpers.simulations import (
     stream,
     times,
 )
+from spinning_top_sim.streams.schedule import MOST_PIECES, STEPS_IN_A_PIECE
 
 from spinning_top_sim import solve
 from spinning_top_sim.solvers import exact, rk45
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.propagator import Propagator
 from spinning_top_sim.streams import parameters, pipeline
-from spinning_top_sim.streams.schedule import MOST_PIECES, STEPS_IN_A_PIECE
 
 PERIOD_NS = 10 * MILLISECOND        # of most streams
 SLEEPING = {'initial.theta': 0.0, 'spin.l3': 3.0}

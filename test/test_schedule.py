@@ -16,9 +16,6 @@ from helpers.simulations import (
     states_of,
     stream,
 )
-
-from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.schedule import (
     LARGEST_BLOCK,
     LONGEST_BLOCK_NS,
@@ -26,6 +23,9 @@ from spinning_top_sim.streams.schedule import (
     SMALLEST_BLOCK,
     Schedule,
 )
+
+from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.streams import parameters
 
 
 def schedule_of(*topics, **values):
