@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The magnetometer: directions by hand, calibration by least squares, noise by its numbers."""
+"""The magnetometer: directions and errors by hand, noise by its numbers."""
 
 import math
 
 import numpy as np
 import pytest
-from helpers.simulations import SECOND, play, simulate, stream
-from stress import sensor as statistics
+from helpers.readings import run
+from helpers.simulations import SECOND
 
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.magnetometer import Magnetometer
@@ -14,15 +14,6 @@ from spinning_top_sim.streams.magnetometer import Magnetometer
 STANDING = {'initial.theta': 0.0, 'spin.l3': 0.0, 'spin.lz': 0.0, 'solver.method': 'exact'}
 ALONG = {'E': 1e-6, 'N': 20e-6, 'U': -40e-6, 'W': -1e-6, 'S': -20e-6, 'D': 40e-6}
 QUARTER = 0.5 * math.pi
-
-
-def messages(values, duration_ns, *topics):
-    """Return {topic: (field, covariance)}, (n, 3) and (n, 9)."""
-    simulation = simulate(values)
-    taken = play(simulation, duration_ns, *topics)
-    decode = stream(simulation, topics[0]).template.decode
-    return {topic: decode(b''.join(data for name, _, data in taken if name == topic))
-            for topic in topics}
 
 
 @pytest.mark.parametrize(('values', 'axes'), [
@@ -35,11 +26,10 @@ def messages(values, duration_ns, *topics):
     ({'initial.theta': QUARTER, 'initial.phi': QUARTER}, 'DWN'),
     ({'initial.theta': math.pi}, 'WND'), ({'initial.psi': QUARTER}, 'NWU')])
 def test_each_axis_reads_the_field_along_it(values, axes):
-    found = messages({**STANDING, 'mag.field': (1e-6, 20e-6, -40e-6), **values}, 0,
-                     'imu/mag', 'ground_truth/mag')
-    for topic, (field, _) in found.items():
-        assert field == pytest.approx(np.array([[ALONG[axis] for axis in axes]]),
-                                      abs=1e-19), topic
+    _, found = run({**STANDING, 'mag.field': (1e-6, 20e-6, -40e-6), **values}, 0,
+                   'imu/mag', 'ground_truth/mag')
+    for _, _, field, _ in found.values():
+        assert field == pytest.approx(np.array([[ALONG[axis] for axis in axes]]), abs=1e-19)
 
 
 def test_the_default_is_the_world_magnetic_model_in_munich():
@@ -48,13 +38,6 @@ def test_the_default_is_the_world_magnetic_model_in_munich():
         date=2026.0, latitude=48.14, longitude=11.58, height=0.52)
     assert parameters.checked({})['mag.field'] == pytest.approx(
         (1e-9 * wmm.Y, 1e-9 * wmm.X, -1e-9 * wmm.Z), abs=10e-9)
-
-
-def test_soft_and_hard_iron_are_found_by_least_squares():
-    """All 12 numbers from one run, each within 3 of its standard deviations."""
-    found, deviations, expected = statistics.magnetic_calibration(0)
-    assert np.abs((found - expected) / deviations).max() < 3.0
-    assert deviations.max() < 0.05
 
 
 def test_the_chain_by_hand():
@@ -71,31 +54,31 @@ NOISY = {**STANDING, 'mag.noise_density': 1e-7, 'mag.resolution': 1.5e-7}
 
 
 def test_noise_has_the_covariance_that_is_published():
-    found = messages({**NOISY, 'mag.rate': 50.0}, 400 * SECOND, 'imu/mag', 'ground_truth/mag')
-    errors = found['imu/mag'][0] - found['ground_truth/mag'][0]
-    covariance = found['imu/mag'][1][0]
+    _, found = run({**NOISY, 'mag.rate': 50.0}, 400 * SECOND, 'imu/mag', 'ground_truth/mag')
+    (_, _, field, (covariance, *_)), (_, _, exact, (known, *_)) = found.values()
+    errors = field - exact
     assert covariance[[0, 4, 8]] == pytest.approx(1e-14 * 50.0 + 1.5e-7 ** 2 / 12.0)
     assert not covariance[[1, 2, 3, 5, 6, 7]].any()
     assert np.var(errors, axis=0) == pytest.approx(covariance[[0, 4, 8]],
                                                    rel=4.0 * math.sqrt(2.0 / len(errors)))
     assert np.abs(np.corrcoef(errors.T) - np.eye(3)).max() < 4.0 / math.sqrt(len(errors))
-    assert found['ground_truth/mag'][1][0][[0, 4, 8]].tolist() == 3 * [1e-18]
+    assert known[[0, 4, 8]].tolist() == 3 * [1e-18]
 
 
 def test_a_change_of_the_rate_changes_noise_and_covariance():
-    simulation = simulate(NOISY)
-    taken = play(simulation, SECOND, 'imu/mag')
-    simulation.apply({'mag.rate': 400.0})
-    taken += play(simulation, 2 * SECOND, 'imu/mag')
-    decode = stream(simulation, 'imu/mag').template.decode
-    variances = [decode(data)[1][0, 0] for *_, data in taken]
-    assert len(taken) == 101 + 400
-    assert variances[100] == pytest.approx(1e-14 * 100.0 + 1.5e-7 ** 2 / 12.0)
-    assert variances[101] == pytest.approx(1e-14 * 400.0 + 1.5e-7 ** 2 / 12.0)
+    _, found = run(NOISY, 2 * SECOND, 'imu/mag', 'ground_truth/mag', events=[
+        (SECOND, lambda simulation: simulation.apply({'mag.rate': 400.0}))])
+    (_, _, field, covariances), (_, _, exact, _) = found.values()
+    assert len(field) == 101 + 400
+    for rows, rate in ((slice(101), 100.0), (slice(101, None), 400.0)):
+        variance = 1e-14 * rate + 1.5e-7 ** 2 / 12.0
+        assert covariances[rows, [0]] == pytest.approx(variance)
+        assert np.var((field - exact)[rows]) == pytest.approx(
+            variance, rel=4.0 * math.sqrt(2.0 / 300.0))
 
 
 def test_the_bias_walks_with_its_density():
-    found = messages({**STANDING, 'mag.random_walk': 1e-8}, 200 * SECOND, 'imu/mag')
-    steps = np.diff(found['imu/mag'][0], axis=0)
+    _, found = run({**STANDING, 'mag.random_walk': 1e-8}, 200 * SECOND, 'imu/mag')
+    steps = np.diff(found['imu/mag'][2], axis=0)
     assert np.std(steps) == pytest.approx(1e-8 * math.sqrt(0.01),
                                           rel=4.0 / math.sqrt(2.0 * steps.size))

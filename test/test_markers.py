@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.reference import SCENES, scene_parameters
-from helpers.simulations import SECOND, play, record, simulate, stream
+from helpers.simulations import EPOCH_NS, SECOND, play, record, simulate, stream
 
 from spinning_top_sim import Top, solve
 from spinning_top_sim.physics.top import LARGEST, SMALLEST, THINNEST, Shape
@@ -37,13 +37,6 @@ def decoded(run, t_ns):
 def axis_of(q):
     x, y, z, w = np.asarray(q).T
     return np.array([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)]).T
-
-
-def exact_tips(run, grid_ns):
-    """Return where the tip is at these times [ns]; before t = 0 it stands at the start."""
-    top, start = run.simulation.top, parameters.start_state(run.simulation.values)
-    exact = solve(top, start, np.maximum(grid_ns, 0) * 1e-9, method='exact')
-    return Shape(top).tip * axis_of(exact.quaternion)
 
 
 # ----------------------------------------------------------------------------------- the shape
@@ -99,34 +92,28 @@ def test_the_body_is_where_the_pose_is(values):
         assert points[-1] == pytest.approx(shape.tip * arm, abs=1e-15)
 
 
-@pytest.mark.parametrize('number', range(len(SCENES)), ids=SCENES)
-def test_the_trace_is_the_path_of_the_tip(number):
-    """25 ms apart, the newest point before the sample; of both solvers by turns."""
-    run = markers_of({**scene_parameters(SCENES[number]),
-                      'solver.method': ('rk45', 'exact')[number % 2]}, duration_ns=3 * SECOND // 2)
+@pytest.mark.parametrize(('values', 'count'), [
+    *(({**scene_parameters(scene), 'solver.method': ('rk45', 'exact')[number % 2]}, 40)
+      for number, scene in enumerate(SCENES)),
+    *(({'markers.trace_length': length, 'markers.trace_points': points}, count)
+      for length, points, count in ((0.0, 200, 0), (1e-9, 1, 1), (3e-9, 200, 3), (0.1, 1, 1),
+                                    (0.06, 7, 7)))])
+def test_the_trace_is_the_path_of_the_tip(values, count):
+    """Evenly spaced, the newest point before the sample; before t = 0 it stands at the start."""
+    run = markers_of(values, duration_ns=3 * SECOND // 2)
+    top, start = run.simulation.top, parameters.start_state(run.simulation.values)
+    tip, length = Shape(top).tip, run.simulation.values['markers.trace_length']
     for t_ns in (0, PERIOD_NS, 10 * PERIOD_NS, 30 * PERIOD_NS):
         points = decoded(run, t_ns)[3]
-        assert len(points) == 41
-        grid = np.arange((t_ns - 1) // 25_000_000 - 39, (t_ns - 1) // 25_000_000 + 1)
-        assert np.abs(points[:-1] - exact_tips(run, grid * 25_000_000)).max() < 1e-12 * abs(
-            Shape(run.simulation.top).tip)
-
-
-@pytest.mark.parametrize(('length', 'points'), [(0.0, 200), (1e-9, 1), (3e-9, 200), (0.1, 1),
-                                                (0.06, 7)])
-def test_short_traces_and_none(length, points):
-    run = markers_of({'markers.trace_length': length, 'markers.trace_points': points,
-                      'solver.method': 'exact'}, duration_ns=SECOND)
-    found = decoded(run, SECOND)[3]
-    if length == 0.0:
-        assert found is None
-        return
-    count = min(points, round(length * SECOND))
-    spacing_ns = round(length * SECOND) // count
-    newest = (SECOND - 1) // spacing_ns
-    grid_ns = spacing_ns * np.arange(newest - count + 1, newest + 1)
-    assert found.shape == (count + 1, 3)
-    assert np.abs(found[:-1] - exact_tips(run, grid_ns)).max() < 1e-12
+        if not count:
+            assert points is None
+            continue
+        spacing_ns = round(length * SECOND) // count
+        newest = (t_ns - 1) // spacing_ns
+        grid_ns = np.maximum(spacing_ns * np.arange(newest - count + 1, newest + 1), 0)
+        exact = solve(top, start, grid_ns * 1e-9, method='exact')
+        assert points.shape == (count + 1, 3)
+        assert np.abs(points[:-1] - tip * axis_of(exact.quaternion)).max() < 1e-12 * abs(tip)
 
 
 def test_a_coarse_solver_leaves_the_trace():
@@ -193,25 +180,17 @@ def test_a_reset_begins_the_trace_anew():
 
 def test_bodies_and_lines_are_drawn_to_the_scale_of_the_top():
     """The axis is 2 % of the distance to the tip wide, the trace half of that."""
-    pytest.importorskip('rclpy')
-    from rclpy.serialization import deserialize_message
-    from visualization_msgs.msg import MarkerArray
-
-    run = markers_of({'top.com_distance': -0.3}, duration_ns=0)
-    body, axis, trace = deserialize_message(run.sent[0], MarkerArray).markers
+    run = markers_of({'top.com_distance': -0.3, 'world_frame': 'map'}, duration_ns=0)
     shape = Shape(run.simulation.top)
-    assert (body.scale.x, body.scale.y, body.scale.z) == (
-        2.0 * shape.radius, 2.0 * shape.radius, shape.height)
-    assert axis.scale.x == pytest.approx(0.02 * abs(shape.tip), rel=1e-12)
-    assert trace.scale.x == pytest.approx(0.01 * abs(shape.tip), rel=1e-12)
-    assert (axis.scale.y, axis.scale.z, trace.scale.y, trace.scale.z) == (0.0, 0.0, 0.0, 0.0)
+    size = (2.0 * shape.radius, 2.0 * shape.radius, shape.height)
     # From the pivot to the tip, then around the half-section of the cylinder, slightly outside.
-    half, rim = 1.01 * 0.5 * shape.height, 1.01 * shape.radius
-    far, near = (0.0, shape.centre - half), (0.0, shape.centre + half)
-    corners = ((0.0, 0.0), (0.0, shape.tip), far, (rim, far[1]), (rim, far[1]), (rim, near[1]),
-               (rim, near[1]), near)
-    assert [(point.x, point.y, point.z) for point in axis.points] == [
-        pytest.approx((x, 0.0, z), rel=1e-12) for x, z in corners]
+    rim, far, near = 1.01 * shape.radius, shape.centre - 0.505 * shape.height, (
+        shape.centre + 0.505 * shape.height)
+    corners = ((0.0, 0.0), (0.0, shape.tip), (0.0, far), (rim, far), (rim, far), (rim, near),
+               (rim, near), (0.0, near))
+    assert run.sent[0] == messages.markers(
+        'map', size, [part for x, z in corners for part in (x, 0.0, z)], -0.02 * shape.tip, 41,
+    ).encode_one(EPOCH_NS, *run.stream.template.decode(run.sent[0]))
 
 
 @pytest.mark.parametrize(('frame', 'count', 'stamp_ns'), [
@@ -220,35 +199,26 @@ def test_bodies_and_lines_are_drawn_to_the_scale_of_the_top():
 def test_the_message_is_what_ros_serializes(frame, count, stamp_ns):
     pytest.importorskip('rclpy')
     from geometry_msgs.msg import Point
-    from rclpy.serialization import deserialize_message
-    from test_templates import assert_same, numbers
+    from test_templates import assert_same, numbers, set_axes, set_stamp
     from visualization_msgs.msg import Marker, MarkerArray
 
-    size, lines = (0.75, 0.75, 0.125), tuple(range(12))
-    template = messages.markers(frame, size, lines, 0.0625, count)
-    dice = numbers(11 + 3 * count)
-    fields = [dice[:3], dice[3:7], dice[7:11], *([dice[11:]] if count else [])]
-    ours = template.encode_one(stamp_ns, *fields)
-    message = deserialize_message(ours, MarkerArray)
-    assert_same(ours, message)
-    body, axis, *trace = message.markers
-    for marker in message.markers:
-        assert marker.header.frame_id == frame
-        stamp = marker.header.stamp
-        assert stamp.sec * SECOND + stamp.nanosec == stamp_ns
-        assert (marker.id, marker.action, marker.frame_locked) == (0, Marker.ADD, False)
-        assert marker.color.a == 1.0
-        assert marker.lifetime.sec == marker.lifetime.nanosec == 0
-    assert len({marker.ns for marker in message.markers}) == len(message.markers)
-    assert (body.type, axis.type) == (Marker.CYLINDER, Marker.LINE_LIST)
-    assert (body.scale.x, body.scale.y, body.scale.z) == size
-    position, q = body.pose.position, body.pose.orientation
-    assert [position.x, position.y, position.z, q.x, q.y, q.z, q.w] == dice[:7]
-    q = axis.pose.orientation
-    assert [q.x, q.y, q.z, q.w] == dice[7:11]
-    assert axis.points == [Point(x=float(i), y=i + 1.0, z=i + 2.0) for i in (0, 3, 6, 9)]
-    assert len(trace) == bool(count)
-    for marker in trace:
-        assert marker.type == Marker.LINE_STRIP
-        assert [c for p in marker.points for c in (p.x, p.y, p.z)] == dice[11:]
-        assert marker.scale.x == 0.5 * axis.scale.x == 0.03125
+    size, lines = (0.75, 0.5, 0.125), numbers(12)
+    centre, body, axis, trace = np.split(np.array(numbers(11 + 3 * count)), (3, 7, 11))
+    expected = MarkerArray()
+    for name, kind, scale, color, position, orientation, points in (
+            ('body', Marker.CYLINDER, size, messages.BODY_COLOR, centre, body, ()),
+            ('axis', Marker.LINE_LIST, (0.0625,), messages.AXIS_COLOR, (), axis, lines),
+            ('trace', Marker.LINE_STRIP, (0.03125,), messages.TRACE_COLOR, (), (), trace)):
+        marker = Marker(ns=name, type=kind, action=Marker.ADD)
+        marker.header.frame_id = frame
+        set_stamp(marker.header.stamp, stamp_ns)
+        set_axes(marker.scale, scale)
+        (marker.color.r, marker.color.g, marker.color.b,
+         marker.color.a) = np.float32(color).tolist()
+        set_axes(marker.pose.position, position)
+        set_axes(marker.pose.orientation, orientation)
+        marker.points = [Point(x=x, y=y, z=z) for x, y, z in np.reshape(points, (-1, 3)).tolist()]
+        expected.markers.append(marker)
+    del expected.markers[2 + bool(count):]
+    assert_same(messages.markers(frame, size, lines, 0.0625, count).encode_one(
+        stamp_ns, centre, body, axis, *([trace] if count else [])), expected)

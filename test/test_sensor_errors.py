@@ -27,11 +27,11 @@ ALL_BIASES = {f'imu.{kind}_{name}': value for kind in ('gyroscope', 'acceleromet
 
 # ------------------------------------------------------------------------- deterministic errors
 
-def test_matrices_g_sensitivity_and_bias_are_found_by_least_squares():
-    """All 27 elements and 6 offsets from one run, each within 3 of its standard deviations."""
+def test_matrices_g_sensitivity_bias_and_iron_are_found_by_least_squares():
+    """All 45 numbers from one run, each within 3 of its standard deviations."""
     found, deviations, expected = statistics.calibration(0)
     assert np.abs((found - expected) / deviations).max() < 3.0
-    assert deviations.max() < 3e-3
+    assert deviations[:33].max() < 3e-3 and deviations[33:].max() < 0.05
 
 
 def test_the_chain_by_hand():

@@ -6,7 +6,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from helpers.readings import fields, run
+from helpers.readings import run
 from helpers.simulations import (
     EPOCH_NS,
     SECOND,
@@ -150,9 +150,7 @@ def test_a_run_in_which_nearly_all_is_lost_goes_on():
 
 
 def test_without_faults_the_labels_say_so():
-    simulation = simulate({'imu.rate': 100.0})
-    found = {LABELS: fields(simulation, play(simulation, SECOND, LABELS), LABELS)}
-    stamps, true, copies = labels(found)
+    stamps, true, copies = labels(run({'imu.rate': 100.0}, SECOND, LABELS)[1])
     assert np.array_equal(stamps, true)
     assert np.array_equal(true, EPOCH_NS + 10_000_000 * np.arange(101))
     assert copies.tolist() == 101 * [1]

@@ -130,11 +130,6 @@ def test_a_template_is_what_ros_serializes(number):
     assert_same(messages.string(frame), String(data=frame))
 
 
-def test_no_covariance_is_zero_which_means_unknown():
-    assert messages.EXACT == (1e-18, 0.0, 0.0, 0.0, 1e-18, 0.0, 0.0, 0.0, 1e-18)
-    assert messages.diagonal(4.0, 0.0) == (4.0, 0.0, 0.0, 1e-18)
-
-
 def test_many_messages_are_single_ones_one_after_the_other():
     """Fields as arrays, as columns and as numbers for all; growing and shrinking counts."""
     template = messages.imu('imu_link', messages.EXACT, messages.EXACT, messages.EXACT)
@@ -185,28 +180,27 @@ def test_every_stream_sends_a_message_of_its_type_with_the_frames_of_the_paramet
 
 
 NOISE = {'imu.gyroscope_noise_density': 1e-3, 'imu.accelerometer_noise_density': 0.02,
-         'imu.gyroscope_resolution': 0.01, 'imu.accelerometer_resolution': 0.3, 'imu.rate': 200.0,
-         'imu_data.rate': 50.0}
+         'imu.gyroscope_resolution': 0.01, 'imu.accelerometer_resolution': 0.3,
+         'imu.orientation_stddev': (0.1, 0.2, 0.0)}
 
 
-@pytest.mark.parametrize(('values', 'reading'), [
-    ({}, (1e-18, 1e-18)),
+@pytest.mark.parametrize(('values', 'orientation', 'rates', 'force'), [
+    ({}, 3 * (1e-18,), 1e-18, 1e-18),
     # density^2 x rate of the IMU + resolution^2/12, of angular velocity and linear acceleration
-    (NOISE, (1e-6 * 200.0 + 1e-4 / 12.0, 4e-4 * 200.0 + 0.09 / 12.0))])
-def test_imu_covariances_follow_rep_145(values, reading):
-    """No orientation estimate: first element -1; all others are what is known."""
-    estimated = {'imu/data', 'ground_truth/imu'}
-    variances = {'imu/data_raw': reading, 'imu/data': reading, 'ground_truth/imu': (1e-18, 1e-18),
-                 'ground_truth/imu_bias': (1e-18, 1e-18)}
-    for topic, _, data in play(simulate(values), 0, *variances):
+    (NOISE, (0.01, 0.04, 1e-18), 1e-6 * 50.0 + 1e-4 / 12.0, 4e-4 * 50.0 + 0.09 / 12.0)])
+def test_imu_covariances_follow_rep_145(values, orientation, rates, force):
+    """No orientation estimate: first element -1; 0 means unknown, so that exact is 1e-18."""
+    unknown, known = [-1.0, *8 * [0.0]], np.diag(3 * [1e-18]).ravel()
+    noisy = (np.diag(3 * [rates]).ravel(), np.diag(3 * [force]).ravel())
+    expected = {'imu/data_raw': (unknown, *noisy),
+                'imu/data': (np.diag(orientation).ravel(), *noisy),
+                'ground_truth/imu': 3 * (known,), 'ground_truth/imu_bias': (unknown, known, known)}
+    simulation = simulate(values)
+    simulation.apply({'imu.rate': 50.0})
+    for topic, _, data in play(simulation, 0, *expected):
         message = deserialize_message(data, Imu)
-        first, *others = message.orientation_covariance
-        assert first == (1e-18 if topic in estimated else -1.0), topic
-        assert others == ([0.0, 0.0, 0.0, 1e-18, 0.0, 0.0, 0.0, 1e-18] if topic in estimated
-                          else 8 * [0.0]), topic
-        for covariance, variance in zip((message.angular_velocity_covariance,
-                                         message.linear_acceleration_covariance),
-                                        variances.pop(topic), strict=True):
-            assert covariance == pytest.approx(np.diag(3 * [variance]).ravel(), rel=1e-12,
-                                               abs=0.0), topic
-    assert not variances
+        for covariance, numbers in zip((
+                message.orientation_covariance, message.angular_velocity_covariance,
+                message.linear_acceleration_covariance), expected.pop(topic), strict=True):
+            assert covariance == pytest.approx(numbers, rel=1e-12, abs=0.0), topic
+    assert not expected

@@ -26,11 +26,9 @@ IDENTITY = np.eye(3).ravel()
 
 def check(seed, folder):
     """Raise where a statistic of this seed is off."""
-    for found, deviations, expected in (calibration(seed), magnetic_calibration(seed)):
-        errors = (found - expected) / deviations
-        assert np.abs(errors).max() < SIGMAS, errors
-    for value in white_and_walk(seed):
-        assert abs(value - 1.0) < 0.03, value
+    found, deviations, expected = calibration(seed)
+    errors = (found - expected) / deviations
+    assert np.abs(errors).max() < SIGMAS, errors
     for value in gauss_markov(seed):
         assert abs(value - 1.0) < 0.02 * SIGMAS / 3.0, value
     _, deviation = flicker(seed)
@@ -51,41 +49,37 @@ COMMANDS = ((3 * SECOND, lambda one: one.command(1.0, 0.8)),
 
 
 def calibration(seed):
-    """Return matrices, g-sensitivity and biases of a run: found, their deviations, commanded."""
+    """
+    Return what least squares find in a run, their standard deviations, and what was commanded.
+
+    Matrices, g-sensitivity and biases of the IMU, soft and hard iron [uT] of the magnetometer.
+    """
     rng = np.random.default_rng(seed)
     rate_matrix, force_matrix = IDENTITY + 0.03 * rng.standard_normal((2, 9))
-    sensitivity = 3e-3 * rng.standard_normal(9)
-    noises = (2e-4, 3e-3)
+    sensitivity, soft = 3e-3 * rng.standard_normal(9), IDENTITY + 0.1 * rng.standard_normal(9)
+    hard = 3e-5 * rng.standard_normal(3)
     _, found = run({
-        **EXCITED, 'seed': seed, 'imu.gyroscope_M': tuple(rate_matrix.tolist()),
-        'imu.accelerometer_M': tuple(force_matrix.tolist()),
-        'imu.gyroscope_A': tuple(sensitivity.tolist()),
-        'imu.gyroscope_noise_density': noises[0], 'imu.accelerometer_noise_density': noises[1],
-        'imu.gyroscope_turn_on_bias': 0.02, 'imu.accelerometer_turn_on_bias': 0.1}, 10 * SECOND,
-        'imu/data_raw', 'ground_truth/imu', 'ground_truth/imu_bias', events=COMMANDS)
-    (*_, read_rates, read_force), (*_, rates, force), (*_, rate_bias, force_bias) = found.values()
-    ones = np.ones((len(rates), 1))
-    of_rates = least_squares(np.hstack((rates, force, ones)), read_rates)
-    of_force = least_squares(np.hstack((force, ones)), read_force)
-    expected = (np.vstack((rate_matrix.reshape(3, 3).T, sensitivity.reshape(3, 3).T,
-                           rate_bias[0])),
-                np.vstack((force_matrix.reshape(3, 3).T, force_bias[0])))
-    return tuple(np.concatenate([np.ravel(part) for part in parts])
-                 for parts in (*zip(of_rates, of_force, strict=True), expected))
-
-
-def magnetic_calibration(seed):
-    """Return soft and hard iron of a run: found, their deviations, commanded [uT]."""
-    rng = np.random.default_rng([seed, 1])
-    soft, hard = IDENTITY + 0.1 * rng.standard_normal(9), 3e-5 * rng.standard_normal(3)
-    _, found = run({
-        **EXCITED, 'seed': seed, 'mag.soft_iron': tuple(soft.tolist()),
-        'mag.hard_iron': tuple(hard.tolist()), 'mag.noise_density': 2e-8}, 10 * SECOND,
-        'ground_truth/mag', 'imu/mag', events=COMMANDS)
-    exact, readings = (1e6 * fields[2] for fields in found.values())
-    found, deviations = least_squares(np.hstack((exact, np.ones((len(exact), 1)))), readings)
-    expected = np.vstack((soft.reshape(3, 3).T, 1e6 * hard))
-    return found.ravel(), deviations.ravel(), expected.ravel()
+        **EXCITED, 'seed': seed, 'imu.gyroscope_M': rate_matrix.tolist(),
+        'imu.accelerometer_M': force_matrix.tolist(), 'imu.gyroscope_A': sensitivity.tolist(),
+        'imu.gyroscope_noise_density': 2e-4, 'imu.accelerometer_noise_density': 3e-3,
+        'imu.gyroscope_turn_on_bias': 0.02, 'imu.accelerometer_turn_on_bias': 0.1,
+        'mag.soft_iron': soft.tolist(), 'mag.hard_iron': hard.tolist(),
+        'mag.noise_density': 2e-8}, 10 * SECOND, 'imu/data_raw', 'ground_truth/imu',
+        'ground_truth/imu_bias', 'imu/mag', 'ground_truth/mag', events=COMMANDS)
+    ((*_, read_rates, read_force), (*_, rates, force), (*_, rate_bias, force_bias),
+     (_, _, read_field, _), (_, _, field, _)) = found.values()
+    results = [[], [], []]
+    for regressors, readings, commanded in (
+            ((rates, force), read_rates, (rate_matrix, sensitivity, rate_bias[0])),
+            ((force,), read_force, (force_matrix, force_bias[0])),
+            ((1e6 * field,), 1e6 * read_field, (soft, 1e6 * hard))):
+        *matrices, offset = commanded
+        expected = np.vstack((*(matrix.reshape(3, 3).T for matrix in matrices), offset))
+        ones = np.ones((len(readings), 1))
+        for result, numbers in zip(results, (*least_squares(
+                np.hstack((*regressors, ones)), readings), expected), strict=True):
+            result.append(numbers.ravel())
+    return map(np.concatenate, results)
 
 
 def least_squares(regressors, readings):
@@ -99,27 +93,17 @@ def least_squares(regressors, readings):
 
 # ------------------------------------------------------------------------- from a sensor at rest
 
-def at_rest(seed, count, period_ns, **errors):
-    """Return what is read at rest, (count, 6), with the same errors for both kinds of axes."""
-    values = {f'imu.{kind}_{name}': value for kind in KINDS for name, value in errors.items()
-              if name != 'band'}
-    if 'band' in errors:
-        values['imu.bias_instability_band'] = errors['band']
-    return read({**values, 'seed': seed}, range(0, count * period_ns, period_ns))[0]
-
-
-def white_and_walk(seed):
-    """Return densities of white noise and walk over those commanded."""
-    white = at_rest(seed, 10_000, 5_000_000, noise_density=0.3)
-    walk = at_rest(seed, 10_000, 5_000_000, random_walk=0.7)
-    return (float(np.std(white)) * math.sqrt(0.005) / 0.3,
-            float(np.std(np.diff(walk, axis=0))) / math.sqrt(0.005) / 0.7)
+def at_rest(seed, count, band=(1.0, 1000.0), **errors):
+    """Return `count` readings at rest, a millisecond apart, with errors of both kinds of axes."""
+    values = {f'imu.{kind}_{name}': value for kind in KINDS for name, value in errors.items()}
+    return read({**values, 'imu.bias_instability_band': band, 'seed': seed},
+                range(0, count * MILLISECOND, MILLISECOND))[0]
 
 
 def gauss_markov(seed):
     """Return variance and correlation time over those commanded: 25 000 times of it, 6 axes."""
     time, lag = 0.01, 5
-    rows = at_rest(seed, 250_000, MILLISECOND, bias_stddev=0.5, bias_correlation_time=time)
+    rows = at_rest(seed, 250_000, bias_stddev=0.5, bias_correlation_time=time)
     variance = np.mean(rows ** 2)
     correlation = np.mean(rows[lag:] * rows[:-lag]) / variance
     return variance / 0.25, -lag * 1e-3 / math.log(correlation) / time
@@ -128,7 +112,7 @@ def gauss_markov(seed):
 def flicker(seed):
     """Return averaging times [s] and the Allan deviation over the parameter, over the band."""
     band = (0.02, 0.5)
-    rows = at_rest(seed, 200_000, MILLISECOND, bias_instability=0.3, band=band)
+    rows = at_rest(seed, 200_000, band, bias_instability=0.3)
     samples = np.unique(np.round(np.geomspace(*band, 9) * 1000.0).astype(int))
     return samples * 1e-3, np.array([allan_deviation(rows, m) for m in samples]) / 0.3
 
