@@ -58,10 +58,8 @@ def test_the_body_has_the_mass_and_the_moments_of_the_top(scene):
     ({'mass': 0.0}, {'radius': math.sqrt(0.3), 'centre': 0.15}),
     ({'com_distance': -0.15}, {'centre': -0.15, 'tip': -1.0}),
     ({'com_distance': 0.0}, {'centre': 0.0, 'tip': 1.0}),
-    ({'com_distance': -0.0}, {'tip': 1.0}),
     ({'lambda3': 1.0}, {'height': THINNEST}),
     ({'com_distance': 1.0}, {'height': THINNEST * math.sqrt(0.15)}),
-    ({'com_distance': 1e200, 'gravity': 0.0}, {'centre': 1e200}),
     ({'mass': 5e-324}, {'radius': LARGEST, 'height': LARGEST}),
     ({'lambda1': 1e300, 'lambda3': 1e300}, {'radius': LARGEST}),
     ({'lambda1': 5e-324, 'lambda3': 5e-324}, {'radius': SMALLEST}),
@@ -142,23 +140,6 @@ def test_the_trace_goes_on_through_commands():
         newest = (t_ns - 1) // 25_000_000
         expected = [axes[max(m, 0) * 25_000_000] for m in range(newest - 39, newest + 1)]
         assert decoded(run, t_ns)[3][:-1] == pytest.approx(tip * np.array(expected), abs=1e-8)
-
-
-def test_who_comes_late_sees_the_same():
-    """Bytes depend on the sample alone: not on when the stream began to be recorded."""
-    expected = markers_of(commands=COMMANDS, duration_ns=2 * SECOND).sent
-    for begin_ns, end_ns in ((1, 800_000_000), (710_000_000, 1_650_000_000)):
-        simulation, taken = simulate(TRACE), []
-        for t_ns, *momenta in sorted((*COMMANDS, (begin_ns,), (end_ns,))):
-            simulation.advance(t_ns)
-            if momenta:
-                simulation.command(*momenta)
-            elif t_ns == begin_ns:
-                taken = record(simulation, 'markers')
-            else:
-                simulation.log_to(None)
-        assert {t: data for _, t, data in taken} == {
-            t: data for t, data in expected.items() if begin_ns < t <= end_ns}
 
 
 def test_commands_for_hours_are_not_kept():

@@ -7,15 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 from helpers.readings import run
-from helpers.simulations import (
-    EPOCH_NS,
-    SECOND,
-    output,
-    play,
-    publish,
-    record,
-    simulate,
-)
+from helpers.simulations import EPOCH_NS, SECOND, output, play, publish, record, simulate
 
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
@@ -89,8 +81,10 @@ def test_offset_drift_and_jitter_are_found_by_a_straight_line(found):
 
 
 def test_losses_and_repetitions_have_their_rates_and_are_independent():
-    timing = Timing(parameters.checked(FAULTS))
-    copies = timing.copies(np.arange(0, 200_000 * PERIOD_NS, PERIOD_NS), PERIOD_NS)
+    timing, other = (Timing(parameters.checked({**FAULTS, 'seed': seed})) for seed in (0, 1))
+    t_ns = np.arange(0, 200_000 * PERIOD_NS, PERIOD_NS)
+    copies = timing.copies(t_ns, PERIOD_NS)
+    assert np.corrcoef(copies, other.copies(t_ns, PERIOD_NS))[0, 1] < 4.0 / math.sqrt(len(t_ns))
     counts, n = Counter(copies.tolist()), len(copies)
     for value, share in ((0, 0.1), (2, 0.9 * 0.05)):
         assert counts[value] / n == pytest.approx(share, abs=4.0 * math.sqrt(share / n))
@@ -109,18 +103,6 @@ def test_no_jitter_puts_a_stamp_before_an_earlier_one(rate, drift):
         assert np.ptp(stamps - np.polyval((1.0 + drift * 1e-6, 0.0), t_ns)) > 0.5 * period_ns
 
 
-def test_a_stamp_depends_on_seed_and_sample_alone():
-    timing = Timing(parameters.checked(FAULTS))
-    t_ns = np.arange(0, 2000 * PERIOD_NS, PERIOD_NS)
-    whole = timing.stamps_ns(EPOCH_NS, t_ns, PERIOD_NS), timing.copies(t_ns, PERIOD_NS)
-    other = Timing(parameters.checked(FAULTS))
-    for k in (1999, 0, 511, 512, 700):
-        assert other.stamps_ns(EPOCH_NS, t_ns[k:k + 1], PERIOD_NS) == whole[0][k]
-        assert other.copies(t_ns[k:k + 3], PERIOD_NS).tolist() == whole[1][k:k + 3].tolist()
-    another = Timing(parameters.checked({**FAULTS, 'seed': 1}))
-    assert not np.array_equal(another.stamps_ns(EPOCH_NS, t_ns, PERIOD_NS), whole[0])
-
-
 def test_stamps_stay_within_what_a_message_holds():
     timing = Timing(parameters.checked({'imu.stamp_offset': -1.0}))
     assert timing.stamps_ns(0, np.array([0, 2 * SECOND]), PERIOD_NS).tolist() == [0, SECOND]
@@ -129,23 +111,16 @@ def test_stamps_stay_within_what_a_message_holds():
         2 ** 31 * SECOND - 1)
 
 
-def test_subscribers_get_what_is_recorded():
-    """Of 401 samples, half of a half twice: 300 messages on average."""
-    simulation = simulate({**FAULTS, 'imu.drop_rate': 0.5, 'imu.duplicate_rate': 0.5})
-    taken, published = record(simulation, RAW), publish(simulation, RAW)
-    simulation.advance(2 * SECOND)
-    assert [data for *_, data in taken] == [data for _, data in published]
-    assert output(simulation, RAW).sent == len(published)
-    assert 240 < len(published) < 360
-
-
 def test_a_run_in_which_nearly_all_is_lost_goes_on():
-    values = {'imu.drop_rate': 0.99, 'solver.method': 'exact'}
+    """Of 20 001 samples, a hundredth, one or two times: subscribers get what is recorded."""
+    values = {'imu.drop_rate': 0.99, 'imu.duplicate_rate': 0.5, 'solver.method': 'exact'}
     simulation = simulate(values)
-    taken = record(simulation, RAW)
+    taken, published = record(simulation, RAW), publish(simulation, RAW)
     assert simulation.advance(100 * SECOND)
     assert simulation.now_ns == 100 * SECOND
-    assert 130 < len(taken) < 270
+    assert 200 < len(taken) < 400
+    assert [data for *_, data in taken] == [data for _, data in published]
+    assert output(simulation, RAW).sent == len(published)
     assert play(simulate(values), 100 * SECOND, RAW) == taken
 
 
