@@ -95,7 +95,7 @@ class ImuRaw(ImuStream):
         self._timing = (timing.Timing(values) if any(map(values.get, timing.FAULTS)) else None)
 
     def encode(self, samples: Samples, epoch_ns: int,
-               ) -> tuple[NDArray[np.int64], NDArray[Any]]:
+               ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         if self._timing is None:
             return super().encode(samples, epoch_ns)
         t_ns = samples.t_ns
@@ -140,7 +140,7 @@ class ImuTiming(Stream):
         super().__init__(values, messages.float64_multi_array(TIMING))
 
     def encode(self, samples: Samples, epoch_ns: int,
-               ) -> tuple[NDArray[np.int64], NDArray[Any]]:
+               ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         t_ns = samples.t_ns
         true_ns = epoch_ns + t_ns
         stamps_ns = self._timing.stamps_ns(epoch_ns, t_ns, self.period_ns)
