@@ -33,7 +33,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.simulation import Simulation
+from spinning_top_sim.streams.live import LiveSimulation
 
 
 @pytest.fixture(scope='module')
@@ -126,7 +126,7 @@ def test_a_reset_begins_again_and_stamps_go_on(peer, served):
     assert (np.diff(stamps) > 0).all()
     (first,) = np.flatnonzero(stamps == epoch)
     assert first >= count
-    offline = Simulation(parameters.checked({}), epoch)
+    offline = LiveSimulation(parameters.checked({}), epoch)
     taken = record(offline, 'pose')
     offline.advance(int(stamps[-1]) - epoch)
     expected = {epoch + t_ns: data for _, t_ns, data in taken}
