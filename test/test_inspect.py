@@ -750,8 +750,8 @@ def test_the_journal_is_read_without_the_chunks_that_have_none_of_it(tmp_path, m
     with open(path, 'rb') as file:
         chunks = make_reader(file).get_summary().chunk_indexes
     with LogReader(path) as reader:
-        read, plain = [], reader._read
-        monkeypatch.setattr(reader, '_read', lambda span: (read.append(span), plain(span))[1])
+        read, plain = [], reader.open_part
+        monkeypatch.setattr(reader, 'open_part', lambda span: (read.append(span), plain(span))[1])
         run = read_run_description(reader)
         assert [event.name for event in run.events] == ['start', 'command']
         assert len(read) <= 4 < len(chunks)
@@ -872,7 +872,8 @@ def test_a_page_is_drawn_where_the_first_readings_are_missing(tmp_path, capsys):
     pytest.importorskip('matplotlib')
     path = log_of(tmp_path / 'run.mcap', '--duration', 60, '-p', 'imu.rate:=1000.0')
     with LogReader(path) as reader:
-        *others, middle = [span for span in reader._index[0] if span.start_ns < 30 * 10 ** 9]
+        *others, middle = [span for span in reader.scan().parts
+                           if span.channel_ids and span.start_ns < 30 * 10 ** 9]
     content = bytearray(path.read_bytes())
     for span in (*others, middle):
         content[span.offset + 100] ^= 1
