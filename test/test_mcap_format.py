@@ -104,41 +104,6 @@ def recover(path: Path, expected: int = ALL_KEPT) -> Path:
 
 # Allowed
 
-def test_extra_fields_and_unknown_kinds_are_read_and_kept(tmp_path):
-    """The specification lets records grow, and gives 0x80 and above to applications."""
-    path = tmp_path / 'a.mcap'
-    plain = message(5, b'1') + message(7, b'2')
-    kept = [
-        padded(SCHEMA, b'\x01\x02\x03'), padded(CHANNEL, b'more'),
-        unknown_kind(0x80, b'of an application'), unknown_kind(0x10, b'of the future'),
-        padded(chunk_of(plain, 5, 7), b'\x00' * 20),
-        padded(record_bytes(Metadata('note', {'a': 'b'})), b'\x06'),
-        padded(record_bytes(Attachment(1, 2, 'name', 'x/y', b'data')), b'behind the checksum'),
-        unknown_kind(0xff, b'')]
-    index = padded(record_bytes(MessageIndex(1, [(5, 0), (7, 32)])), b'??')
-    path.write_bytes(closed(padded(HEADER, b'new'), *kept[:5], index, *kept[5:],
-                            data_end_extra=b'!'))
-    with LogReader(path) as reader:
-        assert reader.whole
-        assert reader.damage.lines() == []
-        assert (reader.damage.truncated, reader.damage.missing) == (False, {})
-        assert reader.metadata == {'note': {'a': 'b'}}
-        (topic,) = reader.topics
-        assert (topic.name, topic.type_name, topic.metadata) == ('/a', 'thing', {'k': 'v'})
-    output = recover(path)
-    assert seen_by_us(path) == seen_by_us(output) == [('/a', 5, b'1'), ('/a', 7, b'2')]
-    assert seen_by_mcap(output) == seen_by_us(output)
-    content = output.read_bytes()
-    found = [content[start:end] for _, start, end in records_of(content)]
-    assert found[0] == padded(HEADER, b'new')
-    assert [record for record in found if record in kept][:len(kept)] == kept
-    with open(output, 'rb') as file:
-        (attachment,) = make_reader(file).iter_attachments()
-    assert attachment.data == b'data'
-    with LogReader(output) as reader:
-        assert reader.damage.lines() == []
-
-
 def test_extra_fields_inside_of_a_chunk_are_ignored_and_not_copied(tmp_path):
     """The reader of mcap itself does not skip them there."""
     path = tmp_path / 'a.mcap'
@@ -205,48 +170,6 @@ def test_a_whole_log_is_read_by_its_indexes(tmp_path, monkeypatch):
     assert seen_by_us(path)
 
 
-def summary_of(path: Path, *records: bytes) -> Summary:
-    """Return the summary of a file with an empty chunk and these records in its summary."""
-    data = MCAP0_MAGIC + HEADER + chunk_of(b'') + record_bytes(DataEnd(0))
-    path.write_bytes(b''.join([
-        data, *records, record_bytes(Footer(len(data), 0, 0)), MCAP0_MAGIC]))
-    with contextlib.closing(McapSource(path, 1 << 20)) as source:
-        return read_summary(source)
-
-
-@pytest.mark.parametrize(('too_long', 'problem'), [
-    (0, ''), (1, 'the summary is not used: it places a chunk outside of the data section')])
-def test_a_summary_places_chunks_in_the_data_section(tmp_path, too_long, problem):
-    begin, end = len(MCAP0_MAGIC + HEADER), len(MCAP0_MAGIC + HEADER + chunk_of(b'')) + 13
-    index = ChunkIndex(
-        chunk_length=end - begin + too_long, chunk_start_offset=begin, compression='',
-        compressed_size=0, message_end_time=5, message_start_time=5, message_index_length=0,
-        uncompressed_size=0, message_index_offsets={})
-    found = summary_of(tmp_path / 'a.mcap', record_bytes(index))
-    assert found.problem == problem
-
-
-def test_a_summary_declares_a_limited_amount(tmp_path, monkeypatch):
-    channels = [record_bytes(Channel(id=number, topic='/a', message_encoding='x', metadata={},
-                                     schema_id=0)) for number in range(1, 4)]
-    assert summary_of(tmp_path / 'a.mcap', *channels).declared_bytes == sum(map(len, channels))
-    monkeypatch.setattr(records, 'MAX_DECLARED', len(channels[0]) * 5 // 2)
-    statistics = record_bytes(Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0))
-    assert not summary_of(tmp_path / 'a.mcap', *channels[:2], statistics).problem
-    assert 'that are read' in summary_of(tmp_path / 'a.mcap', *channels).problem
-
-
-def test_a_channel_that_only_the_summary_calls_otherwise_costs_nothing(tmp_path):
-    path = tmp_path / 'a.mcap'
-    messages = write_stranger(path, {})
-    content = bytearray(path.read_bytes())
-    *_, channel = (start for opcode, start, _ in records_of(content) if opcode == Opcode.CHANNEL)
-    content[channel + 9] += 7
-    repair(content)
-    path.write_bytes(content)
-    assert seen_by_us(path) == messages
-
-
 @pytest.mark.parametrize('has_summary', [True, False])
 @pytest.mark.parametrize('stamps', [(0, 7), (5, 7), (0,), (0, 0), (7, 10 ** 18), ()])
 def test_a_message_at_time_0_belongs_to_the_span(tmp_path, stamps, has_summary):
@@ -262,16 +185,6 @@ def test_a_message_at_time_0_belongs_to_the_span(tmp_path, stamps, has_summary):
         assert reader.whole == has_summary
         assert reader.span == (min(stamps, default=0), max(stamps, default=0))
         assert [message.log_time for message in reader.messages()] == list(stamps)
-
-
-def test_beside_dates_a_time_of_0_is_none(tmp_path):
-    """As of messages that came before the clock of a simulation."""
-    path = tmp_path / 'a.mcap'
-    path.write_bytes(closed(HEADER, RAW_CHANNEL, chunk_of(message(0, b'a'), 0, 0),
-                            chunk_of(message(10 ** 18, b'b'), 10 ** 18, 10 ** 18)))
-    with LogReader(path) as reader:
-        assert reader.span == (10 ** 18, 10 ** 18)
-        assert [message.data for message in reader.messages()] == [b'a', b'b']
 
 
 def test_a_summary_that_is_too_large_to_be_parsed_is_no_damage(tmp_path):
@@ -317,55 +230,6 @@ def test_a_chunk_index_that_lies_costs_nothing(tmp_path, place, wrong):
     repair(content)
     path.write_bytes(content)
     assert seen_by_us(path) == messages
-    assert seen_by_mcap(recover(path)) == messages
-
-
-def test_an_index_with_more_entries_than_its_chunk_is_only_a_defect(tmp_path):
-    path = tmp_path / 'a.mcap'
-    for entries in ([(5, 0)] * 3, [(5, 0), (6, 0)], [(5, 7)]):
-        path.write_bytes(closed(
-            HEADER, RAW_CHANNEL, chunk_of(message(5, b'x')),
-            record_bytes(MessageIndex(1, entries)), record_bytes(MessageIndex(2, entries))))
-        with LogReader(path) as reader:
-            assert [message.data for message in reader.messages()] == [b'x']
-            assert reader.damage.lossless
-            assert any('message index' in line for line in reader.damage.lines())
-        recover(path).unlink()
-
-
-@pytest.mark.parametrize('kind', [Opcode.CHUNK, Opcode.METADATA, Opcode.ATTACHMENT])
-@pytest.mark.parametrize('bit', [4, 7])
-def test_an_indexed_record_does_not_become_one_of_unknown_kind(tmp_path, kind, bit):
-    """One bit makes its opcode that of an application, but the summary has it."""
-    path = tmp_path / 'a.mcap'
-    messages = write_stranger(path, {})
-    content = bytearray(path.read_bytes())
-    start, end = next((start, end) for opcode, start, end in records_of(content) if opcode == kind)
-    content[start] ^= 1 << bit
-    path.write_bytes(content)
-    with LogReader(path) as reader:
-        (loss,) = reader.damage.losses
-        assert (loss.offset, loss.bytes) == (start, end - start)
-    kept = seen_by_mcap(recover(path, SOME_LOST))
-    assert kept == seen_by_us(path)
-    assert kept == messages or (
-        kind == Opcode.CHUNK and kept == messages[-len(kept):] != messages)
-
-
-@pytest.mark.parametrize('has_summary', [True, False])
-@pytest.mark.parametrize('bit', range(8))
-def test_a_message_index_of_another_kind_is_made_anew(tmp_path, bit, has_summary):
-    path = tmp_path / 'a.mcap'
-    messages = write_stranger(path, {})
-    content = bytearray(path.read_bytes())
-    records = records_of(content)
-    start = next(start for opcode, start, _ in records if opcode == Opcode.MESSAGE_INDEX)
-    content[start] ^= 1 << bit
-    last = max(end for opcode, _, end in records if opcode == Opcode.MESSAGE_INDEX)
-    path.write_bytes(content if has_summary else content[:last])
-    with LogReader(path) as reader:
-        assert reader.damage.lossless
-        assert f'found: the message index at byte {start} is wrong' in reader.damage.lines()
     assert seen_by_mcap(recover(path)) == messages
 
 
@@ -542,32 +406,6 @@ def test_the_search_behind_damage_takes_linear_time(tmp_path, monkeypatch):
 CEILING_MB = 1000       # of the process: about three times max_bytes, and the interpreter
 
 
-def peak_of(path: Path, call: str) -> tuple[int, str]:
-    """Run a call in a process of its own; return its peak memory [MB] and what it prints."""
-    done = subprocess.run(
-        [sys.executable, '-c',
-         'import resource\n'
-         'from spinning_top_sim.recording.reader import LogReader\n'
-         'from spinning_top_sim.recording.errors import LogError\n'
-         'from spinning_top_sim.tools.recover import main\n'
-         f'path = {str(path)!r}\n{call}\n'
-         'print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10)'],
-        env=os.environ | {'PYTHONPATH': str(ROOT)}, capture_output=True, text=True, timeout=300,
-        check=True)
-    *printed, peak = done.stdout.splitlines()
-    return int(peak), '\n'.join(printed)
-
-
-READ = """
-with LogReader(path) as reader:
-    try:
-        print(sum(1 for _ in reader.messages()))
-    except LogError as error:
-        print(error)
-    print(*reader.damage.lines(), sep='\\n')
-"""
-
-
 def zstd_chunk(plain: bytes, end: int = 5) -> bytes:
     return chunk_of(plain, 5, end, 'zstd', zstandard.compress(plain))
 
@@ -591,22 +429,6 @@ def many_keys() -> bytes:
 
 def overlapping() -> bytes:
     return zstd_chunk(message(5, b'') + message(6, bytes(200_000_000)) + message(9, b''), 9) * 6
-
-
-@pytest.mark.parametrize(('bomb', 'report'), [
-    (tiny_messages, '1000000'), (long_names, 'refused: chunk'), (many_keys, 'refused: chunk'),
-    (overlapping, 'overlap in time')])
-def test_memory_has_a_ceiling(tmp_path, bomb, report):
-    """Small files that unpack to much; what is refused for its size is called that."""
-    path = tmp_path / 'a.mcap'
-    path.write_bytes(closed(HEADER, RAW_CHANNEL, bomb()))
-    assert path.stat().st_size < 3_000_000
-    peak, printed = peak_of(path, READ)
-    assert report in printed
-    assert 'lost' not in printed
-    assert peak < CEILING_MB
-    peak, _ = peak_of(path, f'main([path, "-o", {str(tmp_path / "b.mcap")!r}])')
-    assert peak < CEILING_MB
 
 
 def test_what_is_read_twice_at_once_has_the_ceiling_twice(tmp_path):
@@ -636,31 +458,7 @@ def test_a_record_of_many_gigabytes_is_not_read(tmp_path, kind):
         assert (loss.refused, loss.bytes) == (True, 9 + size)
 
 
-def test_the_search_behind_damage_unpacks_a_limited_amount(tmp_path, monkeypatch):
-    """Chunks that are small and unpack to much, each with a wrong checksum."""
-    unpacked = []
-    ordinary = records.open_chunk
-    monkeypatch.setattr(records, 'open_chunk', lambda chunk, max_bytes: (
-        unpacked.append(chunk.uncompressed_size), ordinary(chunk, max_bytes))[1])
-    plain = bytearray(zstd_chunk(message(5, bytes(1_000_000))))
-    plain[9 + 24] ^= 1
-    path = tmp_path / 'a.mcap'
-    path.write_bytes(MCAP0_MAGIC + HEADER + b'\x00' + bytes(plain) * 300)
-    max_bytes = 2_000_000
-    with LogReader(path, max_bytes) as reader:
-        assert reader.damage.lost_bytes == path.stat().st_size - len(MCAP0_MAGIC + HEADER)
-    assert len(unpacked) > 1
-    assert sum(unpacked) < 5 * (path.stat().st_size + max_bytes)
-
-
 # The output
-
-def test_a_leftover_of_a_killed_recovery_blocks_nothing(tmp_path):
-    path = tmp_path / 'a.mcap'
-    write_log(path)
-    (tmp_path / f'.recover-{os.getpid()}.tmp').write_text('left over')
-    assert seen_by_us(recover(path)) == seen_by_us(path)
-
 
 @pytest.mark.parametrize('mode', [0o600, 0o444])
 def test_the_output_has_the_mode_of_the_log(tmp_path, mode):
@@ -696,15 +494,3 @@ def test_a_signal_leaves_nothing_behind(tmp_path, number, code):
     assert [item.name for item in tmp_path.iterdir()] == ['a.mcap']
 
 
-def test_application_records_are_kept_in_a_file_with_a_summary(tmp_path):
-    """A summary does not mention them."""
-    path = tmp_path / 'a.mcap'
-    messages = write_log(path)
-    private = unknown_kind(0x9a, b'private')
-    content = re.sub(rb'spinning_top_sim \d', b'a stranger, maybe ', path.read_bytes())
-    (end,) = [start for opcode, start, _ in records_of(content) if opcode == Opcode.DATA_END]
-    assert metadata_of(path)
-    path.write_bytes(content[:end] + private)
-    output = recover(path)
-    assert seen_by_us(output) == seen_by_mcap(output) == messages
-    assert private in output.read_bytes()

@@ -28,6 +28,7 @@ from spinning_top_sim.recording.log_file import MAGIC_SIZE, LogFile, known_chann
 from spinning_top_sim.recording.records import HEAD, DamagedError, Messages
 from spinning_top_sim.recording.rosbag2 import Qos, qos_profiles
 from spinning_top_sim.recording.scan import Part, Scan
+from spinning_top_sim.recording.writer import OUR_LIBRARY
 
 _FIRST_DATE = 10 ** 17      # [ns], in 1973
 _STREAM_BYTES = 1 << 12     # that an open chunk costs besides its content, about
@@ -186,7 +187,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     def scan(self, progress: Callable[[int], object] = lambda offset: None) -> Scan:
         """Return what a scan of the whole file finds, done at the first use."""
         if self._scanned is None:
-            self._scanned = Scan(self.file, self._summary, progress)
+            self._scanned = Scan(self.file, self._summary, progress=progress,
+                                 ours=self.library.startswith(OUR_LIBRARY))
         return self._scanned
 
     def open_part(self, part: Part) -> Messages:

@@ -12,7 +12,7 @@ import struct
 import zlib
 from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from typing import BinaryIO
 
@@ -99,6 +99,13 @@ def parse(raw: bytes) -> McapRecord:
             record_bytes(record)[HEAD.size:], HEAD.size):
         raise DamagedError('a length in it is wrong')
     return record
+
+
+def size_of(record: McapRecord) -> int:
+    """Return the size of a record without fields of later versions [bytes]."""
+    if isinstance(record, Chunk | Attachment):      # whose data are not copied
+        return len(record_bytes(replace(record, data=b''))) + len(record.data)
+    return len(record_bytes(record))
 
 
 def index_entries(raw: bytes) -> int:

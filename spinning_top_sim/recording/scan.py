@@ -17,7 +17,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, DataEnd, McapRecord, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from spinning_top_sim.recording.chunks import time_span
+from spinning_top_sim.recording.chunks import ENTRY_SIZE, INDEX_HEAD, time_span
 from spinning_top_sim.recording.damage import Damage, Loss, count
 from spinning_top_sim.recording.log_file import MAGIC_SIZE, LogFile, Summary, known_channels
 from spinning_top_sim.recording.mcap_writer import record_bytes
@@ -31,6 +31,7 @@ from spinning_top_sim.recording.records import (
     find_messages,
     index_entries,
     open_chunk,
+    size_of,
 )
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA
 
@@ -65,10 +66,11 @@ class Scan:
     """
     All that can be decoded of the data section, and the damage of the file.
 
+    ours : whether this package wrote the file: all messages are in chunks, all kinds are known
     progress : is called with the offset that is reached
     """
 
-    def __init__(self, file: LogFile, summary: Summary,
+    def __init__(self, file: LogFile, summary: Summary, *, ours: bool,
                  progress: Callable[[int], object] = lambda offset: None) -> None:
         self.parts: list[Part] = []                 # in file order
         self.metadata: dict[str, dict[str, str]] = {}   # by name
@@ -76,6 +78,8 @@ class Scan:
 
         self._file = file
         self._summary = summary
+        self._ours = ours
+        self._all_in_chunks = ours or summary.indexes_all_messages
         self._limit = summary.data_limit
         self._losses: list[Loss] = []
         self._defects: list[str] = []
@@ -106,18 +110,18 @@ class Scan:
                 if opcode == Opcode.DATA_END and (
                         end == self._limit if end_is_known else end - offset == _DATA_END_SIZE):
                     break
-                self._take(opcode, offset, end)
+                offset = self._take(opcode, offset, end)
             except DamagedError as damage:
-                end = self._skip(offset, damage)
-            offset = end
+                offset = self._skip(offset, damage)
         self._check_end(offset)
 
-    def _take(self, opcode: int, offset: int, end: int) -> None:
-        """Note what a record holds; raises DamagedError."""
+    def _take(self, opcode: int, offset: int, end: int) -> int:
+        """Note what a record holds, and return where it ends; raises DamagedError."""
         record, messages = self._decode(opcode, offset, end)
+        next_offset = self._end_of(record, offset, end)
         if isinstance(record, int):
             self._lost += 0 if self._behind_chunk else record
-            return
+            return next_offset
         self._behind_chunk = opcode == Opcode.CHUNK
         if isinstance(record, Schema | Channel | Metadata):
             self._small_bytes += end - offset
@@ -134,20 +138,21 @@ class Scan:
             self._add(opcode, offset, end, messages)
         elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
             self.parts.append(Part(opcode, offset, end))
+        return next_offset
 
     def _decode(self, opcode: int, offset: int, end: int,
                 ) -> tuple[McapRecord | int | None, Messages | None]:
         """Return a record, of a message index the number of entries, and the messages in it."""
         check_size(end - offset - HEAD.size, self._file.max_bytes)
-        if opcode != Opcode.CHUNK:
-            self._check_next(end)
         if opcode > Opcode.DATA_END:    # of an application, or of a later version of the format
+            if self._ours:
+                raise DamagedError('there is no such kind of record')
             return None, None
         raw = self._file.raw(offset, end)
         if opcode == Opcode.MESSAGE_INDEX:
             return index_entries(raw), None
         if opcode == Opcode.MESSAGE:
-            if self._summary.indexes_all_messages:
+            if self._all_in_chunks:
                 raise DamagedError('all messages of the file are in chunks')
             return None, find_messages(raw)
         record = self._file.record(offset, end)
@@ -155,11 +160,31 @@ class Scan:
             return record, open_chunk(record, self._file.max_bytes)
         return record, None
 
-    def _check_next(self, end: int) -> None:
-        """Raise DamagedError for a length that nothing proves but that a record begins there."""
-        opcode = self._file.read(end, 1)
-        if end < self._limit and not 0 < opcode[0] <= Opcode.DATA_END:
-            self._file.head(end, self._limit)
+    def _end_of(self, record: McapRecord | int | None, offset: int, end: int) -> int:
+        """Return where a record ends; DamagedError for a length that is not that of its fields."""
+        if record is None:
+            # Only the next record proves the length of a message.
+            is_proven = end == self._limit or self._is_head(end) or (
+                0 < self._file.read(end, 1)[0] <= Opcode.DATA_END)
+            size = 0
+        else:
+            size = (INDEX_HEAD.size + ENTRY_SIZE * record if isinstance(record, int)
+                    else size_of(record))
+            # Bytes behind the known fields may be those of a later version of the format.
+            is_proven = end == offset + size or self._is_record(end) or (
+                end == self._limit and not self._summary.problem)
+        if is_proven:
+            return end
+        if size and self._is_head(offset + size):
+            return offset + size
+        raise DamagedError('its length is not that of its content')
+
+    def _is_head(self, offset: int) -> bool:
+        """Return whether a record seems to begin there, which may be truncated."""
+        head = self._file.read(offset, HEAD.size)
+        opcode, length = HEAD.unpack(head.ljust(HEAD.size, b'\0'))
+        return opcode > 0 and (offset + HEAD.size + length <= self._limit or (
+            opcode <= Opcode.DATA_END and length <= self._file.max_bytes))
 
     def _add(self, opcode: int, offset: int, end: int, messages: Messages) -> None:
         """Note a part with messages, or add a message to the part that ends before it."""
@@ -179,17 +204,18 @@ class Scan:
     def _skip(self, offset: int, damage: DamagedError) -> int:
         """Note a damaged record, and return where the next one begins, or the limit."""
         opcode = self._file.read(offset, 1)[0]
+        is_cut = False
         try:
             end = self._file.head(offset, self._limit)[1]
         except DamagedError:
-            end = 0
-        if not (end == self._limit or (end and self._is_record(end))):
+            end, is_cut = offset, not self._summary.closed
+        if is_cut or not (end == self._limit or self._is_record(end)):
             end = self._search(offset + 1)
         what = ('chunk' if offset in self._summary.chunks
                 else Opcode(opcode).name.lower().replace('_', ' ') if opcode in set(Opcode)
                 else 'record of unknown kind')
-        is_last = end == self._limit and not self._summary.closed
-        if what == 'message index' or (is_last and (opcode in _REPEATED or self._is_bag(offset))):
+        if what == 'message index' or (is_cut and end == self._limit and (
+                opcode in _REPEATED or self._is_bag(offset))):
             self._defects.append(f'{what} at byte {offset}: {damage}')
         else:
             self._losses.append(Loss(offset, end - offset, what, str(damage),
