@@ -50,7 +50,7 @@ class Damage:
     def lines(self) -> list[str]:
         """Return a human-readable report: the sums if something is lost, then each loss."""
         lines = []
-        if not self.lossless:
+        if not self.lossless and not (self.losses and all(loss.refused for loss in self.losses)):
             number = count(self.missing_messages, 'message')
             lines.append(f'lost: {count(self.lost_bytes, "byte")}, ' + (
                 number if self.missing_exactly else f'at least {number}' if self.missing_messages

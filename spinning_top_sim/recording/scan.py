@@ -173,6 +173,9 @@ class Scan:
             # Bytes behind the known fields may be those of a later version of the format.
             is_proven = end == offset + size or self._is_record(end) or (
                 end == self._limit and not self._summary.problem)
+            # It may have swallowed the head of a chunk, and to drop it costs nothing.
+            if isinstance(record, int) and end < self._limit:
+                is_proven = is_proven and self._is_head(end)
         if is_proven:
             return end
         if size and self._is_head(offset + size):
@@ -204,19 +207,22 @@ class Scan:
     def _skip(self, offset: int, damage: DamagedError) -> int:
         """Note a damaged record, and return where the next one begins, or the limit."""
         opcode = self._file.read(offset, 1)[0]
-        is_cut = False
-        try:
-            end = self._file.head(offset, self._limit)[1]
-        except DamagedError:
-            end, is_cut = offset, not self._summary.closed
-        if is_cut or not (end == self._limit or self._is_record(end)):
-            end = self._search(offset + 1)
         what = ('chunk' if offset in self._summary.chunks
                 else Opcode(opcode).name.lower().replace('_', ' ') if opcode in set(Opcode)
                 else 'record of unknown kind')
-        if what == 'message index' or (is_cut and end == self._limit and (
-                opcode in _REPEATED or self._is_bag(offset))):
+        try:
+            _, stated_end = self._file.head(offset, self._limit)
+        except DamagedError:
+            stated_end = 0
+        end = (stated_end if stated_end == self._limit or self._is_record(stated_end)
+               else self._search(offset + 1))
+        is_truncated = not stated_end and not self._summary.closed and end == self._limit
+        if what == 'message index' or (
+                is_truncated and (opcode in _REPEATED or self._is_bag(offset))):
             self._defects.append(f'{what} at byte {offset}: {damage}')
+            if offset < stated_end < end:
+                self._losses.append(Loss(stated_end, end - stated_end, 'something',
+                                         'no record can be decoded there'))
         else:
             self._losses.append(Loss(offset, end - offset, what, str(damage),
                                      isinstance(damage, TooLargeError)))
