@@ -283,8 +283,8 @@ def test_a_record_of_another_kind_costs_no_other_chunk(tmp_path, bit):
             message for message in messages if message[1] not in lost], (opcode, start)
 
 
-@pytest.mark.parametrize(('truncated', 'code'), [(False, SOME_LOST), (True, ALL_KEPT)])
-def test_a_summary_behind_a_damaged_end_of_the_data_is_no_data(tmp_path, truncated, code):
+@pytest.mark.parametrize('truncated', [False, True])
+def test_a_summary_behind_a_damaged_end_of_the_data_is_no_data(tmp_path, truncated):
     """Nothing else tells where it begins if the file is truncated, or it is damaged itself."""
     path = tmp_path / 'a.mcap'
     messages = write_stranger(path, {})
@@ -298,7 +298,7 @@ def test_a_summary_behind_a_damaged_end_of_the_data_is_no_data(tmp_path, truncat
         index = next(start for opcode, start, _ in records if opcode == Opcode.ATTACHMENT_INDEX)
         content[index + 4] ^= 1
     path.write_bytes(content)
-    output = recover(path, code)
+    output = recover(path, SOME_LOST)
     assert seen_by_us(path) == seen_by_mcap(output) == messages
     with open(output, 'rb') as file:
         assert len(list(make_reader(file).iter_attachments())) == 1

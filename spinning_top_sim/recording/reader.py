@@ -59,6 +59,15 @@ class LogMessage(NamedTuple):
     channel_id: int
 
 
+class _Index(NamedTuple):
+    """What a summary tells, as in `Scan`."""
+
+    parts: list[Part]
+    metadata: dict[str, dict[str, str]]
+    schemas: dict[int, Schema]
+    channels: dict[int, Channel]
+
+
 class LogReader(contextlib.AbstractContextManager['LogReader']):
     """
     An MCAP file, open for reading; a context manager.
@@ -109,7 +118,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     def topics(self) -> tuple[LogTopic, ...]:
         """The channels of the log, in the order of their ids."""
         no_schema = Schema(id=0, data=b'', encoding='', name='')
-        schemas, channels = self._declared
+        schemas, channels = self._index.schemas, self._index.channels
         return tuple(LogTopic(
             name=channel.topic, type_name=schema.name,
             schema=schema.data.decode(errors='replace'), schema_encoding=schema.encoding,
@@ -118,21 +127,10 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             for number, channel in sorted(channels.items())
             for schema in [schemas.get(channel.schema_id, no_schema)])
 
-    @functools.cached_property
+    @property
     def metadata(self) -> dict[str, dict[str, str]]:
         """The metadata records by name; of several with one name, the last."""
-        if not self._index_is_right:
-            return self.scan().metadata
-        found = {}
-        size = 0
-        for index in self._summary.metadata:
-            size += index.length
-            with contextlib.suppress(DamagedError):
-                records.check_size(size, records.MAX_DECLARED)
-                record = self.file.record(index.offset, self._summary.data_limit)
-                if isinstance(record, Metadata):
-                    found[record.name] = record.metadata
-        return found
+        return self._index.metadata
 
     @property
     def damage(self) -> Damage:
@@ -146,8 +144,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
         Beside dates, a time of 0 does not count: it says that there was no clock yet.
         """
-        begin_ns = min((part.start_ns for part in self._parts), default=0)
-        end_ns = max((part.end_ns for part in self._parts), default=0)
+        begin_ns = min((part.start_ns for part in self._messages), default=0)
+        end_ns = max((part.end_ns for part in self._messages), default=0)
         if begin_ns == 0 and end_ns > _FIRST_DATE:
             first = next(self.messages(start=1), None)
             begin_ns = first.log_time if first and first.log_time > _FIRST_DATE else 0
@@ -171,13 +169,14 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             A message that is read completely.
         """
         names = None if topics is None else frozenset(topics)
-        schemas, channels = self._declared
-        wanted = {number: channels[number].topic for number in known_channels(schemas, channels)
+        channels = self._index.channels
+        wanted = {number: channels[number].topic
+                  for number in known_channels(self._index.schemas, channels)
                   if names is None or channels[number].topic in names}
         times = range(start or 0, 1 << 64 if end is None else end)
         held: list[int] = []        # bytes of each part that is read and not yet passed
         # A part is read when its time comes.
-        streams = [self._stream(part, wanted, held) for part in self._parts
+        streams = [self._stream(part, wanted, held) for part in self._messages
                    if part.end_ns >= times.start and part.start_ns < times.stop
                    and not part.channel_ids.isdisjoint(wanted)]
         for message in heapq.merge(*streams, key=attrgetter('log_time')):
@@ -224,10 +223,29 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         held.remove(held_bytes)
 
     @functools.cached_property
-    def _index_is_right(self) -> bool:
-        """Whether the summary indexes all messages, and its indexes lead to chunks."""
-        return self._summary.is_complete and all(
-            map(self._leads_to_chunk, self._summary.chunks.values()))
+    def _index(self) -> 'Scan | _Index':
+        """What the summary tells, if that is all and right, else what a scan finds."""
+        summary = self._summary
+        if not (summary.is_complete and all(map(self._leads_to_chunk, summary.chunks.values()))):
+            return self.scan()
+        metadata = {}
+        size = 0
+        for index in summary.metadata:
+            size += index.length
+            with contextlib.suppress(DamagedError):
+                records.check_size(size, records.MAX_DECLARED)
+                record = self.file.record(index.offset, summary.data_limit)
+                if isinstance(record, Metadata):
+                    metadata[record.name] = record.metadata
+        parts = [Part(Opcode.CHUNK, offset, offset + chunk.chunk_length,
+                      frozenset(chunk.message_index_offsets), chunk.message_start_time,
+                      chunk.message_end_time) for offset, chunk in sorted(summary.chunks.items())]
+        return _Index(parts, metadata, summary.schemas, summary.channels)
+
+    @property
+    def _messages(self) -> list[Part]:
+        """The parts of the file that hold messages."""
+        return [part for part in self._index.parts if part.channel_ids]
 
     def _leads_to_chunk(self, index: ChunkIndex) -> bool:
         head = struct.pack(
@@ -235,35 +253,16 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             index.message_start_time, index.message_end_time)
         return self.file.read(index.chunk_start_offset, len(head)) == head
 
-    @functools.cached_property
-    def _parts(self) -> list[Part]:
-        """What the summary indexes, if that is all and right, else what a scan found."""
-        if not self._index_is_right:
-            return [part for part in self.scan().parts if part.channel_ids]
-        return [Part(Opcode.CHUNK, offset, offset + index.chunk_length,
-                     frozenset(index.message_index_offsets), index.message_start_time,
-                     index.message_end_time)
-                for offset, index in sorted(self._summary.chunks.items())
-                if index.message_index_offsets]
-
-    @property
-    def _declared(self) -> tuple[dict[int, Schema], dict[int, Channel]]:
-        """The schemas and channels by id."""
-        found = self._summary if self._index_is_right else self.scan()
-        return found.schemas, found.channels
-
     def _read_header(self) -> Header:
         """Return the header; raises LogError if neither magic nor header is there."""
         magic = self.file.read(0, MAGIC_SIZE)
-        if not magic:
-            raise LogError(f'cannot read {self.path}: it is empty')
-        if magic != MCAP0_MAGIC and MCAP0_MAGIC.startswith(magic):
-            raise LogError(
-                f'cannot read {self.path}: it ends after {self.size} bytes of an MCAP file')
+        problem = ('it is empty' if not magic else 'it is no MCAP file'
+                   if not MCAP0_MAGIC.startswith(magic)
+                   else f'it ends after {self.size} bytes of an MCAP file')
         with contextlib.suppress(DamagedError):
             header = self.file.record(MAGIC_SIZE, self.size)
             if isinstance(header, Header):
                 return header
         if magic != MCAP0_MAGIC:
-            raise LogError(f'cannot read {self.path}: it is no MCAP file')
+            raise LogError(f'cannot read {self.path}: {problem}')
         return Header(profile='ros2', library='')

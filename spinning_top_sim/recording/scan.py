@@ -17,7 +17,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, DataEnd, McapRecord, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from spinning_top_sim.recording.chunks import ENTRY_SIZE, INDEX_HEAD, time_span
+from spinning_top_sim.recording.chunks import time_span
 from spinning_top_sim.recording.damage import Damage, Loss, count
 from spinning_top_sim.recording.log_file import MAGIC_SIZE, LogFile, Summary, known_channels
 from spinning_top_sim.recording.mcap_writer import record_bytes
@@ -110,18 +110,19 @@ class Scan:
                 if opcode == Opcode.DATA_END and (
                         end == self._limit if end_is_known else end - offset == _DATA_END_SIZE):
                     break
-                offset = self._take(opcode, offset, end)
+                self._take(opcode, offset, end)
             except DamagedError as damage:
-                offset = self._skip(offset, damage)
+                end = self._skip(offset, damage)
+            offset = end
         self._check_end(offset)
 
-    def _take(self, opcode: int, offset: int, end: int) -> int:
-        """Note what a record holds, and return where it ends; raises DamagedError."""
+    def _take(self, opcode: int, offset: int, end: int) -> None:
+        """Note what a record holds; raises DamagedError."""
         record, messages = self._decode(opcode, offset, end)
-        next_offset = self._end_of(record, offset, end)
+        self._check_length(record, offset, end)
         if isinstance(record, int):
             self._lost += 0 if self._behind_chunk else record
-            return next_offset
+            return
         self._behind_chunk = opcode == Opcode.CHUNK
         if isinstance(record, Schema | Channel | Metadata):
             self._small_bytes += end - offset
@@ -138,7 +139,6 @@ class Scan:
             self._add(opcode, offset, end, messages)
         elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
             self.parts.append(Part(opcode, offset, end))
-        return next_offset
 
     def _decode(self, opcode: int, offset: int, end: int,
                 ) -> tuple[McapRecord | int | None, Messages | None]:
@@ -160,27 +160,15 @@ class Scan:
             return record, open_chunk(record, self._file.max_bytes)
         return record, None
 
-    def _end_of(self, record: McapRecord | int | None, offset: int, end: int) -> int:
-        """Return where a record ends; DamagedError for a length that is not that of its fields."""
-        if record is None:
-            # Only the next record proves the length of a message.
-            is_proven = end == self._limit or self._is_head(end) or (
-                0 < self._file.read(end, 1)[0] <= Opcode.DATA_END)
-            size = 0
-        else:
-            size = (INDEX_HEAD.size + ENTRY_SIZE * record if isinstance(record, int)
-                    else size_of(record))
-            # Bytes behind the known fields may be those of a later version of the format.
-            is_proven = end == offset + size or self._is_record(end) or (
+    def _check_length(self, record: McapRecord | int | None, offset: int, end: int) -> None:
+        """Raise DamagedError for a length that neither its fields nor the next record prove."""
+        if isinstance(record, McapRecord):
+            is_right = end - offset == size_of(record) or self._is_record(end) or (
                 end == self._limit and not self._summary.problem)
-            # It may have swallowed the head of a chunk, and to drop it costs nothing.
-            if isinstance(record, int) and end < self._limit:
-                is_proven = is_proven and self._is_head(end)
-        if is_proven:
-            return end
-        if size and self._is_head(offset + size):
-            return offset + size
-        raise DamagedError('its length is not that of its content')
+        else:
+            is_right = end == self._limit or self._is_head(end)
+        if not is_right:
+            raise DamagedError('its length is not that of its content')
 
     def _is_head(self, offset: int) -> bool:
         """Return whether a record seems to begin there, which may be truncated."""
