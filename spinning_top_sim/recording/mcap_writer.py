@@ -18,7 +18,6 @@ import zlib
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 from mcap import records
 from mcap.data_stream import RecordBuilder
@@ -149,11 +148,11 @@ class McapWriter:
             self._next_sequence[channel_id] += len(rows)
         self._queue(chunk)
 
-    def chunk_of_rows(self, blocks: Iterable[chunks.RowBlock]) -> Any:
+    def chunk_of_rows(self, blocks: Iterable[chunks.RowBlock]) -> object:
         """Call `append_rows`."""
         self.append_rows(blocks)
 
-    def write_chunk(self, _: None = None) -> None:
+    def write_chunk(self, _: object = None) -> None:
         """Write the chunk in memory, if it holds anything, after those of `append_rows`."""
         self._wait()
         if self._chunk.size:
