@@ -150,7 +150,7 @@ class McapWriter:
 
     def chunk_of_rows(self, blocks: Iterable[chunks.RowBlock]) -> object:
         """Call `append_rows`."""
-        self.append_rows(blocks)
+        return self.append_rows(blocks)  # type: ignore[func-returns-value]
 
     def write_chunk(self, _: object = None) -> None:
         """Write the chunk in memory, if it holds anything, after those of `append_rows`."""
