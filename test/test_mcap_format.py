@@ -159,6 +159,18 @@ def test_a_chunk_of_several_frames_is_read_to_its_end(tmp_path, compression):
         assert reader.damage.lossless
 
 
+def test_a_chunk_that_holds_more_than_it_says_is_not_believed(tmp_path):
+    """It has no checksum; only its size shows that it is damaged."""
+    plain = message(5, b'first') + message(6, b'second')
+    chunk = Chunk(compression='zstd', data=zstandard.compress(plain), uncompressed_crc=0,
+                  uncompressed_size=len(message(5, b'first')), message_start_time=5,
+                  message_end_time=6)
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(closed(HEADER, RAW_CHANNEL, record_bytes(chunk)))
+    with LogReader(path) as reader:
+        assert not list(reader.messages()) and reader.damage.lost_chunks == 1
+
+
 def test_a_chunk_that_is_indexed_twice_is_read_once(tmp_path, monkeypatch):
     """Also where the statistics count it twice."""
     path = tmp_path / 'a.mcap'
