@@ -86,7 +86,7 @@ def check_reading_and_recovery(path, output):
     return read
 
 
-@examples(120)
+@examples(80)
 @given(st.sampled_from((*STRANGERS, 'ours')), st.randoms())
 def test_mutated_logs_are_read_and_recovered(tmp_path, kind, rng):
     """Bits, numbers, lengths and kinds changed, records repeated, removed and torn."""
@@ -121,7 +121,7 @@ def of_ours():
                              if kind == Opcode.CHUNK]
 
 
-@examples(150)
+@examples(100)
 @given(st.data(), st.booleans(), st.binary(max_size=40))
 def test_what_is_whole_stays_whatever_stands_beside_it(tmp_path, data, torn, inserted):
     """Any bytes are put in the place of any others, with a summary or without."""
