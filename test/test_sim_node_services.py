@@ -224,7 +224,7 @@ def test_a_node_follows_the_clock_of_another_and_waits_for_it_aloud(peer, diagno
 
         def warned():
             clock.publish(2 ** 31 - 1)
-            return 'stamps cannot be later than 2038' in node.err
+            return 'end in January 2038' in node.err
 
         wait_for('a warning', warned)
         assert peer.set_together(node, time_scale=1.0).successful

@@ -15,7 +15,7 @@ from spinning_top_sim.streams import messages, parameters, timing
 from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
 from spinning_top_sim.streams.imu import Imu, Sensor
 from spinning_top_sim.streams.magnetometer import Magnetometer
-from spinning_top_sim.streams.stream import Samples, Stream
+from spinning_top_sim.streams.stream import Encoded, Samples, Stream
 
 JOINTS = ('precession_joint', 'nutation_joint', 'spin_joint')
 INVARIANTS = ('energy', 'l3', 'lz', 'energy_drift', 'l3_drift', 'lz_drift',
@@ -94,8 +94,7 @@ class ImuRaw(ImuStream):
         super().__init__(values, imu)
         self._timing = (timing.Timing(values) if any(map(values.get, timing.FAULTS)) else None)
 
-    def encode(self, samples: Samples, epoch_ns: int,
-               ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    def encode(self, samples: Samples, epoch_ns: int) -> Encoded:
         if self._timing is None:
             return super().encode(samples, epoch_ns)
         t_ns = samples.t_ns
@@ -139,8 +138,7 @@ class ImuTiming(Stream):
         self._timing = timing.Timing(values)
         super().__init__(values, messages.float64_multi_array(TIMING))
 
-    def encode(self, samples: Samples, epoch_ns: int,
-               ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    def encode(self, samples: Samples, epoch_ns: int) -> Encoded:
         t_ns = samples.t_ns
         true_ns = epoch_ns + t_ns
         stamps_ns = self._timing.stamps_ns(epoch_ns, t_ns, self.period_ns)
