@@ -167,7 +167,7 @@ def test_any_specification_gives_its_runs_or_is_refused_by_its_source(content):
 
 @pytest.mark.parametrize('content', [
     {'runs': 1, 'duration': 1.0, 'format': 1 << 15_000},
-    {'runs': 1, 'duration': 1.0, 'streams': [1 << 15_000]}, {1 << 15_000: 1}])
+    {'runs': 1, 'duration': 1.0, 'streams': [1 << 15_000]}])
 def test_integers_that_python_does_not_print_are_refused_in_a_line(content):
     with pytest.raises(ValueError, match='int with too many digits') as refusal:
         ensemble_spec.parse(content, 'spec.yaml')
@@ -215,7 +215,7 @@ def test_messages_of_any_frame_stamp_and_numbers_are_read_by_rosbags(frame, stam
 def test_numbers_in_a_table_are_read_back_to_the_last_bit(tmp_path, rows):
     path = tmp_path / 'table.csv'
     path.unlink(missing_ok=True)
-    _write_csv(path, [np.array(rows).reshape(-1, len(UNITS)).T])
+    _write_csv(path, [np.array(rows).reshape(-1, len(UNITS))])
     head, *lines = csv.reader(path.read_text().splitlines())
     assert len(head) == len(UNITS) and len(lines) == len(rows)
     for line, row in zip(lines, rows, strict=True):
