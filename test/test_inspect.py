@@ -551,20 +551,6 @@ def test_a_run_that_no_log_of_its_size_holds_is_not_computed(short, tmp_path, ca
 # ---------------------------------------------------------------------------------- pictures
 
 
-def test_in_every_frame_the_tip_is_where_the_axis_is(tmp_path, monkeypatch):
-    pytest.importorskip('matplotlib')
-    from spinning_top_sim.tools import plots
-    ends = []
-    monkeypatch.setattr(plots, 'draw_tip', lambda _, tip, height: ends.append(height[-1]))
-    found = surveyed(log_of(tmp_path / 'run.mcap', '--duration', 0.5))
-    _, data = found.shown
-    plots.animate(data, tmp_path / 'top.gif')
-    frames = max(2, int(data.time[-1] * plots.FRAMES_PER_S))
-    each = np.arange(frames) / (plots.FRAMES_PER_S * data.period)
-    expected = np.interp(each, np.arange(len(data.height)), data.height)
-    assert ends[-frames:] == pytest.approx(expected, abs=1e-6)
-
-
 def test_pictures_are_drawn(stepped, tmp_path, capsys):
     pytest.importorskip('matplotlib')
     image = pytest.importorskip('PIL.Image')
@@ -580,15 +566,6 @@ def test_pictures_are_drawn(stepped, tmp_path, capsys):
         frames.seek(number)
         shown.append(np.asarray(frames.convert('RGB'), int))
     assert np.mean(np.abs(shown[1] - shown[0]).max(axis=2) > 30) > 0.01
-
-
-@pytest.mark.parametrize('scene', ['planar_pendulum', 'sleeping'])
-def test_a_page_is_drawn_of_odd_scenes(tmp_path, scene, capsys):
-    pytest.importorskip('matplotlib')
-    path = log_of(tmp_path / 'run.mcap', '--params', ROOT / f'config/{scene}.yaml', '--duration',
-                  1, '-p', 'solver.method:=exact')
-    assert told(capsys, path, '--plot', tmp_path / 'page.svg')[0] == 0
-    assert (tmp_path / 'page.svg').stat().st_size > 10_000
 
 
 def test_without_matplotlib_there_is_a_hint(short, tmp_path, capsys, monkeypatch):

@@ -164,11 +164,6 @@ def test_commands_at_one_time_are_applied_in_the_order_given(tmp_path):
         labels = messages_of(log, '/spinning_top/invariants')
         assert labels[1_000_000_000][1] == pytest.approx(1.6)        # samples, then commands
         assert labels[1_100_000_000][1] == pytest.approx(float(last.split(':')[0]))
-        table = simulate(tmp_path / f'{number}.csv', '--duration', 1.2, '--command', f'1:{first}',
-                         '--command', f'1:{last}')
-        with open(table, newline='') as file:
-            *_, row = csv.DictReader(file)
-        assert float(row['l3 [kg m^2/s]']) == pytest.approx(float(last.split(':')[0]))
 
 
 def messages_of(log, topic):
@@ -264,15 +259,6 @@ def test_parquet_without_pyarrow_names_the_extra(tmp_path, capsys, monkeypatch):
     assert "pip install 'spinning_top_sim[parquet]'" in capsys.readouterr().err
 
 
-def test_it_runs_without_standard_streams(tmp_path):
-    path = tmp_path / 'run.csv'
-    run = subprocess.run(
-        ['bash', '-c', '"$0" -m spinning_top_sim.tools.simulate -o "$1" --duration 1 >&- 2>&-',
-         sys.executable, path], timeout=60, check=False)
-    assert run.returncode == 0
-    assert len(np.loadtxt(path, delimiter=',', skiprows=1)) == 101
-
-
 def test_nothing_is_overwritten(tmp_path, capsys):
     for name in ('run.mcap', 'run.csv'):
         path = tmp_path / name
@@ -315,12 +301,6 @@ def test_an_interrupted_run_is_a_shorter_log_of_all_streams_up_to_one_time(
     assert inspect.main([str(path), '--verify']) == 0
     log, _ = read(path)
     assert len(log['/pose']) > 100
-
-
-def test_no_streams_are_a_log_of_events(tmp_path):
-    log, _ = read(simulate(tmp_path / 'run.mcap', '--duration', 1, '-p', 'record.streams:=[]',
-                           '--command', '0.5:2.0:1.5'))
-    assert set(log) == {'/spinning_top/events', '/spinning_top/commands'}
 
 
 def test_rclpy_and_scipy_are_not_imported():

@@ -34,11 +34,9 @@ class Attitudes:
     rows : (4, n) q(world <- body) as x, y, z, w; then, if the log has them, (3, n) angular
         velocity in the body frame [rad/s]; then, if the log has them, phi and psi, which count
         turns, and phi'
-    time, period : (n,) since the first sample, and the mean time between two samples [s]
     cos2, sin2 : (n,) squares of the cosine and sine of theta/2; near a pole the smaller one has
         more digits
     tip, body_tip : (n,) sin(theta) exp(i phi) and sin(theta) exp(i psi)
-    phi_dot : (n,) rate of phi [rad/s], None if the log has no rates
     """
 
     def __init__(self, stamps_ns: NDArray[np.int64], rows: NDArray[np.float64]) -> None:

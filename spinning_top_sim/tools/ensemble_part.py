@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.provenance import version
 from spinning_top_sim.streams import journal
-from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
+from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING
@@ -69,43 +69,21 @@ def samples(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Samp
     simulation = Simulation(values, EPOCH_NS)
     streams = [stream for stream in simulation.streams
                if stream.parameter in names and stream.parameter not in WITHOUT_COLUMNS]
-    for stream in streams:
-        stream.template = _NumbersOnly(stream.template)
-    times: dict[str, list[NDArray[np.int64]]] = {
-        stream.topic: [np.empty(0, np.int64)] for stream in streams}
-    rows = {stream.topic: [np.empty((0, sum(stream.template.counts)))] for stream in streams}
+    times = {stream.topic: [np.empty(0, np.int64)] for stream in streams}
+    rows = {stream.topic: [b''] for stream in streams}
     recorded = journal.recorded_streams(streams, values)
     for block in simulation.play(recorded, round(values['duration'] * NANOSECONDS)):
-        for stream, times_ns, numbers in block.parts:
+        for stream, times_ns, messages in block.parts:
             times[stream.topic].append(times_ns)
-            rows[stream.topic].append(numbers)
+            rows[stream.topic].append(messages.tobytes())
     found = {}
     for stream in streams:
         # A faulty sensor sends some samples twice.
         times_ns, first = np.unique(np.concatenate(times[stream.topic]), return_index=True)
-        columns = np.concatenate(rows[stream.topic])[first].T
-        found[stream.topic] = times_ns, {
-            name: column for name, column in zip(_column_names(stream), columns, strict=True)
-            if name}
+        fields = stream.template.decode(b''.join(rows[stream.topic]))
+        columns = zip(_column_names(stream), np.hstack(fields)[first].T, strict=True)
+        found[stream.topic] = times_ns, {name: column for name, column in columns if name}
     return found
-
-
-class _NumbersOnly(Template):
-    """A template whose messages are rows of the numbers in their fields, and not bytes."""
-
-    def __init__(self, template: Template) -> None:
-        self.counts = template.counts
-
-    def __len__(self) -> int:
-        return 8 * sum(self.counts)
-
-    def encode(self, stamps_ns: NDArray[np.int64],     # type: ignore[override]
-               *values: Field) -> NDArray[np.float64]:
-        columns = [column for field in values for column in field]
-        rows = np.empty((len(columns), len(stamps_ns)))
-        for row, column in zip(rows, columns, strict=True):
-            row[:] = column
-        return rows.T           # a column is contiguous
 
 
 def _column_names(stream: Stream) -> Sequence[str]:

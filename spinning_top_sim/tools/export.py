@@ -9,9 +9,7 @@ formats"; the matrices as its model scale-misalignment writes them).
 """
 
 import argparse
-import errno
 import itertools
-import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,8 +26,6 @@ from spinning_top_sim.tools.recorded_run import RunDescription
 
 BLOCK = 16384               # messages that are read together
 RAW, BIAS, ODOMETRY = 'imu/data_raw', 'ground_truth/imu_bias', 'ground_truth/imu_odom'
-# Parameter that enables a topic.
-SWITCHES = {RAW: 'imu.enabled', BIAS: 'imu.enabled', ODOMETRY: 'ground_truth_imu_odom.enabled'}
 KALIBR_NEEDS = tuple(f'imu.{kind}_{name}' for kind in ('accelerometer', 'gyroscope')
                      for name in ('noise_density', 'random_walk'))
 EUROC_HEAD = ('#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],'
@@ -59,22 +55,17 @@ def _parse(text: str) -> tuple[str, Path]:
 
 def check(exports: Sequence[tuple[str, Path]], topics: Collection[str],
           values: Mapping[str, Any]) -> None:
-    """
-    Check that these files can be made of a run with these topics and parameters.
-
-    Raises ValueError or FileExistsError.
-    """
+    """Raise ValueError or OSError if files cannot be made of a run with these parameters."""
     for kind, path in exports:
         for topic in KINDS[kind][0]:
             if topic not in topics:
-                raise ValueError(f'--export {kind}: the log has no {topic}: it must be recorded '
-                                  f'with {SWITCHES[topic]}')
+                raise ValueError(f'--export {kind}: the log has no {topic}')
         for name in KALIBR_NEEDS if kind == 'kalibr' else ():
             if not values[name] > 0.0:
                 raise ValueError(f'--export kalibr: {name} = {values[name]!r}: kalibr reads only '
                                   'what is > 0')
         if path.exists():
-            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+            raise FileExistsError(f'{path}: File exists')
 
 
 def write(reader: LogReader, run: RunDescription,

@@ -235,10 +235,8 @@ def _motion(number: int, motion: MotionReport, begin_ns: int) -> Iterator[str]:
     if measured is not None:
         yield f'measured from {motion.source}: {count(measured.nutations, "whole nutation")}'
         yield from (f'not measured: {reason}' for reason in measured.missing)
-    elif motion.source is not None:
-        yield 'not measured: too few samples'
     else:
-        yield 'not measured: no topic with an attitude (joint_states, pose, ground_truth/...)'
+        yield 'not measured: no topic with enough attitudes (joint_states, pose, ground_truth/...)'
 
 
 def _verdict(verdict: Verdict) -> Iterator[str]:
