@@ -167,7 +167,7 @@ def test_any_specification_gives_its_runs_or_is_refused_by_its_source(content):
 
 @pytest.mark.parametrize('content', [
     {'runs': 1, 'duration': 1.0, 'format': 1 << 15_000},
-    {'runs': 1, 'duration': 1.0, 'streams': [1 << 15_000]}, {1 << 15_000: 1}])
+    {'runs': 1, 'duration': 1.0, 'streams': [1 << 15_000]}])
 def test_integers_that_python_does_not_print_are_refused_in_a_line(content):
     with pytest.raises(ValueError, match='int with too many digits') as refusal:
         ensemble_spec.parse(content, 'spec.yaml')

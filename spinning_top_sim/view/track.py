@@ -18,7 +18,7 @@ from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.topics import all_streams
-from spinning_top_sim.tools.analysis import SNAP, attitudes_of
+from spinning_top_sim.tools.analysis import attitudes_of
 
 # Number of columns of each topic.  First come the attitude x, y, z, w and the angular velocity in
 # the body; then phi', or for the IMU the specific force.
@@ -28,6 +28,7 @@ ATTITUDES = ('pose', 'joint_states', 'ground_truth/odom', 'ground_truth/imu')   
 RATES = ('joint_states', 'ground_truth/odom')
 PRECESSION = 7              # column of RATES
 ENERGY_DRIFT, ORIENTATION_ERROR = 3, 7     # columns of ~/invariants
+SNAP = 1e-9                 # relative distance within which a motion is taken for a special one
 SAME = 1e-6                 # relative difference between the constants of one motion
 MOST_MOTIONS = 99           # that are kept
 
