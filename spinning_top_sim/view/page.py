@@ -147,7 +147,7 @@ class Page:
         self.server.stop()
 
     def set_tracks(self, tracks: Sequence[Track], shifts_ns: Sequence[int] = (0,)) -> None:
-        """Show these tops instead; a shift is added to the stamp of the page to get the track's."""
+        """Show these tops; a shift is added to a stamp of the page to get the track's."""
         for top in self._tops:
             top.root.remove()
         for plot in self._plots:
