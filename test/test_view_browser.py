@@ -12,7 +12,6 @@ from helpers.browser import Visit
 from helpers.node_harness import SimNode, wait_for
 from helpers.reference import ROOT
 from rclpy.time import Time
-from std_msgs.msg import Float64MultiArray
 
 from spinning_top_sim.physics.attitude import angle_between
 from spinning_top_sim.recording.reader import LogReader
@@ -58,7 +57,6 @@ def test_live(browser, peer, tmp_path):
     with SimNode(tmp_path, {'record.uri': f'{tmp_path}/', 'tick_rate': 50.0}) as node:
         view = SimNode(tmp_path / 'view', namespace=node.namespace, program=VIEW)
         poses = peer.listen(node.topic('pose'), PoseStamped)
-        invariants = peer.listen(node.topic('~/invariants'), Float64MultiArray)
         with view, Visit(browser, address_of(view)) as visit:
             visit.read('cusps')
 
@@ -71,8 +69,6 @@ def test_live(browser, peer, tmp_path):
             # A command, as of any client.
             visit.put('L3 [kg m²/s]', 2.0)
             visit.read(r'spin\.l3 = 2')
-            invariants.wait_more(2)
-            assert invariants.last().data[1] == pytest.approx(2.0, abs=0.01)
 
             # A refused one says why, and the motion goes on.
             visit.press('Step')
@@ -129,8 +125,6 @@ def test_log(browser, log, tmp_path):
         visit.press('Next command')
         visit.read(r't = 2\.500')
         visit.read('loops')
-        visit.press('Play')
-        visit.read(r't = (2\.[6-9]|[3-6])')
         assert visit.errors == []
         assert visit.hosts <= {'127.0.0.1', None}
 

@@ -16,6 +16,7 @@ import rclpy
 from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
@@ -67,6 +68,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
     """A node under examination, which is also a `trial.Filter`; arguments as `examine_node`."""
 
     def __init__(self, topic: str, command: str | None = None) -> None:
+        expand_topic_name(topic, NAME, '/')         # raises ValueError
         self._command = None if command is None else shlex.split(command)
         self._topic = topic
         self._context = Context()

@@ -202,6 +202,8 @@ class LiveView(Node):
                   **dict(zip(SPIN, shown[-len(SPIN):], strict=True))}
         track = Track('', values)
         if self._track is not None:
+            if all(values[name] == self._track.values[name] for name in names):
+                return
             track.samples = self._track.samples
         self._track = track
         self._page.set_tracks([track])

@@ -48,7 +48,8 @@ class DrawnTop:
         name, shape, far = f'/top{number}', track.shape, model.reach(track)
         radius = abs(far)
         self.root = scene.add_frame(name, show_axes=False)
-        self._sphere = scene.add_icosphere(f'{name}/sphere', radius, SPHERE, wireframe=True)
+        self._sphere = scene.add_icosphere(f'{name}/sphere', radius, SPHERE, wireframe=True,
+                                           opacity=0.2, cast_shadow=False)
         self._body = scene.add_frame(f'{name}/body', show_axes=False)
         for part, colour, mesh, position in (
                 ('mark', MARK, trimesh.creation.box((
