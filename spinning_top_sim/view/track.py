@@ -51,9 +51,10 @@ class Samples(NamedTuple):
         return None if index < 0 else (int(self.stamps_ns[index]), self.rows[index])
 
     def thinned(self, most: int) -> 'Samples':
-        """Return at most so many evenly chosen samples."""
+        """Return at most so many evenly chosen samples, with the last one."""
         stride = max(1, -(-len(self.rows) // most))
-        return Samples(self.stamps_ns[::stride], self.rows[::stride])
+        first = (len(self.rows) - 1) % stride
+        return Samples(self.stamps_ns[first::stride], self.rows[first::stride])
 
 
 def joined(parts: Sequence[Samples]) -> Samples:
@@ -114,11 +115,9 @@ class Track:
                            if stream.topic in WIDTHS}
 
     def decode(self, topic: str, stamps_ns: Sequence[int], messages: Sequence[bytes]) -> Samples:
-        """Return serialized messages of a topic as samples, without those of another size."""
-        template = self._templates[topic]
-        fitting = [k for k, message in enumerate(messages) if len(message) == len(template)]
-        stamps = np.array([stamps_ns[k] for k in fitting], np.int64)
-        fields = template.decode(b''.join(messages[k] for k in fitting))
+        """Return serialized messages of a topic as samples."""
+        stamps = np.array(stamps_ns, np.int64)
+        fields = self._templates[topic].decode(b''.join(messages))
         if topic == '~/invariants':
             return Samples(stamps, fields[0])
         found = attitudes_of(topic, self._imu, stamps, fields)
@@ -128,8 +127,6 @@ class Track:
             assert found.phi_dot is not None
             rows = np.column_stack((rows[:, :7], found.phi_dot))
         if topic == 'ground_truth/imu':
-            if len(rows) < len(stamps):         # an attitude of zeros
-                return empty(topic)
             # With imu.sampling = mean these are means, which are near enough for a picture.
             (_, rates), (_, force) = (self._imu.in_body(tuple(fields[0].T), tuple(field.T))
                                       for field in fields[1:3])
