@@ -95,7 +95,8 @@ def test_architecture_has_every_folder_of_the_package_and_no_name_that_does_not_
     folders = {path.parent.name for path in package.glob('*/__init__.py')}
     assert set(re.findall(r'^\| `(\w+)/` \|', text, re.MULTILINE)) == folders
     text = re.sub(r'^```$.*?^```$', '', text, flags=re.MULTILINE | re.DOTALL)
-    named = {word for code in re.findall(r'`([^`]+)`', text) for word in re.findall(r'\w+', code)}
+    named = {word for code in re.findall(r'`([^`]+)`', text)
+             for word in re.findall(r'\w+\b(?!\*)', code)}
     paths = [path for folder in (package, *map(ROOT.joinpath, FOLDERS))
              for path in folder.rglob('*') if path.suffix in ('.py', '.md', '')]
     known = {word for path in (*paths, *ROOT.glob('*.py'))

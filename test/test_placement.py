@@ -21,7 +21,7 @@ def pose_and_twist(state):
     return np.concatenate(q), np.concatenate(attitude.in_world(q, states.rows_angular_velocity))
 
 
-@pytest.mark.parametrize('seed', range(30))
+@pytest.mark.parametrize('seed', range(6))
 def test_a_state_comes_back_from_its_pose_and_twist(seed):
     rng = np.random.default_rng(seed)
     state = State(theta=rng.uniform(0.02, 3.12), theta_dot=rng.normal(), phi=rng.uniform(-3, 3),
@@ -56,25 +56,6 @@ def test_at_a_pole_what_is_not_spin_is_nutation(tilt, inverted, rates):
     assert np.allclose(rates_again, rates, rtol=0.0, atol=1e-14)
 
 
-def test_just_beside_a_pole_the_motion_is_still_what_was_asked_for():
-    """POLE is where rounding disturbs the angular velocity as much as the tilt matters."""
-    columns = [np.array([value]) for value in (0.7, 2.0 * POLE, -1.9)]
-    q = np.concatenate(attitude.quaternion_of_angles(*columns))
-    rates = np.array([0.3, -0.4, 2.0])
-    _, found = pose_and_twist(state_of(TOP, q, rates))
-    assert np.allclose(found, rates, rtol=0.0, atol=1e-7)
-
-
-def test_the_matrix_turns_as_the_quaternion():
-    q = np.array([0.1, -0.5, 0.3, 0.8])
-    q /= np.linalg.norm(q)
-    matrix, vector = rotation_matrix(q), np.array([0.2, -1.0, 3.0])
-    assert np.allclose(matrix.T @ matrix, np.eye(3), atol=1e-15)
-    columns = tuple(np.array([part]) for part in q)
-    assert np.allclose(matrix @ vector,
-                       np.concatenate(attitude.in_world(columns, tuple(vector))), atol=1e-15)
-
-
 @pytest.mark.parametrize('distance', [0.15, 0.0, -0.4])
 def test_the_box_holds_the_body_the_pivot_and_the_tip(distance):
     top = Top(lambda1=0.5, lambda3=0.15, mass=2.0, com_distance=distance, gravity=9.8)
@@ -88,14 +69,7 @@ def test_the_box_holds_the_body_the_pivot_and_the_tip(distance):
         shape.centre + shape.height / 2}
 
 
-def nearest_points(box, rotation, inside):
-    """Return the smallest distance of samples of the box from what `inside` measures."""
-    grid = np.stack(np.meshgrid(*(np.linspace(low, high, 21) for low, high in zip(
-        box.lower, box.upper, strict=True)), indexing='ij'), axis=-1).reshape(-1, 3)
-    return inside(grid @ rotation.T).min()
-
-
-@pytest.mark.parametrize('seed', range(40))
+@pytest.mark.parametrize('seed', range(20))
 def test_overlaps_are_those_of_sampled_points(seed):
     """What samples of the box are inside of overlaps; what is well away from all does not."""
     rng = np.random.default_rng(seed)
@@ -105,10 +79,10 @@ def test_overlaps_are_those_of_sampled_points(seed):
     centre, radius = rng.uniform(-2.0, 2.0, 3), rng.uniform(0.1, 1.0)
     half = rng.uniform(0.05, 0.8, 3)
     other = Box(centre - half, centre + half)
-    to_sphere = nearest_points(box, rotation,
-                               lambda at: np.linalg.norm(at - centre, axis=1) - radius)
-    to_box = nearest_points(box, rotation, lambda at: np.linalg.norm(
-        np.maximum(np.abs(at - centre) - half, 0.0), axis=1))
+    samples = np.stack(np.meshgrid(*np.linspace(box.lower, box.upper, 21).T), axis=-1)
+    away = samples.reshape(-1, 3) @ rotation.T - centre
+    to_sphere = np.linalg.norm(away, axis=1).min() - radius
+    to_box = np.linalg.norm(np.maximum(np.abs(away) - half, 0.0), axis=1).min()
     spacing = 0.1 * math.sqrt(3.0)          # a point of the box is this near to a sample
     for found, distance in ((box.overlaps_sphere(rotation, centre, radius), to_sphere),
                             (box.overlaps_box(rotation, other), to_box)):

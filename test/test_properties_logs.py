@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 from helpers.examples import examples
 from helpers.mutations import mutate
-from helpers.odd_logs import odd_log
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
@@ -39,7 +38,6 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.streams import messages
-from spinning_top_sim.tools import inspect
 
 HEAD = MCAP0_MAGIC + record_bytes(Header(profile='ros2', library='spinning_top_sim 0'))
 CHUNKS = 4
@@ -86,7 +84,7 @@ def check_reading_and_recovery(path, output):
     return read
 
 
-@examples(120)
+@examples(60)
 @given(st.sampled_from((*STRANGERS, 'ours')), st.randoms())
 def test_mutated_logs_are_read_and_recovered(tmp_path, kind, rng):
     """Bits, numbers, lengths and kinds changed, records repeated, removed and torn."""
@@ -95,7 +93,7 @@ def test_mutated_logs_are_read_and_recovered(tmp_path, kind, rng):
     check_reading_and_recovery(path, tmp_path / 'whole.mcap')
 
 
-@examples(60)
+@examples(30)
 @given(st.lists(st.tuples(st.integers(0, 20), st.binary(max_size=60), st.sampled_from(
     (None, None, None, 0, 1, 255, 2 ** 31, 2 ** 63, 2 ** 64 - 1))), max_size=12),
     st.none() | st.integers(0, 1000))
@@ -121,7 +119,7 @@ def of_ours():
                              if kind == Opcode.CHUNK]
 
 
-@examples(150)
+@examples(60)
 @given(st.data(), st.booleans(), st.binary(max_size=40))
 def test_what_is_whole_stays_whatever_stands_beside_it(tmp_path, data, torn, inserted):
     """Any bytes are put in the place of any others, with a summary or without."""
@@ -141,24 +139,13 @@ def test_what_is_whole_stays_whatever_stands_beside_it(tmp_path, data, torn, ins
     assert Counter(read) <= Counter(logged)
 
 
-@examples(20)
-@given(st.randoms())
-def test_odd_logs_end_in_words(tmp_path, capsys, rng):
-    """Metadata, journal, stamps, samples and names of any kind, in a log that is whole."""
-    path = odd_log(tmp_path / 'odd.mcap', rng)
-    assert inspect.main([str(path), '--verify']) in (0, 1)
-    out, err = capsys.readouterr()
-    assert out.startswith(f'{path}: ')
-    assert (out + err).replace('\n', '').isprintable()
-
-
 # ----------------------------------------------------------------------------- messages of others
 
 TYPE = 'sensor_msgs/msg/Imu'
 assert TYPE in LAYOUTS
 
 
-@examples(40)
+@examples(20)
 @given(st.lists(st.one_of(st.binary(max_size=400), st.tuples(
     st.integers(0, 2 ** 62), st.lists(st.floats(), min_size=10, max_size=10))), min_size=1,
     max_size=5), st.sampled_from(('ground_truth/imu', 'said')))
