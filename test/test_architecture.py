@@ -2,6 +2,7 @@
 """The rooms of the package: imports go one way, in no circle, and to public names only."""
 
 import ast
+import functools
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -36,6 +37,7 @@ MODULES = {'.'.join(path.relative_to(PACKAGE.parent).with_suffix('').parts): pat
            for path in sorted(PACKAGE.rglob('*.py'))}
 
 
+@functools.cache
 def imported(path):
     """Return the full names of all that a module imports, anywhere in it."""
     names = set()

@@ -168,18 +168,6 @@ def test_regime_stays_within_its_bounds(top, state):
             solution.mean_spin_rate * period, rel=1e-6, abs=1e-6)
 
 
-def test_unstable_sleeper_leaves_exponentially():
-    """Without spin, theta = theta0 cosh(sqrt(P/lambda1) t) while it is small."""
-    rate = math.sqrt(UNIT.gravity_torque / UNIT.lambda1)
-    for theta0 in (1e-12, 1e-40, 1e-140):
-        solution = ExactSolution(UNIT, start(theta0, l3=0.0, lz=0.0))
-        t = math.log(1e-6 / theta0) / rate
-        expected = theta0 * math.cosh(rate * t)
-        assert solution.states_at_seconds(np.array([t])).theta[0] == pytest.approx(
-            expected, rel=1e-11)
-        assert solution.theta_max == pytest.approx(math.pi, abs=1e-15)
-
-
 def test_rates_of_equilibria():
     sleeping = ExactSolution(TOP, start(0.0, l3=0.2, lz=0.2))
     assert sleeping.nutation_period is None
@@ -340,7 +328,6 @@ def test_a_phase_keeps_its_fraction_of_a_turn():
             apart = per_second * ns / 10 ** 9 - Decimal(float(high[0, 0]))
             apart -= Decimal(float(rest[0, 0]))
             assert abs(apart) <= Decimal('1e-17')
-
 
 
 @pytest.mark.parametrize('seed', range(2))

@@ -5,7 +5,7 @@ The exact solution where its own arithmetic is at its limits.
 Starts within 1e-26 to 1e-99 rad of a pole that is passed, or 1e-19 to 1e-91 rad/s from a turning
 point, passages of a pole at 1e-11 rad, and angles of many turns.  data/hard_cases.json holds their
 states to 28 digits, from Taylor series of Newton's and Euler's equations at two precisions
-(data/make_hard_cases.py): nothing of a closed form is in them.
+(data/make_references.py): nothing of a closed form is in them.
 """
 
 import json

@@ -125,17 +125,6 @@ def test_what_turns_too_fast_is_refused_at_the_start_at_a_reset_and_by_simulate(
     assert not log.exists()
 
 
-def test_a_closed_form_that_ends_stops_the_motion_there():
-    simulation = simulate(solver__method='exact', spin__l3=3e6, spin__lz=1e6)
-    limit_ns = simulation.segment.solver.ns_limit
-    assert 10 ** 17 < limit_ns < LAST_STAMP_NS - simulation.epoch_ns
-    assert simulation.advance(limit_ns)
-    with pytest.raises(IntegrationError, match=r'2\^52 turns'):
-        simulation.advance(limit_ns + SECOND)
-    simulation.command(1.0, 0.5)
-    assert simulation.advance(limit_ns + SECOND)
-
-
 # -------------------------------------------------------------------------------------- stamps
 
 def test_a_run_offline_whose_stamps_would_end_is_refused_before(tmp_path, capsys):

@@ -126,14 +126,6 @@ def test_hanging_at_rest_an_accelerometer_reads_g_upwards():
     assert tuple(float(x[0]) for x in upright) == (0.0, 0.0, TOP['gravity'])
 
 
-def test_the_centre_of_percussion_of_a_horizontal_pendulum_feels_no_force_along_its_swing():
-    """At lambda1/(M R) from the pivot a released horizontal pendulum falls with g."""
-    level = at_rest(math.pi / 2)
-    arm = level.top.lambda1 / (level.top.mass * level.top.com_distance)
-    assert np.array(level.specific_force((0.0, 0.0, arm)))[:, 0] == pytest.approx(
-        (0.0, 0.0, 0.0), abs=1e-14)
-
-
 NAMES = {
     'loop-c-thd+': 'loops', 'wavy-a': 'waves', 'fast-1e+08-cusp': 'cusps',
     'cross-top-a': 'through the top', 'cross-bottom-a': 'through the bottom',

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inputs of any kind: parameters, commands, YAML and CDR are read, or refused by name."""
+"""Inputs of any kind: parameters and YAML are read, or refused by name."""
 
 import dataclasses
 import math
@@ -10,13 +10,11 @@ import yaml
 from helpers.examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
-from rosbags.typesys import Stores, get_typestore
 
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.streams import messages, parameters
+from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import ensemble_spec, scene_file
 
-JAZZY = get_typestore(Stores.ROS2_JAZZY)
 NUMBERS = st.one_of(st.integers(), st.floats(), st.sampled_from((10 ** 400, -2 ** 63, 5e-324)))
 # Python shows no integer of more than 4300 digits; YAML has them, in hexadecimal.
 LONG = st.integers(15_000, 20_000).map(lambda bits: 1 << bits)
@@ -145,26 +143,3 @@ def test_any_specification_gives_its_runs_or_is_refused_by_its_source(content):
         assert is_a_line(str(refusal))
     else:
         assert specification.values(specification.runs - 1) == values
-
-
-# ------------------------------------------------------------------------------------------- CDR
-
-STAMPS = st.integers(-2 ** 31 * 10 ** 9, 2 ** 31 * 10 ** 9 - 1)
-
-
-@examples(40)
-@given(st.text(max_size=9).filter(lambda text: '\0' not in text), STAMPS,
-       st.lists(st.floats(), min_size=10, max_size=10))
-def test_messages_of_any_frame_stamp_and_numbers_are_read_by_rosbags(frame, stamp_ns, numbers):
-    """To the last bit of each number, NaN among them."""
-    template = messages.imu(frame, *3 * (messages.EXACT,))
-    data = template.encode_one(stamp_ns, numbers[:4], numbers[4:7], numbers[7:])
-    message = JAZZY.deserialize_cdr(data, 'sensor_msgs/msg/Imu')
-    assert message.header.frame_id == frame
-    assert message.header.stamp.sec * 10 ** 9 + message.header.stamp.nanosec == stamp_ns
-    found = [getattr(vector, axis) for vector, axes in (
-        (message.orientation, 'xyzw'), (message.angular_velocity, 'xyz'),
-        (message.linear_acceleration, 'xyz')) for axis in axes]
-    assert np.array(found).tobytes() == np.array(numbers).tobytes()
-    assert np.concatenate(template.decode(data), axis=1).tobytes() == np.array(numbers).tobytes()
-    assert template.stamps_ns(data).tolist() == [stamp_ns]

@@ -211,19 +211,6 @@ def test_the_duration_ends_with_its_last_sample():
     assert run.loop.state is tick_loop.LoopState.ENDED
 
 
-def test_what_is_too_late_is_recorded_but_not_published():
-    run = started().publish()
-    run.output('joint_states').publish = lambda data: None      # nobody records it
-    run.ticks(3)
-    sent = len(run.published)
-    for _ in range(2):
-        run.tick(700_000_000)
-    assert run.stamps == grid(run.simulation.now_ns)
-    assert len(run.published) - sent == 2 * 50
-    assert run.pose.skipped > 0
-    assert run.loop.slipped_ns == 0
-
-
 def test_a_clock_too_far_ahead_slips():
     """Whatever the recording cannot take is computed later, so nothing is missing."""
     room = [True]
@@ -334,21 +321,6 @@ def test_after_a_failure_a_step_is_refused_and_sends_nothing(paused):
     with pytest.raises(RuntimeError, match='stands still: for a test'):
         run.loop.step(1, 0.5)
     assert len(run.stamps) == sent
-
-
-def test_a_pause_asked_for_during_a_failure_holds_after_the_reset():
-    run = started().ticks(4)
-    run.loop.fail('for a test')
-    run.loop.resume()
-    run.loop.start()
-    assert run.loop.state is tick_loop.LoopState.FAILED
-    run.loop.pause()
-    assert run.loop.state is tick_loop.LoopState.FAILED and run.loop.failure == 'for a test'
-    run.loop.reset(run.values, 0)
-    assert run.loop.state is tick_loop.LoopState.PAUSED
-    assert run.loop.failure is None
-    run.loop.resume()
-    assert run.loop.state is tick_loop.LoopState.RUNNING
 
 
 def test_nothing_leads_on_from_the_end():
