@@ -40,39 +40,16 @@ MOUNTED = {'imu.lever_arm': (0.1, -0.2, 0.3), 'imu.rpy': (0.1, 0.2, 0.3),
 SCENES = {
     'cusps': {},
     'a sensor elsewhere': {**scene_parameters('looping'), **MOUNTED},
-    'near the separatrix': scene_parameters('near_separatrix'),
     'through a pole': {'initial.theta': 0.5, 'spin.l3': 0.2, 'spin.lz': 0.2},
-    'beside a pole': {'initial.theta': 1e-7, 'spin.l3': 0.5, 'spin.lz': 0.5},
     'no torque': {'top.gravity': 0.0, 'spin.lz': 0.2, **MOUNTED},
-    'sleeping': {'initial.theta': 0.0, 'spin.l3': 3.0},
-    'steady precession': scene_parameters('steady_slow'),
-    'spherical pendulum': scene_parameters('spherical_pendulum'),
     'planar rotation': scene_parameters('planar_pendulum'),
-    'centre of mass below': {'top.com_distance': -0.15, 'initial.theta': 2.5,
-                             'initial.theta_dot': 3.0, 'spin.l3': 0.3, 'spin.lz': -0.1},
-    'fast': {'spin.l3': 20.0},
 }
-# Without gravity, and where it sleeps, both methods are the closed form.
-CASES = [*((scene, 'exact') for scene in SCENES), ('cusps', 'euler'), *(
-    (scene, 'rk45') for scene in ('cusps', 'a sensor elsewhere', 'through a pole', 'fast'))]
-DURATION_NS = 1_000_000_000
+CASES = (('a sensor elsewhere', 'exact'), ('no torque', 'exact'), ('planar rotation', 'exact'),
+         ('cusps', 'euler'), ('a sensor elsewhere', 'rk45'), ('through a pole', 'rk45'))
+DURATION_NS = 500_000_000
 # Two commands and two changes of rates: time [ns], what, its arguments.
-EVENTS = ((250_000_000, 'command', 1.1, 1.1), (450_000_001, 'rate', 'pose', 250.0),
-          (450_000_001, 'rate', 'imu', 320.0), (700_000_003, 'command', 0.9, 0.85))
-
-
-def events_of(scene):
-    """Return the events; at a pole Lz must stay L3, and beside it the motion be a slow one."""
-    if scene in ('sleeping', 'beside a pole'):
-        return (*EVENTS[:3], (700_000_003, 'command', 0.9, 0.9))
-    return EVENTS
-
-
-def apply(simulation, what, first, second):
-    if what == 'command':
-        simulation.command(first * simulation.l3, second * simulation.lz)
-    else:
-        simulation.apply({f'{first}.rate': second})
+EVENTS = ((125_000_000, 'command', 1.1, 1.1), (225_000_001, 'rate', 'pose', 250.0),
+          (225_000_001, 'rate', 'imu', 320.0), (350_000_003, 'command', 0.9, 0.85))
 
 
 class Run:
@@ -82,7 +59,6 @@ class Run:
         solver = ({'solver.equations': 'euler'} if method == 'euler'
                   else {'solver.method': method})
         self.simulation = simulate({**COMMON, **SCENES[scene], **solver})
-        self.events = events_of(scene)
         self.rows = {stream.topic: [] for stream in self.simulation.streams}
 
     def advance(self, t_ns):
@@ -96,12 +72,17 @@ class Run:
     def go(self, splits=()):
         """Run to the end, divided at the events and at `splits` [ns]."""
         stops = [(t_ns, None) for t_ns in (*splits, DURATION_NS)]
-        stops += [(event[0], event[1:]) for event in self.events]
+        stops += [(event[0], event[1:]) for event in EVENTS]
         for t_ns, event in sorted(stops, key=lambda stop: stop[0]):
             if t_ns > self.simulation.now_ns:
                 self.advance(t_ns)
             if event is not None:
-                apply(self.simulation, *event)
+                what, first, second = event
+                if what == 'command':
+                    l3, lz = self.simulation.l3, self.simulation.lz
+                    self.simulation.command(first * l3, second * lz)
+                else:
+                    self.simulation.apply({f'{first}.rate': second})
         assert len(self.simulation.history) == 3
         return self
 
@@ -150,10 +131,8 @@ def assert_same_bytes(found, expected):
     for stream in found.simulation.streams:
         mine, other = found.rows[stream.topic], expected.rows[stream.topic]
         assert [stamp for stamp, _ in mine] == [stamp for stamp, _ in other], stream.topic
-        for k, (one, two) in enumerate(zip(mine, other, strict=True)):
-            assert one == two, (stream.topic, k, one[0] - EPOCH_NS, *(
-                [field.tolist() for field in stream.template.decode(data)]
-                for _, data in (one, two)))
+        differing = [k for k, (one, two) in enumerate(zip(mine, other, strict=True)) if one != two]
+        assert not differing, (stream.topic, differing[0], mine[differing[0]][0] - EPOCH_NS)
 
 
 @pytest.mark.parametrize(('scene', 'method'), CASES)
@@ -161,12 +140,12 @@ def test_any_division_of_a_run_gives_the_same_bytes(scene, method):
     """Offline in large blocks and divided anywhere, and live; what is published is recorded."""
     whole = Run(scene, method).go()
     counts = {topic: len(rows) for topic, rows in whole.rows.items()}
-    assert counts['pose'] > 250 and counts['imu/data_raw'] > 350 and min(counts.values()) > 10
+    assert counts['pose'] > 125 and counts['imu/data_raw'] > 175 and min(counts.values()) > 5
     assert_same_bytes(Run(scene, method).go(random_splits(3, 5)), whole)
-    run = RestlessRun(scene, method, seed=2).go(random_splits(2, 30))
+    run = RestlessRun(scene, method, seed=2).go(random_splits(2, 20))
     assert_same_bytes(run, whole)
     recorded = {topic: {data for _, data in rows} for topic, rows in whole.rows.items()}
-    assert len(run.published) > 25
+    assert len(run.published) > 12
     assert all(data in recorded[topic] for topic, data in run.published)
 
 
@@ -182,19 +161,13 @@ def motion(theta, theta_dot=0.0, *, l3, lz, phi=0.3, psi=-0.7, **top):
 
 MOTIONS = {
     'loops': motion(0.6, 0.2, l3=1.6, lz=1.2),
-    'cusps': motion(0.5, l3=1.6, lz=1.6 * np.cos(0.5)),
     'near the separatrix': motion(0.001, l3=0.5, lz=0.5),
-    'through the top': motion(0.8, -9.0, l3=0.4, lz=0.4),
     'through the bottom': motion(2.6, 3.0, l3=0.4, lz=-0.4),
-    'past a pole': motion(0.8, -9.0, l3=0.4, lz=0.4 + 1e-7),
     'no torque': motion(0.6, 1.5, l3=0.3, lz=0.1, gravity=0.0),
-    'sleeping': motion(0.0, l3=1.6, lz=1.6),
-    'spherical pendulum': motion(2.0, 0.4, l3=0.0, lz=0.3),
     'planar rotation': motion(1.0, -15.0, l3=0.0, lz=0.0),
-    'centre of mass below': motion(2.0, 1.0, l3=0.3, lz=-0.1, com_distance=-0.15),
 }
 motions = pytest.mark.parametrize('name', MOTIONS)
-INSTANTS = 4_000
+INSTANTS = 2_000
 COLUMNS = ('theta', 'theta_dot', 'phi', 'psi', 'angular_velocity', 'l3', 'lz', 'quaternion',
            'theta_folded', 'phi_dot', 'psi_dot', 'angular_acceleration', 'energy')
 
@@ -207,14 +180,8 @@ def some_times(seed, earliest, latest):
     return np.sort(np.concatenate((t, rng.choice(t, 100))))
 
 
-def column(states, name):
-    return np.ascontiguousarray(getattr(states, name))
-
-
 def assert_same_bits(found, expected, name):
-    differs = found.view(np.int64) != expected.view(np.int64)
-    assert not differs.any(), (
-        f'{name}: {np.count_nonzero(differs.reshape(len(differs), -1).any(axis=1))} rows')
+    assert found.tobytes() == expected.tobytes(), name
 
 
 @motions
@@ -224,31 +191,25 @@ def test_exact_states_are_the_same_bits_in_any_blocks_and_any_order(name):
     rng = np.random.default_rng(1)
     t = some_times(1, -20.0, 40.0)
     whole = solve(*MOTIONS[name], t)
-    sizes = rng.permutation(np.concatenate((rng.integers(1, 4, 60), rng.integers(1, 301, 30))))
+    sizes = rng.permutation(np.concatenate((rng.integers(1, 4, 30), rng.integers(1, 301, 15))))
     edges = np.cumsum(sizes)
     parts = [solution.states_at_seconds(part) for part in np.split(t, edges[edges < INSTANTS])]
     order = rng.permutation(INSTANTS)
     shuffled = solve(*MOTIONS[name], t[order])
     for each in COLUMNS:
-        expected = column(whole, each)
-        assert_same_bits(np.concatenate([column(part, each) for part in parts]), expected, each)
-        assert_same_bits(column(shuffled, each), expected[order], each)
-
-
-def test_the_motion_near_the_separatrix_is_that():
-    top, start = MOTIONS['near the separatrix']
-    assert 0.0 < ExactSolution(top, start).m1 < 2e-4
+        expected = getattr(whole, each)
+        assert_same_bits(np.concatenate([getattr(part, each) for part in parts]), expected, each)
+        assert_same_bits(getattr(shuffled, each), expected[order], each)
 
 
 @motions
 def test_stepped_states_are_the_same_bits_whichever_are_left_out(name):
     """Those up to an instant, and those of any subset: also few in a step, or none."""
     rng = np.random.default_rng(4)
-    t = some_times(3, 0.0, 15.0)
+    t = some_times(3, 0.0, 8.0)
     whole = solve(*MOTIONS[name], t, method='rk45', rtol=1e-9)
-    for kept in (np.arange(1), np.arange(int(rng.integers(2, INSTANTS))),
-                 np.flatnonzero(rng.random(INSTANTS) < 0.5),
+    for kept in (np.arange(int(rng.integers(2, INSTANTS))),
                  np.flatnonzero(rng.random(INSTANTS) < 0.01)):
         part = solve(*MOTIONS[name], t[kept], method='rk45', rtol=1e-9)
         for each in COLUMNS:
-            assert_same_bits(column(part, each), column(whole, each)[kept], each)
+            assert_same_bits(getattr(part, each), getattr(whole, each)[kept], each)

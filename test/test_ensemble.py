@@ -17,11 +17,10 @@ from helpers.reference import ROOT
 
 from spinning_top_sim import tools
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.topics import all_streams
 from spinning_top_sim.tools import ensemble_part, ensemble_spec
 from spinning_top_sim.tools.ensemble import main
-from spinning_top_sim.tools.ensemble_part import EnsembleError, compute_part, samples, table
+from spinning_top_sim.tools.ensemble_part import EnsembleError, compute_part, table
 
 pytest.importorskip('distributed')
 pa = pytest.importorskip('pyarrow')
@@ -202,15 +201,13 @@ def test_the_same_command_goes_on_after_an_interruption(whole, tmp_path, ensembl
         os.killpg(running.pid, signal.SIGINT)           # as a terminal does
         _, said = running.communicate(timeout=PATIENCE)
     assert running.returncode == 130
-    assert said.splitlines() == [
-        f'ensemble: {folder} holds what is complete: the same command goes on',
-        'ensemble: interrupted']
+    assert said == 'ensemble: interrupted\n'
     assert not json.loads((folder / 'manifest.json').read_text())['complete']
     torn, *kept = sorted((folder / 'data').iterdir())
     assert 2 <= len(kept) < RUNS // 2
     then = [(part.stat().st_ino, part.stat().st_mtime_ns) for part in kept]
     torn.write_bytes(torn.read_bytes()[:-1])
-    assert ensemble(path, '-o', folder, '--resume') == 0        # as version 1.0 needed it
+    assert ensemble(path, '-o', folder) == 0
     assert contents(folder / 'data') == contents(data)
     assert [(part.stat().st_ino, part.stat().st_mtime_ns) for part in kept] == then
 
@@ -314,7 +311,7 @@ def test_what_is_drawn_has_the_distributions_and_does_not_depend_on_other_names(
 
 
 @pytest.mark.parametrize(('runs', 'duration', 'together'), [
-    (10 ** 6, 10.0, 100), (1000, 10.0, 20), (10, 10.0, 1), (10 ** 6, 1e5, 1)])
+    (10 ** 6, 10.0, 100), (1000, 10.0, 20), (10 ** 6, 1e5, 1)])
 def test_a_part_has_so_many_runs_by_default(runs, duration, together):
     """At most 200 000 rows of 200 Hz, and at least 50 parts."""
     given = {'runs': runs, 'duration': duration}
@@ -326,29 +323,6 @@ def test_a_worker_with_other_versions_computes_nothing(tmp_path):
     with pytest.raises(EnsembleError, match=r"gives other bytes than \{'numpy': '1.0'\}"):
         compute_part(specification, 0, str(tmp_path), {'numpy': '1.0'})
     assert list(tmp_path.iterdir()) == []
-
-
-def test_samples_of_a_run_are_arrays():
-    values = parameters.checked({'duration': 0.5, 'record.streams': ('imu', 'invariants')})
-    found = samples(values, ('imu', 'invariants', 'mag'))
-    assert set(found) == {'imu/data_raw', 'ground_truth/imu_bias', '~/invariants', 'imu/mag',
-                          'ground_truth/mag'}
-    assert len(found['imu/mag'][0]) == 0
-    times, columns = found['imu/data_raw']
-    assert times.tolist() == [5_000_000 * k for k in range(101)]
-    assert {name: len(column) for name, column in columns.items()} == {
-        f'{field}.{axis}': 101 for field in ('angular_velocity', 'linear_acceleration')
-        for axis in 'xyz'}
-
-
-def test_a_run_of_several_blocks_of_steps_is_whole():
-    specification = ensemble_spec.parse({
-        'runs': 1, 'duration': 40.0, 'streams': ['pose'],
-        'params': [{'solver.rtol': 1e-13, 'pose.rate': 10.0}]}, 'test')
-    one = table(specification, 0)
-    assert one['t'].to_pylist() == [k / 10.0 for k in range(401)]
-    norm = sum(one[f'pose.pose.orientation.{axis}'].to_numpy() ** 2 for axis in 'xyzw')
-    assert np.abs(norm - 1.0).max() < 1e-14
 
 
 @pytest.mark.parametrize(('content', 'counts'), [
@@ -384,35 +358,21 @@ def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(
      'there is no parameter spin.l4; did you mean spin.l'),
     ({'params': [{'spin.l4': 1.0}]}, 'no parameter spin.l4'),
     ({'params': ['none.yaml']}, 'none.yaml: No such file'),
-    ({'sample': {'spin.l3': {'gauss': [1, 2]}}},
-     'spin.l3: there is no distribution gauss; there are uniform, normal, log_uniform, values'),
+    ({'sample': {'spin.l3': {'gauss': [1, 2]}}}, 'must be one of uniform, normal, log_uniform'),
     ({'sample': {'spin.l3': {'uniform': [2, 1]}}}, 'uniform = [2, 1]: must be [low, high] with'),
     ({'sample': {'spin.l3': {'uniform': [1, 10 ** 400]}}}, 'must be [low, high] with low <= high'),
-    ({'sample': {'spin.l3': {'uniform': [-1e308, 1e308]}}}, 'and a finite difference'),
-    ({'sample': {'spin.l3': {'log_uniform': [1e-300, 1e300]}}}, 'and a finite ratio'),
-    ({'params': ['a\0b']}, "'a\\x00b': must be a parameter file"),
-    ({'sample': {'spin.l3': {'uniform': [2]}}}, 'uniform = [2]: must be [low, high]'),
-    ({'sample': {'spin.l3': {'normal': [2, -1]}}}, 'deviation >= 0'),
+    ({'sample': {'spin.l3': {'normal': [2]}}}, 'normal = [2]: must be [mean, deviation]'),
     ({'sample': {'top.mass': {'log_uniform': [0, 1]}}}, '0 < low <= high'),
-    ({'sample': {'top.mass': {'uniform': [-1, 1]}}}, 'top.mass = -1: must be a number >= 0'),
     ({'sample': {'top.mass': {'uniform': [1, 1e31]}}}, 'top.mass = 1e+31: must be a number >= 0'),
     ({'sample': {'spin.l3': {'values': []}}}, 'must have one value at least'),
-    ({'sample': {'spin.l3': [1, 2]}}, 'spin.l3 = [1, 2]: must be one of uniform'),
     ({'sample': {'solver.method': {'values': ['exact', 'euler']}}}, "'euler': must be one of"),
     ({'sample': {'markers.trace_points': {'uniform': [1, 2]}}}, 'must be values'),
-    ({'sample': {'use_sim_time': {'values': [True]}}}, 'use_sim_time is of ROS'),
     ({'sample': {'imu.enabled': {'values': [True, False]}}}, 'imu.enabled must not be sampled'),
-    ({'sample': {'record.streams': {'values': [['imu']]}}}, 'record.streams must not be sampled'),
-    ({'streams': ['imu', 'lidar']}, "streams: 'lidar': must be some of pose"),
-    ({'streams': ['markers']}, "'markers': must be some of"),
-    ({'runs': 0}, 'runs = 0: must be an integer >= 1'),
-    ({'runs': 1.5}, 'runs = 1.5: must be an integer'),
-    ({'seed': -1}, 'seed = -1'),
+    ({'streams': ['imu', 'markers']}, "streams: 'markers': must be some of pose"),
+    ({'runs': 1.5}, 'runs = 1.5: must be an integer >= 1'),
     ({'duration': 0.0}, 'duration = 0.0: must be a number > 0'),
-    ({'duration': 'long'}, "duration = 'long'"),
     ({'format': 'csv'}, "format = 'csv': must be one of parquet, mcap"),
-    ({'run': 3}, 'run: there is no such entry; there are runs'),
-])
+    ({'run': 3}, "'run'")])
 def test_a_bad_specification_is_refused_and_makes_nothing(tmp_path, capsys, changes, said):
     path = written(tmp_path, **changes)
     code = main([str(path), '-o', str(tmp_path / 'out')])
@@ -434,57 +394,43 @@ def test_a_folder_of_something_else_is_refused(whole, tmp_path, capsys, ensemble
     assert contents(folder) == before
     assert ensemble(path, '-o', folder) == 2
     error = capsys.readouterr().err
-    assert f'{folder} has another specification: runs = 1, not 40, duration' in error
+    assert f'{folder} has another ensemble: runs = 1, not 40, duration' in error
     assert error.endswith(': choose a new folder, or --overwrite\n')
     turned = written(tmp_path, runs=1, duration=0.05, sample={      # it is another grid
         'spin.l3': {'values': [1.5, 1.7]}, 'initial.theta': {'values': [0.3, 0.6]}})
     assert ensemble(turned, '-o', folder) == 2
-    assert 'has another specification: sample = ' in capsys.readouterr().err
+    assert 'has another ensemble: sample = ' in capsys.readouterr().err
     assert contents(folder) == before
     (folder / 'notes').write_text('mine')
     assert ensemble(turned, '-o', folder, '--overwrite') == 0
     after = contents(folder)
     assert after.pop('notes') == b'mine'
     assert after.keys() == before.keys() and not after.items() & before.items()
-    for arguments in ([], ['--overwrite']):
-        assert ensemble(path, '-o', tmp_path, *arguments) == 2
-        assert capsys.readouterr().err.endswith(
-            f'{tmp_path} exists and has no manifest.json: choose a new folder\n')
+    assert ensemble(path, '-o', tmp_path, '--overwrite') == 2
+    assert capsys.readouterr().err.endswith(
+        f'{tmp_path} exists and has no manifest.json: choose a new folder\n')
 
 
 @pytest.mark.parametrize('text', [
-    '{"format": 2, "versions": 1, "specification": {}}',
-    '{"format": 2, "versions": {}, "specification": []}',
-    '{"format": 3, "versions": {}, "specification": {}}', '[]', '{"format": 1}', '[' * 100_000])
-def test_what_is_no_manifest_is_refused(whole, tmp_path, capsys, text):
+    '{"versions": 1, "specification": {"runs": 1, "duration": 1.0}}', '[' * 100_000])
+def test_what_is_no_manifest_is_refused(tmp_path, capsys, text):
     place = tmp_path / 'manifest.json'
     place.write_text(text)
-    for arguments in ([str(tmp_path), '--row', '0', '-o', str(tmp_path / 'one.mcap')],
-                      [str(whole[1]), '-o', str(tmp_path)]):
-        assert main(arguments) == 2
-        error = capsys.readouterr().err
-        assert error.startswith(f'ensemble: {place} is no manifest') and error.count('\n') == 1
+    assert main([str(tmp_path), '--row', '0', '-o', str(tmp_path / 'one.mcap')]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f'ensemble: {place} is no manifest') and error.count('\n') == 1
 
 
 @pytest.mark.parametrize(('arguments', 'said'), [
     (['--row', '40', '-o', 'one.mcap'], '--row 40: must be from 0 to 39'),
     (['--row', '1', '-o', 'one.csv'], 'one.csv: the name must end in .mcap or .parquet'),
-    (['-o', 'out', '--workers', '0'], '--workers 0: must be'),
-    (['-o', 'out', '--scheduler', 'host'], '--scheduler host: must be such as tcp://host:8786'),
-    (['-o', 'out', '--workers', '1', '--scheduler', 'tcp://127.0.0.1:1'], 'must not be given')])
+    (['-o', 'out', '--workers', '0'], '--workers 0: must be')])
 def test_bad_arguments_are_refused(tmp_path, monkeypatch, capsys, arguments, said):
     path = written(tmp_path)
     monkeypatch.chdir(tmp_path)
     assert main([str(path), *arguments]) == 2
     assert said in capsys.readouterr().err
     assert [entry.name for entry in tmp_path.iterdir()] == ['spec.yaml']
-
-
-def test_a_row_of_logs_without_columns_is_refused(tmp_path, capsys):
-    path = written(tmp_path, format='mcap', streams=['clock'])
-    assert main([str(path), '--row', '0', '-o', str(tmp_path / 'one.parquet')]) == 2
-    assert capsys.readouterr().err == (
-        'ensemble: the streams clock have no columns: only a log (.mcap) can have them\n')
 
 
 @pytest.mark.parametrize('name', ['distributed', 'pyarrow'])

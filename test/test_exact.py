@@ -7,16 +7,12 @@ data/reference_cases.json holds 32 motions at four times each, computed with 70 
 promises: 5e-15, relative for what is larger than 1.
 """
 
-import itertools
 import math
 import pickle
 import random
-import subprocess
-import sys
 from dataclasses import replace
 from decimal import Context, Decimal, Inexact, localcontext
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,12 +21,9 @@ from helpers.reference import CASES, start_of, top_of
 from stress import tops
 
 from spinning_top_sim import State, Top, solve
-from spinning_top_sim.physics.attitude import quaternion_of_angles
-from spinning_top_sim.physics.top import ContinuedState
-from spinning_top_sim.solvers import cubic, theta_setup
+from spinning_top_sim.solvers import cubic
 from spinning_top_sim.solvers.cubic import RootsTooCloseError, cubic_roots
-from spinning_top_sim.solvers.decimal_math import atan2, pi, precision, sin_cos
-from spinning_top_sim.solvers.elliptic import GaussMean
+from spinning_top_sim.solvers.decimal_math import precision
 from spinning_top_sim.solvers.exact import BLOCK, ExactSolution
 from spinning_top_sim.solvers.theta_setup import set_up
 from spinning_top_sim.solvers.times import LARGEST_NS, Rates, Times
@@ -43,12 +36,6 @@ def error(value, digits):
     """Error over max(1, |value|) of a double against a decimal string."""
     true = Decimal(digits)
     return float(abs(Decimal(float(value)) - true) / max(Decimal(1), abs(true)))
-
-
-def difference(a, b):
-    """The largest difference of two arrays over max(1, |b|)."""
-    a, b = np.asarray(a, float), np.asarray(b, float)
-    return float(np.max(np.abs(a - b) / np.maximum(1.0, np.abs(b)), initial=0.0))
 
 
 def columns(states):
@@ -94,57 +81,10 @@ def test_states_at_whole_nanoseconds_agree_with_reference(case):
     ns = np.array([whole_ns(x['t']) for x in references])
     assert len(ns)
     assert_states_are(solution.states(ns), references)
-    for t, reference in zip(ns.tolist(), references, strict=True):
-        grid = solution.states(range(t - 700 * 1_234_567, t + 700 * 1_234_567, 1_234_567))
-        x, y, z, w = grid.quaternion[700]
-        assert max(map(error, (w, x, y, z), reference['q'])) <= BOUND
-
-
-@cases
-def test_phases_do_not_drift_in_ten_years(case):
-    """The theta functions in long decimals, at times that are exact both in seconds and ns."""
-    solution = ExactSolution(top_of(case), start_of(case))
-    motion = set_up(top_of(case), start_of(case))
-    for seconds in (316_000_000, -316_000_000, 271_828_182):
-        if seconds > solution.time_limit:
-            continue
-        true = decimal_quaternion(motion, Decimal(seconds))
-        by_seconds = solution.states_at_seconds(np.array([float(seconds)]))
-        by_ns = solution.states(np.array([seconds * 10 ** 9]))
-        assert by_seconds.quaternion.tobytes() == by_ns.quaternion.tobytes()
-        assert max(float(abs(Decimal(float(a)) - b))
-                   for a, b in zip(by_ns.quaternion[0], true, strict=True)) <= BOUND
-        # The angles have series of their own.
-        x, y, z, w = map(float, true)
-        tilt = 2.0 * math.atan2(math.hypot(x, y), math.hypot(z, w))
-        assert difference(by_ns.theta_folded, tilt) <= BOUND
-
-
-def decimal_quaternion(motion, t):
-    """Evaluate the solution at t seconds in long decimals; x, y, z, w."""
-    with precision(60):
-        phase = motion.quarter0 + motion.offset0 + motion.quarter_rate * t
-        quarters = int(phase.to_integral_value())
-        y = (phase - quarters) * pi() / 2
-        if motion.imaginary:
-            x = motion.stretch * y
-            sin, cos = (x.exp() - (-x).exp()) / 2, (x.exp() + (-x).exp()) / 2
-            point = sin, cos, -sin * sin
-        else:
-            sin, cos = sin_cos(y)
-            point = sin, cos, sin * sin
-        values = []
-        for factor in (motion.alpha, motion.beta):
-            real, imag = factor.parts[quarters % 2]
-            real, imag = real.at(*point), imag.at(*point)
-            if factor.crosses and quarters % 4 >= 2:
-                real = -real
-            angle = factor.rate * t + 2 * pi() * factor.phase_turns + factor.drift * y
-            s, c = sin_cos(angle)
-            values.append((real * c - imag * s, real * s + imag * c))
-        (w, z), (y_, minus_x) = values
-        size = (w * w + z * z + y_ * y_ + minus_x * minus_x).sqrt()
-        return [x / size for x in (-minus_x, y_, z, w)]
+    t, last = ns[-1].item(), references[-1]
+    grid = solution.states(range(t - 700 * 1_234_567, t + 700 * 1_234_567, 1_234_567))
+    x, y, z, w = grid.quaternion[700]
+    assert max(map(error, (w, x, y, z), last['q'])) <= BOUND
 
 
 # ------------------------------------------------------------------------------- every regime
@@ -166,42 +106,25 @@ def steady_start(top, theta, l3):
 
 REGIMES = {
     'looping': (UNIT, start(0.6, l3=6.0, lz=4.5)),
-    'wavy': (UNIT, start(0.6, l3=6.0, lz=6.0)),
     'cusp': (TOP, start(0.5, l3=0.2, lz=0.2 * math.cos(0.5))),
-    'rising nutation': (UNIT, start(1.0, -0.8, l3=5.0, lz=3.0)),
     'near the top pole': (UNIT, start(1e-3, 0.5, l3=2.0, lz=2.0 + 1e-9)),
-    'near the bottom pole': (UNIT, start(math.pi - 1e-6, 0.3, l3=2.0, lz=-2.0)),
     'through the top': (UNIT, start(0.4, -6.0, l3=2.0, lz=2.0)),
     'through the bottom': (UNIT, start(2.4, 1.0, l3=2.0, lz=-2.0)),
-    'from the top': (UNIT, start(0.0, 1.5, l3=2.0, lz=2.0)),
     'from the bottom': (UNIT, start(math.pi, 1.5, l3=2.0, lz=-2.0)),
-    'sleeping, stable': (TOP, start(0.0, l3=0.2, lz=0.2)),
     'sleeping, unstable': (UNIT, start(0.0, l3=1.0, lz=1.0)),
-    'sleeping, stable, touched': (TOP, start(1e-8, l3=0.2, lz=0.2)),
-    'sleeping, unstable, touched': (UNIT, start(1e-8, l3=1.0, lz=1.0)),
-    'hanging': (UNIT, start(math.pi, l3=1.0, lz=-1.0)),
     'hanging, touched': (UNIT, start(math.pi, 1e-9, l3=0.0, lz=0.0)),
-    'separatrix, m1 = 2e-25': (UNIT, start(1e-12, l3=0.3, lz=0.3)),
-    'separatrix, m1 = 3e-41': (UNIT, start(1e-20, l3=0.3, lz=0.3)),
     'separatrix, m1 = 1e-121': (UNIT, start(1e-60, l3=0.3, lz=0.3)),
-    'spherical pendulum': (UNIT, start(2.0, 0.4, l3=0.0, lz=0.9)),
     'planar, oscillating': (UNIT, start(2.0, 0.4, l3=0.0, lz=0.0)),
-    'planar, rotating': (UNIT, start(2.0, 7.0, l3=0.0, lz=0.0)),
     'planar, rotating upside down': (replace(UNIT, gravity=-9.8),
                                      start(1.0, -7.0, l3=0.0, lz=0.0)),
     'no gravity': (replace(TOP, gravity=0.0), start(0.5, 2.0, l3=0.2, lz=0.1)),
-    'pivot in the centre of mass': (replace(TOP, com_distance=0.0), start(0.5, l3=0.2, lz=0.1)),
     'no mass': (replace(TOP, mass=0.0), start(0.5, 1.0, l3=0.0, lz=0.0)),
     'next to no gravity': (replace(TOP, gravity=1e-12), start(0.5, 2.0, l3=0.2, lz=0.1)),
-    'gravity upwards': (replace(TOP, gravity=-G), start(0.5, 1.0, l3=0.02, lz=0.02)),
-    'centre of mass below': (replace(UNIT, com_distance=-0.5), start(0.4, -6.0, l3=2.0, lz=2.0)),
     'upside down through the bottom': (replace(UNIT, com_distance=-0.5),
                                        start(2.4, 6.0, l3=2.0, lz=-2.0)),
     'steady precession': (TOP, steady_start(TOP, 0.5, 0.2)),
-    'steady precession, touched': (TOP, replace(steady_start(TOP, 0.5, 0.2), theta_dot=1e-6)),
     'nothing moves': (replace(TOP, gravity=0.0), start(0.5, l3=0.0, lz=0.0)),
     'fast': (replace(TOP, gravity=1e-3), start(0.5, l3=2.0, lz=2.0 * math.cos(0.5))),
-    'longer than wide': (replace(UNIT, lambda3=1.7), start(0.6, 0.2, l3=-6.0, lz=4.5)),
 }
 regimes = pytest.mark.parametrize('top, state', REGIMES.values(), ids=REGIMES)
 
@@ -220,8 +143,6 @@ def test_regime_keeps_its_constants_and_symmetries(top, state):
     tops.check_derivatives(found, case, solution)
     tops.check_symmetries(found, case, motion, times)
     assert not found.failures, '\n'.join(found.failures)
-    rows = solution.states_at_seconds(np.linspace(-30.0, 30.0, 301) / fastest_rate(top, state))
-    assert (np.abs(np.diff(rows.quaternion, axis=0)) < 1.0).all()       # sign continuous
 
 
 @regimes
@@ -247,34 +168,6 @@ def test_regime_stays_within_its_bounds(top, state):
             solution.mean_spin_rate * period, rel=1e-6, abs=1e-6)
 
 
-def fastest_rate(top, state):
-    return max(1.0, abs(state.l3) / min(top.lambda1, top.lambda3), abs(state.theta_dot),
-               math.sqrt(abs(top.gravity_torque) / top.lambda1))
-
-
-def test_planar_rotation_counts_turns():
-    for gravity, theta_dot in itertools.product((9.8, -9.8, 0.0), (9.0, -9.0)):
-        solution = ExactSolution(replace(UNIT, gravity=gravity),
-                                 start(1.0, theta_dot, l3=0.0, lz=0.0))
-        t = np.linspace(-20.0, 20.0, 20001)
-        theta = solution.states_at_seconds(t).theta
-        assert (np.sign(np.diff(theta)) == np.sign(theta_dot)).all()
-        assert np.abs(np.diff(theta)).max() < 0.03
-        assert solution.states(np.array([20 * 10 ** 9])).theta[0] == theta[-1]
-
-
-def test_unstable_sleeper_leaves_exponentially():
-    """Without spin, theta = theta0 cosh(sqrt(P/lambda1) t) while it is small."""
-    rate = math.sqrt(UNIT.gravity_torque / UNIT.lambda1)
-    for theta0 in (1e-12, 1e-40, 1e-140):
-        solution = ExactSolution(UNIT, start(theta0, l3=0.0, lz=0.0))
-        t = math.log(1e-6 / theta0) / rate
-        expected = theta0 * math.cosh(rate * t)
-        assert solution.states_at_seconds(np.array([t])).theta[0] == pytest.approx(
-            expected, rel=1e-11)
-        assert solution.theta_max == pytest.approx(math.pi, abs=1e-15)
-
-
 def test_rates_of_equilibria():
     sleeping = ExactSolution(TOP, start(0.0, l3=0.2, lz=0.2))
     assert sleeping.nutation_period is None
@@ -287,14 +180,6 @@ def test_rates_of_equilibria():
     assert steady.mean_precession_rate == pytest.approx(rate, rel=1e-14)
     assert ExactSolution(replace(TOP, gravity=0.0), start(0.5, l3=0.0, lz=0.0)
                          ).nutation_period is None
-
-
-def test_small_oscillation_has_the_pendulum_period():
-    solution = ExactSolution(UNIT, start(math.pi - 1e-7, l3=0.0, lz=0.0))
-    # u = cos(theta) repeats twice in a swing.
-    assert solution.nutation_period == pytest.approx(
-        math.pi / math.sqrt(UNIT.gravity_torque / UNIT.lambda1), rel=1e-13)
-    assert solution.m1 == pytest.approx(1.0, abs=1e-13)
 
 
 def test_a_tiny_oscillation_has_its_rate_and_is_refused_below_what_doubles_hold():
@@ -313,37 +198,18 @@ def test_a_tiny_oscillation_has_its_rate_and_is_refused_below_what_doubles_hold(
 # ------------------------------------------------------------------------------- edge inputs
 
 
-def test_no_times_and_a_repeated_time():
-    solution = ExactSolution(*REGIMES['looping'])
-    for none in (solution.states_at_seconds(np.zeros(0)), solution.states(range(0)),
-                 solution.states(range(512, 512)), solution.states(np.zeros(0, np.int64))):
-        assert none.quaternion.shape == (0, 4) and none.angular_velocity.shape == (0, 3)
-    assert (np.ptp(solution.states(np.full(3, 7)).quaternion, axis=0) == 0.0).all()
-
-
-def test_columns_belong_to_the_times_that_were_given():
-    solution = ExactSolution(*REGIMES['looping'])
-    for times, ask in ((np.array([1.0, 2.0]), solution.states_at_seconds),
-                       (np.array([1, 2]), solution.states)):
-        expected, states = ask(times.copy()), ask(times)
-        times[:] += 5
-        for name in ('t', 'theta', 'quaternion'):
-            assert (getattr(states, name) == getattr(expected, name)).all(), name
-
-
-@pytest.mark.parametrize('asked', [False, True])
 @pytest.mark.parametrize('settings', [
     {'method': 'exact'}, {'method': 'rk45'}, {'method': 'rk45', 'equations': 'euler'}])
-def test_states_can_be_pickled(settings, asked):
+def test_states_can_be_pickled(settings):
     states = solve(*REGIMES['looping'], [0.0, 1.0], **settings)
-    if asked:
-        assert states.phi.shape == (2,)
+    before = pickle.loads(pickle.dumps(states))     # no column is computed yet
+    assert before.phi.tobytes() == states.phi.tobytes()
     copy = pickle.loads(pickle.dumps(states))
     for name in ('t', 'phi', 'theta_dot', 'quaternion', 'angular_velocity', 'energy', 'l3'):
         assert getattr(copy, name).tobytes() == getattr(states, name).tobytes(), name
 
 
-@pytest.mark.parametrize('name', ['looping', 'through the top', 'fast', 'nothing moves'])
+@pytest.mark.parametrize('name', ['looping', 'nothing moves'])
 def test_a_range_has_the_bits_of_its_times_in_any_pieces(name):
     """Of nanoseconds and of years, backwards, where the integers end, and beyond one block."""
     solution = ExactSolution(*REGIMES[name])
@@ -361,16 +227,8 @@ def test_a_range_has_the_bits_of_its_times_in_any_pieces(name):
                 expected[part].tobytes())
 
 
-@pytest.mark.parametrize('t', [[math.nan], [0.0, math.inf], [-math.inf], [1e300]])
-def test_times_that_are_none_are_refused(t):
-    solution = ExactSolution(*REGIMES['looping'])
-    with pytest.raises(ValueError, match='t = '):
-        solution.states_at_seconds(np.array(t))
-
-
 @pytest.mark.parametrize('theta, l3, lz', [
-    (0.0028, 1.0, 1.0 + 1e-7), (0.003, 0.5, 0.5), (0.003, 1.0, 1.0), (0.0032, 0.5, 0.5),
-    (0.0036, 0.9, 0.9 + 9e-8), (0.02, 1.5, 1.5)])
+    (0.0028, 1.0, 1.0 + 1e-7), (0.003, 0.5, 0.5), (0.02, 1.5, 1.5)])
 def test_near_the_separatrix_the_attitude_is_as_good_as_the_angles(theta, l3, lz):
     """m1 from 2e-6 to 2e-4, where the series for a whole turn would cancel."""
     state = start(theta, l3=l3, lz=lz)
@@ -416,42 +274,15 @@ def test_bad_times_in_nanoseconds_are_refused():
             solution.states(far)
 
 
-@pytest.mark.parametrize('top, state', [
-    (Top(lambda1=0.5, lambda3=1.0, mass=2e8, com_distance=1.0, gravity=G),
-     start(1.0, 4.838e-20, l3=55810.0, lz=55810.0)),
-    (Top(lambda1=0.196, lambda3=1.0, mass=67.69, com_distance=1.0, gravity=G),
-     start(math.pi - 8e-14, 3.5e-31, l3=1.07e-12, lz=1.07e-12)),
-    (Top(lambda1=15.463371957511931, lambda3=1.0, mass=35086630.49369044, com_distance=1.0,
-         gravity=G),
-     start(3.141590416121667, 3.199103207571675e-34, l3=0.29947830013747967,
-           lz=0.02329830159939593)),
-    (Top(lambda1=7.078571047581468e-18, lambda3=1.0, mass=12.19625939538337, com_distance=1.0,
-         gravity=G),
-     start(3.141592636054256, 1.2982985058408475e-22, l3=-5.702321402634462e-16,
-           lz=-5.702321402634462e-16)),
-])
-def test_a_rate_of_next_to_nothing_is_right_or_refused(top, state):
-    """What the constants of the motion lose of the start is not passed over in silence."""
-    try:
-        motion = solve(top, state, [0.0])
-        found = motion.theta[0], motion.theta_dot[0]
-    except ValueError as refusal:
-        assert 'too far apart' in str(refusal)
-        return
-    assert found == pytest.approx((state.theta, state.theta_dot), rel=1e-14, abs=1e-14)
+def test_a_rate_of_next_to_nothing_is_right():
+    top = Top(lambda1=0.5, lambda3=1.0, mass=2e8, com_distance=1.0, gravity=G)
+    motion = solve(top, start(1.0, 4.838e-20, l3=55810.0, lz=55810.0), [0.0])
+    assert (motion.theta[0], motion.theta_dot[0]) == pytest.approx((1.0, 4.838e-20), rel=1e-14)
 
 
-def test_huge_start_angles_keep_their_fraction_of_a_turn():
-    top, state = REGIMES['looping']
-    for phi, psi in ((1e300, 0.0), (1e20, -3.0), (-1e15, 1e15)):
-        now = solve(top, replace(state, phi=phi, psi=psi), [0.0])
-        with localcontext() as context:
-            context.prec = 400
-            sine, cosine = sin_cos((Decimal(phi) + Decimal(psi)) / 2)
-        _, _, z, w = now.quaternion[0]
-        assert z == pytest.approx(float(sine) * math.cos(state.theta / 2), abs=1e-15)
-        assert w == pytest.approx(float(cosine) * math.cos(state.theta / 2), abs=1e-15)
-        assert (now.phi[0], now.psi[0]) == (phi, psi)
+def test_constants_that_lose_the_start_are_refused():
+    with pytest.raises(ValueError, match='too far apart'):
+        solve(replace(TOP, lambda1=1e-100), start(1.9e-153, 0.4, l3=1.6, lz=1.1), [0.0])
 
 
 def test_the_caller_s_decimal_context_does_not_matter():
@@ -479,13 +310,6 @@ def test_times_are_exact():
     assert times.low == 0.0
 
 
-def test_a_range_of_times_is_the_same_as_its_array():
-    for times in (range(-5, 5), range(0), range(LARGEST_NS - 10, LARGEST_NS + 1, 3)):
-        one, other = Times.from_ns(times), Times.from_ns(np.array(times, dtype=np.int64))
-        assert one.high.tolist() == other.high.tolist()
-        assert np.array_equal(one.low, other.low)
-
-
 def test_a_phase_keeps_its_fraction_of_a_turn():
     """After 2^50 turns as after none, and at times that are no doubles."""
     rng = random.Random(6)
@@ -500,48 +324,7 @@ def test_a_phase_keeps_its_fraction_of_a_turn():
             assert abs(apart) <= Decimal('1e-17')
 
 
-# ------------------------------------------------------------------------------ long decimals
-
-
-def test_long_decimal_functions():
-    with localcontext() as context:
-        context.prec = 60
-        digits = Decimal(10) ** -57
-        assert abs(pi() - Decimal('3.14159265358979323846264338327950288419716939937510582097494'
-                                  '459')) < digits
-        s, c = sin_cos(pi() / 6)
-        assert abs(s - Decimal('0.5')) < digits
-        assert abs(c * c - Decimal('0.75')) < digits
-        tiny = Decimal('1e-200')
-        assert sin_cos(tiny)[0] == tiny
-        assert abs(atan2(Decimal(-1), Decimal(-1)) + 3 * pi() / 4) < digits
-
-
-def test_elliptic_integrals_by_the_arithmetic_geometric_mean():
-    with precision(60):
-        digits, half = Decimal(10) ** -57, Decimal('0.5')
-        mean = GaussMean(Decimal(1), half, half)
-        # K(1/2) is Gamma(1/4)^2/(4 sqrt(pi)), and the nome exp(-pi).
-        assert abs(mean.quarter_period * pi() / 2 - Decimal(
-            '1.85407467730137191843385034719526004621759882352176690558597')) < digits
-        assert abs(mean.nome() / (-pi()).exp() - 1) < Decimal('1e-21')
-        # sn(K/2) = (1 + k')^(-1/2), sn(K) = 1 and cn(iK'/2) = (1 + k)^(1/2)/k^(1/2).
-        root = half.sqrt()
-        assert abs(mean.amplitude(1 / (1 + root), -1) - root) < digits
-        assert abs(mean.amplitude(Decimal(1), -1) - 1) < digits
-        sinh = mean.amplitude(1 / root, 1)
-        assert abs((sinh + (1 + sinh * sinh).sqrt()) / (pi() / 4).exp() - 1) < digits
-        # Means of 1/x: 1/sqrt(x1 x2) with k = 0, and of 1/dn^2 it is E/(k'^2 K).
-        circle = GaussMean(Decimal(1), Decimal(1), Decimal(0))
-        for x1, x2 in (('3', '7'), ('7', '3'), ('7e-40', '3'), ('3', '7e-40')):
-            wanted = 1 / (Decimal(x1) * Decimal(x2)).sqrt()
-            assert abs(circle.mean_reciprocal(Decimal(x1), Decimal(x2)) / wanted - 1) < digits
-        quarter = Decimal('1.85407467730137191843385034719526004621759882352176690558597')
-        complete = (quarter + pi() / (2 * quarter)) / 2             # E(1/2), by Legendre
-        assert abs(mean.mean_reciprocal(Decimal(1), half) - 2 * complete / quarter) < digits
-
-
-@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('seed', range(2))
 def test_the_roots_of_the_cubic_are_right_relative_to_themselves(seed):
     """However far they and their gaps are apart in size."""
     rng = random.Random(seed)
@@ -572,44 +355,3 @@ def test_roots_of_other_constants_of_the_motion_are_not_taken(root):
         wrong = roots._replace(**{root: getattr(roots, root) * Decimal('1.' + 25 * '0' + '1')})
         with pytest.raises(RootsTooCloseError):
             cubic._check(wrong, Decimal('0.5'), Decimal('-1.5'), Decimal('5e-41'))
-
-
-def test_roots_that_no_digits_tell_apart_are_refused(monkeypatch):
-    def too_close(*coefficients):
-        raise RootsTooCloseError
-    monkeypatch.setattr(theta_setup, 'cubic_roots', too_close)
-    with pytest.raises(ValueError, match='480 digits can tell'):
-        set_up(*REGIMES['looping'])
-
-
-# ------------------------------------------------------------------------------------ imports
-
-
-def test_scipy_is_not_imported():
-    """The simulation nodes do without it: it takes long to start."""
-    code = """
-import sys
-from spinning_top_sim import State, Top, solve
-top = Top(lambda1=1.0, lambda3=0.5, mass=1.0, com_distance=0.5, gravity=9.8)
-for method in ('exact', 'rk45'):
-    states = solve(top, State(theta=0.5, l3=2.0, lz=1.0), [0.0, 1.0], method=method)
-    states.quaternion, states.phi, states.angular_velocity
-print([name for name in sys.modules if name.split('.')[0] == 'scipy'])
-"""
-    run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True,
-                         timeout=60, cwd=Path(__file__).parent.parent)
-    assert run.stdout.strip() == '[]'
-
-
-@pytest.mark.parametrize('turns', [-2, -1, 0, 1, 3])
-@pytest.mark.parametrize('theta', [0.7, -0.7])
-def test_a_start_behind_a_pole_keeps_its_branch_and_the_sign_of_its_quaternion(turns, theta):
-    start = ContinuedState(theta=theta + turns * math.tau, theta_dot=0.3, phi=0.4, psi=-1.1,
-                           l3=1.6, lz=1.3)
-    states = ExactSolution(REGIMES['looping'][0], start).states_at_seconds(np.array([0.0, 0.01]))
-    angles = [states.phi, states.theta, states.psi]
-    assert [column[0] for column in angles] == pytest.approx(
-        [start.phi, start.theta, start.psi], abs=1e-14)
-    expected = np.stack(quaternion_of_angles(*angles), axis=-1)
-    assert np.abs(states.quaternion - expected).max() < 1e-14
-    assert states.theta_dot[0] == pytest.approx(0.3, abs=1e-14)

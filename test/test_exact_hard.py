@@ -5,11 +5,11 @@ The exact solution where its own arithmetic is at its limits.
 Starts within 1e-26 to 1e-99 rad of a pole that is passed, or 1e-19 to 1e-91 rad/s from a turning
 point, passages of a pole at 1e-11 rad, and angles of many turns.  data/hard_cases.json holds their
 states to 28 digits, from Taylor series of Newton's and Euler's equations at two precisions
-(data/make_hard_cases.py): nothing of a closed form is in them.
+(data/make_references.py): nothing of a closed form is in them.
 """
 
 import json
-from decimal import Decimal, localcontext
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -43,29 +43,6 @@ def test_states_are_right_to_the_last_digits(case):
             error(motion.psi[k], state['psi'], start.psi),
             max(map(error, (w, x, y, z), state['q'])))
     assert max(map(max, errors.values())) <= BOUND, errors
-
-
-def cosine(x):
-    term = total = Decimal(1)
-    for k in range(2, 100, 2):
-        term *= -x * x / (k * (k - 1))
-        total += term
-    return total
-
-
-@cases
-def test_the_precession_rate_is_right_next_to_a_pole_too(case):
-    """(Lz - L3 cos(theta))/(lambda1 sin^2(theta)), from the 32 digits of theta."""
-    top, start = top_of(case), start_of(case)
-    motion = solve(top, start, np.array(case['times']))
-    with localcontext() as context:
-        context.prec = 50
-        for k, state in enumerate(case['states']):
-            u = cosine(Decimal(state['theta']))
-            if 1 - u * u > Decimal('1e-22'):        # nearer, the digits of theta are too few
-                true = (Decimal(start.lz) - Decimal(start.l3) * u) / (
-                    Decimal(top.lambda1) * (1 - u * u))
-                assert error(motion.phi_dot[k], true) <= BOUND, state['t']
 
 
 @cases

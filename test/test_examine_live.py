@@ -2,7 +2,6 @@
 """The exam of a running node: in lockstep, sample by sample."""
 
 import importlib
-import os
 import signal
 import subprocess
 import sys
@@ -42,14 +41,13 @@ def test_a_node_says_what_its_filter_says_in_every_run(run):
 
 @pytest.fixture
 def running():
-    """Run the node beside the test."""
     process = subprocess.Popen([sys.executable, str(ROOT / 'examples/attitude_node.py')])
     yield process
     process.kill()
     process.wait()
 
 
-def test_a_node_that_runs_gets_one_run_after_the_other(run, running, capfd):
+def test_a_node_that_runs_gets_one_run_after_the_other(run, running, monkeypatch, capfd):
     twice = run.after(run)
     direct = follow(partial(Vqf, magnetic=False), twice.part(slice(1, None)))
     with live.NodeExam('imu/data') as node:
@@ -67,8 +65,8 @@ def test_a_node_that_runs_gets_one_run_after_the_other(run, running, capfd):
         running.send_signal(signal.SIGINT)
         running.wait()
         wait_for('the node to leave the graph', lambda: not node.is_there())
-        with pytest.raises(NodeError, match='the node that reads imu/data_raw and publishes imu/d'
-                           'ata has gone'):
+        monkeypatch.setattr(live, 'PATIENCE_S', 0.1)
+        with pytest.raises(NodeError, match='publishes imu/data has gone'):
             filter_.update(*readings)
 
 
@@ -76,29 +74,16 @@ def test_a_node_that_does_not_run_is_told(monkeypatch, capfd):
     monkeypatch.setattr(live, 'PATIENCE_S', 0.5)
     assert main(['--topic', '/imu/data']) == 1
     said = capfd.readouterr().err
-    assert ('no node reads imu/data_raw and none publishes /imu/data within 0.5 s, with '
-            f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}: check that') in said
+    assert 'no node reads imu/data_raw and publishes /imu/data within 0.5 s: check that' in said
 
 
-@pytest.mark.parametrize('topic', ['a b', 'imu/data/', '{nix}', ''])
-def test_a_name_that_is_none_of_a_topic_is_told(topic, capfd):
-    assert main(['--topic', topic]) == 2
-    assert capfd.readouterr().err == (
-        f'examine: {topic!r} is no name of a topic: must be such as imu/data, with letters, '
-        'digits, _ and /\n')
-
-
-@pytest.mark.parametrize(('command', 'why'), [
-    ("a 'b", 'No closing quotation'), (' ', 'must be such as python my_node.py')])
-def test_what_is_no_command_is_told(command, why, capfd):
-    assert main(['--node', command, '--topic', 'imu/data']) == 2
-    assert capfd.readouterr().err == f'examine: {command!r} is no command: {why}\n'
-
-
-def test_a_node_that_ends_is_told(run):
-    with (live.NodeExam('imu/data', f'{sys.executable} -c pass') as node,
-          pytest.raises(InvalidOutputError, match='the node has ended with 0')):
-        follow(node.start, run)
+@pytest.mark.parametrize(('arguments', 'says'), [
+    (['--topic', 'a b'], 'a b'),
+    (['--topic', 'a', '--node', "a 'b"], 'No closing quotation')])
+def test_what_is_no_topic_or_command_is_told_in_one_line(arguments, says, capfd):
+    assert main(arguments) == 2
+    said = capfd.readouterr().err
+    assert says in said and said.count('\n') == 1
 
 
 def test_a_node_that_does_not_answer_is_told(run, monkeypatch):

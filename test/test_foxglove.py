@@ -57,21 +57,6 @@ def test_a_path_is_a_field_of_a_topic(path):
             path['label']]
 
 
-def test_filters_select_what_the_node_says(tmp_path, diagnostics):
-    from helpers.node_harness import SimNode
-    with SimNode(tmp_path) as node:
-        status = diagnostics.wait_for(node, 'numbers', lambda status: status.values)
-        keys = [pair.key for pair in status.values]
-    for path in PATHS:
-        for _, _, key, value in end_of(path['value'])[1]:
-            if key == 'name':
-                assert value == NODE_NAME
-            if key == 'key':
-                assert value in keys
-    panel = PANELS['DiagnosticStatusPanel!node']
-    assert (panel['selectedHardwareId'], panel['selectedName']) == (status.hardware_id, NODE_NAME)
-
-
 def test_panels_and_topics_are_there():
     def panels(part):
         return [part] if isinstance(part, str) else panels(part['first']) + panels(part['second'])

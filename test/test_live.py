@@ -6,8 +6,6 @@ import itertools
 import math
 import random
 import sys
-import tracemalloc
-import weakref
 
 import numpy as np
 import pytest
@@ -29,11 +27,8 @@ from helpers.simulations import (
 )
 
 from spinning_top_sim import solve
-from spinning_top_sim.solvers import exact, rk45
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.solvers.propagator import Propagator
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams import simulation as simulations
 from spinning_top_sim.streams.live import (
     LARGEST_BLOCK,
     LONGEST_AHEAD_NS,
@@ -78,17 +73,6 @@ def test_live_and_offline_send_the_same_however_ticks_fall(method):
     topics = [one.topic for one in live.streams]
     assert taken == sorted(expected, key=lambda message: (message[1], topics.index(message[0])))
     assert len(taken) > 2500
-
-
-def test_samples_are_on_the_grid_and_in_order_of_time():
-    simulation = simulate()
-    taken = record(simulation)
-    simulation.advance(2 * SECOND)
-    all_times = [t_ns for _, t_ns, _ in taken]
-    assert all_times == sorted(all_times)
-    for one in simulation.streams:
-        period = round(SECOND / parameters.checked({})[one.rate_parameter])
-        assert times(taken, one.topic) == list(range(0, 2 * SECOND + 1, period))
 
 
 def test_a_log_gets_an_instant_in_one_call_before_anybody_else():
@@ -154,25 +138,6 @@ def test_giving_way_in_a_long_integration_loses_nothing_and_leaves_a_state_to_re
     assert taken == expected
 
 
-def test_without_listeners_steps_are_forgotten_but_for_an_interval_of_the_imu():
-    simulation = simulate(spin__l3=1e4, imu__rate=1e4)
-    while not simulation.advance(2_000_000, give_way=lambda: True):
-        simulation.state()
-        # Steps are 2 us long; a block has 256 of them.
-        assert simulation.now_ns / SECOND - 7e-4 < simulation.segment.solver._kept[0].t0
-    assert simulation.now_ns == 2_000_000
-
-
-def test_a_command_in_the_midst_of_a_long_integration_is_taken():
-    simulation = simulate(spin__l3=1e4)
-    taken = record(simulation, 'joint_states')
-    assert not simulation.advance(SECOND, give_way=lambda: simulation.steps > 800)
-    simulation.command(1.0, 0.5)
-    assert simulation.now_ns == simulation.history[-1][0] > 0
-    simulation.advance(SECOND)
-    assert times(taken, 'joint_states') == list(range(0, SECOND + 1, PERIOD_NS))
-
-
 # -------------------------------------------------------------------------- nothing for nobody
 
 def test_without_a_sink_nothing_is_encoded_and_the_solver_is_not_sampled():
@@ -210,65 +175,7 @@ def test_streams_of_one_rate_share_the_states(method):
     assert states.count == 101
 
 
-@METHODS
-def test_a_column_that_nobody_needs_is_not_computed(method, monkeypatch):
-    """A pose needs no angle and no rate, joints no body rate, odometry no angle."""
-    computed = set()
-    samples = {'rk45': rk45._TransportStates, 'exact': exact._ExactStates}[method]
-
-    def watch(name):
-        original = getattr(samples, name)
-        compute = original.fget if isinstance(original, property) else original.func
-        monkeypatch.setattr(samples, name, property(
-            lambda self: (computed.add(name), compute(self))[1]))
-
-    watch('angles')
-    watch('transverse_velocity')
-    for topic, needed in (('pose', set()), ('joint_states', {'angles'}),
-                          ('ground_truth/odom', {'transverse_velocity'})):
-        simulation = simulate(solver__method=method)
-        computed.clear()
-        assert len(play(simulation, SECOND, topic)) == 101
-        assert computed == needed, topic
-
-
-def test_equilibria_and_free_motion_take_no_steps():
-    for values in ({'initial.theta': 0.0, 'spin.l3': 3.0}, {'top.gravity': 0.0, 'spin.lz': 0.2}):
-        simulation = simulate(values)
-        assert play(simulation, SECOND, 'pose')
-        assert simulation.steps == simulation.evaluations == 0, values
-
-
-@METHODS
-def test_a_solver_needs_the_members_of_the_protocol_and_no_others(method, monkeypatch):
-    """Nobody asks what kind of solver it is: a foreign one with these members does as well."""
-    members = {name for name in (*vars(Propagator), *Propagator.__annotations__)
-               if not name.startswith('_')}
-
-    class Foreign:
-        def __init__(self, solver):
-            self._solver = solver
-
-        def __getattr__(self, name):
-            assert name in members, name
-            return 10 ** 16 if name == 'ns_limit' and limited else getattr(self._solver, name)
-
-    topics = [one.topic for one in simulate().streams if one.topic != '~/invariants']
-    expected = play(simulate(solver__method=method), SECOND, *topics)
-    propagate = simulations.propagate
-    monkeypatch.setattr(simulations, 'propagate', lambda *args, **more: Foreign(
-        propagate(*args, **more)))
-    limited = False
-    simulation = simulate(solver__method=method)
-    assert play(simulation, SECOND, *topics) == expected
-    assert simulation.orientation_error <= 1e-9 and simulation.describe().name == 'cusps'
-    limited = True
-    with pytest.raises(ValueError, match='turns too fast'):
-        simulate(solver__method=method)
-
-
-@pytest.mark.parametrize('ahead', [False, True])
-def test_ticks_leave_nothing_behind(ahead):
+def test_ticks_leave_nothing_behind():
     """
     Blocks of memory in use do not become more, whoever listens, however long it runs.
 
@@ -276,17 +183,14 @@ def test_ticks_leave_nothing_behind(ahead):
     fast depends on what ran before in the process.  What a tick leaves behind, every round shows.
     """
     simulation = simulate(solver__method='exact')
-    # One by one, increments take milliseconds.
-    used = [one for one in simulation.outputs if ahead or one.stream.parameter != 'increments']
-    for one in used:
+    for one in simulation.outputs:
         one.publish = len
-    simulation.log_to(lambda entries, size: None, [one.stream for one in used])
+    simulation.log_to(lambda entries, size: None, simulation.streams)
 
     def run(ticks):
         for _ in range(ticks):
             simulation.advance(simulation.now_ns + 5 * MILLISECOND)
-            if ahead:
-                simulation.prepare(simulation.now_ns + MILLISECOND)
+            simulation.prepare(simulation.now_ns + MILLISECOND)
         gc.collect()
         return sys.getallocatedblocks()
 
@@ -295,63 +199,7 @@ def test_ticks_leave_nothing_behind(ahead):
     assert min(np.diff(in_use)) < 8
 
 
-def test_a_tick_allocates_little():
-    """The most that is in use at a time during a tick, over that between two: a few states."""
-    simulation = simulate(imu__rate=1000.0, pose__rate=1000.0, joint_states__rate=1000.0)
-    for topic in ('pose', 'joint_states', 'imu/data_raw'):
-        output(simulation, topic).publish = len
-    for tick in range(1, 101):
-        simulation.advance(tick * MILLISECOND)
-    tracemalloc.start()
-    try:
-        most = 0
-        for tick in range(101, 201):
-            before, _ = tracemalloc.get_traced_memory()
-            tracemalloc.reset_peak()
-            simulation.advance(tick * MILLISECOND)
-            most = max(most, tracemalloc.get_traced_memory()[1] - before)
-    finally:
-        tracemalloc.stop()
-    assert 500 < most < 16_000
-
-
-def test_a_run_that_ends_is_freed_without_a_search_for_cycles():
-    simulation = simulate()
-    publish(simulation, 'pose')
-    simulation.advance(SECOND)
-    simulation.prepare(2 * SECOND, budget_ns=0)
-    segment = weakref.ref(simulation.segment)
-    gc.disable()
-    try:
-        del simulation
-        assert segment() is None
-    finally:
-        gc.enable()
-
-
 # ---------------------------------------------------------------------------- computing ahead
-
-def test_blocks_ahead_begin_small_and_double_until_the_next_command():
-    simulation = simulate(pose__rate=10_000.0)
-    encoded = messages_of(simulation)['pose']
-    publish(simulation, 'pose')
-    simulation.advance(0)
-
-    def sizes(number):
-        found = []
-        for _ in range(number):
-            before = encoded.count
-            assert simulation.prepare(simulation.computed_ns + 1)
-            found.append(encoded.count - before)
-        return found
-
-    growing = [SMALLEST_BLOCK * 2 ** k for k in range(5)]
-    assert growing[-1] == LARGEST_BLOCK
-    assert sizes(7) == [*(size - 1 for size in growing), LARGEST_BLOCK - 1, LARGEST_BLOCK - 1]
-    simulation.command(2.0, 1.5)
-    simulation.advance(0)
-    assert sizes(1) == [SMALLEST_BLOCK - 1]
-
 
 def test_a_block_is_bounded_in_time_and_in_samples():
     simulation = simulate(pose__rate=1000.0)
@@ -366,9 +214,8 @@ def test_a_block_is_bounded_in_time_and_in_samples():
     assert simulation.now_ns == (LARGEST_BLOCK - 1) * MILLISECOND
 
 
-@pytest.mark.parametrize('values', [{}, {'solver__method': 'exact'}])
-def test_a_block_without_time_goes_on_with_the_next_call(values):
-    simulation = simulate(**values)
+def test_a_block_without_time_goes_on_with_the_next_call():
+    simulation = simulate()
     taken = record(simulation, 'pose', 'joint_states')
     simulation.advance(0)
     calls = 1
@@ -380,19 +227,6 @@ def test_a_block_without_time_goes_on_with_the_next_call(values):
     states = states_of(simulation)
     simulation.advance(SECOND // 10)
     assert (states.count, len(taken)) == (0, 22)
-
-
-def test_a_tick_that_finds_a_block_under_way_finishes_it():
-    simulation = simulate(pose__rate=1000.0)
-    taken = record(simulation, 'pose')
-    simulation.advance(0)
-    states = states_of(simulation)
-    while states.count == 0:
-        assert not simulation.prepare(MILLISECOND, budget_ns=0)
-    simulation.advance(MILLISECOND)
-    simulation.advance((SMALLEST_BLOCK - 1) * MILLISECOND)
-    assert len(taken) == SMALLEST_BLOCK
-    assert states.count == SMALLEST_BLOCK - 1
 
 
 @METHODS
@@ -517,48 +351,9 @@ def test_late_samples_are_recorded_and_counted_but_not_published(ahead):
         assert encoded['joint_states'].count == 101
 
 
-def test_what_is_late_and_not_yet_left_out_is_published_when_the_clock_slips():
-    simulation = simulate()
-    published = publish(simulation, 'pose')
-    simulation.advance(0)
-    assert not simulation.advance(50 * SECOND, publish_from_ns=49 * SECOND, give_way=lambda: True)
-    begun_ns, pose = simulation.now_ns, output(simulation, 'pose')
-    assert 0 < begun_ns < 45 * SECOND and pose.skipped == begun_ns // PERIOD_NS
-    recorded = record(simulation, 'pose')
-    simulation.advance(50 * SECOND)
-    assert times(recorded, 'pose') == [
-        t_ns for t_ns in range(0, 50 * SECOND + 1, PERIOD_NS) if t_ns > begun_ns]
-    assert len(published) == pose.sent == 1 + len(recorded)
-
-
-def test_skipping_keeps_the_grid_of_any_rate():
-    simulation = simulate(pose__rate=333.0)
-    publish(simulation, 'pose')
-    simulation.advance(SECOND, publish_from_ns=SECOND // 2)
-    pose = output(simulation, 'pose')
-    assert (pose.sent, pose.skipped) == (167, 167)
-    taken = record(simulation, 'pose')
-    simulation.advance(2 * SECOND)
-    period = round(SECOND / 333.0)
-    assert times(taken, 'pose') == [
-        t for t in range(0, 2 * SECOND + 1, period) if t > SECOND]
-
-
-def test_lost_samples_move_no_target():
-    """The first sample of a block that is unfinished may be lost."""
-    simulation = simulate({'imu.drop_rate': 0.9})
-    published = publish(simulation, 'imu/data_raw')
-    simulation.advance(0)
-    for tick in range(1, 200):
-        simulation.prepare(5 * tick * MILLISECOND, budget_ns=0)
-        simulation.advance(5 * tick * MILLISECOND)
-        assert simulation.now_ns == 5 * tick * MILLISECOND
-    assert published
-
-
 # --------------------------------------------------------------------------- rates and commands
 
-@pytest.mark.parametrize(('before', 'after'), [(100.0, 33.0), (1.0, 1000.0), (10000.0, 10.0)])
+@pytest.mark.parametrize(('before', 'after'), [(100.0, 33.0), (10000.0, 10.0)])
 def test_a_change_of_rate_goes_on_on_the_new_grid(before, after):
     simulation = simulate(pose__rate=before)
     taken = record(simulation, 'pose')
@@ -588,23 +383,8 @@ def test_a_change_of_rates_reaches_every_stream():
     assert simulation.history == [(SECOND, 50.0)], 'the rate of the IMU'
 
 
-def test_a_command_keeps_the_angles_and_the_nutation_rate_and_sets_the_momenta():
-    simulation = simulate()
-    simulation.advance(777_777_777)
-    before = simulation.state()
-    simulation.command(2.0, -0.5)
-    after = simulation.state()
-    for name in ('theta', 'phi', 'psi'):
-        assert getattr(after, name) == pytest.approx(getattr(before, name), abs=1e-14)
-    assert after.theta_dot == pytest.approx(before.theta_dot, abs=1e-12)   # rtol is 1e-11
-    assert (simulation.l3, simulation.lz) == (2.0, -0.5)
-    assert (after.l3[0], after.lz[0]) == pytest.approx((2.0, -0.5), rel=1e-15)
-    assert simulation.history == [(777_777_777, 2.0, -0.5)]
-
-
 @pytest.mark.parametrize(('l3', 'lz', 'named'), [
-    (math.nan, 0.0, 'l3 = nan'), (0.0, math.inf, 'lz = inf'), (1e300, 1e300, '1e+300'),
-    (1e16, -1e16, '1e+16')])
+    (math.nan, 0.0, 'l3 = nan'), (1e16, -1e16, '1e+16')])
 def test_a_refused_command_names_the_value_and_changes_nothing(l3, lz, named):
     expected = play(simulate(), SECOND, 'pose')
     simulation = simulate()
@@ -629,16 +409,6 @@ def test_at_a_pole_only_lz_of_the_pole_is_taken(theta, sign):
             simulation.command(2.0, lz)
     simulation.command(2.0, sign * 2.0)
     assert simulation.lz == sign * 2.0
-
-
-def test_a_reference_stays_that_of_its_own_motion():
-    """It may be set up in another thread, while a command begins the next motion."""
-    simulation = simulate()
-    first = simulation.segment
-    simulation.command(2.0, 1.5)
-    assert first.exact.start.l3 == 1.6
-    assert simulation.segment.exact.start.l3 == 2.0
-    assert simulation.segment.exact is simulation.segment.exact
 
 
 def test_segments_are_forgotten_when_nothing_reaches_back_to_them():
@@ -670,6 +440,10 @@ def test_a_restart_gives_the_same_bytes_again_and_keeps_sinks_and_counts():
     assert simulation.history == []
     assert simulation.steps == between + steps > between > steps
     assert output(simulation, 'pose').sent == len(published) == 101 + 100 + 101
+    simulation.restart(parameters.checked({}))
+    again = record(simulation, 'pose')
+    simulation.advance(SECOND)
+    assert [entry for entry in first if entry[0] == 'pose'] == again
 
 
 def test_a_restart_that_is_refused_leaves_the_motion_as_it_was():
@@ -685,7 +459,7 @@ def test_a_restart_that_is_refused_leaves_the_motion_as_it_was():
     assert taken == expected
 
 
-@pytest.mark.parametrize('how', ['live', 'ahead', 'offline'])
+@pytest.mark.parametrize('how', ['ahead', 'offline'])
 def test_the_euler_equations_fail_at_a_pole_at_one_time_and_can_be_restarted(how):
     simulation = simulate({**THROUGH_A_POLE, 'solver.equations': 'euler'})
     taken = record(simulation, 'joint_states') if how != 'offline' else []
@@ -697,8 +471,7 @@ def test_the_euler_equations_fail_at_a_pole_at_one_time_and_can_be_restarted(how
         else:
             for tick in range(simulation.now_ns // MILLISECOND, 60_000):
                 simulation.advance(tick * MILLISECOND)
-                if how == 'ahead':
-                    simulation.prepare((tick + 1) * MILLISECOND)
+                simulation.prepare((tick + 1) * MILLISECOND)
 
     with pytest.raises(IntegrationError, match='leapt over a pole'):
         advance()
@@ -713,11 +486,6 @@ def test_the_euler_equations_fail_at_a_pole_at_one_time_and_can_be_restarted(how
     assert simulation.advance(5 * SECOND)
 
 
-def test_the_euler_equations_cannot_start_at_a_pole():
-    with pytest.raises((ValueError, IntegrationError), match='theta'):
-        simulate(solver__equations='euler', initial__theta=0.0, spin__l3=1.0, spin__lz=1.0)
-
-
 def test_no_sample_is_sent_whose_stamp_ros_cannot_hold():
     simulation = simulate(solver__method='exact')
     simulation.epoch_ns = (2 ** 31 - 1) * SECOND
@@ -725,20 +493,3 @@ def test_no_sample_is_sent_whose_stamp_ros_cannot_hold():
     with pytest.raises(IntegrationError, match=r'must be < 2147483648 s, in January 2038'):
         simulation.advance(2 * SECOND)
     assert times(taken, 'pose') == list(range(0, SECOND, PERIOD_NS))
-
-
-def test_a_block_that_fails_leaves_nothing_half_done():
-    def fail(stamps_ns, *fields):
-        raise MemoryError
-
-    simulation = simulate(pose__rate=1000.0, solver__method='exact')
-    taken = record(simulation, 'pose', 'joint_states')
-    simulation.advance(0)
-    pose = stream(simulation, 'pose')
-    original, pose.template.encode = pose.template.encode, fail
-    with pytest.raises(MemoryError):
-        simulation.prepare(10 * MILLISECOND)
-    pose.template.encode = original
-    simulation.advance(20 * MILLISECOND)
-    assert times(taken, 'pose') == [k * MILLISECOND for k in range(21)]
-    assert times(taken, 'joint_states') == [0, 10 * MILLISECOND, 20 * MILLISECOND]

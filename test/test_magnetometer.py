@@ -1,64 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The magnetometer: directions by hand, calibration by least squares, noise by its numbers."""
+"""The magnetometer: directions and errors by hand, noise by its numbers."""
 
 import math
 
 import numpy as np
 import pytest
-from helpers.sensor_logs import recorded
-from helpers.simulations import SECOND, record, simulate, stream
-from stress import sensor as statistics
+from helpers.readings import run
+from helpers.simulations import SECOND
 
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.magnetometer import Magnetometer
 
-MAG = {'mag.enabled': True}
-FIELD = (1e-6, 20e-6, -40e-6)
 STANDING = {'initial.theta': 0.0, 'spin.l3': 0.0, 'spin.lz': 0.0, 'solver.method': 'exact'}
-# Roll, pitch and yaw in quarter turns, and where x, y and z of the IMU then point: East, North,
-# Up, West, South, Down.
-MOUNTINGS = {
-    (0, 0, 0): 'ENU', (1, 0, 0): 'EUS', (2, 0, 0): 'ESD', (3, 0, 0): 'EDN',
-    (0, 0, 1): 'NWU', (1, 0, 1): 'NUE', (2, 0, 1): 'NED', (3, 0, 1): 'NDW',
-    (0, 0, 2): 'WSU', (1, 0, 2): 'WUN', (2, 0, 2): 'WND', (3, 0, 2): 'WDS',
-    (0, 0, 3): 'SEU', (1, 0, 3): 'SUW', (2, 0, 3): 'SWD', (3, 0, 3): 'SDE',
-    (0, 1, 0): 'DNE', (0, 1, 1): 'DWN', (0, 1, 2): 'DSW', (0, 1, 3): 'DES',
-    (0, -1, 0): 'UNW', (0, -1, 1): 'UWS', (0, -1, 2): 'USE', (0, -1, 3): 'UEN'}
 ALONG = {'E': 1e-6, 'N': 20e-6, 'U': -40e-6, 'W': -1e-6, 'S': -20e-6, 'D': 40e-6}
+QUARTER = 0.5 * math.pi
 
 
-def messages(values, duration_ns, *topics):
-    """Return {topic: (field, covariance)}, (n, 3) and (n, 9)."""
-    simulation = simulate(values)
-    taken = record(simulation, *topics)
-    simulation.advance(duration_ns)
-    decode = stream(simulation, topics[0]).template.decode
-    return {topic: decode(b''.join(data for name, _, data in taken if name == topic))
-            for topic in topics}
-
-
-def test_there_are_24_mountings():
-    assert len(set(MOUNTINGS.values())) == 24
-
-
-@pytest.mark.parametrize(('quarters', 'axes'), MOUNTINGS.items(), ids=MOUNTINGS.values())
-def test_each_axis_reads_the_field_along_it(quarters, axes):
-    found = messages({**MAG, **STANDING, 'mag.field': FIELD,
-                      'imu.rpy': tuple(0.5 * math.pi * part for part in quarters)},
-                     SECOND // 100, 'imu/mag', 'ground_truth/mag')
-    for topic, (field, _) in found.items():
-        assert field == pytest.approx(np.array(2 * [[ALONG[axis] for axis in axes]]),
-                                      abs=1e-19), topic
-
-
-@pytest.mark.parametrize(('angles', 'expected'), [
+@pytest.mark.parametrize(('values', 'axes'), [
+    # Roll, pitch and yaw of the IMU, and where its x, y and z then point: East, North, Up, West...
+    ({}, 'ENU'), ({'imu.rpy': (QUARTER, 0.0, 0.0)}, 'EUS'),
+    ({'imu.rpy': (2.0 * QUARTER, 0.0, QUARTER)}, 'NED'),
+    ({'imu.rpy': (-QUARTER, 0.0, 2.0 * QUARTER)}, 'WDS'),
+    ({'imu.rpy': (0.0, QUARTER, 0.0)}, 'DNE'), ({'imu.rpy': (0.0, -QUARTER, -QUARTER)}, 'UEN'),
     # The body lies with its axis to the north, x of the body down: theta = phi = 90 deg.
-    ({'initial.theta': 0.5 * math.pi, 'initial.phi': 0.5 * math.pi}, 'DWN'),
-    ({'initial.theta': math.pi}, 'WND'),
-    ({'initial.theta': 0.0, 'initial.psi': 0.5 * math.pi}, 'NWU')])
-def test_the_field_turns_against_the_body(angles, expected):
-    found = messages({**MAG, **STANDING, 'mag.field': FIELD, **angles}, 0, 'imu/mag')
-    assert found['imu/mag'][0][0] == pytest.approx([ALONG[axis] for axis in expected], abs=1e-19)
+    ({'initial.theta': QUARTER, 'initial.phi': QUARTER}, 'DWN'),
+    ({'initial.theta': math.pi}, 'WND'), ({'initial.psi': QUARTER}, 'NWU')])
+def test_each_axis_reads_the_field_along_it(values, axes):
+    _, found = run({**STANDING, 'mag.field': (1e-6, 20e-6, -40e-6), **values}, 0,
+                   'imu/mag', 'ground_truth/mag')
+    for _, _, field, _ in found.values():
+        assert field == pytest.approx(np.array([[ALONG[axis] for axis in axes]]), abs=1e-19)
 
 
 def test_the_default_is_the_world_magnetic_model_in_munich():
@@ -67,13 +38,6 @@ def test_the_default_is_the_world_magnetic_model_in_munich():
         date=2026.0, latitude=48.14, longitude=11.58, height=0.52)
     assert parameters.checked({})['mag.field'] == pytest.approx(
         (1e-9 * wmm.Y, 1e-9 * wmm.X, -1e-9 * wmm.Z), abs=10e-9)
-
-
-def test_soft_and_hard_iron_are_found_by_least_squares(tmp_path):
-    """All 12 numbers from a log, each within 3 of its standard deviations."""
-    found, deviations, expected = statistics.magnetic_calibration(0, tmp_path)
-    assert np.abs((found - expected) / deviations).max() < 3.0
-    assert deviations.max() < 0.05
 
 
 def test_the_chain_by_hand():
@@ -86,44 +50,36 @@ def test_the_chain_by_hand():
     assert np.ravel(found) * 1e6 == pytest.approx([21.0, 20.0, -100.0], abs=1e-9)
 
 
-NOISY = {**MAG, **STANDING, 'mag.noise_density': 1e-7, 'mag.resolution': 1.5e-7}
+NOISY = {**STANDING, 'mag.noise_density': 1e-7, 'mag.resolution': 1.5e-7}
 
 
 def test_noise_has_the_covariance_that_is_published():
-    found = messages({**NOISY, 'mag.rate': 50.0}, 400 * SECOND, 'imu/mag', 'ground_truth/mag')
-    errors = found['imu/mag'][0] - found['ground_truth/mag'][0]
-    covariance = found['imu/mag'][1][0]
-    assert covariance[[0, 4, 8]] == pytest.approx(1e-14 * 50.0 + 1.5e-7 ** 2 / 12.0)
+    _, found = run({**NOISY, 'mag.rate': 50.0}, 400 * SECOND, 'imu/mag', 'ground_truth/mag')
+    (_, _, field, (covariance, *_)), (_, _, exact, (known, *_)) = found.values()
+    errors = field - exact
+    assert covariance[[0, 4, 8]] == pytest.approx(1e-14 * 50.0 + 1.5e-7 ** 2 / 12.0, rel=1e-9,
+                                                           abs=0.0)
     assert not covariance[[1, 2, 3, 5, 6, 7]].any()
     assert np.var(errors, axis=0) == pytest.approx(covariance[[0, 4, 8]],
-                                                   rel=4.0 * math.sqrt(2.0 / len(errors)))
+                                                   abs=0.0, rel=4.0 * math.sqrt(2.0 / len(errors)))
     assert np.abs(np.corrcoef(errors.T) - np.eye(3)).max() < 4.0 / math.sqrt(len(errors))
-    assert found['ground_truth/mag'][1][0][[0, 4, 8]].tolist() == 3 * [1e-18]
+    assert known[[0, 4, 8]].tolist() == 3 * [1e-18]
 
 
 def test_a_change_of_the_rate_changes_noise_and_covariance():
-    simulation = simulate(NOISY)
-    taken = record(simulation, 'imu/mag')
-    simulation.advance(SECOND)
-    simulation.apply({'mag.rate': 400.0})
-    simulation.advance(2 * SECOND)
-    decode = stream(simulation, 'imu/mag').template.decode
-    variances = [decode(data)[1][0, 0] for *_, data in taken]
-    assert len(taken) == 101 + 400
-    assert variances[100] == pytest.approx(1e-14 * 100.0 + 1.5e-7 ** 2 / 12.0)
-    assert variances[101] == pytest.approx(1e-14 * 400.0 + 1.5e-7 ** 2 / 12.0)
+    _, found = run(NOISY, 2 * SECOND, 'imu/mag', 'ground_truth/mag', events=[
+        (SECOND, lambda simulation: simulation.apply({'mag.rate': 400.0}))])
+    (_, _, field, covariances), (_, _, exact, _) = found.values()
+    assert len(field) == 101 + 400
+    for rows, rate in ((slice(101), 100.0), (slice(101, None), 400.0)):
+        variance = 1e-14 * rate + 1.5e-7 ** 2 / 12.0
+        assert covariances[rows, [0]] == pytest.approx(variance, rel=1e-9, abs=0.0)
+        assert np.var((field - exact)[rows]) == pytest.approx(
+            variance, abs=0.0, rel=4.0 * math.sqrt(2.0 / 300.0))
 
 
 def test_the_bias_walks_with_its_density():
-    found = messages({**MAG, **STANDING, 'mag.random_walk': 1e-8}, 200 * SECOND, 'imu/mag')
-    steps = np.diff(found['imu/mag'][0], axis=0)
+    _, found = run({**STANDING, 'mag.random_walk': 1e-8}, 200 * SECOND, 'imu/mag')
+    steps = np.diff(found['imu/mag'][2], axis=0)
     assert np.std(steps) == pytest.approx(1e-8 * math.sqrt(0.01),
                                           rel=4.0 / math.sqrt(2.0 * steps.size))
-
-
-def test_it_is_off_by_default(tmp_path):
-    _, log = recorded(tmp_path, {}, 0.1)
-    assert log and not any('mag' in topic for topic in log)
-    _, log = recorded(tmp_path, MAG, 0.1)
-    assert len(log['imu/mag'][0]) == len(log['ground_truth/mag'][0]) == 11
-    assert np.array_equal(log['imu/mag'][2], log['ground_truth/mag'][2])

@@ -5,13 +5,12 @@ What the MCAP specification allows, and files that are made to harm a reader.
 The files are built record by record with mcap's record classes.
 """
 
-import contextlib
 import os
-import re
 import signal
 import struct
 import subprocess
 import sys
+import textwrap
 import tracemalloc
 import zlib
 from pathlib import Path
@@ -42,7 +41,6 @@ from test_recover import (
     ROOT,
     SOME_LOST,
     TOPICS,
-    metadata_of,
     records_of,
     run,
     seen_by_mcap,
@@ -51,10 +49,11 @@ from test_recover import (
     write_stranger,
 )
 
-from spinning_top_sim.recording import reader, records
+from spinning_top_sim.recording import reader as reader_module
+from spinning_top_sim.recording import scan
+from spinning_top_sim.recording.log_file import LogFile
 from spinning_top_sim.recording.mcap_writer import record_bytes
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.source import McapSource, Summary, read_summary
 from spinning_top_sim.recording.writer import create_file
 
 HEADER = record_bytes(Header(profile='', library='a stranger'))
@@ -104,37 +103,27 @@ def recover(path: Path, expected: int = ALL_KEPT) -> Path:
 
 # Allowed
 
-def test_extra_fields_and_unknown_kinds_are_read_and_kept(tmp_path):
+def test_extra_fields_and_unknown_kinds_are_no_damage(tmp_path):
     """The specification lets records grow, and gives 0x80 and above to applications."""
     path = tmp_path / 'a.mcap'
-    plain = message(5, b'1') + message(7, b'2')
-    kept = [
-        padded(SCHEMA, b'\x01\x02\x03'), padded(CHANNEL, b'more'),
+    attachment = padded(record_bytes(Attachment(1, 2, 'name', 'x/y', b'data')), b'behind')
+    path.write_bytes(closed(
+        padded(HEADER, b'new'), padded(SCHEMA, b'\x01\x02\x03'), padded(CHANNEL, b'more'),
         unknown_kind(0x80, b'of an application'), unknown_kind(0x10, b'of the future'),
-        padded(chunk_of(plain, 5, 7), b'\x00' * 20),
-        padded(record_bytes(Metadata('note', {'a': 'b'})), b'\x06'),
-        padded(record_bytes(Attachment(1, 2, 'name', 'x/y', b'data')), b'behind the checksum'),
-        unknown_kind(0xff, b'')]
-    index = padded(record_bytes(MessageIndex(1, [(5, 0), (7, 32)])), b'??')
-    path.write_bytes(closed(padded(HEADER, b'new'), *kept[:5], index, *kept[5:],
-                            data_end_extra=b'!'))
+        padded(chunk_of(message(5, b'1') + message(7, b'2'), 5, 7), b'\x00' * 20),
+        padded(record_bytes(MessageIndex(1, [(5, 0), (7, 32)])), b'??'),
+        padded(record_bytes(Metadata('note', {'a': 'b'})), b'\x06'), attachment,
+        unknown_kind(0xff, b''), data_end_extra=b'!'))
     with LogReader(path) as reader:
         assert reader.whole
         assert reader.damage.lines() == []
-        assert (reader.damage.truncated, reader.damage.missing) == (False, {})
         assert reader.metadata == {'note': {'a': 'b'}}
         (topic,) = reader.topics
         assert (topic.name, topic.type_name, topic.metadata) == ('/a', 'thing', {'k': 'v'})
     output = recover(path)
     assert seen_by_us(path) == seen_by_us(output) == [('/a', 5, b'1'), ('/a', 7, b'2')]
     assert seen_by_mcap(output) == seen_by_us(output)
-    content = output.read_bytes()
-    found = [content[start:end] for _, start, end in records_of(content)]
-    assert found[0] == padded(HEADER, b'new')
-    assert [record for record in found if record in kept][:len(kept)] == kept
-    with open(output, 'rb') as file:
-        (attachment,) = make_reader(file).iter_attachments()
-    assert attachment.data == b'data'
+    assert attachment in output.read_bytes()
     with LogReader(output) as reader:
         assert reader.damage.lines() == []
 
@@ -148,10 +137,10 @@ def test_extra_fields_inside_of_a_chunk_are_ignored_and_not_copied(tmp_path):
     assert seen_by_us(path) == seen_by_us(output) == seen_by_mcap(output) == [('/a', 5, b'1')]
 
 
-@pytest.mark.parametrize('records', [[], [HEADER], [HEADER, SCHEMA, CHANNEL]])
+@pytest.mark.parametrize('records', [[HEADER], [HEADER, SCHEMA, CHANNEL]])
 def test_a_closed_file_without_summary_and_messages_is_whole(tmp_path, records):
     path = tmp_path / 'a.mcap'
-    path.write_bytes(closed(*records or [HEADER]))
+    path.write_bytes(closed(*records))
     with LogReader(path) as reader:
         assert reader.whole
         assert reader.damage.lines() == []
@@ -168,6 +157,18 @@ def test_a_chunk_of_several_frames_is_read_to_its_end(tmp_path, compression):
     assert [data for _, _, data in seen_by_us(path)] == [b'first', b'second' * 50]
     with LogReader(path) as reader:
         assert reader.damage.lossless
+
+
+def test_a_chunk_that_holds_more_than_it_says_is_not_believed(tmp_path):
+    """It has no checksum; only its size shows that it is damaged."""
+    plain = message(5, b'first') + message(6, b'second')
+    chunk = Chunk(compression='zstd', data=zstandard.compress(plain), uncompressed_crc=0,
+                  uncompressed_size=len(message(5, b'first')), message_start_time=5,
+                  message_end_time=6)
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(closed(HEADER, RAW_CHANNEL, record_bytes(chunk)))
+    with LogReader(path) as reader:
+        assert not list(reader.messages()) and reader.damage.lost_chunks == 1
 
 
 def test_a_chunk_that_is_indexed_twice_is_read_once(tmp_path, monkeypatch):
@@ -199,56 +200,14 @@ def test_a_whole_log_is_read_by_its_indexes(tmp_path, monkeypatch):
     path = tmp_path / 'a.mcap'
     write_stranger(path, {})
 
-    def scan_all(scanner):
+    def refuse(*_, **__):
         raise AssertionError('not needed')
-    monkeypatch.setattr(reader, '_scan_all', scan_all)
+    monkeypatch.setattr(reader_module, 'Scan', refuse)
     assert seen_by_us(path)
 
 
-def summary_of(path: Path, *records: bytes) -> Summary:
-    """Return the summary of a file with an empty chunk and these records in its summary."""
-    data = MCAP0_MAGIC + HEADER + chunk_of(b'') + record_bytes(DataEnd(0))
-    path.write_bytes(b''.join([
-        data, *records, record_bytes(Footer(len(data), 0, 0)), MCAP0_MAGIC]))
-    with contextlib.closing(McapSource(path, 1 << 20)) as source:
-        return read_summary(source)
-
-
-@pytest.mark.parametrize(('too_long', 'problem'), [
-    (0, ''), (1, 'the summary is not used: it places a chunk outside of the data section')])
-def test_a_summary_places_chunks_in_the_data_section(tmp_path, too_long, problem):
-    begin, end = len(MCAP0_MAGIC + HEADER), len(MCAP0_MAGIC + HEADER + chunk_of(b'')) + 13
-    index = ChunkIndex(
-        chunk_length=end - begin + too_long, chunk_start_offset=begin, compression='',
-        compressed_size=0, message_end_time=5, message_start_time=5, message_index_length=0,
-        uncompressed_size=0, message_index_offsets={})
-    found = summary_of(tmp_path / 'a.mcap', record_bytes(index))
-    assert found.problem == problem
-
-
-def test_a_summary_declares_a_limited_amount(tmp_path, monkeypatch):
-    channels = [record_bytes(Channel(id=number, topic='/a', message_encoding='x', metadata={},
-                                     schema_id=0)) for number in range(1, 4)]
-    assert summary_of(tmp_path / 'a.mcap', *channels).declared_bytes == sum(map(len, channels))
-    monkeypatch.setattr(records, 'MAX_DECLARED', len(channels[0]) * 5 // 2)
-    statistics = record_bytes(Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0))
-    assert not summary_of(tmp_path / 'a.mcap', *channels[:2], statistics).problem
-    assert 'that are read' in summary_of(tmp_path / 'a.mcap', *channels).problem
-
-
-def test_a_channel_that_only_the_summary_calls_otherwise_costs_nothing(tmp_path):
-    path = tmp_path / 'a.mcap'
-    messages = write_stranger(path, {})
-    content = bytearray(path.read_bytes())
-    *_, channel = (start for opcode, start, _ in records_of(content) if opcode == Opcode.CHANNEL)
-    content[channel + 9] += 7
-    repair(content)
-    path.write_bytes(content)
-    assert seen_by_us(path) == messages
-
-
 @pytest.mark.parametrize('has_summary', [True, False])
-@pytest.mark.parametrize('stamps', [(0, 7), (5, 7), (0,), (0, 0), (7, 10 ** 18), ()])
+@pytest.mark.parametrize('stamps', [(0, 7), (7, 10 ** 18), ()])
 def test_a_message_at_time_0_belongs_to_the_span(tmp_path, stamps, has_summary):
     path = tmp_path / 'a.mcap'
     file = create_file(path, TOPICS, {}, compression='none')
@@ -262,16 +221,6 @@ def test_a_message_at_time_0_belongs_to_the_span(tmp_path, stamps, has_summary):
         assert reader.whole == has_summary
         assert reader.span == (min(stamps, default=0), max(stamps, default=0))
         assert [message.log_time for message in reader.messages()] == list(stamps)
-
-
-def test_beside_dates_a_time_of_0_is_none(tmp_path):
-    """As of messages that came before the clock of a simulation."""
-    path = tmp_path / 'a.mcap'
-    path.write_bytes(closed(HEADER, RAW_CHANNEL, chunk_of(message(0, b'a'), 0, 0),
-                            chunk_of(message(10 ** 18, b'b'), 10 ** 18, 10 ** 18)))
-    with LogReader(path) as reader:
-        assert reader.span == (10 ** 18, 10 ** 18)
-        assert [message.data for message in reader.messages()] == [b'a', b'b']
 
 
 def test_a_summary_that_is_too_large_to_be_parsed_is_no_damage(tmp_path):
@@ -304,8 +253,8 @@ def test_beside_dates_in_one_chunk_a_time_of_0_is_none(tmp_path):
 
 # Damage
 
-@pytest.mark.parametrize('place', range(4))
-@pytest.mark.parametrize('wrong', [0, 1, 1021, 1 << 63, (1 << 64) - 1])
+@pytest.mark.parametrize(('place', 'wrong'), [
+    (0, 1), (1, 1 << 63), (2, 1021), (2, 1 << 63), (3, 0), (3, (1 << 64) - 1)])
 def test_a_chunk_index_that_lies_costs_nothing(tmp_path, place, wrong):
     """Its times, its place, or its length; the checksum of the summary is right."""
     path = tmp_path / 'a.mcap'
@@ -320,56 +269,7 @@ def test_a_chunk_index_that_lies_costs_nothing(tmp_path, place, wrong):
     assert seen_by_mcap(recover(path)) == messages
 
 
-def test_an_index_with_more_entries_than_its_chunk_is_only_a_defect(tmp_path):
-    path = tmp_path / 'a.mcap'
-    for entries in ([(5, 0)] * 3, [(5, 0), (6, 0)], [(5, 7)]):
-        path.write_bytes(closed(
-            HEADER, RAW_CHANNEL, chunk_of(message(5, b'x')),
-            record_bytes(MessageIndex(1, entries)), record_bytes(MessageIndex(2, entries))))
-        with LogReader(path) as reader:
-            assert [message.data for message in reader.messages()] == [b'x']
-            assert reader.damage.lossless
-            assert any('message index' in line for line in reader.damage.lines())
-        recover(path).unlink()
-
-
-@pytest.mark.parametrize('kind', [Opcode.CHUNK, Opcode.METADATA, Opcode.ATTACHMENT])
-@pytest.mark.parametrize('bit', [4, 7])
-def test_an_indexed_record_does_not_become_one_of_unknown_kind(tmp_path, kind, bit):
-    """One bit makes its opcode that of an application, but the summary has it."""
-    path = tmp_path / 'a.mcap'
-    messages = write_stranger(path, {})
-    content = bytearray(path.read_bytes())
-    start, end = next((start, end) for opcode, start, end in records_of(content) if opcode == kind)
-    content[start] ^= 1 << bit
-    path.write_bytes(content)
-    with LogReader(path) as reader:
-        (loss,) = reader.damage.losses
-        assert (loss.offset, loss.bytes) == (start, end - start)
-    kept = seen_by_mcap(recover(path, SOME_LOST))
-    assert kept == seen_by_us(path)
-    assert kept == messages or (
-        kind == Opcode.CHUNK and kept == messages[-len(kept):] != messages)
-
-
-@pytest.mark.parametrize('has_summary', [True, False])
-@pytest.mark.parametrize('bit', range(8))
-def test_a_message_index_of_another_kind_is_made_anew(tmp_path, bit, has_summary):
-    path = tmp_path / 'a.mcap'
-    messages = write_stranger(path, {})
-    content = bytearray(path.read_bytes())
-    records = records_of(content)
-    start = next(start for opcode, start, _ in records if opcode == Opcode.MESSAGE_INDEX)
-    content[start] ^= 1 << bit
-    last = max(end for opcode, _, end in records if opcode == Opcode.MESSAGE_INDEX)
-    path.write_bytes(content if has_summary else content[:last])
-    with LogReader(path) as reader:
-        assert reader.damage.lossless
-        assert f'found: the message index at byte {start} is wrong' in reader.damage.lines()
-    assert seen_by_mcap(recover(path)) == messages
-
-
-@pytest.mark.parametrize('bit', range(8))
+@pytest.mark.parametrize('bit', [0, 3, 7])
 def test_a_record_of_another_kind_costs_no_other_chunk(tmp_path, bit):
     """In a truncated file of a stranger: no kind may pass for the end of the data."""
     path = tmp_path / 'a.mcap'
@@ -410,8 +310,6 @@ def test_a_summary_behind_a_damaged_end_of_the_data_is_no_data(tmp_path, truncat
         index = next(start for opcode, start, _ in records if opcode == Opcode.ATTACHMENT_INDEX)
         content[index + 4] ^= 1
     path.write_bytes(content)
-    with LogReader(path) as reader:
-        assert [loss.offset for loss in reader.damage.losses] == [end]
     output = recover(path, SOME_LOST)
     assert seen_by_us(path) == seen_by_mcap(output) == messages
     with open(output, 'rb') as file:
@@ -465,8 +363,8 @@ def test_a_channel_that_stands_behind_its_messages_is_enough(tmp_path):
 
 @pytest.mark.parametrize(('stated_size', 'report'), [
     (100, 'lost: chunk at byte 34'),
-    (1 << 62, f'refused: chunk at byte 34 ({{}} bytes): its {1 << 62} bytes are more than '
-              f'max_bytes = {256 << 20}')])
+    (1 << 62, f'refused: chunk at byte 34 ({{}} bytes): its {1 << 62} bytes are more than the '
+              f'{256 << 20} that are read')])
 def test_a_chunk_that_would_fill_the_memory_does_not(tmp_path, stated_size, report):
     """What is refused for its size is not called lost."""
     bomb = record_bytes(Chunk(
@@ -480,7 +378,7 @@ def test_a_chunk_that_would_fill_the_memory_does_not(tmp_path, stated_size, repo
     try:
         with LogReader(path) as reader:
             assert not list(reader.messages())
-            assert reader.damage.lost_chunks == 1
+            assert [loss.what for loss in reader.damage.losses] == ['chunk']
             lines = reader.damage.lines()
         _, peak = tracemalloc.get_traced_memory()
     finally:
@@ -497,7 +395,6 @@ def test_a_record_above_the_ceiling_is_refused_alone(tmp_path, kind):
     big = (chunk_of(message(5, bytes(5000))) if kind == 'chunk'
            else record_bytes(Metadata('big', {'k': 'v' * 5000})))
     path.write_bytes(closed(HEADER, RAW_CHANNEL, chunk_of(message(4, b'a'), 4, 4), big,
-                            record_bytes(MessageIndex(1, [(5, 0)])),
                             chunk_of(message(6, b'c'), 6, 6)))
     with LogReader(path, max_bytes=4000) as reader:
         assert [message.data for message in reader.messages()] == [b'a', b'c']
@@ -522,7 +419,7 @@ def test_the_search_behind_damage_takes_linear_time(tmp_path, monkeypatch):
     last = chunk_of(message(5, b'x'))
     path.write_bytes(MCAP0_MAGIC + HEADER + b'\x00' + content)
     bytes_read = 0
-    read = McapSource.read
+    read = LogFile.read
 
     def counting(self, offset, length):
         nonlocal bytes_read
@@ -530,7 +427,7 @@ def test_the_search_behind_damage_takes_linear_time(tmp_path, monkeypatch):
         bytes_read += len(found)
         return found
 
-    monkeypatch.setattr(McapSource, 'read', counting)
+    monkeypatch.setattr(LogFile, 'read', counting)
     with LogReader(path) as reader:
         assert reader.damage.lost_bytes == size + 1
     assert bytes_read < 20 * size
@@ -542,38 +439,12 @@ def test_the_search_behind_damage_takes_linear_time(tmp_path, monkeypatch):
 CEILING_MB = 1000       # of the process: about three times max_bytes, and the interpreter
 
 
-def peak_of(path: Path, call: str) -> tuple[int, str]:
-    """Run a call in a process of its own; return its peak memory [MB] and what it prints."""
-    done = subprocess.run(
-        [sys.executable, '-c',
-         'import resource\n'
-         'from spinning_top_sim.recording.reader import LogReader\n'
-         'from spinning_top_sim.recording.errors import LogError\n'
-         'from spinning_top_sim.tools.recover import main\n'
-         f'path = {str(path)!r}\n{call}\n'
-         'print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10)'],
-        env=os.environ | {'PYTHONPATH': str(ROOT)}, capture_output=True, text=True, timeout=300,
-        check=True)
-    *printed, peak = done.stdout.splitlines()
-    return int(peak), '\n'.join(printed)
-
-
-READ = """
-with LogReader(path) as reader:
-    try:
-        print(sum(1 for _ in reader.messages()))
-    except LogError as error:
-        print(error)
-    print(*reader.damage.lines(), sep='\\n')
-"""
-
-
 def zstd_chunk(plain: bytes, end: int = 5) -> bytes:
     return chunk_of(plain, 5, end, 'zstd', zstandard.compress(plain))
 
 
 def tiny_messages() -> bytes:
-    return zstd_chunk(message(5, b'') * 1_000_000)
+    return zstd_chunk(message(5, b'') * 300_000)
 
 
 def long_names() -> bytes:
@@ -584,29 +455,62 @@ def long_names() -> bytes:
 
 
 def many_keys() -> bytes:
-    metadata = {str(number): '' for number in range(1_500_000)}
-    return zstd_chunk(record_bytes(Channel(
-        id=2, topic='/b', message_encoding='x', metadata=metadata, schema_id=0)))
+    channel = record_bytes(Channel(id=2, topic='/b', message_encoding='x', metadata={},
+                                   schema_id=0))
+    entries = b''.join(b'\x07\0\0\0%07d\0\0\0\0' % number for number in range(1_200_000))
+    content = channel[9:-4] + struct.pack('<I', len(entries)) + entries
+    return zstd_chunk(unknown_kind(Opcode.CHANNEL, content))
 
 
 def overlapping() -> bytes:
-    return zstd_chunk(message(5, b'') + message(6, bytes(200_000_000)) + message(9, b''), 9) * 6
+    return zstd_chunk(message(5, b'') + message(6, bytes(200_000_000)) + message(9, b''), 9) * 3
 
 
 @pytest.mark.parametrize(('bomb', 'report'), [
-    (tiny_messages, '1000000'), (long_names, 'refused: chunk'), (many_keys, 'refused: chunk'),
+    (tiny_messages, '300000'), (long_names, 'refused: chunk'), (many_keys, 'refused: chunk'),
     (overlapping, 'overlap in time')])
 def test_memory_has_a_ceiling(tmp_path, bomb, report):
     """Small files that unpack to much; what is refused for its size is called that."""
     path = tmp_path / 'a.mcap'
     path.write_bytes(closed(HEADER, RAW_CHANNEL, bomb()))
     assert path.stat().st_size < 3_000_000
-    peak, printed = peak_of(path, READ)
-    assert report in printed
-    assert 'lost' not in printed
-    assert peak < CEILING_MB
-    peak, _ = peak_of(path, f'main([path, "-o", {str(tmp_path / "b.mcap")!r}])')
-    assert peak < CEILING_MB
+    done = subprocess.run(
+        [sys.executable, '-c', textwrap.dedent(f"""
+            import resource
+            from spinning_top_sim.recording.reader import LogReader
+            from spinning_top_sim.recording.errors import LogError
+            from spinning_top_sim.tools.recover import main
+            with LogReader({str(path)!r}) as reader:
+                try:
+                    print(sum(1 for _ in reader.messages()))
+                except LogError as error:
+                    print(error)
+                print(*reader.damage.lines(), sep='\\n')
+            main([{str(path)!r}])
+            print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10)
+            """)],
+        env=os.environ | {'PYTHONPATH': str(ROOT)}, capture_output=True, text=True, timeout=300,
+        check=True)
+    assert report in done.stdout
+    assert 'lost' not in done.stdout
+    assert int(done.stdout.splitlines()[-1]) < CEILING_MB
+
+
+def test_a_search_unpacks_a_limited_amount(tmp_path, monkeypatch):
+    """Chunks that are small and unpack to much, each with a wrong checksum."""
+    unpacked = []
+    ordinary = scan.open_chunk
+    monkeypatch.setattr(scan, 'open_chunk', lambda chunk, max_bytes: (
+        unpacked.append(chunk.uncompressed_size), ordinary(chunk, max_bytes))[1])
+    plain = bytearray(zstd_chunk(message(5, bytes(1_000_000))))
+    plain[9 + 24] ^= 1
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(MCAP0_MAGIC + HEADER + b'\x00' + bytes(plain) * 300)
+    max_bytes = 2_000_000
+    with LogReader(path, max_bytes) as reader:
+        assert reader.damage.lost_bytes == path.stat().st_size - len(MCAP0_MAGIC + HEADER)
+    assert len(unpacked) > 1
+    assert sum(unpacked) < 5 * (path.stat().st_size + max_bytes)
 
 
 def test_what_is_read_twice_at_once_has_the_ceiling_twice(tmp_path):
@@ -619,7 +523,7 @@ def test_what_is_read_twice_at_once_has_the_ceiling_twice(tmp_path):
 
 
 @pytest.mark.parametrize('kind', [
-    Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.SCHEMA, 0x90])
+    Opcode.CHUNK, Opcode.METADATA, 0x90])
 def test_a_record_of_many_gigabytes_is_not_read(tmp_path, kind):
     """It is a hole in the file: to read it, or to copy it, would take minutes and the disk."""
     path, size = tmp_path / 'a.mcap', 100 << 30
@@ -636,42 +540,17 @@ def test_a_record_of_many_gigabytes_is_not_read(tmp_path, kind):
         assert (loss.refused, loss.bytes) == (True, 9 + size)
 
 
-def test_the_search_behind_damage_unpacks_a_limited_amount(tmp_path, monkeypatch):
-    """Chunks that are small and unpack to much, each with a wrong checksum."""
-    unpacked = []
-    ordinary = records.open_chunk
-    monkeypatch.setattr(records, 'open_chunk', lambda chunk, max_bytes: (
-        unpacked.append(chunk.uncompressed_size), ordinary(chunk, max_bytes))[1])
-    plain = bytearray(zstd_chunk(message(5, bytes(1_000_000))))
-    plain[9 + 24] ^= 1
-    path = tmp_path / 'a.mcap'
-    path.write_bytes(MCAP0_MAGIC + HEADER + b'\x00' + bytes(plain) * 300)
-    max_bytes = 2_000_000
-    with LogReader(path, max_bytes) as reader:
-        assert reader.damage.lost_bytes == path.stat().st_size - len(MCAP0_MAGIC + HEADER)
-    assert len(unpacked) > 1
-    assert sum(unpacked) < 5 * (path.stat().st_size + max_bytes)
-
-
 # The output
 
-def test_a_leftover_of_a_killed_recovery_blocks_nothing(tmp_path):
+def test_the_output_has_the_mode_of_the_log(tmp_path):
     path = tmp_path / 'a.mcap'
     write_log(path)
-    (tmp_path / f'.recover-{os.getpid()}.tmp').write_text('left over')
-    assert seen_by_us(recover(path)) == seen_by_us(path)
+    path.chmod(0o400)
+    assert recover(path).stat().st_mode & 0o777 == 0o400
 
 
-@pytest.mark.parametrize('mode', [0o600, 0o444])
-def test_the_output_has_the_mode_of_the_log(tmp_path, mode):
-    path = tmp_path / 'a.mcap'
-    write_log(path)
-    path.chmod(mode)
-    assert recover(path).stat().st_mode & 0o777 == mode
-
-
-@pytest.mark.parametrize(('number', 'code'), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-def test_a_signal_leaves_nothing_behind(tmp_path, number, code):
+def test_a_signal_leaves_nothing_behind(tmp_path):
+    """test_recover.py has Ctrl-C."""
     path = tmp_path / 'a.mcap'
     write_log(path)
     child = subprocess.Popen(
@@ -688,23 +567,11 @@ def test_a_signal_leaves_nothing_behind(tmp_path, number, code):
     try:
         assert child.stdout.readline() == 'ready\n'
         assert len(list(tmp_path.iterdir())) == 2
-        child.send_signal(number)
-        assert child.wait(timeout=20) == code
+        child.send_signal(signal.SIGTERM)
+        assert child.wait(timeout=20) == 143
     finally:
         child.kill()
         child.communicate()
     assert [item.name for item in tmp_path.iterdir()] == ['a.mcap']
 
 
-def test_application_records_are_kept_in_a_file_with_a_summary(tmp_path):
-    """A summary does not mention them."""
-    path = tmp_path / 'a.mcap'
-    messages = write_log(path)
-    private = unknown_kind(0x9a, b'private')
-    content = re.sub(rb'spinning_top_sim \d', b'a stranger, maybe ', path.read_bytes())
-    (end,) = [start for opcode, start, _ in records_of(content) if opcode == Opcode.DATA_END]
-    assert metadata_of(path)
-    path.write_bytes(content[:end] + private)
-    output = recover(path)
-    assert seen_by_us(output) == seen_by_mcap(output) == messages
-    assert private in output.read_bytes()

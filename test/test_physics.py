@@ -2,22 +2,15 @@
 """Constants and states of the top, attitude mathematics, regimes: no ROS."""
 
 import math
-from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
-from helpers.random_tops import random_case
 from helpers.reference import CASES, SCENES, scene_parameters, start_of, top_of
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.regimes import (
-    Description,
-    nutation_cubic,
-    regime,
-    swing,
-)
+from spinning_top_sim.physics.regimes import Description, regime
 from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
@@ -28,9 +21,8 @@ STATE = {'theta': 0.7, 'theta_dot': 0.4, 'phi': 0.3, 'psi': -1.2, 'l3': 1.6, 'lz
 
 
 @pytest.mark.parametrize(('field', 'value'), [
-    ('lambda1', 0.0), ('lambda1', -1.0), ('lambda1', math.nan), ('lambda3', 0.0),
-    ('lambda3', math.inf), ('mass', -2.0), ('gravity', math.nan), ('com_distance', -math.inf),
-    ('mass', 'heavy'), ('mass', None), ('gravity', True), ('mass', 10 ** 400)])
+    ('lambda1', 0.0), ('lambda3', math.inf), ('mass', -2.0), ('gravity', math.nan),
+    ('mass', None), ('gravity', True), ('mass', 10 ** 400)])
 def test_a_bad_constant_is_refused_by_name_and_value(field, value):
     with pytest.raises(ValueError, match=rf'{field} = .*must be') as error:
         Top(**{**TOP, field: value})
@@ -38,8 +30,7 @@ def test_a_bad_constant_is_refused_by_name_and_value(field, value):
 
 
 @pytest.mark.parametrize(('field', 'value'), [
-    ('theta', -1e-300), ('theta', math.nextafter(math.pi, 4.0)), ('theta', math.nan),
-    ('theta_dot', math.inf), ('phi', math.nan), ('psi', -math.inf), ('l3', math.nan),
+    ('theta', -1e-300), ('theta', math.nextafter(math.pi, 4.0)), ('phi', math.nan),
     ('lz', '1.0 kg')])
 def test_a_bad_state_is_refused_by_name_and_value(field, value):
     with pytest.raises(ValueError, match=rf'{field} = .*must be') as error:
@@ -59,11 +50,6 @@ def test_at_a_pole_only_one_lz_is_possible(theta, lz, allowed):
     (5e-324, (-1.7976931348623157e308,) * 3)])
 def test_a_drift_is_relative_absolute_where_the_constant_is_0_and_finite(start, expected):
     assert tuple(relative_drift(np.array([-1.0, -2.0, -3.0]), start)) == expected
-
-
-def test_negative_distances_and_gravity_are_legal():
-    assert Top(**{**TOP, 'com_distance': -0.1}).gravity_torque < 0.0
-    assert Top(**{**TOP, 'gravity': -9.8}).gravity_torque < 0.0
 
 
 def test_realizable_is_the_triangle_inequality_about_the_centre_of_mass():
@@ -116,18 +102,6 @@ def test_energy_and_momenta_are_those_of_the_lagrangian():
         assert state.energy[0] == pytest.approx(kinetic + top.gravity_torque * c)
 
 
-def test_vectors_turn_into_the_body():
-    v = (0.3, -1.1, 0.7)
-    for _, state in random_states(10):
-        into_body = rotation_of(state).inv()
-        in_body = np.array(attitude.in_body(state.rows_quaternion, v))[:, 0]
-        assert in_body == pytest.approx(into_body.apply(v), abs=1e-14)
-        assert np.array(state.rows_vertical)[:, 0] == pytest.approx(
-            into_body.apply((0.0, 0.0, 1.0)), abs=1e-14)
-        assert np.array(state.rows_axis)[:, 0] == pytest.approx(
-            rotation_of(state).apply((0.0, 0.0, 1.0)), abs=1e-14)
-
-
 def test_products_and_angles_of_rotations():
     one, other = Rotation.random(20, random_state=1), Rotation.random(20, random_state=2)
     p, q = tuple(one.as_quat().T), tuple(other.as_quat().T)
@@ -152,32 +126,11 @@ def test_hanging_at_rest_an_accelerometer_reads_g_upwards():
     assert tuple(float(x[0]) for x in upright) == (0.0, 0.0, TOP['gravity'])
 
 
-def test_the_centre_of_percussion_of_a_horizontal_pendulum_feels_no_force_along_its_swing():
-    """At lambda1/(M R) from the pivot a released horizontal pendulum falls with g."""
-    level = at_rest(math.pi / 2)
-    arm = level.top.lambda1 / (level.top.mass * level.top.com_distance)
-    assert np.array(level.specific_force((0.0, 0.0, arm)))[:, 0] == pytest.approx(
-        (0.0, 0.0, 0.0), abs=1e-14)
-
-
-def test_states_of_many_times_have_the_shapes_that_they_say():
-    states = solve(Top(**TOP), State(**STATE), np.linspace(0.0, 1.0, 7))
-    assert len(states) == 7
-    for name in ('t', 'theta', 'phi', 'psi', 'theta_dot', 'phi_dot', 'psi_dot', 'theta_folded',
-                 'energy', 'l3', 'lz', 'norm_error'):
-        assert getattr(states, name).shape == (7,), name
-    assert states.quaternion.shape == (7, 4)
-    for name in ('angular_velocity', 'angular_acceleration'):
-        assert getattr(states, name).shape == (7, 3), name
-
-
 NAMES = {
-    'loop-a': 'loops', 'loop-c-thd+': 'loops', 'wavy-a': 'waves', 'cusp-headline-a': 'cusps',
-    'cusp-e-low': 'cusps', 'fast-1e+08-cusp': 'cusps', 'cross-top-a': 'through the top',
-    'cross-bottom-a': 'through the bottom', 'sleep-exact-stable': 'sleeping',
-    'hang-pi-double': 'hanging', 'spherical-a': 'spherical pendulum',
-    'planar-osc-thd': 'planar pendulum, swinging', 'planar-rot-': 'planar pendulum, rotating',
-    'free-R0-fixedaxis': 'free top', 'steady-fast': 'steady precession', 'negP-a': 'loops'}
+    'loop-c-thd+': 'loops', 'wavy-a': 'waves', 'fast-1e+08-cusp': 'cusps',
+    'cross-top-a': 'through the top', 'cross-bottom-a': 'through the bottom',
+    'hang-pi-double': 'hanging', 'planar-osc-thd': 'planar pendulum, swinging',
+    'free-R0-fixedaxis': 'free top', 'negP-a': 'loops'}
 
 
 @pytest.mark.parametrize(('case', 'name'), NAMES.items())
@@ -265,7 +218,6 @@ def test_the_extremes_are_those_of_the_motion(theta, theta_dot, l3, lz):
 
 
 RESTING = {
-    'steady_slow': ({}, 'steady precession: theta = '),
     'steady_fast': ({}, 'steady precession: theta = '),
     'sleeping': ({}, 'sleeping: theta = 0 deg'),
     'cusp': ({'initial.theta': math.pi, 'spin.l3': 1.6, 'spin.lz': -1.6},
@@ -284,140 +236,9 @@ def test_a_resting_axis_is_one_for_the_regime_the_description_and_the_solver(sce
     assert isinstance(simulation.segment.solver, ExactSolution)
 
 
-@pytest.mark.parametrize('distance', [0.15, -0.15])
-@pytest.mark.parametrize('l3', [0.0, 1.6, 3.0])
-@pytest.mark.parametrize('lz', [0.0, 1.6, 3.0])
-@pytest.mark.parametrize('theta', [1e-300, 1e-170, 1e-162, 1e-9, math.pi - 4e-16])
-def test_starts_next_to_a_pole_are_described(theta, l3, lz, distance):
-    top, start = Top(**{**TOP, 'com_distance': distance}), State(theta=theta, l3=l3, lz=lz)
-    try:
-        solution = ExactSolution(top, start)
-    except ValueError:
-        assert theta < 1e-100               # beyond what doubles hold
-        return
-    description = solution.describe()
-    assert str(description)
-    if description.nutation_period is None:
-        assert solution.theta_max - solution.theta_min < 2e-6
-
-
-def test_ends_of_a_range_show_no_rounding_dust():
-    description, _, _ = described()
-    assert description.name == 'cusps' and description.precession_max > 1.0
-    assert '(0 to ' in str(description)
-    assert 0.0 < abs(description.precession_min) < 1e-12
-
-
-@pytest.mark.parametrize('theta_dot', [1e-2, 1e-4, 1e-6, 1e-8, 1e-10])
-@pytest.mark.parametrize('theta', [0.02, 0.5, 2.5, 3.1415])
-def test_a_range_shows_two_ends_or_the_tilt_rests(theta, theta_dot):
-    top = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
-    # Steady precession, touched: lambda1 cos(theta) Omega^2 - L3 Omega + P = 0.
-    l3, cosine = 2.0, math.cos(theta)
-    rate = 2.0 * top.gravity_torque / (l3 + math.sqrt(
-        l3 * l3 - 4.0 * top.lambda1 * cosine * top.gravity_torque))
-    lz = top.lambda1 * rate * math.sin(theta) ** 2 + l3 * cosine
-    description = ExactSolution(
-        top, State(theta=theta, theta_dot=theta_dot, l3=l3, lz=lz)).describe()
-    rests = description.name in ('steady precession', 'sleeping', 'hanging')
-    assert rests == (description.nutation_period is None) == (' every ' not in str(description))
-    assert not rests or theta_dot < 1e-5
-    if not rests:
-        low, high = str(description).split('from ')[1].split(' deg')[0].split(' to ')
-        assert float(low) < float(high)
-
-
-def test_a_start_beside_the_top_is_described():
-    top = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
-    for theta in (1e-100, 1e-170, 1e-200):
-        description = ExactSolution(top, State(theta=theta, l3=2.0, lz=2.0)).describe()
-        assert description.name == 'sleeping' and description.theta_min == theta
-        assert ' every ' not in str(description)
-
-
-def test_swing_contains_every_reference_tilt():
-    """Two roots that nearly meet are known to the square root of a rounding only."""
-    for case in CASES.values():
-        if case['regime'] in ('planar', 'pole-crossing') or case['name'] == 'hang-pi-double':
-            continue
-        low, high = swing(top_of(case), start_of(case))
-        for state in case['states']:
-            u = math.cos(float(state['theta_folded']))
-            slack = 2e-8 if case['regime'] == 'separatrix' else 1e-12
-            assert low - slack <= u <= high + slack, case['name']
-
-
-@pytest.mark.parametrize(('name', 'value'), [
-    ('top.lambda1', 0.0), ('top.lambda1', 'big'), ('pose.rate', -5.0), ('pose.rate', 1e5),
-    ('solver.method', 'rk4'), ('imu.sampling', 'often'), ('imu.lever_arm', (1.0, 2.0)),
-    ('seed', 1.5), ('seed', 10 ** 400), ('pose.enabled', 1), ('spin.l3', None),
-    ('record.streams', ('pose', 'poses')),
-    ('step.count', 0), ('initial.theta', 3.2), ('tick_rate', math.nan), ('no.such', 1.0)])
-def test_a_bad_parameter_is_refused_by_name_and_value(name, value):
-    with pytest.raises(ValueError, match=name.replace('.', r'\.')) as error:
-        parameters.checked({name: value})
-    shown = list(value) if name == 'record.streams' else value
-    assert repr(shown) in str(error.value)
-
-
-def test_an_integer_is_taken_for_a_double():
-    value = parameters.checked({'spin.l3': 2})['spin.l3']
-    assert value == 2.0 and isinstance(value, float)
-
-
-@pytest.mark.parametrize('theta', [1e-9, 1e-3, math.pi - 1e-3, math.pi - 1e-9])
-def test_the_cubic_keeps_its_digits_next_to_both_poles(theta):
-    """Where L3 and Lz nearly cancel, against 60 digits from the smaller of sin and cos theta/2."""
-    lambda1, torque, l3 = 0.123, 2.94, 1.6
-    sine, cosine = math.sin(0.5 * theta), math.cos(0.5 * theta)
-    upright = theta < 1.0
-    found = nutation_cubic(lambda1, torque, l3, l3 if upright else -l3, 0.0, sine, cosine)
-    with localcontext() as context:
-        context.prec = 60
-        small = Decimal(sine if upright else cosine) ** 2
-        sign, inertia, spin = (1 if upright else -1), Decimal(lambda1), Decimal(l3)
-        u0 = sign * (1 - 2 * small)
-        momentum = 2 * sign * spin * small              # Lz - L3 u0
-        sine2 = 4 * small * (1 - small)
-        kinetic = (momentum / inertia) ** 2 / sine2 * inertia / 2
-        expected = (
-            2 * momentum * spin / inertia ** 2
-            - 2 / inertia * (2 * u0 * kinetic + Decimal(torque) * sine2),
-            2 / inertia * (2 * u0 * Decimal(torque) - kinetic) - (spin / inertia) ** 2)
-    assert found[0] == 0.0
-    for value, exact in zip(found[1:3], expected, strict=True):
-        assert value == pytest.approx(float(exact), rel=1e-14, abs=0.0)
-
-
 @pytest.mark.parametrize(('low', 'high', 'text'), [
     (12.3456, 45.6789, '12.35 to 45.68'), (30.0, 30.00123, '30 to 30.001'),
     (12.3456, 12.3456, '12.35 to 12.35'), (-1e-17, 2.0, '0 to 2'), (-3.0, 1e-17, '-3 to 0')])
 def test_a_description_shows_ranges_with_as_many_digits_as_tell_their_ends_apart(low, high, text):
     motion = Description('waves', 1.0, 0.5, 0.7, 0.0, low, high, 0.0, 0.5, 2.0)
     assert f'precession 0 rad/s ({text}), spin' in str(motion)
-
-
-@pytest.mark.parametrize('theta', [0.2, 2.1])
-def test_the_swing_of_a_pendulum_that_turns_over_ends_at_the_poles(theta):
-    top = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
-    assert swing(top, State(theta=theta, theta_dot=20.0, l3=0.0, lz=0.0)) == (-1.0, 1.0)
-
-
-def test_the_swing_is_that_of_the_samples_of_a_nutation():
-    """Of random tops on both sides of the horizontal, and through the poles."""
-    compared = 0
-    for seed in range(80):
-        case = random_case(seed)
-        period = ExactSolution(case.top, case.start).nutation_period
-        if not period:
-            continue
-        motion = solve(case.top, case.start, np.linspace(0.0, period, 2001))
-        u = np.cos(motion.theta)
-        low, high = swing(case.top, case.start)
-        # Turning points lie between samples; they are of second order in their distance.  Next
-        # to the separatrix two roots of the cubic are one, and half of the digits are lost.
-        apart = 1e-4 * (high - low) + 1e-7
-        assert low - 1e-7 <= u.min() <= low + apart, case
-        assert high - apart <= u.max() <= high + 1e-7, case
-        compared += 1
-    assert compared > 60

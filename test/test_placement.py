@@ -21,7 +21,7 @@ def pose_and_twist(state):
     return np.concatenate(q), np.concatenate(attitude.in_world(q, states.rows_angular_velocity))
 
 
-@pytest.mark.parametrize('seed', range(30))
+@pytest.mark.parametrize('seed', range(6))
 def test_a_state_comes_back_from_its_pose_and_twist(seed):
     rng = np.random.default_rng(seed)
     state = State(theta=rng.uniform(0.02, 3.12), theta_dot=rng.normal(), phi=rng.uniform(-3, 3),
@@ -54,15 +54,6 @@ def test_at_a_pole_what_is_not_spin_is_nutation(tilt, inverted, rates):
     assert np.allclose(np.abs(again @ q), 1.0, rtol=0.0, atol=1e-15)
     assert np.allclose(again, q, rtol=0.0, atol=POLE)
     assert np.allclose(rates_again, rates, rtol=0.0, atol=1e-14)
-
-
-def test_just_beside_a_pole_the_motion_is_still_what_was_asked_for():
-    """POLE is where rounding disturbs the angular velocity as much as the tilt matters."""
-    columns = [np.array([value]) for value in (0.7, 2.0 * POLE, -1.9)]
-    q = np.concatenate(attitude.quaternion_of_angles(*columns))
-    rates = np.array([0.3, -0.4, 2.0])
-    _, found = pose_and_twist(state_of(TOP, q, rates))
-    assert np.allclose(found, rates, rtol=0.0, atol=1e-7)
 
 
 @pytest.mark.parametrize('distance', [0.15, 0.0, -0.4])

@@ -3,7 +3,6 @@
 
 import functools
 import os
-import struct
 import tempfile
 from collections import Counter
 from pathlib import Path
@@ -11,11 +10,9 @@ from pathlib import Path
 import pytest
 from helpers.examples import examples
 from helpers.mutations import mutate
-from helpers.odd_logs import odd_log
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
-from mcap.records import Header
 from mcap.writer import MCAP0_MAGIC
 from test_recover import (
     ALL_KEPT,
@@ -34,14 +31,11 @@ from test_recover import (
 from spinning_top_sim.exam.log import LAYOUTS, examine_log
 from spinning_top_sim.exam.report import Report
 from spinning_top_sim.recording.errors import LogError
-from spinning_top_sim.recording.mcap_writer import record_bytes
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.streams import messages
-from spinning_top_sim.tools import inspect
 
-HEAD = MCAP0_MAGIC + record_bytes(Header(profile='ros2', library='spinning_top_sim 0'))
 CHUNKS = 4
 
 
@@ -86,27 +80,12 @@ def check_reading_and_recovery(path, output):
     return read
 
 
-@examples(120)
+@examples(60)
 @given(st.sampled_from((*STRANGERS, 'ours')), st.randoms())
 def test_mutated_logs_are_read_and_recovered(tmp_path, kind, rng):
     """Bits, numbers, lengths and kinds changed, records repeated, removed and torn."""
     path = tmp_path / 'broken.mcap'
     path.write_bytes(mutate(originals()[kind], rng))
-    check_reading_and_recovery(path, tmp_path / 'whole.mcap')
-
-
-@examples(60)
-@given(st.lists(st.tuples(st.integers(0, 20), st.binary(max_size=60), st.sampled_from(
-    (None, None, None, 0, 1, 255, 2 ** 31, 2 ** 63, 2 ** 64 - 1))), max_size=12),
-    st.none() | st.integers(0, 1000))
-def test_records_of_noise_crash_nothing(tmp_path, records, summary_start):
-    content = HEAD + b''.join(
-        struct.pack('<BQ', kind, len(body) if length is None else length) + body
-        for kind, body, length in records)
-    if summary_start is not None:
-        content += struct.pack('<BQQQI', 2, 20, summary_start, 0, 0) + MCAP0_MAGIC
-    path = tmp_path / 'noise.mcap'
-    path.write_bytes(content)
     check_reading_and_recovery(path, tmp_path / 'whole.mcap')
 
 
@@ -121,7 +100,7 @@ def of_ours():
                              if kind == Opcode.CHUNK]
 
 
-@examples(150)
+@examples(60)
 @given(st.data(), st.booleans(), st.binary(max_size=40))
 def test_what_is_whole_stays_whatever_stands_beside_it(tmp_path, data, torn, inserted):
     """Any bytes are put in the place of any others, with a summary or without."""
@@ -141,24 +120,13 @@ def test_what_is_whole_stays_whatever_stands_beside_it(tmp_path, data, torn, ins
     assert Counter(read) <= Counter(logged)
 
 
-@examples(20)
-@given(st.randoms())
-def test_odd_logs_end_in_words(tmp_path, capsys, rng):
-    """Metadata, journal, stamps, samples and names of any kind, in a log that is whole."""
-    path = odd_log(tmp_path / 'odd.mcap', rng)
-    assert inspect.main([str(path), '--verify']) in (0, 1)
-    out, err = capsys.readouterr()
-    assert out.startswith(f'{path}: ')
-    assert (out + err).replace('\n', '').isprintable()
-
-
 # ----------------------------------------------------------------------------- messages of others
 
 TYPE = 'sensor_msgs/msg/Imu'
 assert TYPE in LAYOUTS
 
 
-@examples(40)
+@examples(20)
 @given(st.lists(st.one_of(st.binary(max_size=400), st.tuples(
     st.integers(0, 2 ** 62), st.lists(st.floats(), min_size=10, max_size=10))), min_size=1,
     max_size=5), st.sampled_from(('ground_truth/imu', 'said')))

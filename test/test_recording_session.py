@@ -21,7 +21,7 @@ from spinning_top_sim.nodes.simulator import Simulator
 from spinning_top_sim.recording import provenance, writer
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.streams.simulation import Simulation
+from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.tools import inspect
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -35,7 +35,7 @@ class Recorded:
         given = {name.replace('__', '.'): value for name, value in values.items()}
         self.values = parameters.checked({'record.uri': str(folder), 'record.min_free_bytes': 0,
                                           **given})
-        self.simulation = Simulation(self.values, EPOCH_NS)
+        self.simulation = LiveSimulation(self.values, EPOCH_NS)
         self.lock = FairLock()
         self.remapped = {}
         self.session = RecordingSession(self.simulation, self.lock, self.topics)
@@ -159,7 +159,7 @@ def test_a_file_that_is_named_is_never_overwritten_and_nothing_is_kept(tmp_path)
     with pytest.raises(RecordingError, match='exists'):
         recorded.start()
     assert path.read_bytes() == b'precious'
-    assert not any(stream.has_sinks for stream in recorded.simulation.streams)
+    assert not any(output.is_used for output in recorded.simulation.outputs)
     recorded.simulation.advance(SECOND)
     assert recorded.session.stop() is None
     assert recorded.session.numbers() == {'recorder': 'off'}
@@ -172,7 +172,7 @@ def test_topics_of_one_name_are_refused_and_nothing_is_kept(tmp_path):
     with pytest.raises(RecordingError, match="'/ns/pose' is listed twice"):
         recorded.start()
     assert list(tmp_path.iterdir()) == []
-    assert not any(stream.has_sinks for stream in recorded.simulation.streams)
+    assert not any(output.is_used for output in recorded.simulation.outputs)
     assert recorded.session.stop() is None
 
 

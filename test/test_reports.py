@@ -19,7 +19,7 @@ from spinning_top_sim.nodes import reports
 from spinning_top_sim.nodes.reports import MotionReport
 from spinning_top_sim.nodes.tick_loop import TickLoop
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.simulation import Simulation
+from spinning_top_sim.streams.live import LiveSimulation
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def clock(monkeypatch):
 def reported():
     """A report of a paused simulation that stands at 1.25 s, and what it is about."""
     values = parameters.checked({'start_paused': True})
-    simulation = Simulation(values)
+    simulation = LiveSimulation(values)
     session = SimpleNamespace(error=None, warning=None, size='',
                               numbers=lambda: {'recorder': 'off'}, has_room=lambda: True,
                               write_command=print, write_event=lambda *_, **__: None)
@@ -113,7 +113,7 @@ def test_the_status_line_and_what_is_told_of_a_new_motion(clock, reported):
     reported.loop.command(2.0, 1.0)
     assert reported.report.new_motion() is not None
     assert ' | log 1.2 MB | ' in reported.report.status_line()
-    reported.simulation.streams[0].sent = 12
+    reported.simulation.outputs[0].sent = 12
     assert ' | 12 messages | ' in reported.report.status_line()
     reported.loop.resume()
     assert re.search(r' \| x\d+\.\d\d \| ', reported.report.status_line())

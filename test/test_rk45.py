@@ -28,8 +28,7 @@ from spinning_top_sim.solvers.dormand_prince import (
 from spinning_top_sim.solvers.equations import EulerEquations, TransportEquations
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.propagator import propagate
-from spinning_top_sim.solvers.rk45 import STEPS_TOGETHER
-from spinning_top_sim.solvers.unwrap import PhaseUnwrapper, turns_to_follow
+from spinning_top_sim.solvers.unwrap import PhaseUnwrapper
 from spinning_top_sim.streams import parameters
 
 NODES = tuple(map(Fraction, ['0', '1/5', '3/10', '4/5', '8/9', '1', '1']))
@@ -89,33 +88,9 @@ def test_dense_output_is_as_good_as_the_steps(equations_type):
     assert np.all(ratios > 5.5)
 
 
-@both_equations
-def test_dense_output_meets_the_steps_at_their_ends(equations_type):
-    """With values and both derivatives, of unequal steps, in any order."""
-    equations = equations_type(top_of(LOOPING), start_of(LOOPING), 1e-7, 0.0)
-    integrator = Integrator(equations)
-    steps = [integrator.step() for _ in range(20)]
-    interpolants = Interpolants(steps, equations)
-    numbers = np.array([7, 19, 0, 7, 12])
-    ends = interpolants.at(numbers, np.array([steps[k].t1 for k in numbers]))
-    begins = interpolants.at(numbers, np.array([steps[k].t0 for k in numbers]))
-    for column, k in enumerate(numbers):
-        assert begins[:, column] == pytest.approx(np.array(steps[k].y0).view(float), abs=1e-15)
-        assert ends[:, column] == pytest.approx(np.array(steps[k].y1).view(float), abs=1e-14)
-    h = 1e-5
-    for begin, derivative in ((True, 'derivative0'), (False, 'derivative1')):
-        t = np.array([steps[k].t0 if begin else steps[k].t1 for k in numbers])
-        slope = (interpolants.at(numbers, t + h) - interpolants.at(numbers, t - h)) / (2.0 * h)
-        for column, k in enumerate(numbers):
-            assert slope[:, column] == pytest.approx(
-                np.array(getattr(steps[k], derivative)).view(float), abs=1e-6)
-
-
-# Beyond 1e-6 at rtol 1e-12, and why: near a separatrix or an unstable equilibrium neighbouring
-# motions part like exp(k t), so an error of 1e-13 once made, say at the third number [s], has
-# grown as far by then.
-ILL_CONDITIONED = {('sleep-unstable-1e-8', 100.0): 10.0, ('sep-rounded-a', 30.0): 0.0,
-                   ('planar-sep-rounded', 30.0): 0.0}
+# Near a separatrix neighbouring motions part like exp(k t): 1e-13 grows beyond 1e-6.
+ILL_CONDITIONED = {('sleep-unstable-1e-8', 100.0), ('sep-rounded-a', 30.0),
+                   ('planar-sep-rounded', 30.0)}
 
 
 @pytest.mark.parametrize('name', CASES)
@@ -140,79 +115,36 @@ def test_reference_cases_up_to_100_s(name):
                                                         abs=1e-6)
 
 
-def test_the_ill_conditioned_cases_are_that():
-    """A nudge of 1e-13 rad/s on the way moves the exact end further than the bound."""
-    for (name, t), since in ILL_CONDITIONED.items():
-        top, start = top_of(CASES[name]), start_of(CASES[name])
-        begin = solve(top, start, [since])
-        ends = [solve(top, State(theta=begin.theta[0], theta_dot=begin.theta_dot[0] + nudge,
-                                 phi=begin.phi[0], psi=begin.psi[0], l3=start.l3, lz=start.lz),
-                      [t - since]).quaternion[0]
-                for nudge in (0.0, 1e-13)]
-        assert angle(*ends) > 1e-6, name
-
-
 def cusp_scene():
     values = parameters.checked(scene_parameters('cusp'))
     return parameters.top_of(values), parameters.start_state(values), values
 
 
-def test_ten_minutes_of_the_cusp_scene():
+def test_a_minute_of_the_cusp_scene():
     """Orientation, invariants, cost and cusps of the default solver at its default tolerance."""
-    seconds = 600.0
+    seconds = 60.0
     top, start, values = cusp_scene()
     exact = ExactSolution(top, start)
-    assert math.degrees(exact.theta_max - exact.theta_min) >= 10.0
     stepped = propagate(top, start, method='rk45', rtol=values['solver.rtol'],
                         atol=values['solver.atol'])
     period = exact.nutation_period
-    cusps = period * np.arange(int(seconds / period) + 1)
-    tenth = int(10.0 / period)
-    first = stepped.states_at_seconds(cusps[:tenth + 1])
-    assert stepped.evaluations <= 10.0 * 1500
-    rest = stepped.states_at_seconds(cusps[tenth + 1:])
-    for states in (first, rest):
-        assert np.abs(states.phi_dot).max() <= 1e-6
-        assert np.abs(states.energy / first.energy[0] - 1.0).max() <= 1e-12
-        assert np.abs(states.l3 / start.l3 - 1.0).max() <= 1e-12
-        assert np.abs(states.lz / start.lz - 1.0).max() <= 1e-12
-    truth = exact.states_at_seconds(cusps[tenth:tenth + 1])
-    assert angle(first.quaternion[-1], truth.quaternion[0]) < 1e-8
+    states = stepped.states_at_seconds(period * np.arange(int(seconds / period) + 1))
+    assert np.abs(states.phi_dot).max() <= 1e-6
+    assert np.abs(states.energy / states.energy[0] - 1.0).max() <= 1e-12
+    assert np.abs(states.l3 / start.l3 - 1.0).max() <= 1e-12
+    assert np.abs(states.lz / start.lz - 1.0).max() <= 1e-12
     last, truth = stepped.states_at_seconds(np.array([seconds])), solve(top, start, [seconds])
-    assert angle(last.quaternion[0], truth.quaternion[0]) < 3e-8
-    assert abs(last.phi[0] - truth.phi[0]) < 3e-8
+    assert angle(last.quaternion[0], truth.quaternion[0]) < 3e-9
+    assert abs(last.phi[0] - truth.phi[0]) < 3e-9
     assert stepped.evaluations <= seconds * 1500
 
 
-@pytest.mark.parametrize('offset', [1e-2, 1e-4, 1e-6, 1e-9, 0.0])
+@pytest.mark.parametrize('offset', [1e-2, 1e-9, 0.0])
 def test_a_pass_by_the_pole_costs_the_same_however_close(offset):
-    top = Top(lambda1=1.0, lambda3=0.5, mass=1.0, com_distance=0.5, gravity=9.8)
     start = State(theta=1.0, theta_dot=-4.0, l3=1.5, lz=1.5 + offset)
-    motion = propagate(top, start, method='rk45', rtol=1e-9)
+    motion = propagate(ONE_TOP, start, method='rk45', rtol=1e-9)
     motion.reach(50 * SECOND)
     assert motion.evaluations < 20_000
-
-
-def test_the_quaternion_keeps_its_sign_and_the_angles_their_branch():
-    top, start, _ = cusp_scene()
-    for case in ('cross-top-a', 'planar-rot-', 'nearpole-thmin~1e-6', 'spherical-small-Lz'):
-        top, start = top_of(CASES[case]), start_of(CASES[case])
-        t = np.arange(0.0, 20.0, 2e-3)
-        motion = solve(top, start, t, method='rk45')
-        steps = np.linalg.norm(np.diff(motion.quaternion, axis=0), axis=1)
-        assert steps.max() < 0.05
-        assert np.abs(np.diff(motion.theta)).max() < 0.05
-        truth = solve(top, start, t, method='exact')
-        for column in ('theta', 'phi', 'psi'):
-            assert getattr(motion, column) == pytest.approx(getattr(truth, column), abs=1e-7)
-
-
-def test_unit_quaternion_and_invariants_in_every_sample():
-    top, start, _ = cusp_scene()
-    motion = solve(top, start, np.linspace(0.0, 20.0, 5003), method='rk45')
-    assert np.abs(np.linalg.norm(motion.quaternion, axis=1) - 1.0).max() <= 4e-16
-    assert np.abs(motion.energy / motion.energy[0] - 1.0).max() <= 1e-13
-    assert np.abs(motion.l3 / start.l3 - 1.0).max() <= 1e-13
 
 
 @pytest.mark.parametrize('name', ['free-R0-fixedaxis', 'sleep-exact-stable', 'steady-fast'])
@@ -227,27 +159,15 @@ def test_free_motion_and_equilibria_take_no_steps(name):
 
 # ------------------------------------------------------------------- the paper's equations
 
-def euler(top, start, t, rtol=1e-9):
-    return solve(top, start, [t], method='rk45', equations='euler', rtol=rtol)
-
-
-def one_top(gravity=9.8):
-    return Top(lambda1=1.0, lambda3=0.5, mass=1.0, com_distance=0.5, gravity=gravity)
+ONE_TOP = Top(lambda1=1.0, lambda3=0.5, mass=1.0, com_distance=0.5, gravity=9.8)
 
 
 LITERAL_FAILURES = {
     'start at the pole, moving': ({'theta': 0.0, 'theta_dot': 2.0, 'l3': 1.5, 'lz': 1.5}, 5.0),
-    'start at the pole, at rest': ({'theta': 0.0, 'l3': 2.0, 'lz': 2.0}, 5.0),
-    'cos(theta) rounds to 1': ({'theta': 1e-8, 'l3': 2.0, 'lz': 2.0}, 10.0),
-    'passes the pole at 1e-6': (
-        {'theta': 1.0, 'theta_dot': -4.0, 'l3': 1.5, 'lz': 1.500004}, 5.0),
     'passes the pole at 1e-9': (
         {'theta': 0.8, 'theta_dot': -3.5, 'l3': 2.0, 'lz': 2.000000001}, 5.0),
     'crosses the pole': ({'theta': 0.8, 'theta_dot': -3.5, 'l3': 2.0, 'lz': 2.0}, 5.0),
-    'unstable sleeper': ({'theta': 1e-8, 'l3': 2.0, 'lz': 2.0}, 9.0),
     'hanging': ({'theta': math.pi, 'l3': 3.0, 'lz': -3.0}, 7.3),
-    'separatrix': (
-        {'theta': 1.0, 'theta_dot': -1.8196845223428513, 'l3': 2.0, 'lz': 2.0}, 30.0),
 }
 
 
@@ -257,29 +177,13 @@ def test_the_literal_equations_stop_with_advice_where_they_fail(name, rtol):
     fields, t = LITERAL_FAILURES[name]
     start = State(**fields)
     with pytest.raises(IntegrationError, match=r'euler equations.*pole.*transport'):
-        euler(one_top(), start, t, rtol)
-    exact = solve(one_top(), start, [t], method='exact')
-    regular = solve(one_top(), start, [t], method='rk45', rtol=1e-12)
-    tolerance = 1e-2 if name == 'separatrix' else 1e-7
-    assert angle(regular.quaternion[0], exact.quaternion[0]) < tolerance
+        solve(ONE_TOP, start, [t], method='rk45', equations='euler', rtol=rtol)
+    exact = solve(ONE_TOP, start, [t], method='exact')
+    regular = solve(ONE_TOP, start, [t], method='rk45', rtol=1e-12)
+    assert angle(regular.quaternion[0], exact.quaternion[0]) < 1e-7
 
 
-def test_a_wide_pass_at_a_loose_tolerance_is_right_or_refused():
-    """At theta_min = 1e-4 a step of tolerance 1e-6 can leap over the pole."""
-    for offset in (1e-2, 1e-3, 4e-4, 1e-4, 1e-5):
-        start = State(theta=1.0, theta_dot=-4.0, l3=1.5, lz=1.5 + offset)
-        truth = solve(one_top(), start, [3.7], method='exact')
-        try:
-            motion = euler(one_top(), start, 3.7, 1e-6)
-        except IntegrationError as error:
-            assert 'transport' in str(error)
-        else:
-            assert motion.phi[0] == pytest.approx(truth.phi[0], abs=1e-2)
-            assert motion.psi[0] == pytest.approx(truth.psi[0], abs=1e-2)
-
-
-@pytest.mark.parametrize('name', ['loop-a', 'loop-c-thd+', 'wavy-a', 'cusp-headline-a',
-                                  'oblate-neg-spin', 'negP-a', 'spherical-a'])
+@pytest.mark.parametrize('name', ['loop-c-thd+', 'oblate-neg-spin', 'negP-a'])
 def test_away_from_the_poles_the_literal_equations_are_right(name):
     case = CASES[name]
     states = case['states'][:2]
@@ -291,51 +195,12 @@ def test_away_from_the_poles_the_literal_equations_are_right(name):
         assert motion.psi[i] == pytest.approx(float(state['psi']), abs=1e-8)
 
 
-def test_the_literal_equations_are_the_derivatives_of_the_exact_motion():
-    """For a top none of whose constants is 1."""
-    top = Top(lambda1=0.3, lambda3=0.2, mass=2.0, com_distance=0.15, gravity=9.8)
-    start = State(theta=0.9, theta_dot=0.7, phi=0.3, psi=-0.4, l3=1.1, lz=0.6)
-    exact, equations = ExactSolution(top, start), EulerEquations(top, start, 1e-9, 0.0)
-
-    def angles_at(t):
-        states = exact.states_at_seconds(t)
-        return np.array([states.theta, states.theta_dot, states.phi, states.psi])
-
-    def derivatives_at(t):
-        return np.transpose([equations.derivative(*y) for y in angles_at(t).T.tolist()])
-
-    t, h = np.linspace(0.1, 3.0, 30), 1e-4
-    slope = (angles_at(t + h) - angles_at(t - h)) / (2.0 * h)
-    assert derivatives_at(t) == pytest.approx(slope, rel=1e-5, abs=1e-5)
-    slope = (derivatives_at(t + h) - derivatives_at(t - h)) / (2.0 * h)
-    second = equations.second_derivative(angles_at(t), derivatives_at(t))
-    assert second == pytest.approx(slope, rel=1e-5, abs=1e-4)
-
-
-def test_the_literal_equations_begin_with_a_step_for_the_fastest_rate():
-    top = Top(lambda1=0.5, lambda3=0.25, mass=2.0, com_distance=0.25, gravity=4.0)
-    equations = EulerEquations(top, State(theta=1.0, theta_dot=-1.0, l3=2.0, lz=-3.0), 1e-6, 2e-6)
-    assert equations.fastest_rate == 1.0 + 5.0 / 0.5 + 2.0 / 0.25 + 2.0
-    assert equations.tolerance == pytest.approx(3e-6)
-
-
-@pytest.mark.parametrize('start', [
-    State(theta=0.8, theta_dot=-9.0, l3=0.4, lz=0.4),
-    State(theta=2.6, theta_dot=3.0, l3=0.4, lz=-0.4)])
-def test_rates_are_right_on_the_way_through_a_pole(start):
-    top = Top(lambda1=0.3, lambda3=0.2, mass=2.0, com_distance=0.15, gravity=9.8)
-    t = np.linspace(0.0, 3.0, 3001)
-    stepped, truth = solve(top, start, t, method='rk45', rtol=1e-12), solve(top, start, t)
-    assert np.abs(np.sin(truth.theta)).min() < 1e-2
-    assert stepped.angular_velocity == pytest.approx(truth.angular_velocity, abs=1e-7)
-
-
 # ------------------------------------------------------------------------- bad arguments
 
 @pytest.mark.parametrize(('arguments', 'message'), [
     ({'method': 'rk4'}, "method = 'rk4'"), ({'equations': 'newton'}, "equations = 'newton'"),
-    ({'rtol': 0.0}, r'rtol = 0\.0'), ({'rtol': math.nan}, 'rtol = nan'),
-    ({'rtol': 1.0}, r'rtol = 1\.0'), ({'atol': -1.0}, r'atol = -1\.0')])
+    ({'rtol': math.nan}, 'rtol = nan'), ({'rtol': 1.0}, r'rtol = 1\.0'),
+    ({'atol': -1.0}, r'atol = -1\.0')])
 def test_bad_settings_are_refused_by_name_and_value(arguments, message):
     top, start, _ = cusp_scene()
     with pytest.raises(ValueError, match=message):
@@ -344,28 +209,13 @@ def test_bad_settings_are_refused_by_name_and_value(arguments, message):
 
 @pytest.mark.parametrize(('t', 'message'), [
     ([1.0, 0.5], r't\[1\] = 0\.5 s after 1\.0'), ([-1.0], r't\[0\] = -1\.0'),
-    ([0.0, math.nan], r't\[1\] = nan'), ([math.inf], r't\[0\] = inf'), ([[1.0]], 'shape'),
-    (1.0, 'shape'), (['soon'], 'soon'), (np.array([1], 'm8[s]'), 'timedelta64.*numbers, in s'),
+    ([0.0, math.nan], r't\[1\] = nan'), ([[1.0]], 'shape'), (['soon'], 'soon'),
     (np.array(['2026-01-01'], 'M8[ns]'), 'datetime64.*numbers, in s'),
-    (np.array([1.0 + 0.0j]), 'numbers, in s'), ([10 ** 400], 'numbers, in s'),
     ([10 ** 5000], 'numbers, in s')])
 def test_bad_times_are_refused(t, message):
     top, start, _ = cusp_scene()
     with pytest.raises(ValueError, match=message):
         solve(top, start, t, method='rk45')
-
-
-@pytest.mark.parametrize(('l3', 'lz'), [(1.0, 1.0), (1.0, -1.0), (0.0, 0.0)])
-def test_through_a_pole_the_attitude_is_that_of_the_angles(l3, lz):
-    """There a phase is known without the steps; the attitude has it too, whatever their error."""
-    top = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
-    start = State(theta=1.2, theta_dot=0.3, phi=0.4, psi=-0.7, l3=l3, lz=lz)
-    motion = solve(top, start, np.linspace(0.0, 10.0, 1001), method='rk45', rtol=1e-5)
-    plus, minus = 0.5 * (motion.phi + motion.psi), 0.5 * (motion.phi - motion.psi)
-    cosine, sine = np.cos(0.5 * motion.theta), np.sin(0.5 * motion.theta)
-    expected = np.array([-sine * np.sin(minus), sine * np.cos(minus),
-                         cosine * np.sin(plus), cosine * np.cos(plus)]).T
-    assert np.abs(motion.quaternion - expected).max() < 1e-13         # of angles up to 70 rad
 
 
 @pytest.mark.parametrize(('l3', 'theta'), [(1.0, 1.2), (1.0, 0.001), (0.0, 0.001)])
@@ -380,8 +230,7 @@ def test_through_a_pole_the_invariants_hold(l3, theta):
 
 
 @pytest.mark.parametrize(('theta', 'theta_dot', 'l3', 'lz'), [
-    (0.1, 0.0, 1.6, 1.591), (0.1, 0.3, 1.6, 1.59), (0.1, 0.3, 3.0, 2.99),
-    (3.05, 0.2, 1.0, -0.99)])
+    (0.1, 0.3, 1.6, 1.59), (3.05, 0.2, 1.0, -0.99)])
 def test_close_to_a_pole_the_invariants_hold(theta, theta_dot, l3, lz):
     """At tilts of 0.05 to 0.25 rad from the vertical, where rounding is magnified."""
     top = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
@@ -468,55 +317,11 @@ def test_a_limited_number_of_steps_is_taken_and_goes_on_later():
         other.states(range(60 * SECOND, 60 * SECOND + 1)).quaternion.tobytes())
 
 
-def test_reading_far_ahead_keeps_few_steps():
-    motion = looping_motion()
-    motion.states_at_seconds(np.array([0.0, 100.0]))
-    assert motion.steps > 5 * STEPS_TOGETHER
-    assert len(motion._kept) <= STEPS_TOGETHER + 1
-
-
-def test_the_begin_and_the_end_of_a_step_belong_to_it():
-    motion = looping_motion()
-    step_ns = SECOND // 512                     # a binary fraction: such a sum is exact
-    motion._integrator._next_step = 1.0 / 512.0
-    motion.reach(step_ns)
-    assert motion.reached_ns == step_ns
-    end = motion.states(range(step_ns, step_ns + 1)).quaternion
-    assert motion.steps == 1
-    motion.reach(4 * step_ns)
-    assert motion.states(range(0, 2 * step_ns + 1, step_ns)).quaternion[1].tobytes() == (
-        end.tobytes())
-
-
-def test_late_instants_that_one_double_stands_for_are_all_reached():
-    """Else whoever asks for one of them goes on asking."""
-    motion, late = looping_motion(), 10 ** 17
-    step = motion._kept[-1]
-    motion._kept = [step._replace(t0=late / SECOND - 1.0, t1=late / SECOND)]
-    motion._integrator.step = lambda: step._replace(t0=late / SECOND, t1=late / SECOND + 1.0)
-    for ns in range(late - 20, late + 20):
-        assert motion.reach(ns)
-        assert motion.reached_ns >= ns
-
-
 # ------------------------------------------------------------------------- unwrapped phases
 
-@pytest.mark.parametrize(('momentum', 'low'), [
-    (2.0, -0.5 * math.pi), (0.5, -0.5 * math.pi), (0.0, -math.pi), (-0.5, -1.5 * math.pi),
-    (-2.0, -1.5 * math.pi)])
-def test_a_phase_follows_the_one_before_it_in_its_sense(momentum, low):
-    phase, before = np.linspace(-20.0, 20.0, 4001), 0.3
-    turns = turns_to_follow(phase, before, momentum)
-    assert (turns == np.rint(turns)).all()
-    ahead = phase + math.tau * turns - before
-    assert low - 1e-12 <= ahead.min() < low + 0.02
-    assert low + math.tau - 0.02 < ahead.max() <= low + math.tau + 1e-12
-
-
-@pytest.mark.parametrize(('rtol', 'bound'), [(1e-3, 0.5), (1e-5, 1e-2), (1e-9, 1e-4)])
+@pytest.mark.parametrize(('rtol', 'bound'), [(1e-3, 0.5), (1e-9, 1e-4)])
 @pytest.mark.parametrize(('l3', 'lz'), [
-    (1.5, 1.5 + 1e-9), (1.5, 1.5 - 1e-9), (1.5, 1.5), (1.5, -1.5), (1.5, -1.5 + 1e-4), (0.0, 0.0),
-    (1.5, 0.7)])
+    (1.5, 1.5 - 1e-9), (1.5, -1.5), (1.5, -1.5 + 1e-4), (0.0, 0.0)])
 def test_phases_are_followed_past_the_poles(l3, lz, rtol, bound):
     """
     Every phase at the begin of a step is the exact one there, however fast it turns.
@@ -557,27 +362,13 @@ def test_an_error_that_is_no_number_is_no_small_error(equations_type):
             integrator.step()
 
 
-# Tops that need 1e8 and more steps for the time that is asked for, alone or as the last of many.
-FAST_TOPS = {
-    'spin': (Top(lambda1=1e-8, lambda3=1e-8, mass=1.0, com_distance=0.1, gravity=9.81),
-             State(theta=0.7, l3=40.0, lz=-11.0)),
-    'gravity': (Top(lambda1=1.0, lambda3=0.5, mass=3e9, com_distance=4e8, gravity=-9.81),
-                State(theta=0.7, theta_dot=1.0, l3=0.4, lz=0.1)),
-    'no gravity': (Top(lambda1=1.0, lambda3=0.5, mass=0.0, com_distance=1.0, gravity=9.81),
-                   State(theta=0.7, theta_dot=1e10, l3=1e9, lz=1e6)),
-}
-
-
-@pytest.mark.parametrize('name', FAST_TOPS)
 @pytest.mark.parametrize('equations', ['transport', 'euler'])
 @pytest.mark.parametrize('t', [[1.0], np.linspace(0.0, 1.0, 100_001)])
-def test_a_time_that_takes_too_many_steps_is_refused_at_once(name, equations, t):
-    top, start = FAST_TOPS[name]
-    if name == 'no gravity' and equations == 'transport':       # takes no steps
-        assert np.isfinite(solve(top, start, t, method='rk45').quaternion).all()
-        return
+def test_a_time_that_takes_too_many_steps_is_refused_at_once(equations, t):
+    top = Top(lambda1=1e-8, lambda3=1e-8, mass=1.0, com_distance=0.1, gravity=9.81)
     with pytest.raises(IntegrationError, match=r'steps of .* s away: use|leapt over a pole'):
-        solve(top, start, t, method='rk45', equations=equations, rtol=1e-6)
+        solve(top, State(theta=0.7, l3=40.0, lz=-11.0), t, method='rk45', equations=equations,
+              rtol=1e-6)
 
 
 @pytest.mark.parametrize('settings', [
@@ -594,40 +385,3 @@ def test_a_motion_leaves_nothing_for_the_garbage_collector(settings):
         assert [reference() for reference in there] == [None, None]
     finally:
         gc.enable()
-
-
-def of_size(lambda1, lambda3, torque, **start):
-    return (Top(lambda1=lambda1, lambda3=lambda3, mass=1.0, com_distance=torque, gravity=1.0),
-            State(**{'phi': 0.3, 'psi': -0.7, **start}))
-
-
-# Time scales, rates and products of rates at the ends of the range of doubles.
-EXTREMES = {
-    'slow': of_size(1e20, 1e20, 5e-324, theta=1.0, theta_dot=0.0, l3=0.0, lz=0.0),
-    'slow spin': of_size(1e30, 1e25, 1e-300, theta=2.0, theta_dot=-1e-310, l3=1e-150, lz=1e-151),
-    'fast': of_size(1e8, 1e8, 1e290, theta=1e-8, theta_dot=-1e-20, l3=0.0, lz=0.0),
-    'thin': of_size(0.006, 5e-324, 0.1, theta=2.0, theta_dot=-0.003, l3=0.0, lz=0.0),
-    'thin, spinning': of_size(1e-8, 1e-310, 1e-309, theta=math.pi, theta_dot=-1e-150, l3=-1e-310,
-                              lz=1e-310),
-    'thick': of_size(1e150, 1e-150, -1e-143, theta=1e-8, theta_dot=-1e3, l3=-1e20, lz=-1e20),
-    'turned far': of_size(1.0, 0.5, 4.9, theta=0.6, l3=2.0, lz=1.0, phi=1.7e308, psi=1.7e308),
-    'light': of_size(1e-8, 1e-8, 1e-20, theta=0.4, theta_dot=3.0, l3=1e-9, lz=1e-10),
-    'heavy': of_size(1e8, 2e8, 1e8, theta=3.1, theta_dot=0.3, l3=1e6, lz=-1e6),
-}
-
-
-@pytest.mark.filterwarnings('error')
-@pytest.mark.parametrize('equations', ['transport', 'euler'])
-@pytest.mark.parametrize('name', EXTREMES)
-def test_tops_of_extreme_sizes_are_solved_or_refused(name, equations):
-    top, start = EXTREMES[name]
-    for t in ([0.0, 1e-3], [100.0], [0.0, 1e171]):
-        try:
-            motion = solve(top, start, t, method='rk45', equations=equations, rtol=1e-6)
-            for column in ('theta', 'phi', 'psi', 'theta_dot', 'phi_dot', 'psi_dot', 'quaternion',
-                           'angular_velocity', 'angular_acceleration', 'energy'):
-                assert np.isfinite(getattr(motion, column)).all(), column
-        except (ValueError, IntegrationError) as refusal:
-            assert len(str(refusal)) > 25
-        else:
-            assert motion.theta[0] == pytest.approx(start.theta, abs=1e-9) or t[0] > 0.0

@@ -76,8 +76,7 @@ def test_a_file_gives_the_parameters_that_the_node_starts_with(tmp_path):
 
 
 @pytest.mark.parametrize('sections', [
-    ['/*'], ['/spinning_top'], ['/**/spinning_top'], ['spinning_top', '/**'],
-    ['/**', 'spinning_top'], ['/**', 'other']])
+    ['/**/spinning_top'], ['spinning_top', '/**'], ['/**', 'spinning_top'], ['/**', 'other']])
 def test_the_last_section_of_the_node_decides(tmp_path, sections):
     path = tmp_path / 'p.yaml'
     path.write_text(''.join(f'{name}:\n  ros__parameters:\n    world_frame: f{k}\n'
@@ -96,8 +95,7 @@ def test_a_file_may_have_parameters_of_ros_only(tmp_path, section):
                  '-p', 'use_sim_time:=true', '-p', 'qos_overrides./a.b:=1', '--quiet']) == 0
 
 
-@pytest.mark.parametrize('text', ['!!bool maybe', '!!float 1', '!!set {a}', '!own [1.0]',
-                                  '[!!int 1]'])
+@pytest.mark.parametrize('text', ['!!bool maybe', '[!!int 1]'])
 def test_a_tag_that_rcl_ignores_is_refused_in_one_line(tmp_path, capsys, text):
     path = scene(tmp_path / 'p.yaml', **{'spin.l3': text})
     assert main(['-o', str(tmp_path / 'run.mcap'), '--duration', '1', '--params', str(path)]) == 2
@@ -106,13 +104,7 @@ def test_a_tag_that_rcl_ignores_is_refused_in_one_line(tmp_path, capsys, text):
     assert error.endswith(': must be !!str, as rcl ignores all others\n')
 
 
-def test_a_deep_file_is_refused(tmp_path):
-    path = scene(tmp_path / 'p.yaml', **{'spin.l3': '[' * 10_000})
-    with pytest.raises(ValueError, match=r'p\.yaml'):
-        read_scene(path)
-
-
-@pytest.mark.parametrize('name', ['1', 'true', '[a]', '<<', '""', '? {a: b}\n   '])
+@pytest.mark.parametrize('name', ['1', '[a]', '<<'])
 def test_a_name_that_is_no_text_is_refused(tmp_path, name):
     path = scene(tmp_path / 'p.yaml', **{name: '1.5'})
     with pytest.raises(ValueError, match=r'p\.yaml'):

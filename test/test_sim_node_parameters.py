@@ -273,18 +273,18 @@ def test_streams_can_be_switched_off_and_on_and_only_subscribers_make_work(node)
     assert '/pose' not in {name for name, _ in node.node.get_publisher_names_and_types_by_node(
         'spinning_top', '/')}
     assert node.set(pose__enabled=True).successful
-    pose = next(one for one in node.simulation.streams if one.topic == 'pose')
-    encoded, encode = [], pose.encode
+    output = next(one for one in node.simulation.outputs if one.stream.topic == 'pose')
+    pose, encoded, encode = output.stream, [], output.stream.encode
     pose.encode = lambda *given: encoded.append(given) or encode(*given)
     node.step(5)
-    assert encoded == [] and pose.publish is None
+    assert encoded == [] and output.publish is None
     kind = type(node.node._outputs.by_topic['pose'].msg_type())
     subscription = node.node.create_subscription(kind, 'pose', print, 10)
     wait_for('a subscriber', node.node._outputs.by_topic['pose'].get_subscription_count)
     node.step(5)
-    assert encoded and pose.publish is not None
+    assert encoded and output.publish is not None
     assert node.set(pose__enabled=False).successful
-    assert pose.publish is None
+    assert output.publish is None
     node.node.destroy_subscription(subscription)
     del pose.encode
 

@@ -99,20 +99,15 @@ def test_the_log_has_the_bytes_of_the_live_pipeline(tmp_path, scene, method):
 
 
 def test_the_same_command_line_gives_the_same_file(tmp_path):
-    for method in ('rk45', 'exact'):
-        arguments = ('--duration', 3, '-p', f'solver.method:={method}', *EVERYTHING)
-        first = simulate(tmp_path / f'{method}1.mcap', *arguments)
-        second = simulate(tmp_path / f'{method}2.mcap', *arguments)
-        (a, _), (b, _) = read(first), read(second)
-        assert a == b
-        (c, _) = read(simulate(tmp_path / f'{method}3.mcap', *arguments, '--seed', 7))
-        assert c['/imu/data_raw'] != a['/imu/data_raw']
-        assert c['/pose'] == a['/pose']
+    arguments = ('--duration', 3, *EVERYTHING)
+    first, second = (read(simulate(tmp_path / f'{k}.mcap', *arguments))[0] for k in range(2))
+    other, _ = read(simulate(tmp_path / 'other.mcap', *arguments, '--seed', 7))
+    assert first == second
+    assert other['/imu/data_raw'] != first['/imu/data_raw'] and other['/pose'] == first['/pose']
 
 
-@pytest.mark.parametrize('scene', ['cusp', 'near_separatrix'])
-def test_a_scene_is_read_by_rosbags_and_mcap_ros2_support(tmp_path, scene):
-    path = simulate(tmp_path / 'run.mcap', '--params', ROOT / 'config' / f'{scene}.yaml',
+def test_a_scene_is_read_by_rosbags_and_mcap_ros2_support(tmp_path):
+    path = simulate(tmp_path / 'run.mcap', '--params', ROOT / 'config/near_separatrix.yaml',
                     '--duration', 1, '-p', 'solver.method:=exact', '--namespace', '/lab')
     with open(path, 'rb') as file:
         decoded = [(channel.topic, message.log_time, ros) for _, channel, message, ros in
@@ -126,7 +121,7 @@ def test_a_scene_is_read_by_rosbags_and_mcap_ros2_support(tmp_path, scene):
     also = [ros for topic, _, ros in other if topic == '/lab/pose']
     assert len(poses) == 101
     assert [p.pose.orientation.w for p in poses] == [p.pose.orientation.w for p in also]
-    values = parameters.checked(scene_parameters(scene))
+    values = parameters.checked(scene_parameters('near_separatrix'))
     truth = solve(parameters.top_of(values), parameters.start_state(values),
                   np.arange(101) / 100.0)
     assert [p.pose.orientation.w for p in poses] == pytest.approx(
@@ -169,11 +164,6 @@ def test_commands_at_one_time_are_applied_in_the_order_given(tmp_path):
         labels = messages_of(log, '/spinning_top/invariants')
         assert labels[1_000_000_000][1] == pytest.approx(1.6)        # samples, then commands
         assert labels[1_100_000_000][1] == pytest.approx(float(last.split(':')[0]))
-        table = simulate(tmp_path / f'{number}.csv', '--duration', 1.2, '--command', f'1:{first}',
-                         '--command', f'1:{last}')
-        with open(table, newline='') as file:
-            *_, row = csv.DictReader(file)
-        assert float(row['l3 [kg m^2/s]']) == pytest.approx(float(last.split(':')[0]))
 
 
 def messages_of(log, topic):
@@ -188,6 +178,8 @@ def test_a_command_exactly_at_the_end_is_applied(tmp_path):
     assert list(log['/spinning_top/commands']) == [1_000_000_000]
     events = events_of(log)
     assert [event['event'] for event in events] == ['start', 'command']
+    assert events[1] == {'event': 'command', 't_ns': 1_000_000_000, 'sent_ns': 1_000_000_000,
+                         'l3': 2.0, 'lz': 1.5}
     assert max(log['/pose']) == 1_000_000_000
 
 
@@ -196,27 +188,19 @@ def events_of(log):
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [
-    (['--duration', '0'], 'duration = 0.0 s'), ([], 'duration = 0.0 s'),
+    (['--duration', '0'], 'duration = 0.0 s'),
     (['--duration', '1', '-p', 'top.lambda1:=-1'], 'top.lambda1 = -1'),
     (['--duration', '1', '-p', 'spin.l3=2'], "'spin.l3=2'"),
     (['--duration', '1', '--epoch', 'nan'], '--epoch nan'),
-    (['--duration', '1', '--epoch=-3'], '--epoch -3'),
     (['--duration', '10', '--epoch', '2147483640'], '2038'),
-    (['--duration', '1', '--epoch', '2147483648'], '--epoch 2147483648.0: must be >= 0 and < 2'),
-    (['--duration', '1e300'], 'must be'), (['--duration', '3e9'], 'must be'),
     (['--duration', '1', '--command', '1:2'], '--command 1:2'),
     (['--duration', '1', '--command=-1:2:2'], '--command -1:2:2'),
     (['--duration', '1', '--command', '1.000000001:2:1.5'], 'end of the run, 1 s'),
-    (['--duration', '1', '--command', 'nan:2:1.5'], '--command nan:2:1.5'),
-    (['--duration', '1', '-p', 'spin.l3:=[1'], 'spin.l3:=[1 is not YAML'),
-    (['--duration', '1', '--command', '0.5:nan:2'], '--command 0.5:nan:2: L3 and LZ must be fin'),
-    (['--duration', '1', '--command', '0.5:2:-inf'], 'L3 and LZ must be finite'),
-    (['--duration', '1', '--command', '0.5:1e20:1'], '--command 0.5:1e20:1: L3 and LZ must'),
-    (['--duration', '1', '--command', '0.5:1:1e300'], 'as must be the energy'),
+    (['--duration', '1', '--command', '0.5:nan:2'], '--command 0.5:nan:2'),
     (['--duration', '1', '-p', 'initial.theta:=0.0', '-p', 'solver.equations:=euler'],
      'transport'),
     (['--duration', '1', '-p', 'spin.l3:=1e20'], 'no motion from'),
-])
+    (['--duration', '1', '-o', 'run.bag'], 'must end in .mcap, .csv, .parquet')])
 def test_wrong_arguments_are_told_in_a_line_and_leave_no_file(
         tmp_path, capsys, arguments, message):
     for name in ('run.mcap', 'run.csv'):
@@ -231,29 +215,24 @@ def test_wrong_arguments_are_told_in_a_line_and_leave_no_file(
      'simulate: --command 0.5:2.0:1.0: lz = 1.0 kg m^2/s with l3 = 2.0: the axis is at a pole'),
     (['-p', 'solver.method:=exact', '--command', '0.5:1.0:1e18'],
      'simulate: --command 0.5:1.0:1e+18: no motion from')])
-@pytest.mark.parametrize('name', ['run.mcap', 'run.csv', 'run.parquet'])
+@pytest.mark.parametrize('name', ['run.mcap', 'run.csv'])
 def test_a_command_that_the_state_refuses_ends_the_run_there(
-        request, tmp_path, capsys, name, arguments, message):
-    table = request.getfixturevalue('parquet') if name == 'run.parquet' else None
+        tmp_path, capsys, name, arguments, message):
     path = tmp_path / name
     assert main(['-o', str(path), '--quiet', '--duration', '1', *arguments]) == 1
     error = capsys.readouterr().err
     assert error.startswith(message) and error.count('\n') == 1
     assert error.endswith('; the file holds the run up to t = 0.5 s\n')
     if name == 'run.mcap':
-        log, _ = read(path)
-        assert max(log['/pose']) == 500_000_000
-    elif name == 'run.csv':
-        assert np.loadtxt(path, delimiter=',', skiprows=1)[-1, 0] == 0.5
+        assert max(read(path)[0]['/pose']) == 500_000_000
     else:
-        assert table.read_table(path)['t'].to_pylist()[-1] == 0.5
+        assert np.loadtxt(path, delimiter=',', skiprows=1)[-1, 0] == 0.5
 
 
-@pytest.mark.parametrize('rate', [100.0, 2000.0])
-def test_a_table_holds_the_rows_up_to_where_the_equations_end(tmp_path, capsys, rate):
+def test_a_table_holds_the_rows_up_to_where_the_equations_end(tmp_path, capsys):
     """The paper's equations end at the pole, which the wheel that stands upright falls through."""
     given = ['--quiet', '--duration', '5', '-p', 'solver.equations:=euler', '-p', 'spin.lz:=1.6',
-             '-p', f'pose.rate:={rate}']
+             '-p', 'pose.rate:=2000.0']
     assert [main(['-o', str(tmp_path / name), *given]) for name in ('a.mcap', 'a.csv')] == [1, 1]
     assert capsys.readouterr().err.count('a step leapt over a pole') == 2
     log, _ = read(tmp_path / 'a.mcap')
@@ -266,71 +245,18 @@ def test_a_table_holds_the_rows_up_to_where_the_equations_end(tmp_path, capsys, 
     (['--duration', '1', '--params', '/nowhere.yaml'], 'simulate: /nowhere.yaml: No such file'),
     (['--duration', '1', '-o', '/nowhere/run.mcap'],
      'simulate: cannot record to /nowhere/run.mcap: there is no directory /nowhere\n'),
-    (['--duration', '1', '-o', '/proc/run.mcap'],
-     'simulate: cannot record to /proc/run.mcap: no files can be made in /proc\n'),
     (['--duration', '1', '-o', '/nowhere/run.csv'],
-     'simulate: /nowhere/run.csv: No such file or directory\n'),
-    (['--duration', '1', '-o', '/proc/run.csv'],
-     'simulate: /proc/run.csv: No such file or directory\n'),
-    (['--duration', '1', '-o', '/proc/self/fd/run.mcap'],
-     'simulate: cannot record to /proc/self/fd/run.mcap: no files can be made in /proc/self/fd\n'),
-    (['--duration', '1', '-o', '/dev/null', '--format', 'mcap'], '/dev/null'),
-])
+     'simulate: /nowhere/run.csv: No such file or directory\n')])
 def test_what_cannot_be_simulated_is_told_in_a_line(tmp_path, capsys, arguments, message):
     assert main(['-o', str(tmp_path / 'run.mcap'), '--quiet', *arguments]) == 1
     error = capsys.readouterr().err
     assert message in error and error.count('\n') == 1 and 'Traceback' not in error
 
 
-def test_a_params_file_that_is_no_yaml_or_of_another_node(tmp_path, capsys):
-    broken = tmp_path / 'broken.yaml'
-    for text, message in ((': : [', 'not YAML'), ('other:\n  ros__parameters:\n    a: 1\n',
-                                                 'no parameters for the node spinning_top'),
-                          ('spinning_top:\n  ros__parameters: [1]\n',
-                           'no parameters for the node spinning_top'),
-                          ('[1, 2]', 'no parameters for the node spinning_top')):
-        broken.write_text(text)
-        assert main(['-o', str(tmp_path / 'r.mcap'), '--params', str(broken), '--duration', '1',
-                     '--quiet']) == 2
-        assert message in capsys.readouterr().err
-
-
-@pytest.mark.parametrize('name', ['run', 'run.bag', 'run.mcap.zst', 'run.CSV', '.mcap', 'run.'])
-def test_an_unknown_extension_is_refused(tmp_path, capsys, name):
-    assert main(['-o', str(tmp_path / name), '--duration', '1', '--quiet']) == 2
-    error = capsys.readouterr().err
-    assert name in error and '.mcap, .csv, .parquet' in error
-    assert list(tmp_path.iterdir()) == []
-    arguments = ['--duration', '1', '--quiet', '--format', 'mcap']
-    assert main(['-o', str(tmp_path / name), *arguments]) == 0
-    assert read(tmp_path / name)
-
-
-@pytest.mark.parametrize('arguments', [
-    ['-o', 'run.parquet'], ['-o', 'run', '--format', 'parquet'],
-    ['-o', 'run.csv', '-p', 'initial.theta:=0.0', '-p', 'spin.lz:=1.0'],
-    ['-o', 'run.mcap', '--command', '2:1.0:1.0'], ['-o', 'run.csv', '--command', '2:1.0:1.0'],
-    ['-o', 'run.mcap', '--command', '1.000000001:1:1'], ['-o', 'new/'], ['-o', 'new/run.csv']])
-def test_what_is_refused_leaves_no_file(tmp_path, monkeypatch, arguments):
-    monkeypatch.setitem(sys.modules, 'pyarrow', None)
-    monkeypatch.chdir(tmp_path)
-    assert main([*arguments, '--duration', '1', '--quiet']) in (1, 2)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_parquet_without_pyarrow_names_the_extra(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, 'pyarrow', None)
     assert main(['-o', str(tmp_path / 'run.parquet'), '--duration', '1', '--quiet']) == 1
     assert "pip install 'spinning_top_sim[parquet]'" in capsys.readouterr().err
-
-
-def test_it_runs_without_standard_streams(tmp_path):
-    path = tmp_path / 'run.csv'
-    run = subprocess.run(
-        ['bash', '-c', '"$0" -m spinning_top_sim.tools.simulate -o "$1" --duration 1 >&- 2>&-',
-         sys.executable, path], timeout=60, check=False)
-    assert run.returncode == 0
-    assert len(np.loadtxt(path, delimiter=',', skiprows=1)) == 101
 
 
 def test_nothing_is_overwritten(tmp_path, capsys):
@@ -341,8 +267,7 @@ def test_nothing_is_overwritten(tmp_path, capsys):
         assert path.read_text() == 'precious' and str(path) in capsys.readouterr().err
 
 
-@pytest.mark.parametrize('method', ['exact', 'rk45'])
-def test_a_full_disk_leaves_a_readable_log(tmp_path, method):
+def test_a_full_disk_leaves_a_readable_log(tmp_path):
     path = tmp_path / 'run.mcap'
 
     def small_files():
@@ -351,7 +276,7 @@ def test_a_full_disk_leaves_a_readable_log(tmp_path, method):
     run = subprocess.run(
         [sys.executable, '-c', 'import signal, sys\nsignal.signal(signal.SIGXFSZ, signal.SIG_IGN)'
          '\nfrom spinning_top_sim.tools.simulate import main\nsys.exit(main())',
-         '-o', path, '--duration', '200', '--quiet', '-p', f'solver.method:={method}'],
+         '-o', path, '--duration', '200', '--quiet', '-p', 'solver.method:=exact'],
         preexec_fn=small_files, capture_output=True, text=True, timeout=120, check=False)
     assert run.returncode == 1 and 'Traceback' not in run.stderr
     assert 'File too large' in run.stderr
@@ -359,9 +284,8 @@ def test_a_full_disk_leaves_a_readable_log(tmp_path, method):
     assert len(found['/pose']) > 100
 
 
-@pytest.mark.parametrize('method', ['exact', 'rk45'])
 def test_an_interrupted_run_is_a_shorter_log_of_all_streams_up_to_one_time(
-        tmp_path, capsys, monkeypatch, method):
+        tmp_path, capsys, monkeypatch):
     path, encode, calls = tmp_path / 'run.mcap', Stream.encode, []
 
     def interrupted(self, *arguments):
@@ -371,29 +295,12 @@ def test_an_interrupted_run_is_a_shorter_log_of_all_streams_up_to_one_time(
         return encode(self, *arguments)
 
     monkeypatch.setattr(Stream, 'encode', interrupted)
-    assert main(['-o', str(path), '--duration', '40', '--quiet',
-                 '-p', f'solver.method:={method}']) == 130
+    assert main(['-o', str(path), '--duration', '40', '--quiet']) == 130
     assert capsys.readouterr().err == 'simulate: interrupted\n'
     monkeypatch.undo()
     assert inspect.main([str(path), '--verify']) == 0
     log, _ = read(path)
     assert len(log['/pose']) > 100
-
-
-def test_no_streams_are_a_log_of_events(tmp_path):
-    log, _ = read(simulate(tmp_path / 'run.mcap', '--duration', 1, '-p', 'record.streams:=[]',
-                           '--command', '0.5:2.0:1.5'))
-    assert set(log) == {'/spinning_top/events', '/spinning_top/commands'}
-
-
-def test_events_tell_the_run(tmp_path):
-    log, metadata = read(simulate(tmp_path / 'run.mcap', '--duration', 1,
-                                  '--command', '0.5:2.0:1.5'))
-    events = events_of(log)
-    assert [event['event'] for event in events] == ['start', 'command']
-    assert events[1] == {'event': 'command', 't_ns': 500_000_000, 'sent_ns': 500_000_000,
-                         'l3': 2.0, 'lz': 1.5}
-    assert json.loads(metadata['parameters'])['spin.l3'] == 1.6
 
 
 def test_rclpy_and_scipy_are_not_imported():
@@ -421,14 +328,3 @@ def test_progress_is_shown_on_a_terminal_only(monkeypatch):
         assert ('simulated 100%|' in stream.getvalue()) == shown
         assert ('20/20 s' in stream.getvalue()) == shown
         assert shown or stream.getvalue() == ''
-
-
-@pytest.mark.parametrize(('name', 'code'), [('run.csv', 0), ('run.mcap', 1)])
-def test_without_mcap_there_are_tables_and_a_clear_error(tmp_path, name, code):
-    run = subprocess.run(
-        [sys.executable, '-c', 'import sys\nsys.modules["mcap"] = None\n'
-         'from spinning_top_sim.tools.simulate import main\nsys.exit(main())',
-         '-o', tmp_path / name, '--duration', '1', '--quiet'],
-        capture_output=True, text=True, timeout=60, check=False)
-    assert run.returncode == code and 'Traceback' not in run.stderr
-    assert ('needs the Python package mcap' in run.stderr) == (code == 1)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim.physics.top import Shape
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.simulation import Simulation
+from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.streams.topics import JOINTS, JointStates, Pose
 from spinning_top_sim.tools import urdf
 
@@ -50,7 +50,7 @@ def matrix(q):
 def test_the_joint_states_put_base_link_where_the_pose_is(tmp_path, scene):
     values = {**scene_parameters(scene), **MOUNTED}
     model = robot(tmp_path, values)
-    simulation = Simulation(parameters.checked(values))
+    simulation = LiveSimulation(parameters.checked(values))
     pose = next(s for s in simulation.streams if isinstance(s, Pose))
     joints = next(s for s in simulation.streams if isinstance(s, JointStates))
     taken = record(simulation, pose.topic, joints.topic)

@@ -10,8 +10,8 @@ or a published filter by name.
 
 exit codes:
   0    no fault was found
-  1    the filter has faults, a file cannot be read or written, or the node or
-       the workers are not there
+  1    the filter has faults, a file cannot be read or written, or the node is
+       not there
   2    wrong arguments
   130  interrupted
 The faults and the measures are defined in docs/exam.md.
@@ -30,17 +30,16 @@ from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.trial import NodeError
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.tools import cli
-from spinning_top_sim.tools.ensemble_part import EnsembleError
 
 # Options for each kind of subject.
 OPTIONS = {'a log': ('topic', 'truth', 'heading'), 'a node': ('topic', 'level', 'imu', 'seeds'),
-           '--filter': ('level', 'imu', 'seeds', 'workers')}
+           '--filter': ('level', 'imu', 'seeds')}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
     return cli.run('examine', __doc__, argv, _add_arguments, _run,
-                   (ValueError, LogError, OSError, ImportError, EnsembleError, NodeError))
+                   (ValueError, LogError, OSError, ImportError, NodeError))
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,18 +57,10 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--level', choices=SEEDS, help='level of the exam of a filter or node; default: quick')
     add('--imu', metavar='FILE', help='parameter file of the IMU, as in config/imu')
     add('--seeds', type=int, metavar='N', help='number of noisy runs')
-    add('--workers', type=int, metavar='N',
-        help='processes that share the seeds of --filter; they take seconds to start')
     add('--json', action='store_true', help='print everything as JSON')
     add('--junit', type=Path, metavar='FILE', help='write JUnit XML')
-    add('--page', type=_picture, metavar='FILE',
+    add('--page', type=Path, metavar='FILE',
         help='draw a page of figures (.png, .pdf, .svg); needs matplotlib')
-
-
-def _picture(name: str) -> Path:
-    if Path(name).suffix.lower() not in ('.png', '.pdf', '.svg'):
-        raise argparse.ArgumentTypeError(f'{name}: must end in .png or .pdf or .svg')
-    return Path(name)
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -89,24 +80,21 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the given options by name.  Raise ValueError for those of another subject."""
+    """Return the given options by name.  Raises ValueError for those of another subject."""
     subject = ('a log' if arguments.log is not None else
                '--filter' if arguments.filter is not None else 'a node')
     options = {name: value for names in OPTIONS.values() for name in names
                if (value := getattr(arguments, name)) is not None}
-    for name, value in options.items():
-        if name not in OPTIONS[subject]:
-            raise ValueError(f'--{name} {value}: {subject} takes '
-                             f'{", ".join(f"--{one}" for one in OPTIONS[subject])} only')
+    for name in options.keys() - OPTIONS[subject]:
+        raise ValueError(f'--{name}: {subject} takes --{", --".join(OPTIONS[subject])} only')
     return options
 
 
 def _report(arguments: argparse.Namespace) -> Report:
-    if [arguments.log, arguments.node, arguments.filter].count(None) < 2:
+    if ([arguments.log, arguments.node, arguments.filter].count(None) < 2
+            or arguments.filter is arguments.topic is None):
         raise ValueError('give either a log and --topic, --node and --topic, --topic alone, or '
                          '--filter')
-    if arguments.filter is None and arguments.topic is None:
-        raise ValueError('--topic: which topic has the attitudes? Or --filter: which filter?')
     options = _options(arguments)
     if arguments.log is not None:
         options['north'] = options.pop('heading', None)

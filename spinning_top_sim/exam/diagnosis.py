@@ -38,28 +38,14 @@ CONSISTENT = 0.9999             # probability of the NEES band
 
 
 class Fault(NamedTuple):
-    """
-    A fault of a filter.
-
-    Parameters
-    ----------
-    name : str
-        One of FAULTS.
-    evidence : str
-        Why the exam reports it.
-    """
+    """A fault of a filter: its name, one of FAULTS, and why the exam reports it."""
 
     name: str
     evidence: str
 
 
 class Hypothesis(NamedTuple):
-    """
-    A possible misreading, and how to undo it.
-
-    given : changes the readings for the filter; None leaves them as they are
-    read : changes the attitudes of the filter
-    """
+    """A possible misreading, and what undoes it: other readings, or other attitudes."""
 
     faults: tuple[str, ...]
     text: str
@@ -74,16 +60,8 @@ def _turned(left: Sequence[float], right: Sequence[float] = (0.0, 0.0, 0.0, 1.0)
                               * Rotation.from_quat(right)).as_quat()
 
 
-def _scaled(factor: float) -> ChangeReadings:
-    return lambda gyroscope, accelerometer, dt: (factor * gyroscope, accelerometer)
-
-
 def for_first_order(gyroscope: Reals, accelerometer: Reals, dt: Reals) -> tuple[Reals, Reals]:
-    """
-    Return the rates for which the normalised first-order step q + q w dt/2 is exact.
-
-    Such a step turns by 2 atan(|w| dt/2), which is less than |w| dt by |w dt|^3/12.
-    """
+    """Return the rates for which the normalised first-order step q + q w dt/2 is exact."""
     half = 0.5 * dt * np.linalg.norm(gyroscope, axis=1)
     longer = np.tan(np.minimum(half, 1.5)) / np.where(half > 0.0, half, 1.0)
     return gyroscope * np.where(half > 0.0, longer, 1.0)[:, np.newaxis], accelerometer
@@ -111,8 +89,9 @@ READINGS = (
 REPEATED = (
     GRAVITY_SIGN,
     Hypothesis(('gyroscope_units',), 'with the gyroscope multiplied by pi/180',
-               given=_scaled(np.pi / 180.0)),
-    Hypothesis(('gyroscope_units',), 'with the gyroscope in deg/s', given=_scaled(180.0 / np.pi)))
+               given=lambda gyroscope, accelerometer, dt: (np.radians(gyroscope), accelerometer)),
+    Hypothesis(('gyroscope_units',), 'with the gyroscope in deg/s',
+               given=lambda gyroscope, accelerometer, dt: (np.degrees(gyroscope), accelerometer)))
 
 
 def marks(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
@@ -141,7 +120,6 @@ def explain(outcome: Outcome, absolute: bool,
     """
     Return the misreading whose inversion removes the error of a settled filter, or None.
 
-    absolute : whether the heading is judged
     again : repeats the run for a hypothesis; None if that is not possible
     """
     before = error_of(outcome, absolute)

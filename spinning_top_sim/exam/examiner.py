@@ -4,10 +4,9 @@
 import contextlib
 import math
 import operator
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -49,16 +48,12 @@ TURN_S = 30.0
 DECLINATION = np.radians(2.0)
 
 NOTHING_MISREAD = Hypothesis((), '')
-# The number of a run, and its outcome or the reason why there is none.
-Result = tuple[int, Outcome | InvalidOutputError]
-# Calls a function with each number and yields the results in any order.
-Compute = Callable[[Callable[[int], Result], Iterable[int]], Iterable[Result]]
 
 
 def examine(make_filter: MakeFilter, level: str = 'quick',
             imu: Mapping[str, Any] | str | Path | None = None,
             seeds: int | Iterable[int] | None = None, *, subject: str | None = None,
-            workers: int = 1, isolated: bool = True, restart: bool = True) -> Report:
+            isolated: bool = True, restart: bool = True) -> Report:
     """
     Examine an attitude filter.
 
@@ -75,29 +70,11 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
         Seeds of the noisy runs, or their number.  The default, SEEDS, depends on the level.
     subject : str, optional
         Name in the report.  The default is the name of the filter's class.
-    workers : int, optional
-        Number of Dask processes that share the seeds and the additional motions of 'full'.
     isolated : bool, optional
         If False, the filter runs in this process, where a debugger can reach it.  A filter that
         crashes or never returns then ends the exam.
     restart : bool, optional
         If False, one filter is made, in this process, and used for all runs.
-
-    Returns
-    -------
-    Report
-        Faults with their evidence, and measures.
-
-    Raises
-    ------
-    ValueError
-        If the level, a parameter, a seed or the number of workers is not allowed.
-    OSError
-        If the parameter file cannot be read.
-    ImportError
-        If there are several workers and Dask is not installed.
-    EnsembleError
-        If the workers are lost.
 
     Notes
     -----
@@ -109,14 +86,9 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
         raise ValueError(f'level = {level!r}: must be one of {", ".join(SEEDS)}')
     values = _imu_parameters(imu)
     numbers = list(SEEDS[level]) if seeds is None else _seed_numbers(seeds)
-    if not 1 <= workers <= 1024 or (workers > 1 and not (isolated and restart)):
-        raise ValueError(f'workers = {workers}: must be from 1 to 1024, and 1 for a filter in '
-                         'this process')
-    with _computing_by(workers) as compute:
-        exam = (_Exam(_NewFilter(make_filter, feed_apart if isolated else feed, values), numbers,
-                      compute) if restart else
-                _OneFilterExam(_OneFilter(cache(make_filter), feed, values), numbers, compute))
-        exam.sit(EXTRA if level == 'full' else ())
+    exam = (_Exam(_NewFilter(make_filter, feed_apart if isolated else feed, values), numbers)
+            if restart else _OneFilterExam(_OneFilter(cache(make_filter), feed, values), numbers))
+    exam.sit(EXTRA if level == 'full' else ())
     return Report(one_line(subject or getattr(make_filter, '__name__', 'filter')),
                   tuple(diagnosis.one_of_each(exam.faults)), exam.measures, exam.outcomes)
 
@@ -135,8 +107,7 @@ def _imu_parameters(imu: Mapping[str, Any] | str | Path | None) -> Mapping[str, 
 
 def _seed_numbers(seeds: int | Iterable[int]) -> list[int]:
     try:
-        numbers = list(map(operator.index, range(seeds) if isinstance(
-            seeds, int | np.integer) else seeds))
+        numbers = list(map(operator.index, seeds if isinstance(seeds, Iterable) else range(seeds)))
     except TypeError:
         numbers = []
     if not numbers or min(numbers) < 0:
@@ -144,27 +115,9 @@ def _seed_numbers(seeds: int | Iterable[int]) -> list[int]:
     return numbers
 
 
-@contextlib.contextmanager
-def _computing_by(workers: int) -> Iterator[Compute]:
-    if workers == 1:
-        yield map
-        return
-    try:
-        from spinning_top_sim.tools import ensemble_cluster  # noqa: PLC0415
-    except ImportError as error:
-        raise ImportError("several workers need Dask: pip install 'spinning_top_sim[exam]' "
-                          f'({error})') from error
-    with ensemble_cluster.connect(workers, None) as client:
-        yield partial(ensemble_cluster.compute, client)
-
-
 @dataclass
 class _NewFilter:
-    """
-    Feeds each run to a new filter.
-
-    correction : the misreading that was already found; it is undone in every run
-    """
+    """Feeds each run to a new filter, and undoes the misreading that was already found."""
 
     make_filter: MakeFilter
     feed: Feed
@@ -181,25 +134,10 @@ class _NewFilter:
         except InvalidOutputError as error:
             raise InvalidOutputError(f'{run.name}: {error}') from error
 
-    def follow_one(self, runs: Sequence[tuple[Scenario, int]], number: int) -> Result:
-        """Return the result for one of these scenarios and seeds."""
-        scenario, seed = runs[number]
-        try:
-            return number, self.follow(scenarios.record(scenario, self.imu, seed))
-        except InvalidOutputError as error:
-            return number, error
-
 
 @dataclass
 class _OneFilter(_NewFilter):
-    """
-    Feeds all runs to one filter.
-
-    Before each run the sensor turns slowly to the attitude at which the run begins, so that the
-    filter has settled there.
-
-    attitude : present attitude of the sensor, q(world <- sensor)
-    """
+    """Feeds all runs to one filter; before each the sensor turns slowly to where it begins."""
 
     attitude: Reals = field(default_factory=lambda: np.array((0.0, 0.0, 0.0, 1.0)))
 
@@ -219,9 +157,8 @@ class _Exam:
     biased = BIASED
     judges_covariance = True
 
-    def __init__(self, subject: _NewFilter, seeds: Sequence[int], compute: Compute) -> None:
-        self._subject, self._seeds, self._compute = subject, seeds, compute
-        self._imu = subject.imu
+    def __init__(self, subject: _NewFilter, seeds: Sequence[int]) -> None:
+        self._subject, self._seeds, self._imu = subject, seeds, subject.imu
         self._absolute = False
         self.faults: list[Fault] = []
         self.measures: dict[str, float] = {}
@@ -229,7 +166,8 @@ class _Exam:
 
     def sit(self, extra: Sequence[Scenario]) -> None:
         """Do all runs, those of the `extra` scenarios included."""
-        self._guard(self._ask_for_field)
+        with self._guarded():
+            self._ask_for_field()
         noisy = self._noisy_runs()
         if not noisy:
             return
@@ -238,11 +176,13 @@ class _Exam:
         self.measures['stamp_offset_s'] = offset.seconds
         self._add(fault)
         if not self.faults:
-            self._guard(lambda: self._add(diagnosis.divergence(self._pivot, self._absolute)))
+            with self._guarded():
+                self._add(diagnosis.divergence(self._pivot, self._absolute))
         if all(fault.name != 'diverges' for fault in self.faults):  # else they show nothing more
             for part in (self._judge_integration, partial(self._judge_lever_arm, noisy[0]),
                          self._judge_bias):
-                self._guard(part)
+                with self._guarded():
+                    part()
         self._do_extra(extra)
         if not self.faults:
             self._add(diagnosis.divergence(noisy[0], self._absolute))
@@ -255,10 +195,11 @@ class _Exam:
         if fault is not None:
             self.faults.append(fault)
 
-    def _guard(self, part: Callable[[], None]) -> None:
-        """Do a part of the exam; a failure of the filter in it does not end the other parts."""
+    @contextlib.contextmanager
+    def _guarded(self) -> Iterator[None]:
+        """End a part of the exam where the filter fails in it, and report that."""
         try:
-            part()
+            yield
         except InvalidOutputError as error:
             self._add(Fault('invalid_output', str(error)))
 
@@ -270,17 +211,6 @@ class _Exam:
     def _record(self, scenario: Scenario) -> Run:
         return scenarios.record(scenario, self._imu, self._seeds[0])
 
-    def _try(self, runs: Sequence[tuple[Scenario, int]]) -> dict[int, Outcome]:
-        """Return the outcomes of scenarios and seeds by number, without those that failed."""
-        results = self._compute(partial(self._subject.follow_one, runs), range(len(runs)))
-        done = {}
-        for number, result in sorted(results, key=itemgetter(0)):
-            if isinstance(result, Outcome):
-                done[number] = result
-            else:
-                self._add(Fault('invalid_output', str(result)))
-        return done
-
     def _ask_for_field(self) -> None:
         """Find out whether the filter uses the field: only then its heading can be judged."""
         run = self._record(scenarios.SLOW).part(slice(FIELD_ASKED))
@@ -289,12 +219,7 @@ class _Exam:
         self._absolute = bool(np.max(np.abs(one - two)) > 1e-9)
 
     def _noisy_runs(self) -> list[Outcome]:
-        """
-        Return the outcomes of all seeds on the slow motion.
-
-        A misreading that explains their errors is reported, and undone from here on, so that it
-        does not hide other faults.
-        """
+        """Return the outcomes of all seeds, and undo a misreading that explains their errors."""
         original = self._runs_of_seeds()
         self.outcomes += original
         found = self._misreading(original[0].last()) if original else None
@@ -308,8 +233,12 @@ class _Exam:
 
     def _runs_of_seeds(self) -> list[Outcome]:
         """Return the outcomes on the slow motion; drop the seeds for which the filter failed."""
-        done = self._try([(scenarios.SLOW, seed) for seed in self._seeds])
-        self._seeds = [self._seeds[number] for number in done]
+        done = {}
+        for seed in self._seeds:
+            with self._guarded():
+                done[seed] = self._subject.follow(
+                    scenarios.record(scenarios.SLOW, self._imu, seed))
+        self._seeds = list(done)
         return list(done.values())
 
     def _misreading(self, settled: Outcome) -> Hypothesis | None:
@@ -372,11 +301,12 @@ class _Exam:
         self._add(fault)
 
     def _do_extra(self, extra: Sequence[Scenario]) -> None:
-        done = self._try([(scenario, self._seeds[0]) for scenario in extra])
-        self.outcomes += done.values()
-        for number, outcome in done.items():
-            self.measures[f'tilt_rms_{extra[number].name}_deg'] = math.degrees(
-                rms(outcome.last().errors.tilt))
+        for scenario in extra:
+            with self._guarded():
+                outcome = self._run(scenario)
+                self.outcomes.append(outcome)
+                self.measures[f'tilt_rms_{scenario.name}_deg'] = math.degrees(
+                    rms(outcome.last().errors.tilt))
 
 
 class _OneFilterExam(_Exam):
@@ -391,7 +321,8 @@ class _OneFilterExam(_Exam):
         """Do all runs."""
         super().sit(extra)
         if self._seeds and self.outcomes:
-            self._guard(self._measure_convergence)
+            with self._guarded():
+                self._measure_convergence()
 
     def _ask_for_field(self) -> None:
         """Turn the field to and fro: if the attitude follows, the heading can be judged."""

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Feeds a filter in a process of its own, so that a filter that hangs or crashes harms nothing else.
-
-The process is a fork of this one, so it need not import the class of the filter.
-"""
+"""Feeds a filter in a fork of this process, so that hanging or crashing harms nothing else."""
 
 import contextlib
 import mmap

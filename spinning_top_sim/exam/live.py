@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-The exam of a ROS node, in lockstep: the node gets a sample when it has answered the one before.
-
-So the result does not depend on the load of the machine.  Either the exam starts the node anew
-for every run, or a running node gets all runs one after the other.
-"""
+"""The exam of a ROS node, in lockstep: it gets a sample when it has answered the one before."""
 
 import contextlib
 import os
@@ -20,6 +15,7 @@ import numpy as np
 import rclpy
 from numpy.typing import NDArray
 from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -33,18 +29,12 @@ from spinning_top_sim.exam.trial import NodeError
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools.attitudes import NO_ORIENTATION
 
-try:                            # takes least processor time
-    from rclpy.experimental import EventsExecutor as Executor
-except ImportError:
-    from rclpy.executors import SingleThreadedExecutor as Executor
-
 IMU_TOPIC, FIELD_TOPIC = 'imu/data_raw', 'imu/mag'
 PATIENCE_S = 20.0               # for a node to start, and for an answer
 FIRST_PATIENCE_S, UNANSWERED = 1.0, 5       # some nodes do not answer their first samples
 START_NS = NANOSECONDS          # in ROS a stamp of 0 means "no time"
 # A running node must never see time go back, not even from one exam to the next.  So the first
-# stamp of an exam is the uptime of the machine multiplied by FASTEST, the greatest speed-up of an
-# exam.  The stamps start again after 460 days, before their seconds overflow.
+# stamp of an exam is the uptime of the machine multiplied by the greatest speed-up of an exam.
 FASTEST, LAST_NS = 50, 2 * 10 ** 9 * NANOSECONDS
 NAME, FRAME = 'examine', 'imu_link'
 
@@ -64,15 +54,8 @@ def examine_node(topic: str, command: str | None = None, level: str = 'quick',
     level, imu, seeds : optional
         As for `examine`.
 
-    Returns
-    -------
-    Report
-        Faults with their evidence, and measures.
-
     Raises
     ------
-    ValueError
-        If the topic or command is invalid, or as `examine`.
     NodeError
         If the node is not found, or other nodes publish on its topics.
     """
@@ -82,27 +65,17 @@ def examine_node(topic: str, command: str | None = None, level: str = 'quick',
 
 
 class NodeExam(contextlib.AbstractContextManager['NodeExam']):
-    """
-    A node under examination, which is also a `trial.Filter`.
-
-    The arguments are those of `examine_node`.  Raises ValueError if one of them is invalid.
-    """
-
-    slowest = float('inf')      # `update` has its own timeout
+    """A node under examination, which is also a `trial.Filter`; arguments as `examine_node`."""
 
     def __init__(self, topic: str, command: str | None = None) -> None:
-        try:
-            expand_topic_name(topic, NAME, '/')
-        except ValueError:          # its text names a line of rcl
-            raise ValueError(f'{topic!r} is no name of a topic: must be such as imu/data, with '
-                             'letters, digits, _ and /') from None
-        self._command = None if command is None else _words(command)
+        expand_topic_name(topic, NAME, '/')         # raises ValueError
+        self._command = None if command is None else shlex.split(command)
         self._topic = topic
         self._context = Context()
         rclpy.init(context=self._context)
         self._node = Node(NAME, context=self._context, parameter_overrides=[
             Parameter('use_sim_time', value=False)])
-        self._executor = Executor(context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         profile = QoSProfile(depth=100)
         self._clock, self._imu, self._field = (
@@ -120,25 +93,16 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         rclpy.shutdown(context=self._context)
 
     def start(self) -> 'NodeExam':
-        """
-        Start the node anew, or find the running one; return it as a filter.
-
-        Raises RuntimeError if it does not start, and NodeError if none runs, or if other nodes
-        publish on its topics.
-        """
+        """Start the node anew, or find the running one; return it as a filter."""
         self._end_process()
         if self._command is not None:
             self._process = subprocess.Popen(self._command, start_new_session=True)
         there = self._wait(self.is_there, PATIENCE_S)
         self._find_others()
         if not there:
-            missing = ' and none '.join(
-                [f'reads {IMU_TOPIC}'] * (not self._imu.get_subscription_count())
-                + [f'publishes {self._topic}'] * (not self._node.count_publishers(self._topic)))
-            text = (f'no node {missing} within {PATIENCE_S:g} s, with ROS_DOMAIN_ID='
-                    f'{os.environ.get("ROS_DOMAIN_ID", "0")}: check that it runs, its '
-                    'ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE, its namespace and '
-                    'remappings')
+            text = (f'no node reads {IMU_TOPIC} and publishes {self._topic} within '
+                    f'{PATIENCE_S:g} s: check that it runs, its ROS_DOMAIN_ID '
+                    f'({os.environ.get("ROS_DOMAIN_ID", "0")} here), namespace and remappings')
             raise RuntimeError(text) if self._process is not None else NodeError(text)
         self._now_ns = (START_NS if self._process is not None else
                         FASTEST * time.monotonic_ns() % LAST_NS + START_NS)
@@ -155,8 +119,12 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         self._publish(gyroscope, accelerometer, magnetometer)
         patience = PATIENCE_S if self._answered else FIRST_PATIENCE_S
         if not self._wait(lambda: self._now_ns in self._answers, patience):
+            if self._command is None and not self.is_there():
+                raise NodeError(f'the node that reads {IMU_TOPIC} and publishes {self._topic} '
+                                'has gone')
             if self._answered or self._sent > UNANSWERED:
-                self._tell_no_answer(patience)
+                raise RuntimeError(f'no attitude has the stamp {self._now_ns * 1e-9:.9f} s of its '
+                                   f'sample within {patience:g} s')
             return np.array((0.0, 0.0, 0.0, 1.0))
         self._answered += 1
         message = self._answers.pop(self._now_ns)
@@ -182,15 +150,6 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
              field.magnetic_field.z) = magnetometer.tolist()
             self._field.publish(field)
         self._imu.publish(imu)
-
-    def _tell_no_answer(self, patience: float) -> None:
-        if self._command is None and not self.is_there():
-            raise NodeError(f'the node that reads {IMU_TOPIC} and publishes {self._topic} has '
-                            'gone')
-        others = (f'; others came, such as {min(self._answers) * 1e-9:.9f} s'
-                  if self._answers else '')
-        raise RuntimeError(f'no attitude has the stamp {self._now_ns * 1e-9:.9f} s of its sample '
-                           f'within {patience:g} s{others}')
 
     def is_there(self) -> bool:
         """Return whether a node reads the samples, and one publishes the attitudes."""
@@ -233,14 +192,3 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         # Wait until its endpoints leave the graph, so that they are not taken for the next node's.
         self._wait(lambda: not self._imu.get_subscription_count()
                    and not self._node.count_publishers(self._topic), PATIENCE_S)
-
-
-def _words(command: str) -> list[str]:
-    """Return the words of a command line.  Raises ValueError."""
-    try:
-        words = shlex.split(command)
-    except ValueError as error:
-        raise ValueError(f'{command!r} is no command: {error}') from None
-    if not words:
-        raise ValueError(f'{command!r} is no command: must be such as python my_node.py')
-    return words

@@ -70,11 +70,7 @@ def convergence_order(rates: Sequence[float], errors: Sequence[float]) -> float:
 
 
 def moved(estimates: Reals, truth: Reals) -> Reals:
-    """
-    Return the angles (n,) [rad] between attitudes after the first ones are aligned.
-
-    This is the integration error of a filter that starts from another attitude.
-    """
+    """Return the angles (n,) [rad] between attitudes after the first ones are aligned."""
     est, true = Rotation.from_quat(estimates), Rotation.from_quat(truth)
     aligned: Reals = ((true[0] * est[0].inv()) * est * true.inv()).magnitude()
     return aligned
@@ -113,12 +109,7 @@ def time_offset(estimates: Reals, truth: Reals, rates: Reals, absolute: bool) ->
 
 
 class Nees(NamedTuple):
-    """
-    Normalised estimation error squared (NEES).
-
-    ratio : mean divided by its expectation; 1 for a consistent filter
-    degrees : degrees of freedom of the mean
-    """
+    """Mean of the NEES divided by its expectation, and the degrees of freedom of the mean."""
 
     ratio: float
     degrees: float

@@ -26,8 +26,7 @@ class ReferenceFilter:
     Parameters
     ----------
     gyroscope_density, accelerometer_density, field_density : float
-        White noise of gyroscope, accelerometer and magnetometer [rad/s/sqrt(Hz)],
-        [m/s^2/sqrt(Hz)], [T/sqrt(Hz)].
+        White noise [rad/s/sqrt(Hz)], [m/s^2/sqrt(Hz)], [T/sqrt(Hz)].
     field : tuple of three float
         Magnetic field in the world: east, north, up [T].
     bias_stddev : float

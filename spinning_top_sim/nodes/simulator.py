@@ -27,7 +27,7 @@ from spinning_top_sim.nodes.publishers import StreamPublishers
 from spinning_top_sim.nodes.recording_session import RecordingSession
 from spinning_top_sim.nodes.ros_parameters import SPIN
 from spinning_top_sim.nodes.tick_loop import (
-    EPOCH_GRID_NS,
+    LAST_EPOCH_NS,
     TOO_LATE,
     LoopState,
     TickLoop,
@@ -35,7 +35,7 @@ from spinning_top_sim.nodes.tick_loop import (
 )
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
+from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.streams.simulation import PoleError
 
@@ -101,7 +101,7 @@ class Simulator(Node):
         date_ns = self._date.now_ns()
         if date_ns == 0:
             return
-        if self._date.follows and date_ns > LAST_STAMP_NS - EPOCH_GRID_NS:
+        if self._date.follows and date_ns > LAST_EPOCH_NS:
             self._log.warning(f'/clock: {TOO_LATE}', once=True)
             return
         self.destroy_timer(self._begin_timer)

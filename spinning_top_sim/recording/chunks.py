@@ -1,31 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes chunks in memory that is reused: of single messages, and of rows of an array for speed."""
+"""Builds chunks, of single messages or of whole arrays of them, in memory that is reused."""
 
 from __future__ import annotations
 
 import mmap
 import struct
+import zlib
 from array import array
 from collections import defaultdict
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import lz4.frame  # type: ignore[import-untyped]
+import numpy as np
 import zstandard
 from mcap.opcode import Opcode
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    # The next messages of a topic: its index, log times (n,) [ns], messages (n, size).
-    Rows = tuple[int, NDArray[np.integer], NDArray[np.uint8]]
+from mcap.records import Chunk
+from numpy.typing import NDArray
 
 CHUNK_BYTES = 1 << 20   # uncompressed; a single larger message still makes a chunk of its own
 
-# Half the time of zstd's own default, 3, and less memory, for files that are 1 to 6 % larger:
+# The fastest level that compresses nearly as well as zstd's own default, 3:
 # `python benchmark/log_compression.py`.
-ZSTD_LEVEL = 1
+ZSTD_LEVEL = -1
+
+# The next messages of a topic: its index, log times (n,) [ns], messages (n, size).
+RowBlock = tuple[int, NDArray[np.integer], NDArray[np.uint8]]
 
 # Message index entries of a chunk by channel id: log time, offset in the uncompressed chunk, log
 # time, offset, .. (uint64), as in the file: no platform of ROS 2 Jazzy is big-endian.
@@ -35,17 +34,25 @@ Entries = Mapping[int, 'array[int]']
 # Index"); mcap's record classes do the rest.
 MESSAGE = struct.Struct('<BQHIQQ')  # opcode, length, channel, sequence, log and publish time
 MESSAGE_FIELDS = 2 + 4 + 8 + 8      # what `length` counts besides the data
-_MESSAGE_DTYPE = [('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
-                  ('log_time', '<u8'), ('publish_time', '<u8')]     # and the data
 _MESSAGE_OPCODE = int(Opcode.MESSAGE)   # is packed faster
 INDEX_HEAD = struct.Struct('<BQHI')     # opcode, length, channel, length of the entries
 ENTRY_SIZE = 8 + 8                      # of a message index
 
 
 class PlainChunk:
-    """The messages of a chunk, uncompressed."""
+    """
+    The messages of a chunk, uncompressed.
 
-    def __init__(self) -> None:
+    compression : 'zstd', 'lz4' or 'none'
+    """
+
+    def __init__(self, compression: str = 'none') -> None:
+        self._compression = compression
+        if compression == 'zstd':
+            # The default window of the level is half a chunk; a whole one saves up to 20 %.
+            self._zstd = zstandard.ZstdCompressor(
+                compression_params=zstandard.ZstdCompressionParameters.from_level(
+                    ZSTD_LEVEL, window_log=CHUNK_BYTES.bit_length() - 1))
         self.clear()
         self._memory = memoryview(b'')
         self._enlarge(2 * CHUNK_BYTES)
@@ -60,8 +67,18 @@ class PlainChunk:
         """The message records, valid until the chunk changes."""
         return self._memory[:self.size]
 
+    def record(self) -> Chunk:
+        """Return the chunk, compressed."""
+        start_ns, end_ns = time_span(self.entries)
+        return Chunk(
+            compression='' if self._compression == 'none' else self._compression,
+            data=self._compressed(), uncompressed_size=self.size,
+            uncompressed_crc=zlib.crc32(self.data), message_start_time=start_ns,
+            message_end_time=end_ns)
+
     def add(self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int,
             data: bytes | bytearray | memoryview) -> None:
+        """Add a message."""
         offset = self.size
         start = offset + MESSAGE.size
         end = start + len(data)
@@ -79,52 +96,44 @@ class PlainChunk:
     def add_rows(self, channel_id: int, sequence: int, times_ns: NDArray[np.integer],
                  rows: NDArray[np.uint8]) -> None:
         """
-        Add messages of one length, in a tenth of the time that they take one by one.
+        Add messages of one length.
 
         sequence : sequence number of the first
         times_ns : log and publish times (n,), n >= 1, in any order
         rows : (n, size of a message)
         """
-        import numpy as np  # noqa: PLC0415 - recovery needs none
-
         count, size = rows.shape
-        dtype = np.dtype([*_MESSAGE_DTYPE, ('data', 'u1', (size,))])
-        offset, end = self.size, self.size + count * dtype.itemsize
+        record_size = MESSAGE.size + size
+        offset, end = self.size, self.size + count * record_size
         if end > len(self._memory):
             self._enlarge(end)
-        messages = np.frombuffer(self._memory[offset:end], dtype)
-        messages['opcode'] = Opcode.MESSAGE
-        messages['length'] = MESSAGE_FIELDS + size
-        messages['channel'] = channel_id
-        messages['sequence'] = sequence + np.arange(count) & 0xFFFFFFFF
-        messages['log_time'] = messages['publish_time'] = times_ns
-        messages['data'] = rows
-        entries = np.column_stack((times_ns, np.arange(offset, end, dtype.itemsize))).astype('u8')
-        self.entries[channel_id].frombytes(entries.tobytes())
+        messages = np.frombuffer(self._memory[offset:end], np.uint8).reshape(count, record_size)
+        head = MESSAGE.pack(_MESSAGE_OPCODE, MESSAGE_FIELDS + size, channel_id, 0, 0, 0)
+        messages[:, :MESSAGE.size] = np.frombuffer(head, np.uint8)
+        messages[:, MESSAGE.size:] = rows
+        numbers = messages.view(np.dtype({
+            'names': ('sequence', 'log_time', 'publish_time'), 'formats': ('<u4', '<u8', '<u8'),
+            'offsets': (11, 15, 23), 'itemsize': record_size}))[:, 0]
+        numbers['sequence'] = np.arange(sequence, sequence + count)
+        numbers['log_time'] = numbers['publish_time'] = times_ns
+        entries = np.empty((count, 2), np.uint64)
+        entries[:, 0] = times_ns
+        entries[:, 1] = np.arange(offset, end, record_size)
+        self.entries[channel_id].frombytes(entries.data.cast('B'))
         self.size = end
+
+    def _compressed(self) -> bytes:
+        if self._compression == 'zstd':
+            # The one-call interface would allocate as much memory as the chunk has.
+            stream = self._zstd.compressobj(size=self.size)
+            return stream.compress(self.data) + stream.flush()
+        return lz4.frame.compress(self.data) if self._compression == 'lz4' else bytes(self.data)
 
     def _enlarge(self, size: int) -> None:
         # Private: a process that forks would share it with its children.
         larger = memoryview(mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS))
         larger[:self.size] = self.data
         self._memory = larger
-
-
-def compressor(compression: str) -> Callable[[memoryview], bytes]:
-    """Return what compresses chunks: 'zstd', 'lz4' or 'none'."""
-    if compression == 'zstd':
-        # A window of a whole chunk, where the level has half of that: files are 20 % smaller.
-        zstd = zstandard.ZstdCompressor(
-            compression_params=zstandard.ZstdCompressionParameters.from_level(
-                ZSTD_LEVEL, window_log=CHUNK_BYTES.bit_length() - 1))
-
-        def compress(plain: memoryview) -> bytes:
-            # As a stream, because at once it would take as much memory as the chunk has.
-            stream = zstd.compressobj(size=len(plain))
-            return stream.compress(plain) + stream.flush()
-
-        return compress
-    return lz4.frame.compress if compression == 'lz4' else bytes
 
 
 def message_indexes(entries: Entries) -> dict[int, bytes]:
@@ -138,5 +147,6 @@ def message_indexes(entries: Entries) -> dict[int, bytes]:
 
 def time_span(entries: Entries) -> tuple[int, int]:
     """Return the earliest and the latest stamp in the entries of a chunk; (0, 0) in none."""
-    times = [numbers[::2] for numbers in entries.values()]
-    return min(map(min, times), default=0), max(map(max, times), default=0)
+    times = [np.frombuffer(numbers, np.uint64)[::2] for numbers in entries.values()]
+    return (min((int(column.min()) for column in times), default=0),
+            max((int(column.max()) for column in times), default=0))

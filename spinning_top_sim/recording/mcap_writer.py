@@ -2,7 +2,7 @@
 """
 Writes MCAP files that end after a whole record at any time, whatever happens to the disk.
 
-mcap's own Writer buffers what it cannot write, then reports success, and cannot go back.
+mcap.Writer reports success after a failed write and cannot truncate.
 
 Layout: header, metadata of the run, schemas, channels | chunk, its message indexes | ... |
 `rosbag2` metadata, data end | summary, footer.
@@ -11,11 +11,12 @@ Layout: header, metadata of the run, schemas, channels | chunk, its message inde
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import itertools
 import os
+import queue
 import zlib
 from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 from mcap import records
@@ -24,25 +25,32 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording import chunks
+from spinning_top_sim.recording.chunks import PlainChunk
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA, bag_metadata_yaml
+
+_COMPRESSING = 2    # chunks of rows that are compressed at once
+_NOTHING: Future[None] = Future()
+_NOTHING.set_result(None)
 
 
 class McapWriter:
     """
-    A new MCAP file, which must not exist (FileExistsError), written by one thread at a time.
+    A new MCAP file, which must not exist (FileExistsError), used by one thread at a time.
 
     Every write goes to an explicit position behind the last whole record, so neither an OSError
     nor an interrupt can shift what follows.  After an OSError `finish` may still be tried.
 
-    compression : of chunks that are made here, 'zstd', 'lz4' or 'none'
+    compression : of the chunks, 'zstd', 'lz4' or 'none'
     """
 
     def __init__(self, path: Path, *, header: bytes, compression: str) -> None:
         self._path = path
-        self._compression = '' if compression == 'none' else compression
-        self._compress = chunks.compressor(compression)
-        self._chunk = chunks.PlainChunk()           # of messages that come one by one
-        self._spare_chunks: list[chunks.PlainChunk] = []    # for rows
+        self._compression = compression
+        self._chunk = PlainChunk(compression)       # of messages that come one by one
+        # Chunks of rows: one is filled while the others are compressed.
+        self._spare_chunks: queue.SimpleQueue[PlainChunk] = queue.SimpleQueue()
+        self._pool: ThreadPoolExecutor | None = None
+        self._queued = _NOTHING                     # the last chunk of rows
 
         self.message_counts: dict[int, int] = {}    # messages in the file by channel id
         self.chunk_count = 0
@@ -76,30 +84,31 @@ class McapWriter:
                 self._path.unlink()
             raise
 
-    def write(self, record: records.Schema | records.Channel | records.Metadata,
-              raw: bytes = b'') -> None:
-        """Write a record, or its bytes `raw` from another file; schemas come before channels."""
+    def write(self, record: records.McapRecord, raw: bytes = b'') -> None:
+        """
+        Write a schema, a channel (after its schema), metadata or an attachment.
+
+        raw : the bytes of the record in another file
+        """
         offset = self.size
         raw = raw or record_bytes(record)
         self._write([raw])
         if isinstance(record, records.Metadata):
             self._summary_records[Opcode.METADATA_INDEX].append(
                 record_bytes(records.MetadataIndex(offset, len(raw), record.name)))
-        elif isinstance(record, records.Schema) and record.id not in self._type_names:
+        elif isinstance(record, records.Attachment):
+            self._summary_records[Opcode.ATTACHMENT_INDEX].append(
+                record_bytes(records.AttachmentIndex(
+                    offset=offset, length=len(raw), log_time=record.log_time,
+                    create_time=record.create_time, data_size=len(record.data), name=record.name,
+                    media_type=record.media_type)))
+        elif isinstance(record, records.Schema):
             self._type_names[record.id] = record.name
             self._summary_records[Opcode.SCHEMA].append(raw)
-        elif isinstance(record, records.Channel) and record.id not in self._channels:
+        elif isinstance(record, records.Channel):
             self._channels[record.id] = record
             self._summary_records[Opcode.CHANNEL].append(raw)
             self.message_counts[record.id] = self._next_sequence[record.id] = 0
-
-    def copy_record(self, blocks: Iterable[bytes], index: records.McapRecord | None) -> None:
-        """Write an attachment, or a record of unknown kind, in blocks of any size."""
-        offset = self.size
-        self._write(blocks)
-        if isinstance(index, records.AttachmentIndex):
-            self._summary_records[Opcode.ATTACHMENT_INDEX].append(
-                record_bytes(dataclasses.replace(index, offset=offset)))
 
     def append(self, topic_index: int, log_time_ns: int, data: bytes) -> None:
         """Add the next message of channel `topic_index + 1`, as `add_message` does."""
@@ -115,31 +124,44 @@ class McapWriter:
         if self._chunk.size >= chunks.CHUNK_BYTES:
             self.write_chunk()
 
-    def chunk_of_rows(self, blocks: Iterable[chunks.Rows]) -> chunks.PlainChunk:
-        """Make a chunk for `write_chunk`, which another thread may be running."""
-        chunk = self._spare_chunks.pop() if self._spare_chunks else chunks.PlainChunk()
+    def append_rows(self, blocks: Iterable[chunks.RowBlock]) -> None:
+        """
+        Add a chunk of messages that come as arrays, after the messages that came one by one.
+
+        The arrays are copied before this returns.  Two threads compress and write the chunks in
+        the order in which they came.  This waits while both are busy, and raises the OSError of
+        an earlier chunk.
+        """
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(_COMPRESSING, 'chunks')
+            for _ in range(_COMPRESSING + 1):
+                self._spare_chunks.put(PlainChunk(self._compression))
+        if self._queued.done():
+            self._wait()
+        if self._chunk.size:
+            self._queue(self._chunk)
+            self._chunk = self._spare_chunks.get()
+        chunk = self._spare_chunks.get()
         for topic_index, times_ns, rows in blocks:
             channel_id = topic_index + 1
             chunk.add_rows(channel_id, self._next_sequence[channel_id], times_ns, rows)
             self._next_sequence[channel_id] += len(rows)
-        return chunk
+        self._queue(chunk)
 
-    def write_chunk(self, rows: chunks.PlainChunk | None = None) -> None:
-        """Compress and write a chunk of rows, or the one in memory if it holds anything."""
-        chunk = rows or self._chunk
-        if chunk.size:
-            start_ns, end_ns = chunks.time_span(chunk.entries)
-            self.copy_chunk(records.Chunk(
-                compression=self._compression, data=self._compress(chunk.data),
-                uncompressed_size=chunk.size, uncompressed_crc=zlib.crc32(chunk.data),
-                message_start_time=start_ns, message_end_time=end_ns), chunk.entries)
-            chunk.clear()
-        if rows:
-            self._spare_chunks.append(rows)
+    def chunk_of_rows(self, blocks: Iterable[chunks.RowBlock]) -> object:
+        """Call `append_rows`."""
+        return self.append_rows(blocks)  # type: ignore[func-returns-value]
 
-    def copy_chunk(self, chunk: records.Chunk, entries: chunks.Entries, raw: bytes = b'') -> None:
-        """Write a compressed chunk and its message indexes; `raw` is as in `write`."""
-        raw = raw or record_bytes(chunk)
+    def write_chunk(self, _: object = None) -> None:
+        """Write the chunk in memory, if it holds anything, after those of `append_rows`."""
+        self._wait()
+        if self._chunk.size:
+            self.copy_chunk(self._chunk.record(), self._chunk.entries)
+            self._chunk.clear()
+
+    def copy_chunk(self, chunk: records.Chunk, entries: chunks.Entries) -> None:
+        """Write a compressed chunk and its message indexes."""
+        raw = record_bytes(chunk)
         indexes = chunks.message_indexes(entries)
         offsets = list(itertools.accumulate(
             map(len, indexes.values()), initial=self.size + len(raw)))
@@ -176,14 +198,15 @@ class McapWriter:
             raise OSError(f'{free} bytes are free on the disk, fewer than min_free_bytes = '
                           f'{min_free_bytes}')
 
-    def finish(self, *, bag: bool = True, file_name: str = '', former_bag: str = '') -> None:
+    def finish(self, *, bag: bool = True, file_name: str = '') -> None:
         """
         Write the summary, bring all to the disk and close the file.
 
         bag : whether to write a `rosbag2` record, which names `file_name`, default: this file
-        former_bag : the bag metadata of the log that this one is made from
         """
         try:
+            if self._pool is not None:
+                self._pool.shutdown()
             if bag:
                 topics = [(channel, self._type_names.get(channel.schema_id, ''),
                            self.message_counts[channel.id])
@@ -191,13 +214,34 @@ class McapWriter:
                 self.write(records.Metadata(BAG_METADATA, {
                     'serialized_metadata': bag_metadata_yaml(
                         topics, file_name=file_name or self._path.name, start_ns=self._start_ns,
-                        end_ns=self._end_ns, former=former_bag)}))
+                        end_ns=self._end_ns)}))
             self._write([record_bytes(records.DataEnd(self._end[1]))])
             self._write([self._summary()])
             self.sync()
             sync_directory(self._path.parent)
         finally:
             self._file.close()
+
+    def _queue(self, chunk: PlainChunk) -> None:
+        """Have a chunk compressed in a thread, and written after those queued before."""
+        assert self._pool is not None
+        self._queued = self._pool.submit(self._write_in_turn, chunk, self._queued)
+
+    def _wait(self) -> None:
+        """Wait for the chunks that are queued.  Raises the OSError of one, but only once."""
+        queued = self._queued
+        if queued.exception() is not None:
+            self._queued = _NOTHING
+        queued.result()
+
+    def _write_in_turn(self, chunk: PlainChunk, before: Future[None]) -> None:
+        try:
+            record = chunk.record()
+            before.result()
+            self.copy_chunk(record, chunk.entries)
+        finally:
+            chunk.clear()
+            self._spare_chunks.put(chunk)
 
     def _summary(self) -> bytes:
         """Return the summary section, the footer and the closing magic."""

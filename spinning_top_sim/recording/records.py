@@ -1,30 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Parses MCAP records whose bytes may be wrong: a record is what it says it is, or DamagedError.
+Parses MCAP records whose bytes may be wrong: mcap's record classes, and DamagedError.
 
-mcap's record classes take what is truncated or inconsistent for shorter strings and smaller
-numbers.  Here every length inside a record must fit.  Bytes behind the known fields are allowed:
-later versions of the format may add fields (MCAP specification, "Records").
+mcap's classes take a truncated field for a shorter one.  Here every length must fit the record.
+Bytes behind the known fields are allowed, because later versions of the format may add fields.
 """
 
 from __future__ import annotations
 
 import struct
-import sys
 import zlib
 from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from typing import BinaryIO
 
 import lz4.frame  # type: ignore[import-untyped]
-import mcap.records
+import numpy as np
 import zstandard
-from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.records import Attachment, Chunk, McapRecord, Message
+from mcap.stream_reader import StreamReader
 
 from spinning_top_sim.recording.chunks import ENTRY_SIZE, INDEX_HEAD, MESSAGE, MESSAGE_FIELDS
 from spinning_top_sim.recording.mcap_writer import record_bytes
@@ -35,37 +33,35 @@ HEAD = struct.Struct('<BQ')         # of every record: opcode, length of what fo
 
 _BLOCK = 1 << 20    # bytes decompressed at a time
 _MESSAGE_OPCODE = int(Opcode.MESSAGE)   # compares faster
-# mcap's class of each kind that is parsed as a whole: that of CHUNK_INDEX is ChunkIndex.
-_CLASSES: dict[int, type[McapRecord]] = {
-    opcode: getattr(mcap.records, opcode.name.title().replace('_', '')) for opcode in Opcode
-    if opcode not in (Opcode.MESSAGE, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT)}
 
 
 class DamagedError(Exception):
-    """A record is not what it says it is; the text says why."""
+    """A record cannot be decoded; the text says why."""
 
 
 class TooLargeError(DamagedError):
-    """A record may be right but is larger than what is read into memory."""
+    """A record is larger than what is read into memory; it may be right."""
 
 
 @dataclass
-class ChunkContents:
-    """The content of a chunk whose checksum is right, or of messages outside of chunks."""
+class Messages:
+    """The messages of a chunk, or adjacent ones outside of chunks."""
 
-    plain: bytes | bytearray    # uncompressed
+    plain: bytes | bytearray    # the uncompressed records
     # As in message indexes: millions of tiny messages fit into a chunk.
     entries: dict[int, array[int]] = field(default_factory=dict)
-    declared: list[Schema | Channel] = field(default_factory=list)
-    right: bool = True      # may be copied as a whole
+    declared: list[McapRecord] = field(default_factory=list)    # schemas and channels
 
-    def messages(self, *, by_time: bool = False) -> Iterator[Message]:
+    def in_order(self, *, by_time: bool = False) -> Iterator[Message]:
         """Yield the messages in file order, or by log time and equal ones in file order."""
+        if not self.entries:
+            return
         plain = memoryview(self.plain)
-        places = sorted(by_time * time << 64 | offset for numbers in self.entries.values()
-                        for time, offset in zip(numbers[::2], numbers[1::2], strict=True))
-        for place in places:
-            offset = place & (1 << 64) - 1
+        times, offsets = np.concatenate([
+            np.frombuffer(numbers, np.uint64).reshape(-1, 2) for numbers in self.entries.values()
+            ]).T
+        for place in np.lexsort((offsets, times) if by_time else (offsets,)):
+            offset = int(offsets[place])
             _, length, channel_id, sequence, log_time, publish_time = MESSAGE.unpack_from(
                 plain, offset)
             yield Message(
@@ -74,84 +70,64 @@ class ChunkContents:
                 data=plain[offset + MESSAGE.size:offset + HEAD.size + length].tobytes())
 
 
-class StrictStream(ReadDataStream):
-    """Reading beyond the end raises EndOfFile."""
+class _Record(BytesIO):
+    """The bytes of a record; reading beyond its end raises EndOfFile."""
 
-    def read(self, length: int) -> bytes:
-        data: bytes = super().read(min(length, sys.maxsize))
-        if len(data) != length:
-            raise EndOfFile()
+    def read(self, size: int | None = -1) -> bytes:
+        data = super().read(size)
+        if len(data) != size:
+            raise EndOfFile
         return data
 
 
-def check_size(size: int, max_bytes: int) -> None:
-    """Raise TooLargeError for what is not read into memory."""
-    if size > max_bytes:
-        raise TooLargeError(f'its {size} bytes are more than max_bytes = {max_bytes}')
+def check_size(size: int, limit: int) -> None:
+    """Raise TooLargeError for more bytes than are read into memory."""
+    if size > limit:
+        raise TooLargeError(f'its {size} bytes are more than the {limit} that are read')
 
 
-def check_declared(size: int) -> None:
-    """Raise TooLargeError for too many bytes of schemas, channels and metadata."""
-    if size > MAX_DECLARED:
-        raise TooLargeError(f'{size} bytes of schemas, channels or metadata are more than '
-                            f'the {MAX_DECLARED} that are read')
-
-
-def name_of(opcode: int) -> str:
-    """Return what a kind of record is called in reports."""
-    if opcode in set(Opcode):
-        return Opcode(opcode).name.lower().replace('_', ' ')
-    return f'record of unknown kind {opcode:#04x}'
-
-
-def parse(raw: bytes) -> tuple[McapRecord, int]:
-    """
-    Return the record, and how many bytes stand behind its known fields.
-
-    Raises DamagedError, also for messages, message indexes and attachments.
-    """
-    record_class = _CLASSES.get(raw[0])
-    if record_class is None:
-        raise DamagedError('there is no such kind of record')
-    if record_class is not Chunk:
-        check_declared(len(raw))
-    stream = StrictStream(BytesIO(raw))
+def parse(raw: bytes) -> McapRecord:
+    """Return a record of a known kind from all of its bytes; raises DamagedError."""
+    if raw[0] not in (Opcode.CHUNK, Opcode.ATTACHMENT):
+        check_size(len(raw), MAX_DECLARED)
     try:
-        stream.read(HEAD.size)
-        record: McapRecord = record_class.read(stream)  # type: ignore[attr-defined]
-    except McapError:
-        raise DamagedError('a length inside of it leads beyond its end') from None
-    except UnicodeDecodeError:
-        raise DamagedError('a text in it is no UTF-8') from None
-    # mcap may run over the end of a map.  A chunk has none, and writing it would copy its data.
-    if not isinstance(record, Chunk) and not raw.startswith(
+        record = next(StreamReader(_Record(raw), skip_magic=True, emit_chunks=True).records)
+    except (McapError, OverflowError, UnicodeDecodeError):
+        raise DamagedError('a length or a text in it is wrong') from None
+    # mcap reads a map beyond its end.
+    if not isinstance(record, Chunk | Attachment) and not raw.startswith(
             record_bytes(record)[HEAD.size:], HEAD.size):
-        raise DamagedError('its length is not that of its content')
-    return record, len(raw) - stream.count
+        raise DamagedError('a length in it is wrong')
+    return record
 
 
-def parse_message_index(raw: bytes) -> tuple[int, array[int], int]:
-    """Return the channel of a message index, its entries, and how many bytes stand behind them."""
-    extra = len(raw) - INDEX_HEAD.size
-    if extra >= 0:
-        _, _, channel_id, size = INDEX_HEAD.unpack_from(raw)
-        extra -= size
-    if extra < 0 or size % ENTRY_SIZE:
-        raise DamagedError('its length is not that of its content')
-    return channel_id, array('Q', raw[INDEX_HEAD.size:INDEX_HEAD.size + size]), extra
+def size_of(record: McapRecord) -> int:
+    """Return the size of a record without fields of later versions [bytes]."""
+    if isinstance(record, Chunk | Attachment):      # whose data are not copied
+        return len(record_bytes(replace(record, data=b''))) + len(record.data)
+    return len(record_bytes(record))
 
 
-def open_chunk(chunk: Chunk, max_bytes: int) -> ChunkContents:
-    """Decompress and check a chunk, whose checksum is 0 if it has none; raises DamagedError."""
+def index_entries(raw: bytes) -> int:
+    """Return the number of entries of a message index; raises DamagedError."""
+    entries, rest = divmod(int.from_bytes(raw[INDEX_HEAD.size - 4:INDEX_HEAD.size], 'little'),
+                           ENTRY_SIZE)
+    if rest or INDEX_HEAD.size + entries * ENTRY_SIZE > len(raw):
+        raise DamagedError('a length in it is wrong')
+    return entries
+
+
+def open_chunk(chunk: Chunk, max_bytes: int) -> Messages:
+    """Return the content of a chunk whose checksum, if it has one, is right; DamagedError."""
     plain = _decompress(chunk, max_bytes)
     if chunk.uncompressed_crc and zlib.crc32(plain) != chunk.uncompressed_crc:
         raise DamagedError('its checksum is wrong')
-    return break_up(plain)
+    return find_messages(plain)
 
 
-def break_up(plain: bytes | bytearray) -> ChunkContents:
-    """Return the messages and declarations among records that stand one after the other."""
-    contents = ChunkContents(plain)
+def find_messages(plain: bytes | bytearray) -> Messages:
+    """Return the messages and declarations in records that follow one another; DamagedError."""
+    found = Messages(plain)
     declared_bytes = offset = 0
     size = len(plain)
     while offset < size:
@@ -159,24 +135,19 @@ def break_up(plain: bytes | bytearray) -> ChunkContents:
             raise DamagedError('a record in it is truncated')
         opcode, length = HEAD.unpack_from(plain, offset)
         end = offset + HEAD.size + length
-        if end > size:
-            raise DamagedError('a record in it leads beyond its end')
+        if end > size or (opcode == _MESSAGE_OPCODE and length < MESSAGE_FIELDS):
+            raise DamagedError('the length of a record in it is wrong')
         if opcode == _MESSAGE_OPCODE:
-            if length < MESSAGE_FIELDS:
-                raise DamagedError('a message is shorter than a message can be')
             _, _, channel_id, _, log_time, _ = MESSAGE.unpack_from(plain, offset)
-            if channel_id not in contents.entries:
-                contents.entries[channel_id] = array('Q')
-            contents.entries[channel_id].extend((log_time, offset))
+            if channel_id not in found.entries:
+                found.entries[channel_id] = array('Q')
+            found.entries[channel_id].extend((log_time, offset))
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             declared_bytes += length
-            check_declared(declared_bytes)
-            record, extra = parse(bytes(plain[offset:end]))
-            contents.right &= not extra         # mcap's reader does not skip what it does not know
-            assert isinstance(record, Schema | Channel)
-            contents.declared.append(record)
+            check_size(declared_bytes, MAX_DECLARED)
+            found.declared.append(parse(bytes(plain[offset:end])))
         offset = end
-    return contents
+    return found
 
 
 def _decompress(chunk: Chunk, max_bytes: int) -> bytes | bytearray:

@@ -177,50 +177,40 @@ def _is_int64(value: object) -> TypeGuard[int]:
 
 
 def bag_metadata_yaml(topics: Sequence[tuple[Channel, str, int]], *, file_name: str,
-                      start_ns: int, end_ns: int, former: str = '') -> str:
+                      start_ns: int, end_ns: int) -> str:
     """
     Return the `serialized_metadata` of the `rosbag2` record.
 
     topics : channels with their type and the number of their messages, in the order of the file
-    former : the metadata of the log that this one is made from; its ROS distribution and custom
-        data stay, as they are
     """
     # A file name may hold bytes that are no text: they must not spoil the closing of a log.
     file_name = file_name.encode(errors='replace').decode()
     start = {'nanoseconds_since_epoch': start_ns}
     duration = {'nanoseconds': end_ns - start_ns}
     total = sum(messages for _, _, messages in topics)
-    return '\n'.join((
-        _dump({
-            'version': 9,   # of rosbag2_storage::BagMetadata in jazzy
-            'storage_identifier': 'mcap',
-            'duration': duration,
-            'starting_time': start,
-            'message_count': total,
-            'topics_with_message_count': [
-                {'topic_metadata': {
-                    'name': channel.topic,
-                    'type': type_name,
-                    'serialization_format': channel.message_encoding,
-                    'offered_qos_profiles': [
-                        {key: _POLICY_NAMES[key][value] if key in _POLICY_NAMES else value
-                         for key, value in qos.items()} for qos in qos_profiles(channel)],
-                    'type_description_hash': channel.metadata.get('topic_type_hash', '')},
-                 'message_count': messages} for channel, type_name, messages in topics],
-            'compression_format': '',
-            'compression_mode': '',
-            'relative_file_paths': [file_name],
-            'files': [{'path': file_name, 'starting_time': start, 'duration': duration,
-                       'message_count': total}]}),
-        _block(former, 'custom_data') or 'custom_data: ~',
-        _block(former, 'ros_distro')
-        or _dump({'ros_distro': os.environ.get('ROS_DISTRO') or 'jazzy'})))
-
-
-def _block(text: str, key: str) -> str:
-    """Return the lines of a key at the top of a YAML text, as they are."""
-    match = re.search(rf'^{key}:.*(?:\n[ \t].*)*', text, re.MULTILINE)
-    return match.group() if match else ''
+    return _dump({
+        'version': 9,   # of rosbag2_storage::BagMetadata in jazzy
+        'storage_identifier': 'mcap',
+        'duration': duration,
+        'starting_time': start,
+        'message_count': total,
+        'topics_with_message_count': [
+            {'topic_metadata': {
+                'name': channel.topic,
+                'type': type_name,
+                'serialization_format': channel.message_encoding,
+                'offered_qos_profiles': [
+                    {key: _POLICY_NAMES[key][value] if key in _POLICY_NAMES else value
+                     for key, value in qos.items()} for qos in qos_profiles(channel)],
+                'type_description_hash': channel.metadata.get('topic_type_hash', '')},
+             'message_count': messages} for channel, type_name, messages in topics],
+        'compression_format': '',
+        'compression_mode': '',
+        'relative_file_paths': [file_name],
+        'files': [{'path': file_name, 'starting_time': start, 'duration': duration,
+                   'message_count': total}],
+        'custom_data': None,
+        'ros_distro': os.environ.get('ROS_DISTRO') or 'jazzy'})
 
 
 class _Dumper(yaml.SafeDumper):

@@ -8,7 +8,7 @@ it is computed in.
 
 from collections.abc import Iterator, Sequence
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 from spinning_top_sim.streams.path import Path
-from spinning_top_sim.streams.stream import Samples, Stream
+from spinning_top_sim.streams.stream import Rows, Samples, Stream
 
 STEPS_IN_A_PIECE = 4
 NEVER_NS = 2 ** 63 - 1
@@ -31,7 +31,7 @@ class Block(NamedTuple):
     """
 
     until_ns: int
-    parts: Sequence[tuple[Stream, NDArray[np.int64], NDArray[Any]]]
+    parts: Sequence[tuple[Stream, NDArray[np.int64], Rows]]
 
 
 def blocks(path: Path, streams: Sequence[Stream], epoch_ns: int, after_ns: int, until_ns: int, *,

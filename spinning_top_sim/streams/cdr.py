@@ -1,23 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Serialized ROS messages (XCDR version 1, little endian), written once and patched ever after.
+Serialized ROS messages (XCDR version 1, little endian), as templates whose numbers are replaced.
 
-Format: OMG DDS-XTypes 1.3, sect. 7.4.1 and the RTPS encapsulation header: four bytes 00 01 00 00,
-then every primitive aligned to its own size counted from behind that header; a string is its
-length with the closing NUL, a sequence its element count, then the elements.  Padding is zero, so
-equal messages are equal bytes.
+Format: OMG DDS-XTypes 1.3, sect. 7.4.1, and the RTPS encapsulation header.  After the header
+00 01 00 00 every primitive is aligned to its own size, counted from the end of the header.  A
+string is its length with the closing NUL, then its bytes; a sequence is the number of its
+elements, then the elements.  Padding is zero, so that equal messages have equal bytes.
 """
 
 import struct
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 ENCAPSULATION = b'\x00\x01\x00\x00'
 NANOSECONDS = 1_000_000_000
-# Seconds of a stamp are an int32: they end in January 2038.
+# The seconds of a stamp are an int32: the last stamp is in January 2038.
 LAST_STAMP_NS = 2 ** 31 * NANOSECONDS - 1
 
 # The numbers of a field in n messages: an array (n, count), or `count` columns or numbers.
@@ -26,10 +27,10 @@ Field = NDArray[np.float64] | Sequence[NDArray[np.float64] | float]
 
 class CdrWriter:
     """
-    Appends the parts of a message in the order of its definition.
+    Appends the parts of a message in the order of its definition; its methods return itself.
 
-    stamps_at : offsets of its stamps
-    fields : offset and number of the doubles of each field, which differ from message to message
+    stamps_at : offset of each stamp
+    fields : offset and number of doubles of each field, which differ from message to message
     """
 
     def __init__(self) -> None:
@@ -37,34 +38,37 @@ class CdrWriter:
         self.stamps_at: list[int] = []
         self.fields: list[tuple[int, int]] = []
 
-    def append(self, code: str, *values: float) -> None:
+    def append(self, code: str, *values: float) -> Self:
         """Append numbers of one type, a code of `struct`."""
         if values:
             size = struct.calcsize('<' + code)
             self.buffer += bytes(-(len(self.buffer) - len(ENCAPSULATION)) % size)
         self.buffer += struct.pack(f'<{len(values)}{code}', *values)
+        return self
 
-    def field(self, count: int) -> None:
-        """Append doubles that differ from message to message."""
+    def field(self, count: int) -> Self:
+        """Append a field of doubles."""
         self.append('d', *(count * (0.0,)))
         self.fields.append((len(self.buffer) - 8 * count, count))
+        return self
 
-    def stamp(self) -> None:
+    def stamp(self) -> Self:
         """Append a builtin_interfaces/Time that differs from message to message."""
         self.append('I', 0, 0)
         self.stamps_at.append(len(self.buffer) - 8)
+        return self
 
-    def string(self, *texts: str) -> None:
+    def string(self, *texts: str) -> Self:
         """Append strings."""
         for text in texts:
             data = text.encode() + b'\0'
             self.append('I', len(data))
             self.buffer += data
+        return self
 
-    def header(self, frame_id: str) -> None:
+    def header(self, frame_id: str) -> Self:
         """Append a std_msgs/Header."""
-        self.stamp()
-        self.string(frame_id)
+        return self.stamp().string(frame_id)
 
 
 class Template:
@@ -75,9 +79,9 @@ class Template:
     """
 
     def __init__(self, writer: CdrWriter) -> None:
-        # Padded to four bytes, as RTPS does: what arrives is then what was sent.
+        # RTPS pads to four bytes; a template does so too, so that logs have what subscribers get.
         self._buffer = writer.buffer + bytes(-len(writer.buffer) % 4)
-        self._stamps_at, self._fields = tuple(writer.stamps_at), tuple(writer.fields)
+        self._stamps_at, self._fields = writer.stamps_at, writer.fields
         self.counts = tuple(count for _, count in self._fields)
         self._rows: NDArray[np.void] = np.empty(0, np.void)
 
@@ -97,7 +101,7 @@ class Template:
         return len(self._buffer)
 
     def encode(self, stamps_ns: NDArray[np.int64], *values: Field) -> NDArray[np.uint8]:
-        """Return messages with stamps (n,) [ns], bytes (n, size), valid until the next call."""
+        """Return messages (n, size) with stamps (n,) [ns]; they are valid until the next call."""
         count = len(stamps_ns)
         if len(self._rows) < count:
             self._rows = np.frombuffer(count * self._buffer, self._row_type)
@@ -109,8 +113,8 @@ class Template:
             if isinstance(value, np.ndarray):
                 field[:] = value
             else:
-                for column, numbers in zip(range(field.shape[1]), value, strict=True):
-                    field[:, column] = numbers
+                for column, numbers in zip(field.T, value, strict=True):
+                    column[:] = numbers
         return rows.view(np.uint8).reshape(count, len(self))
 
     def encode_one(self, stamp_ns: int, *values: Field) -> bytes:
@@ -118,19 +122,23 @@ class Template:
         return self.encode(np.array([stamp_ns]), *values).tobytes()
 
     def decode(self, data: bytes) -> tuple[NDArray[np.float64], ...]:
-        """Return the fields, (n, count) each, of n messages one after the other."""
+        """Return the fields, (n, count) each, of n concatenated messages."""
         rows = np.frombuffer(data, self._row_type)
         return tuple(rows[f'field{i}'] for i in range(len(self._fields)))
 
     def stamps_ns(self, data: bytes) -> NDArray[np.int64]:
-        """Return the stamps (n,) [ns] of n messages one after the other."""
+        """Return the stamps (n,) [ns] of n concatenated messages."""
         rows, at = np.frombuffer(data, self._row_type), self._stamps_at[0]
         stamps: NDArray[np.int64] = rows[f'sec{at}'].astype(np.int64) * NANOSECONDS
         stamps += rows[f'nanosec{at}']
         return stamps
 
     def field_at(self, at: int) -> tuple[int, int, int] | None:
-        """Return field, element and offset of what holds a byte: field -1 is the stamp."""
+        """
+        Return what the byte at an offset belongs to: field, element, and offset of the element.
+
+        The field is -1 for a stamp; None is returned for a byte that is the same in all messages.
+        """
         for stamp_at in self._stamps_at:
             if 0 <= at - stamp_at < 8:
                 return -1, 0, stamp_at

@@ -111,6 +111,11 @@ class LiveSimulation(Simulation):
         self._work: Iterator[Block | None] | None = None
         self._block = SMALLEST_BLOCK
 
+    def restart(self, values: Mapping[str, Any]) -> None:
+        super().restart(values)
+        for output, stream in zip(self.outputs, self.streams, strict=True):
+            output.stream = stream
+
     def output(self, stream: Stream) -> Output:
         """Return the output of a stream."""
         return next(output for output in self.outputs if output.stream is stream)
@@ -194,8 +199,6 @@ class LiveSimulation(Simulation):
         holds_for = self.version, self._usage.changes
         if holds_for != self._holds_for:
             self._holds_for = holds_for
-            for output, stream in zip(self.outputs, self.streams, strict=True):
-                output.stream = stream
             self._used = [output for output in self.outputs if output.is_used]
             self._queue.clear()
             self._work, self.computed_ns, self._block = None, self.now_ns, SMALLEST_BLOCK

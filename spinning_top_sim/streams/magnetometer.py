@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The magnetometer, in the frame of the IMU: the magnetic field, and what is added to it."""
+"""The magnetometer, in the frame of the IMU: the magnetic field and the errors of the sensor."""
 
 import math
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from spinning_top_sim.streams.imu import Converter, transformed
 
 class Magnetometer:
     """
-    The readings of a magnetometer that takes a sample every `period_ns`.
+    A magnetometer that takes a sample every `period_ns`.
 
     variance : of white noise and rounding together [T^2]
 
@@ -36,11 +36,11 @@ class Magnetometer:
             if walk else ())
 
     def true(self, orientation: Quaternion) -> Vector:
-        """Return the field [T] in a frame of these orientations in the world."""
+        """Return the field [T] in frames with these orientations in the world."""
         return attitude.in_body(orientation, self._field)
 
     def read(self, exact: Vector, times: range) -> Vector:
-        """Return the readings [T] at these times [ns] where the field is this."""
+        """Return the readings [T] of the field `exact` at these times [ns]."""
         white, bias = self._noise.at(times)
         x, y, z = (self._converter.convert(value + one_bias + one_white)
                    for value, one_bias, one_white in zip(

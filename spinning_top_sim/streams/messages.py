@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The messages that the simulator sends, as templates.
+Templates of the messages that the simulator sends.
 
-Fields stand in the order of the installed .msg definitions (ROS 2 Jazzy, common_interfaces 5.3);
-a test compares every template with what rclpy serializes.
+Their parts are in the order of the .msg definitions (ROS 2 Jazzy, common_interfaces 5.3); a test
+compares every template with the serializer of rclpy.
 """
 
 from collections.abc import Sequence
@@ -11,12 +11,13 @@ from collections.abc import Sequence
 from spinning_top_sim.streams.cdr import CdrWriter, Template
 
 UNKNOWN_ORIENTATION = (-1.0,) + 8 * (0.0,)      # REP-145: no orientation in this message
-# Stands for exact, in SI units: a covariance of zeros means unknown (sensor_msgs/Imu).
+# A covariance of zeros means unknown (sensor_msgs/Imu), so that exact values have this variance.
 EXACT_VARIANCE = 1e-18
 CYLINDER, LINE_STRIP, LINE_LIST = 3, 4, 5       # visualization_msgs/Marker
 BODY_COLOR = (0.20, 0.40, 0.70, 1.0)            # red, green, blue, alpha
 AXIS_COLOR = (0.95, 0.75, 0.20, 1.0)
 TRACE_COLOR = (0.90, 0.30, 0.20, 1.0)
+ORIGIN, NO_ROTATION = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
 
 def diagonal(*variances: float) -> tuple[float, ...]:
@@ -31,132 +32,106 @@ EXACT = diagonal(0.0, 0.0, 0.0)
 
 def pose_stamped(frame_id: str) -> Template:
     """geometry_msgs/PoseStamped at the origin; fields: orientation x, y, z, w."""
-    writer = CdrWriter()
-    writer.header(frame_id)
-    writer.append('d', 0.0, 0.0, 0.0)
-    writer.field(4)
-    return Template(writer)
+    return Template(CdrWriter().header(frame_id).append('d', *ORIGIN).field(4))
 
 
 def joint_state(names: Sequence[str]) -> Template:
     """sensor_msgs/JointState without effort; fields: positions, velocities."""
-    writer = CdrWriter()
-    writer.header('')
-    writer.append('I', len(names))
-    writer.string(*names)
+    count = len(names)
+    writer = CdrWriter().header('').append('I', count).string(*names)
     for _ in ('position', 'velocity'):
-        writer.append('I', len(names))
-        writer.field(len(names))
-    writer.append('I', 0)
-    return Template(writer)
+        writer.append('I', count).field(count)
+    return Template(writer.append('I', 0))
 
 
 def imu(frame_id: str, *covariances: Sequence[float]) -> Template:
     """sensor_msgs/Imu; fields: orientation x, y, z, w, angular velocity, linear acceleration."""
-    writer = CdrWriter()
-    writer.header(frame_id)
+    writer = CdrWriter().header(frame_id)
     for count, covariance in zip((4, 3, 3), covariances, strict=True):
-        writer.field(count)
-        writer.append('d', *covariance)
+        writer.field(count).append('d', *covariance)
     return Template(writer)
 
 
 def magnetic_field(frame_id: str) -> Template:
-    """sensor_msgs/MagneticField; fields: the field, its covariance."""
-    writer = CdrWriter()
-    writer.header(frame_id)
-    writer.field(3)
-    writer.field(9)
-    return Template(writer)
+    """sensor_msgs/MagneticField; fields: the magnetic field, its covariance."""
+    return Template(CdrWriter().header(frame_id).field(3).field(9))
 
 
 def odometry(frame_id: str, child_frame_id: str, *, moves: bool = False) -> Template:
     """
-    nav_msgs/Odometry, exact.
+    nav_msgs/Odometry with exact values.
 
-    Fields: orientation, body rates; if the point `moves`: position, orientation, velocity in the
-    child frame, body rates.
+    Fields: orientation, angular velocity; for a point that `moves`: position, orientation,
+    velocity in the child frame, angular velocity.
     """
-    writer = CdrWriter()
-    writer.header(frame_id)
-    writer.string(child_frame_id)
+    writer = CdrWriter().header(frame_id).string(child_frame_id)
     for count in (4, 3):
         if moves:
             writer.field(3)
         else:
-            writer.append('d', 0.0, 0.0, 0.0)       # position, linear velocity: the pivot rests
-        writer.field(count)
-        writer.append('d', *diagonal(*(6 * (0.0,))))
+            writer.append('d', *ORIGIN)             # position and velocity of the pivot
+        writer.field(count).append('d', *diagonal(*6 * (0.0,)))
     return Template(writer)
 
 
 def stamped(frame_id: str, count: int) -> Template:
     """geometry_msgs/Vector3Stamped (count 3) or QuaternionStamped (4); fields: x, y, z(, w)."""
-    writer = CdrWriter()
-    writer.header(frame_id)
-    writer.field(count)
-    return Template(writer)
+    return Template(CdrWriter().header(frame_id).field(count))
 
 
 def float64_multi_array(labels: Sequence[str]) -> Template:
     """std_msgs/Float64MultiArray, one dimension labelled with its columns; fields: the data."""
-    writer = CdrWriter()
-    writer.append('I', 1)
-    writer.string(','.join(labels))
-    writer.append('I', len(labels), len(labels), 0, len(labels))    # size, stride, offset, size
-    writer.field(len(labels))
-    return Template(writer)
+    count = len(labels)
+    # Number of dimensions; label, size and stride; offset of the data, their number.
+    return Template(CdrWriter().append('I', 1).string(','.join(labels))
+                    .append('I', count, count, 0, count).field(count))
 
 
 def clock() -> Template:
     """rosgraph_msgs/Clock; no fields."""
-    writer = CdrWriter()
-    writer.stamp()
-    return Template(writer)
+    return Template(CdrWriter().stamp())
 
 
 def markers(frame_id: str, size: Sequence[float], lines: Sequence[float], line_width: float,
             trace_points: int) -> Template:
     """
-    visualization_msgs/MarkerArray: a cylinder, lines on it, and the trace if it has points.
+    visualization_msgs/MarkerArray: a cylinder, lines on it, and a trace if it has points.
 
-    Fields: position and orientation of the cylinder, orientation of the lines, the trace's points.
+    Fields: position and orientation of the cylinder, orientation of the lines, points of the
+    trace.
 
     size : diameters and height of the cylinder [m]
     lines : x, y and z of begin and end of each line, in the body frame [m]
     line_width : [m]; the trace is half as wide
     """
-    writer = CdrWriter()
-    writer.append('I', 3 if trace_points else 2)
-    _marker(writer, frame_id, 'body', CYLINDER, size, BODY_COLOR, 'position', 'orientation')
-    _marker(writer, frame_id, 'axis', LINE_LIST, (line_width, 0.0, 0.0), AXIS_COLOR,
-            'orientation', points=lines)
+    writer = CdrWriter().append('I', 3 if trace_points else 2)
+    _begin(writer, frame_id, 'body', CYLINDER).field(3).field(4)
+    _end(writer, size, BODY_COLOR, 0)
+    _begin(writer, frame_id, 'axis', LINE_LIST).append('d', *ORIGIN).field(4)
+    _end(writer, (line_width, 0.0, 0.0), AXIS_COLOR, len(lines) // 3, lines)
     if trace_points:
-        _marker(writer, frame_id, 'trace', LINE_STRIP, (0.5 * line_width, 0.0, 0.0), TRACE_COLOR,
-                'points', points=3 * trace_points * (0.0,))
+        _begin(writer, frame_id, 'trace', LINE_STRIP).append('d', *ORIGIN, *NO_ROTATION)
+        _end(writer, (0.5 * line_width, 0.0, 0.0), TRACE_COLOR, trace_points)
     return Template(writer)
 
 
-def _marker(writer: CdrWriter, frame_id: str, namespace: str, kind: int, scale: Sequence[float],
-            color: Sequence[float], *fields: str, points: Sequence[float] = ()) -> None:
-    """Append a visualization_msgs/Marker whose `fields` differ from message to message."""
-    def numbers(name: str, *values: float) -> None:
-        if name in fields:
-            writer.field(len(values))
-        else:
-            writer.append('d', *values)
+def _begin(writer: CdrWriter, frame_id: str, namespace: str, kind: int) -> CdrWriter:
+    """Append the parts of a visualization_msgs/Marker before its pose."""
+    # id, type, action: add or modify
+    return writer.header(frame_id).string(namespace).append('i', 0, kind, 0)
 
-    writer.header(frame_id)
-    writer.string(namespace)
-    writer.append('i', 0, kind, 0)                          # id, type, action: add, or modify
-    numbers('position', 0.0, 0.0, 0.0)
-    numbers('orientation', 0.0, 0.0, 0.0, 1.0)
-    writer.append('d', *scale)
-    writer.append('f', *color)
+
+def _end(writer: CdrWriter, scale: Sequence[float], color: Sequence[float], count: int,
+         points: Sequence[float] = ()) -> None:
+    """Append the parts of a Marker behind its pose; `count` points that are not given: a field."""
+    writer.append('d', *scale).append('f', *color)
     writer.append('I', 0, 0)                                # lifetime: for ever
     writer.append('?', False)                               # frame_locked
-    writer.append('I', len(points) // 3)
-    numbers('points', *points)
+    writer.append('I', count)
+    if points:
+        writer.append('d', *points)
+    elif count:
+        writer.field(3 * count)
     writer.append('I', 0)                                   # colors
     writer.string('')                                       # texture_resource
     writer.append('I', 0, 0)                                # texture: stamp, frame, format, data
@@ -169,6 +144,4 @@ def _marker(writer: CdrWriter, frame_id: str, namespace: str, kind: int, scale: 
 
 def string(text: str) -> bytes:
     """Return a serialized std_msgs/String."""
-    writer = CdrWriter()
-    writer.string(text)
-    return bytes(writer.buffer)
+    return bytes(CdrWriter().string(text).buffer)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The random numbers of the sensors.
+Random numbers of the sensors.
 
-Each depends on the seed, on what it is for, and on the number of its sample or on its time; never
-on what was drawn before.  A jump in time draws as few numbers as the next block does.
+A number depends on the seed, on its purpose, and on the number or the time of its sample, not on
+what was drawn before.  A jump in time therefore draws as few numbers as the next block does.
 """
 
 import enum
@@ -14,46 +14,44 @@ from functools import lru_cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-# Samples as columns (columns, n), or as rows (n, columns).
-Rows = NDArray[np.float64]
-# A path changes this often, whatever the rate of its sensor.
+# Step of the paths, whatever the rate of the sensor is.
 STEP_NS = 1_000_000
-# Random numbers are drawn for so many samples, or steps of a path, together: a power of two.
+# Number of samples, or steps of a path, whose random numbers are drawn together: a power of two.
 DRAWN_TOGETHER = 512
-# Correlation times of a flicker grow by this factor.
+# Ratio of the correlation times of two neighbouring parts of a flicker noise.
 SPACING = 8.0
 
 
 class Purpose(enum.IntEnum):
-    """What a random number is for: those of two purposes are independent."""
+    """What a random number is used for; numbers for different purposes are independent."""
 
     WHITE, TURN_ON, WALK, GAUSS_MARKOV, FLICKER, ORIENTATION = range(6)
     TIMING, MAG_WHITE, MAG_WALK = range(6, 9)
 
 
-def white(seed: int, purpose: Purpose, numbers: NDArray[np.int64], columns: int) -> Rows:
-    """Return normal numbers (columns, n) of the samples of these ascending numbers."""
-    return _columns(partial(_normal, seed, purpose, columns=columns), numbers)
+def white(seed: int, purpose: Purpose, numbers: NDArray[np.int64], columns: int,
+          ) -> NDArray[np.float64]:
+    """Return standard normal numbers (columns, n) for samples with ascending numbers (n,)."""
+    return _gathered(partial(_normal, seed, purpose, columns=columns), numbers)
 
 
-def constant(seed: int, purpose: Purpose, columns: int) -> Rows:
-    """Return a normal number for each column, (columns, 1)."""
+def constant(seed: int, purpose: Purpose, columns: int) -> NDArray[np.float64]:
+    """Return a standard normal number for each column, (columns, 1)."""
     return _normal(seed, purpose, 0, columns, count=1).T
 
 
 @dataclass(frozen=True)
 class Path:
     """
-    Independent random paths in time, one for each column: sums of Gauss-Markov processes.
+    Independent random functions of time, each a sum of Gauss-Markov processes.
 
-    times : correlation time [s] of each part and column, parts x columns; inf: a random walk
-        from 0, else the part is stationary
-    scales : standard deviation of each part and column; density of a random walk [1/sqrt(s)]
+    times : correlation time [s] of each process, parts x columns; inf for a random walk from 0,
+        all others are stationary
+    scales : standard deviation of each process; of a random walk, its density [1/sqrt(s)]
 
-    The steps have the exact law of the process, whatever the correlation time is (D. Gillespie,
-    "Exact numerical simulation of the Ornstein-Uhlenbeck process and its integral", Phys. Rev. E
-    54 (1996) 2084).  Half-way between two times that are known, a path has the law that follows
-    from both (P. Levy's construction of Brownian motion).
+    Steps are exact for any correlation time (D. Gillespie, "Exact numerical simulation of the
+    Ornstein-Uhlenbeck process and its integral", Phys. Rev. E 54 (1996) 2084).  Values between
+    two known ones are those of the Brownian bridge, by bisection (P. Levy's construction).
     """
 
     seed: int
@@ -61,12 +59,12 @@ class Path:
     times: tuple[tuple[float, ...], ...]
     scales: tuple[tuple[float, ...], ...]
 
-    def at(self, t_ns: NDArray[np.int64]) -> Rows:
-        """Return the paths at ascending times >= 0 [ns], (columns, n)."""
-        return _columns(partial(_path, self), t_ns // STEP_NS)
+    def at(self, t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the values (columns, n) at ascending times (n,) >= 0 [ns]."""
+        return _gathered(partial(_path, self), t_ns // STEP_NS)
 
-    def law(self, steps: int) -> tuple[Rows, Rows]:
-        """Return the decay over so many steps, and the variance that the path gains meanwhile."""
+    def law(self, steps: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the decay of each process over a number of steps, and the variance it gains."""
         times, seconds = np.array(self.times), steps * STEP_NS * 1e-9
         return np.exp(-seconds / times), np.where(
             np.isinf(times), seconds, -np.expm1(-2.0 * seconds / times))
@@ -74,21 +72,23 @@ class Path:
 
 class SensorNoise:
     """
-    White noise, numbered by sample, and the bias, a path in time, of a sensor.
+    The noise of a sensor: white noise, numbered by sample, and a bias, which is a path in time.
 
-    deviation, offset : (columns, 1) standard deviation of the white noise, constant bias
+    deviation : standard deviation of the white noise, (columns, 1)
+    offset : constant part of the bias, (columns, 1)
     """
 
-    def __init__(self, seed: int, purpose: Purpose, period_ns: int, deviation: Rows, offset: Rows,
-                 paths: Sequence[Path]) -> None:
+    def __init__(self, seed: int, purpose: Purpose, period_ns: int,
+                 deviation: NDArray[np.float64], offset: NDArray[np.float64],
+                 paths: Sequence[Path] = ()) -> None:
         self._seed, self._purpose, self._period_ns = seed, purpose, period_ns
-        # + 0.0: no bias is -0.
+        # Adding 0.0 turns -0.0 into 0.0.
         self._deviation, self._offset, self._paths = deviation, offset + 0.0, paths
-        self._newest: tuple[range, Rows, Rows] = range(0), offset, offset
+        self._newest = range(0), offset, offset
 
-    def at(self, times: range) -> tuple[Rows, Rows]:
+    def at(self, times: range) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return white noise and bias at these times [ns], (columns, n) or (columns, 1) each."""
-        if self._newest[0] != times:      # streams of one rate ask for the same ones
+        if self._newest[0] != times:      # streams of one rate ask for the same times
             t_ns = np.arange(times.start, times.stop, times.step)
             noise, bias = np.zeros_like(self._deviation), self._offset
             if self._deviation.any():
@@ -102,11 +102,11 @@ class SensorNoise:
 
 def flicker_parts(shortest: float, longest: float) -> Sequence[tuple[float, float]]:
     """
-    Return correlation time [s] and standard deviation of some Gauss-Markov processes.
+    Return correlation times [s] and standard deviations of some Gauss-Markov processes.
 
-    The Allan deviation of their sum is 1 from `shortest` to `longest` [s], within 6 %.  Each
-    process has its largest Allan variance at 1.89 correlation times; the variances are those with
-    which the sum is 1 at all these averaging times.
+    The Allan deviation of their sum is 1 within 6 % for averaging times from `shortest` to
+    `longest` [s].  The Allan variance of each process has its maximum at 1.89 correlation times;
+    there the sum is exactly 1.
     """
     count = 1 + round(np.log(longest / shortest) / np.log(SPACING))
     tau = (np.geomspace(shortest, longest, count) if count > 1
@@ -117,7 +117,7 @@ def flicker_parts(shortest: float, longest: float) -> Sequence[tuple[float, floa
     return list(zip(times.tolist(), np.sqrt(variances).tolist(), strict=True))
 
 
-def gauss_markov_allan_variance(ratio: Rows) -> Rows:
+def gauss_markov_allan_variance(ratio: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     Return the Allan variance of a Gauss-Markov process of variance 1.
 
@@ -125,14 +125,15 @@ def gauss_markov_allan_variance(ratio: Rows) -> Rows:
 
     (IEEE Std 952-1997, annex C, with the variance q^2 T/2.)
     """
-    whole = 2.0 / ratio * (1.0 - (3.0 - 4.0 * np.exp(-ratio) + np.exp(-2.0 * ratio))
-                           / (2.0 * ratio))
-    # There its terms cancel.
-    return np.where(ratio < 1e-3, ratio * (2.0 / 3.0 - 0.5 * ratio), whole)
+    closed = 2.0 / ratio * (1.0 - (3.0 - 4.0 * np.exp(-ratio) + np.exp(-2.0 * ratio))
+                            / (2.0 * ratio))
+    # The closed form cancels at small ratios; use its series there.
+    return np.where(ratio < 1e-3, ratio * (2.0 / 3.0 - 0.5 * ratio), closed)
 
 
-def _columns(block: Callable[[int], Rows], numbers: NDArray[np.int64]) -> Rows:
-    """Return the samples of these ascending numbers, (columns, n), from blocks of them."""
+def _gathered(block: Callable[[int], NDArray[np.float64]], numbers: NDArray[np.int64],
+              ) -> NDArray[np.float64]:
+    """Return samples (columns, n) by ascending numbers, from blocks (DRAWN_TOGETHER, columns)."""
     edges = np.flatnonzero(np.diff(numbers // DRAWN_TOGETHER)) + 1
     return np.concatenate([block(int(part[0]) // DRAWN_TOGETHER)[part % DRAWN_TOGETHER]
                            for part in np.split(numbers, edges)]).T
@@ -140,11 +141,12 @@ def _columns(block: Callable[[int], Rows], numbers: NDArray[np.int64]) -> Rows:
 
 @lru_cache(16)
 def _normal(seed: int, purpose: Purpose, number: int, columns: int,
-            count: int = DRAWN_TOGETHER, of_ends: bool = False) -> Rows:
+            count: int = DRAWN_TOGETHER, of_ends: bool = False) -> NDArray[np.float64]:
     """
-    Draw normal numbers (count, columns) that depend on nothing else that is drawn.
+    Return standard normal numbers (count, columns) that depend on the arguments alone.
 
-    Philox is counter-based (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC11).
+    Philox is a counter-based generator (J. Salmon et al., "Parallel random numbers: as easy as 1,
+    2, 3", SC11).
     """
     counter = [0, int(of_ends), int(purpose), number]
     return np.random.Generator(np.random.Philox(key=seed, counter=counter)
@@ -152,47 +154,49 @@ def _normal(seed: int, purpose: Purpose, number: int, columns: int,
 
 
 @lru_cache(8)
-def _path(path: Path, block: int) -> Rows:
-    """Return the paths in a block of steps, (512, columns), between its ends."""
+def _path(path: Path, block: int) -> NDArray[np.float64]:
+    """Return the values of a path at the steps of a block, (DRAWN_TOGETHER, columns)."""
     parts, columns = np.shape(path.times)
     normal = _normal(path.seed, path.purpose, block, parts * columns).reshape(-1, parts, columns)
     steps = np.empty((DRAWN_TOGETHER + 1, parts, columns))
-    steps[0], steps[-1] = _end(path, block), _end(path, block + 1)
+    steps[0], steps[-1] = _begin(path, block), _begin(path, block + 1)
     apart = DRAWN_TOGETHER // 2
     while apart:
         steps[apart::2 * apart] = _between(path, apart, steps[:-1:2 * apart],
                                            steps[2 * apart::2 * apart], normal[apart::2 * apart])
         apart //= 2
     steps[:-1] *= path.scales
-    total: Rows = steps[:-1, 0]
-    for part in range(1, parts):
+    total: NDArray[np.float64] = steps[:-1, 0]
+    for part in range(1, parts):        # np.sum may add in another order
         total = total + steps[:-1, part]
     return total
 
 
 @lru_cache(256)
-def _end(path: Path, block: int) -> Rows:
+def _begin(path: Path, block: int) -> NDArray[np.float64]:
     """
-    Return the parts of a path where a block begins, by way of some log2(block) others.
+    Return the processes of a path where a block begins, (parts, columns).
 
-    Those at powers of two follow from one another, all others lie half-way between two.
+    The block with the number 2^k follows from the block 2^(k-1).  Every other block is half-way
+    between two with fewer digits, so that some log2(block) values are computed.
     """
     shape = np.shape(path.times)
-    normal: Rows = _normal(path.seed, path.purpose, block, shape[0] * shape[1], 1, True
-                           ).reshape(shape)
+    normal: NDArray[np.float64] = _normal(path.seed, path.purpose, block, shape[0] * shape[1], 1,
+                                          True).reshape(shape)
     if block == 0:
         return np.where(np.isinf(path.times), 0.0, normal)
-    apart = block & -block          # the largest power of two that divides it
+    apart = block & -block          # the largest power of two that divides the number
     if block == apart:
         before = block // 2
         decay, gained = path.law((block - before) * DRAWN_TOGETHER)
-        return decay * _end(path, before) + np.sqrt(gained) * normal
-    return _between(path, apart * DRAWN_TOGETHER, _end(path, block - apart),
-                    _end(path, block + apart), normal)
+        return decay * _begin(path, before) + np.sqrt(gained) * normal
+    return _between(path, apart * DRAWN_TOGETHER, _begin(path, block - apart),
+                    _begin(path, block + apart), normal)
 
 
-def _between(path: Path, steps: int, before: Rows, after: Rows, normal: Rows) -> Rows:
-    """Return the parts of a path half-way between two states, so many steps from either."""
+def _between(path: Path, steps: int, before: NDArray[np.float64], after: NDArray[np.float64],
+             normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the processes half-way between two known values, `steps` away from each."""
     decay, gained = path.law(steps)
     square = 1.0 + decay * decay
     return decay / square * (before + after) + np.sqrt(gained / square) * normal

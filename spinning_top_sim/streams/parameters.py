@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Every parameter of a simulation: name, default, unit, range, and when a change takes effect.
+The parameters of a simulation: name, default, unit, range, and when a change takes effect.
 
-One table serves the node (descriptors, validation), the command line and the documentation.
-The defaults are the cusp scene: a bicycle wheel on a pivot, spun about its axis and let go.
+The node (descriptors, validation), the command line and the documentation use the same table.
+The defaults describe the cusp scene: a bicycle wheel on a pivot, spun about its axis and let go.
 """
 
 import contextlib
@@ -32,11 +32,11 @@ class Effect(enum.Enum):
 @dataclass(frozen=True)
 class Parameter:
     """
-    One parameter.  Its type is that of the default; None is a double that may be left unset.
+    One parameter.  Its type is the type of the default; a default of None is an unset double.
 
-    minimum, maximum : of a number, or of each number in a list
+    minimum, maximum : bounds of a number, or of each number in a list
     above : exclusive lower bound
-    smallest : of what is not 0
+    smallest : smallest number that is allowed besides 0
     choices : allowed strings
     """
 
@@ -53,11 +53,11 @@ class Parameter:
 
     @property
     def is_double(self) -> bool:
-        """Whether the value is a double (an integer is taken for one)."""
+        """Whether the value is a double; an integer is converted."""
         return self.default is None or isinstance(self.default, float)
 
     def describe(self, range_too: bool = True) -> str:
-        """Return text, unit, range and effect as one line."""
+        """Return text, unit, range and effect in one line."""
         return '; '.join(filter(None, (
             self.text + (f' [{self.unit}]' if self.unit else ''),
             self.allowed if range_too and (self.choices or self._bounds()) else '',
@@ -70,7 +70,7 @@ class Parameter:
 
     @property
     def allowed(self) -> str:
-        """Return what may be given, in words."""
+        """The allowed values, in words."""
         if self.choices:
             return f'must be one of {", ".join(self.choices)}'
         kind = {bool: 'true or false', int: 'an integer', str: 'a string', float: 'a number',
@@ -81,7 +81,7 @@ class Parameter:
         return f'must be {kind} {self._bounds()}'.rstrip()
 
     def check(self, value: Value) -> Value:
-        """Return the value in its own type.  Raises ValueError with name, value, allowed."""
+        """Return the value in the type of the default.  Raises ValueError if it is not allowed."""
         if value is None and self.default is None:
             return None
         with contextlib.suppress(TypeError, OverflowError):
@@ -94,7 +94,7 @@ class Parameter:
     def _is_allowed(self, value: Value) -> bool:
         default = self.default
         if isinstance(default, tuple):
-            if isinstance(value, str | bytes | Mapping | Set):       # no lists, though iterable
+            if isinstance(value, str | bytes | Mapping | Set):       # iterable, but not lists
                 return False
             if isinstance(default[0], str):
                 return all(isinstance(item, str) for item in value)
@@ -111,7 +111,7 @@ class Parameter:
                 and not (self.smallest and 0 < number < self.smallest))
 
 
-# name, default rate [Hz], on by default, what it is; without a rate of its own it has `imu.rate`
+# Name, default rate [Hz], on by default, description.  Streams with None have the rate `imu.rate`.
 STREAM_DEFAULTS: tuple[tuple[str, float | None, bool, str], ...] = (
     ('pose', 100.0, True, 'pose (geometry_msgs/PoseStamped)'),
     ('joint_states', 100.0, True, 'joint_states (sensor_msgs/JointState)'),
@@ -130,11 +130,11 @@ STREAM_DEFAULTS: tuple[tuple[str, float | None, bool, str], ...] = (
 )
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 HIGHEST_RATE = 10_000.0
-# The motion is kept for a second: the longest interval of an increment, or a mean.
+# Increments and means are taken over at most one second, for which the motion is kept.
 LOWEST_RATE_OF_INTERVALS = 1.0
-# Values of physics up to here have squares and products that doubles hold.
+# Squares and products of physical quantities up to this are within the range of doubles.
 LARGEST = 1e30
-# The longest time of anything [s], three years.
+# Longest time [s], three years.
 LONGEST = 1e8
 
 _at_once = partial(Parameter, effect=Effect.NOW)
@@ -151,7 +151,7 @@ def _stream(name: str, rate: float | None, enabled: bool, text: str) -> Iterator
 
 
 def _axes(kind: str, unit: str, walk_unit: str) -> list[Parameter]:
-    """Return the error model of three axes; names and units as kalibr has them."""
+    """Return the parameters of the errors of three axes, with the names and units of kalibr."""
     errors = [
         _at_reset(f'imu.{kind}_{name}', 0.0, text, unit_text, 0.0, 1e12, smallest=1e-12)
         for name, text, unit_text in (
@@ -174,8 +174,8 @@ def _axes(kind: str, unit: str, walk_unit: str) -> list[Parameter]:
 
 TABLE: tuple[Parameter, ...] = (
     _at_reset('top.mass', 2.0, 'Mass of the top', 'kg', 0.0, LARGEST),
-    _at_reset('top.com_distance', 0.15, 'From the pivot to the centre of mass along the axis, '
-              'signed', 'm', -LARGEST, LARGEST),
+    _at_reset('top.com_distance', 0.15, 'Signed distance from the pivot to the centre of mass '
+              'along the axis', 'm', -LARGEST, LARGEST),
     _at_reset('top.lambda1', 0.123, 'Moment of inertia across the axis, about the pivot',
               'kg m^2', above=0.0, maximum=LARGEST),
     _at_reset('top.lambda3', 0.15, 'Moment of inertia along the axis', 'kg m^2', above=0.0,
@@ -185,7 +185,7 @@ TABLE: tuple[Parameter, ...] = (
     _at_reset('initial.theta_dot', 0.0, 'Nutation rate at the start', 'rad/s', -1e12, 1e12),
     _at_reset('initial.phi', 0.0, 'Precession angle at the start', 'rad', -1e12, 1e12),
     _at_reset('initial.psi', 0.0, 'Spin angle at the start', 'rad', -1e12, 1e12),
-    # These two without a range: the motion decides what is too fast.
+    # No range: the limit depends on the motion.
     _at_once('spin.l3', 1.6, 'Angular momentum along the axis; a change is a command',
               'kg m^2/s'),
     _at_once('spin.lz', None, 'Angular momentum along the vertical; a change is a command; unset: '
@@ -242,9 +242,9 @@ TABLE: tuple[Parameter, ...] = (
     *(_at_reset(f'mag.{name}', 0.0, text, unit, 0.0, 1e3, smallest=1e-18)
       for name, text, unit in (
           ('noise_density', 'White noise of the magnetometer, 0 = none', 'T/sqrt(Hz)'),
-          ('random_walk', 'Random walk of its bias, 0 = none', 'T/s/sqrt(Hz)'),
-          ('range', 'Its largest reading, 0 = unlimited', 'T'),
-          ('resolution', 'Smallest step of its readings, 0 = none', 'T'))),
+          ('random_walk', 'Random walk of the bias of the magnetometer, 0 = none', 'T/s/sqrt(Hz)'),
+          ('range', 'Largest reading of the magnetometer, 0 = unlimited', 'T'),
+          ('resolution', 'Smallest step of the readings of the magnetometer, 0 = none', 'T'))),
     _at_reset('markers.trace_length', 4.0, 'How far back the trace of the tip goes, 0 = no trace',
               's', 0.0, 3600.0),
     _at_reset('markers.trace_points', 200, 'Points of the trace, evenly spaced in time', '', 1,
@@ -264,14 +264,14 @@ TABLE: tuple[Parameter, ...] = (
                   'free', 'bytes', 0, 2 ** 62),
     _at_once('step.count', 1, 'Steps of one ~/step', '', 1, 1_000_000),
     _at_once('step.dt', 0.01, 'Simulated time of one step', 's', 1e-6, 1e3),
-    _at_once('status_period', 1.0, 'Of the status line on the terminal, 0 = none', 's', 0.0,
+    _at_once('status_period', 1.0, 'Period of the status line on the terminal, 0 = none', 's', 0.0,
               LONGEST, smallest=0.01),
 )
 BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in TABLE}
 
 
 def checked(values: Mapping[str, Value]) -> dict[str, Value]:
-    """Return the defaults with these values put in.  Raises ValueError for what is not allowed."""
+    """Return all parameters: these values, else defaults.  Raises ValueError for bad values."""
     result = {parameter.name: parameter.default for parameter in TABLE}
     for name, value in values.items():
         if name == 'pacing':        # in logs of 1.0; it had no effect
@@ -299,13 +299,17 @@ def checked(values: Mapping[str, Value]) -> dict[str, Value]:
 
 
 def top_of(values: Mapping[str, Value]) -> Top:
-    """Return the top that these parameters describe.  Raises ValueError as `Top` does."""
+    """Return the top that these parameters describe.  Raises ValueError like `Top`."""
     return Top(**{name: values[f'top.{name}']
                   for name in ('lambda1', 'lambda3', 'mass', 'com_distance', 'gravity')})
 
 
 def start_state(values: Mapping[str, Value]) -> State:
-    """Return the state to start from; an unset spin.lz is the cusp.  Raises ValueError."""
+    """
+    Return the start state; an unset `spin.lz` is that of the cusp.
+
+    Raises ValueError like `State`.
+    """
     theta, l3, lz = values['initial.theta'], values['spin.l3'], values['spin.lz']
     if lz is None:      # "Analysis of Symmetric Spinning Top" (2023), sect. 4.1 and eq. (33)
         lz = l3 * math.cos(theta)

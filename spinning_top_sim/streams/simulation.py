@@ -27,7 +27,7 @@ from spinning_top_sim.streams.topics import ImuStream, all_streams
 FIRST_STEPS, OFFLINE_STEPS = 500, 2000
 # Offline, a block has so many bytes, but covers no more time than this, for the sake of progress;
 # nor are there more blocks than this.
-OFFLINE_BYTES, LONGEST_OFFLINE_NS, MOST_BLOCKS = 1 << 20, 100 * NANOSECONDS, 20_000
+OFFLINE_BYTES, LONGEST_OFFLINE_NS, MOST_BLOCKS = 4 << 20, 100 * NANOSECONDS, 20_000
 # Turns a second whose phases doubles hold for the shortest run.
 MOST_RATE = MOST_TURNS / SHORTEST_RUN_NS * NANOSECONDS
 

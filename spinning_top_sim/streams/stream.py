@@ -13,6 +13,10 @@ from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
 from spinning_top_sim.streams.path import Path
 
 Result = TypeVar('Result')
+# Messages as rows (n, size): bytes or, of a table, numbers.
+Rows = NDArray[Any]
+# Times (n,) [ns] of messages, and the messages.
+Encoded = tuple[NDArray[np.int64], Rows]
 
 
 class Samples:
@@ -85,8 +89,7 @@ class Stream:
         return range((after_ns // self.period_ns + 1) * self.period_ns, until_ns + 1,
                      self.period_ns)
 
-    def encode(self, samples: Samples, epoch_ns: int,
-               ) -> tuple[NDArray[np.int64], NDArray[Any]]:
+    def encode(self, samples: Samples, epoch_ns: int) -> Encoded:
         """
         Return the messages of samples.
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What goes wrong between a sample and its message: wrong stamps, lost and repeated messages."""
+"""Timing faults of the IMU: wrong stamps, lost messages and repeated messages."""
 
 from collections.abc import Mapping
 from statistics import NormalDist
@@ -11,17 +11,18 @@ from numpy.typing import NDArray
 from spinning_top_sim.streams import noise
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 
-Integers = NDArray[np.int64]
-# Of the period: jitter is cut there, so that no stamp is before that of an earlier sample.
+# Jitter is cut at this share of the period, so that no stamp is before that of an earlier sample.
 MOST_JITTER = 0.45
+FAULTS = ('imu.stamp_offset', 'imu.stamp_jitter', 'imu.clock_drift', 'imu.drop_rate',
+          'imu.duplicate_rate')
 
 
 class Timing:
     """
-    The stamps of an IMU, and how many messages each of its samples becomes.
+    The stamps of an IMU, and the number of messages that are sent for each of its samples.
 
-    The clock of the IMU has an offset, a drift and a jitter.  All three depend on the seed, the
-    number of the sample and its time alone.
+    Offset, drift and jitter of its clock depend on the seed, the number of the sample and its
+    time alone.
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
@@ -29,24 +30,26 @@ class Timing:
         self._offset_ns = round(values['imu.stamp_offset'] * NANOSECONDS)
         self._jitter_ns = values['imu.stamp_jitter'] * NANOSECONDS
         self._drift = values['imu.clock_drift'] * 1e-6
-        # Normal numbers below these: with such a probability.
+        # A standard normal number is below these with the probability of the fault.
         self._dropped_below, self._repeated_below = (
             NormalDist().inv_cdf(rate) if rate else -np.inf
             for rate in (values['imu.drop_rate'], values['imu.duplicate_rate']))
 
-    def stamps_ns(self, epoch_ns: int, t_ns: Integers, period_ns: int) -> Integers:
-        """Return the stamps [ns] of the samples at these times; epoch_ns is that of t = 0."""
+    def stamps_ns(self, epoch_ns: int, t_ns: NDArray[np.int64], period_ns: int,
+                  ) -> NDArray[np.int64]:
+        """Return the stamps (n,) [ns] of samples at times (n,) [ns]; epoch_ns is that of t = 0."""
         jitter, _, _ = self._draw(t_ns, period_ns)
         most = MOST_JITTER * period_ns
         errors = self._drift * t_ns + np.clip(self._jitter_ns * jitter, -most, most)
-        stamps: Integers = epoch_ns + self._offset_ns + t_ns + np.rint(errors).astype(np.int64)
+        stamps: NDArray[np.int64] = (
+            epoch_ns + self._offset_ns + t_ns + np.rint(errors).astype(np.int64))
         return np.clip(stamps, 0, LAST_STAMP_NS)
 
-    def copies(self, t_ns: Integers, period_ns: int) -> Integers:
-        """Return how often the samples at these times are sent: 0, 1 or 2 times."""
+    def copies(self, t_ns: NDArray[np.int64], period_ns: int) -> NDArray[np.int64]:
+        """Return how many messages are sent for each of the samples: 0, 1 or 2."""
         _, drop, repeat = self._draw(t_ns, period_ns)
         return np.where(drop < self._dropped_below, 0,
                         np.where(repeat < self._repeated_below, 2, 1))
 
-    def _draw(self, t_ns: Integers, period_ns: int) -> noise.Rows:
+    def _draw(self, t_ns: NDArray[np.int64], period_ns: int) -> NDArray[np.float64]:
         return noise.white(self._seed, noise.Purpose.TIMING, t_ns // period_ns, 3)

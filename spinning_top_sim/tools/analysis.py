@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column
-from spinning_top_sim.physics.regimes import regime
-from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.physics.top import Top
 from spinning_top_sim.streams.imu import Imu
 
 if TYPE_CHECKING:
@@ -24,9 +23,7 @@ if TYPE_CHECKING:
 DEGREE, WINDOW = 15, 64
 LEAST_SAMPLES = 9.0         # in a nutation, for a spline as good as the data
 RESTS = 1e-9                # a tilt that changes less does not nutate: rounding decides [rad]
-RATE_TOLERANCE = 1e-3       # relative difference between the rates of the data and of the spline
 LARGEST_STEP = 2.5          # between two samples of an angle that can be unwrapped [rad]
-SNAP = 1e-9                 # relative distance within which a motion is taken for a special one
 
 
 class Attitudes:
@@ -37,11 +34,9 @@ class Attitudes:
     rows : (4, n) q(world <- body) as x, y, z, w; then, if the log has them, (3, n) angular
         velocity in the body frame [rad/s]; then, if the log has them, phi and psi, which count
         turns, and phi'
-    time, period : (n,) since the first sample, and the mean time between two samples [s]
     cos2, sin2 : (n,) squares of the cosine and sine of theta/2; near a pole the smaller one has
         more digits
     tip, body_tip : (n,) sin(theta) exp(i phi) and sin(theta) exp(i psi)
-    phi_dot, sin2_rate : (n,) rates of phi and sin2 [1/s], None if the log has no rates
     """
 
     def __init__(self, stamps_ns: NDArray[np.int64], rows: NDArray[np.float64]) -> None:
@@ -54,10 +49,9 @@ class Attitudes:
         up_1, up_2, _ = self.up = attitude.vertical_in_body(self.quaternion)
         self.tip, self.body_tip = tip_x + 1j * tip_y, -up_1 + 1j * up_2
         self.omega = tuple(rows[4:7]) or None
-        self.phi_dot = self.sin2_rate = None
+        self.phi_dot = None
         if self.omega is not None:
             one, two, _ = self.omega
-            self.sin2_rate = 0.5 * (up_2 * one - up_1 * two)
             with np.errstate(invalid='ignore'):     # NaN at a pole
                 self.phi_dot = (one * up_1 + two * up_2) / (up_1 ** 2 + up_2 ** 2)
         self.counts_turns = len(rows) == 10
@@ -134,9 +128,11 @@ class Measured:
     missing: tuple[str, ...]              # why numbers are None
 
 
-def measure(data: Attitudes) -> Measured:
+def measure(data: Attitudes, expected: float | None = None) -> Measured:
     """
     Measure a motion from two or more samples at one rate.
+
+    expected : period of its nutation [s]: too few samples show a slower one
 
     A nutation lasts from one rise of the tip through its middle height to the next.  The tip is
     fastest there, and far from the poles, where phi may jump.
@@ -146,7 +142,11 @@ def measure(data: Attitudes) -> Measured:
     if high - low >= RESTS:
         nutations, begin, end = _crossings(data)
         period = (end - begin) / nutations * data.period if nutations else None
-        reason = 'not one whole nutation' if period is None else _unresolved(data, period)
+        in_one = min(period or math.inf, expected or math.inf) / data.period
+        if in_one < LEAST_SAMPLES:
+            reason = f'{in_one:.1f} samples in a nutation are too few'
+        elif period is None:
+            reason = 'not one whole nutation'
     precession, spin = (None if reason else _mean_rate(data, angle, tip, begin, end)
                         for angle, tip in ((data.phi, data.tip), (data.psi, data.body_tip)))
     if not reason and None in (precession, spin):
@@ -201,21 +201,6 @@ def _crossings(data: Attitudes) -> tuple[int, float, float]:
     return len(rising) - 1, begin, end
 
 
-def _unresolved(data: Attitudes, period: float) -> str:
-    """Return why the samples are too few for a nutation, '' if they are not."""
-    rate, count = data.sin2_rate, len(data.stamps_ns)
-    if rate is not None and count > WINDOW // 2:
-        # Too few samples show a slower nutation than there is; then the rates do not fit.
-        middle = count // 2
-        at = np.arange(middle - WINDOW // 8, middle + WINDOW // 8)
-        difference = _spline(data.sin2, middle)(at, 1) / data.period - rate[at]
-        if np.max(np.abs(difference)) > RATE_TOLERANCE * np.max(np.abs(rate)):
-            return ('a nutation takes only a few samples: '
-                    'the rates in the data are not those of the curve')
-    samples = period / data.period
-    return '' if samples >= LEAST_SAMPLES else f'{samples:.1f} samples in a nutation are too few'
-
-
 def _mean_rate(data: Attitudes, angle: Column, tip: NDArray[np.complex128], begin: float,
                end: float) -> float | None:
     """Return the mean rate of phi or psi [rad/s] between two indices, None if unknown."""
@@ -230,22 +215,3 @@ def _mean_rate(data: Attitudes, angle: Column, tip: NDArray[np.complex128], begi
     ends = np.array([_spline(slow, index)(index) for index in at])
     turned = angle[here] + rate * (at - here) + np.angle(ends * np.conj(slow[here]))
     return float((turned[1] - turned[0]) / ((end - begin) * data.period))
-
-
-def measured_regime(top: Top, data: Attitudes) -> str | None:
-    """Return the name of a motion from its samples, None if they have no rates."""
-    values, rate = data.constants(top), data.sin2_rate
-    if values is None or rate is None:
-        return None
-    l3, lz = float(np.median(values[1])), float(np.median(values[2]))
-    middle = int(np.argmin(np.abs(data.height - np.median(data.height))))
-    sine = float(abs(data.tip[middle]))
-    theta = math.atan2(sine, data.height[middle])
-    theta_dot = 2.0 * float(rate[middle]) / sine if sine >= SNAP else 0.0
-    natural = math.sqrt(top.lambda1 * max(abs(top.gravity_torque), top.lambda1 * theta_dot ** 2))
-    scale = max(abs(l3), abs(lz), natural) * SNAP
-    l3, lz = (0.0 if abs(momentum) < scale else momentum for momentum in (l3, lz))
-    lz = next((pole for pole in (l3, -l3) if abs(lz - pole) < scale), lz)
-    if sine < SNAP:
-        theta, lz = (0.0, l3) if theta < 1.0 else (math.pi, -l3)
-    return regime(top, State(theta=theta, theta_dot=theta_dot, l3=l3, lz=lz), SNAP)

@@ -5,16 +5,12 @@ import argparse
 import contextlib
 import importlib
 import os
-import shutil
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import TextIO
 
 OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130         # argparse uses 2, too
-LINE_EVERY_S = 10.0         # between lines of progress without a terminal
-GAP = '  '                  # before each column of a table
 
 
 def _start(module: str) -> int:
@@ -30,18 +26,12 @@ simulate, inspect, recover, ensemble, examine = (partial(_start, module) for mod
     'tools.simulate', 'tools.inspect', 'tools.recover', 'tools.ensemble', 'exam.command'))
 
 
-class _Version(argparse.Action):
-    """Prints the version.  It is looked up only here, because that takes time."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from spinning_top_sim.recording.provenance import version  # noqa: PLC0415
-        print(parser.prog, version('spinning_top_sim'))
-        parser.exit()
-
-
 def add_version(parser: argparse.ArgumentParser) -> None:
     """Add the option `--version`."""
-    parser.add_argument('--version', action=_Version, nargs=0, help='print the version, then end')
+    from spinning_top_sim.recording.provenance import version  # noqa: PLC0415 - for a fast --help
+
+    parser.add_argument('--version', action='version',
+                        version=f'%(prog)s {version("spinning_top_sim")}')
 
 
 def run(name: str, help_text: str | None, argv: Sequence[str] | None,
@@ -94,20 +84,9 @@ def print_line(text: str, file: TextIO | None = None) -> None:
 @contextlib.contextmanager
 def progress(what: str, total: float, unit: str, *, quiet: bool = False,
              ) -> Iterator[Callable[[float], None]]:
-    """Show progress as a bar or, without a terminal, in lines; yield what takes what is done."""
-    if quiet or not total > 0.0:
+    """Show progress as a bar on a terminal; yield what takes what is done."""
+    if quiet or not total > 0.0 or not sys.stderr.isatty():
         yield lambda done: None
-        return
-    if not sys.stderr.isatty():
-        told_s = time.monotonic()
-
-        def show(done: float) -> None:
-            nonlocal told_s
-            if time.monotonic() - told_s >= LINE_EVERY_S:
-                told_s = time.monotonic()
-                print_line(f'{what} {min(done / total, 1.0):.0%}', sys.stderr)
-
-        yield show
         return
     from tqdm import tqdm  # noqa: PLC0415 - it takes 50 ms
 
@@ -118,20 +97,10 @@ def progress(what: str, total: float, unit: str, *, quiet: bool = False,
 
 
 def table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
-    """
-    Yield the lines of a table; all columns but the first are right-aligned.
-
-    If the table is wider than the terminal, the cells of the first column have their own lines.
-    """
+    """Yield the lines of a table; all columns but the first are right-aligned."""
     cells = [[*map(printable, row)] for row in (head, *rows)]
     first, *widths = (max(map(len, column)) for column in zip(*cells, strict=True))
-    columns = shutil.get_terminal_size((118, 0)).columns        # 118 without a terminal
-    stacked = first + sum(widths) + len(GAP) * (len(widths) + 1) > columns
     yield from ('', title)
     for name, *numbers in cells:
-        start = name.ljust(first)
-        if stacked:
-            yield GAP + name
-            start = ''
         aligned = (number.rjust(wide) for number, wide in zip(numbers, widths, strict=True))
-        yield GAP.join(('', start, *aligned)).rstrip()
+        yield '  '.join(('', name.ljust(first), *aligned)).rstrip()

@@ -4,30 +4,15 @@ Simulate many runs from one specification into a dataset: the samples of all
 runs in Parquet files, or a log (MCAP) a run. Dask shares the runs among the
 processes of this machine, or of a cluster.
 
-A specification is YAML:
-
-  runs: 10000                                # numbers 0 to 9999
-  seed: 7                                    # of all that is drawn
-  duration: 10.0                             # of a run [s]
-  params: [config/wavy.yaml, {solver.method: exact}]
-  sample:                                    # what differs from run to run
-    initial.theta: {uniform: [0.2, 1.2]}     # [low, high]
-    spin.l3: {normal: [1.6, 0.1]}            # [mean, deviation]
-    imu.gyroscope_noise_density: {log_uniform: [1.0e-4, 1.0e-2]}
-    params: {values: [config/imu/bmi088.yaml, config/imu/adis16470.yaml]}
-  streams: [imu, ground_truth_imu]           # default: those that are enabled
-  format: parquet                            # or mcap
-
-Lists of values make a grid, which the runs go through in turn. Files are
-sought beside the specification, else here. The dataset is DIR/data, and
-DIR/manifest.json has the specification, versions, and the runs that failed.
-The same command again computes the files that are missing, such as after an
-interruption. A run depends on the specification and its number alone:
+docs/howto.md describes the specification and the dataset, and
+examples/ensemble.yaml is one. A run depends on the specification and its
+number alone. The same command again computes the files that are missing, such
+as after an interruption.
 
   ensemble DIR --row K -o one.mcap           # computes run K again
 
 exit codes:
-  0    done; runs that failed are told, and the manifest has the reasons
+  0    done; the manifest has the reasons of runs that failed
   1    a file cannot be read or written, or the cluster is lost
   2    wrong arguments or specification
   130  interrupted
@@ -35,7 +20,6 @@ exit codes:
 
 import argparse
 import json
-import re
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
@@ -58,8 +42,7 @@ from spinning_top_sim.tools.ensemble_part import (
 from spinning_top_sim.tools.recorded_run import ODD, reason_of
 
 MANIFEST = 'manifest.json'
-NEW_MANIFEST = f'{MANIFEST}.new'        # while it is written
-FORMAT = 2                              # of the manifest; 1 has the hashes of the files, too
+FORMAT = 2                  # of the manifest
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -75,26 +58,20 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help='the specification, or with --row the folder of a dataset')
     add('-o', '--output', metavar='DIR', required=True, type=Path,
         help='folder of the dataset; with --row a new .mcap or .parquet file')
-    add('--workers', metavar='N', type=int,
+    workers = parser.add_mutually_exclusive_group()
+    workers.add_argument('--workers', metavar='N', type=int,
         help='processes on this machine; default: one a core')
-    add('--scheduler', metavar='ADDRESS',
+    workers.add_argument('--scheduler', metavar='ADDRESS',
         help='of a Dask cluster, such as tcp://host:8786, whose machines all have the package and '
         'DIR')
     add('--overwrite', action='store_true', help='replace the dataset in DIR')
-    # Version 1.0 needed it to go on with a dataset.
-    add('--resume', action='store_true', help=argparse.SUPPRESS)
     add('--row', metavar='K', type=int, help='compute run K alone')
     add('--quiet', action='store_true', help='no progress, no summary')
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    if arguments.workers is not None and not 1 <= arguments.workers <= 1024:
-        raise ValueError(f'--workers {arguments.workers}: must be from 1 to 1024')
-    if arguments.workers is not None and arguments.scheduler is not None:
-        raise ValueError('--workers: must not be given with --scheduler, which has its own')
-    if arguments.scheduler is not None and not re.fullmatch(
-            r'\w+://.+:\d+', arguments.scheduler):
-        raise ValueError(f'--scheduler {arguments.scheduler}: must be such as tcp://host:8786')
+    if arguments.workers is not None and arguments.workers < 1:
+        raise ValueError(f'--workers {arguments.workers}: must be >= 1')
     try:
         return (_compute_dataset if arguments.row is None else _compute_row)(arguments)
     except ImportError as error:
@@ -113,29 +90,26 @@ def _compute_dataset(arguments: argparse.Namespace) -> int:
         'format': FORMAT, 'complete': False, 'versions': versions(),
         'specification': asdict(specification), 'failed': {}}))
     if (folder / MANIFEST).exists():
-        _check_same(folder, manifest, overwrite=arguments.overwrite)
+        difference = _difference(_read_manifest(folder), manifest)
+        if difference and not arguments.overwrite:
+            raise ValueError(f'{folder} has another ensemble: {difference}: choose a new folder, '
+                             'or --overwrite')
     elif folder.exists() and any(folder.iterdir()):
         raise ValueError(f'{folder} exists and has no {MANIFEST}: choose a new folder')
     failed: dict[str, str] = {}
-    try:
-        with (cli.progress('computed', specification.runs, 'runs', quiet=arguments.quiet) as show,
-              ensemble_cluster.connect(arguments.workers, arguments.scheduler) as client):
-            folder.mkdir(parents=True, exist_ok=True)
-            for name in (DATA, UNFINISHED):
-                if arguments.overwrite:
-                    shutil.rmtree(folder / name, ignore_errors=True)
-                (folder / name).mkdir(exist_ok=True)
-            _write_manifest(folder, manifest)
-            task = partial(compute_part, specification, folder=str(folder), wanted=versions())
-            parts = ensemble_cluster.compute(client, task, range(specification.parts))
-            for done, reasons in enumerate(parts, start=1):
-                failed.update(reasons)
-                show(min(done * specification.runs_per_part, specification.runs))
-    except (KeyboardInterrupt, EnsembleError, RecordingError, OSError):
-        if folder.exists():
-            cli.print_line(f'ensemble: {arguments.output} holds what is complete: the same '
-                           'command goes on', sys.stderr)
-        raise
+    with (cli.progress('computed', specification.runs, 'runs', quiet=arguments.quiet) as show,
+          ensemble_cluster.connect(arguments.workers, arguments.scheduler) as client):
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in (DATA, UNFINISHED):
+            if arguments.overwrite:
+                shutil.rmtree(folder / name, ignore_errors=True)
+            (folder / name).mkdir(exist_ok=True)
+        _write_manifest(folder, manifest)
+        task = partial(compute_part, specification, folder=str(folder), wanted=versions())
+        parts = ensemble_cluster.compute(client, task, range(specification.parts))
+        for done, reasons in enumerate(parts, start=1):
+            failed.update(reasons)
+            show(min(done * specification.runs_per_part, specification.runs))
     failed = dict(sorted(failed.items(), key=lambda item: int(item[0])))
     _write_manifest(folder, {**manifest, 'complete': True, 'failed': failed})
     shutil.rmtree(folder / UNFINISHED, ignore_errors=True)  # a killed command's worker may write
@@ -148,25 +122,14 @@ def _compute_dataset(arguments: argparse.Namespace) -> int:
     return cli.OK
 
 
-def _check_same(folder: Path, manifest: Mapping[str, Any], *, overwrite: bool) -> None:
-    """Raise ValueError if a folder has another ensemble that must not be overwritten."""
-    old = _read_manifest(folder)
-    for what in () if overwrite else ('specification', 'versions'):
-        difference = _difference(old[what], manifest[what])
-        if difference:
-            raise ValueError(f'{folder} has another {what}: {difference}: choose a new folder, or '
-                             '--overwrite')
-
-
 def _compute_row(arguments: argparse.Namespace) -> int:
     path: Path = arguments.specification
     if path.is_dir():
         manifest = _read_manifest(path)
-        specification = ensemble_spec.parse(manifest['specification'], str(path / MANIFEST))
-        difference = _difference(manifest['versions'], versions())
-        if difference:
-            cli.print_line(f'ensemble: the last bits may differ: the dataset is of {difference}',
-                           sys.stderr)
+        specification = ensemble_spec.parse(manifest['specification'], str(path))
+        if manifest['versions'] != versions():
+            cli.print_line('ensemble: the last bits may differ: the dataset is of other versions, '
+                           f'{manifest["versions"]}', sys.stderr)
     else:
         specification = ensemble_spec.read(path)
     if not 0 <= arguments.row < specification.runs:
@@ -182,27 +145,25 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
     path = folder / MANIFEST
     try:
         manifest: dict[str, Any] = json.loads(path.read_bytes())
-        is_one = manifest['format'] in (1, FORMAT) and all(
-            isinstance(manifest[name], dict) for name in ('versions', 'specification'))
+        ensemble_spec.parse(manifest['specification'], 'specification')
+        return {**manifest, 'versions': dict(manifest['versions'])}
     except ODD as error:
         raise ValueError(f'{path} is no manifest of an ensemble: {reason_of(error)}') from error
-    if not is_one:
-        raise ValueError(f'{path} is no manifest of an ensemble')
-    return manifest
 
 
 def _write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     """Write the manifest, which is never there in part."""
-    written = folder / NEW_MANIFEST
+    written = folder / f'{MANIFEST}.new'
     written.write_text(json.dumps(manifest, indent=1), encoding='utf-8')
     written.replace(folder / MANIFEST)
 
 
 def _difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    """Return in words which entries differ; the order in them counts, as in a grid of samples."""
+    """Return in words what differs; the order in entries counts, as in a grid of samples."""
     return ', '.join(
-        f'{name} = {old.get(name)!r}, not {new.get(name)!r}' for name in {**old, **new}
-        if json.dumps(old.get(name)) != json.dumps(new.get(name)))
+        f'{name} = {old[what].get(name)!r}, not {new[what].get(name)!r}'
+        for what in ('specification', 'versions') for name in {**old[what], **new[what]}
+        if json.dumps(old[what].get(name)) != json.dumps(new[what].get(name)))
 
 
 if __name__ == '__main__':

@@ -7,7 +7,6 @@ import contextlib
 import logging
 import os
 import signal
-import uuid
 from collections.abc import Callable, Iterable, Iterator
 from multiprocessing import resource_tracker
 from typing import TypeVar
@@ -38,12 +37,17 @@ def connect(workers: int | None, scheduler: str | None) -> Iterator[distributed.
         if scheduler is None:
             # The profile that Dask keeps grows with time.
             stack.enter_context(dask.config.set({'distributed.worker.profile.enabled': False}))
-            with _interrupts_blocked():
+            resource_tracker.ensure_running()   # if it started later, it would unblock SIGINT
+            # A terminal sends Ctrl-C to the workers, too, but only this process reacts.
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            try:
                 # No dashboard, and no port that other machines can reach.
                 address: object = stack.enter_context(distributed.LocalCluster(
                     n_workers=workers or len(os.sched_getaffinity(0)), threads_per_worker=1,
                     host=LOOPBACK, dashboard_address=f'{LOOPBACK}:0',
                     scheduler_kwargs={'dashboard': False}, silence_logs=logging.CRITICAL))
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
         else:
             address = scheduler
         try:
@@ -55,21 +59,6 @@ def connect(workers: int | None, scheduler: str | None) -> Iterator[distributed.
         yield client
 
 
-@contextlib.contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """
-    Start threads and processes with SIGINT blocked.
-
-    A terminal sends Ctrl-C to the workers, too, but only this process reacts.
-    """
-    resource_tracker.ensure_running()       # if it started later, it would unblock the signal
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
 def compute(client: distributed.Client, task: Callable[[int], Result],
             numbers: Iterable[int]) -> Iterator[Result]:
     """
@@ -78,10 +67,8 @@ def compute(client: distributed.Client, task: Callable[[int], Result],
     If a worker is killed, another one computes its task again.  Raises what a task raises, and
     EnsembleError if the scheduler is lost, or if a task kills several workers.
     """
-    # A cluster may have the tasks of several ensembles.
-    results = distributed.as_completed(
-        client.map(task, list(numbers), key=f'ensemble-{uuid.uuid4().hex}', pure=False),
-        loop=client.loop)
+    results = distributed.as_completed(client.map(task, list(numbers), pure=False),
+                                       loop=client.loop)
     try:
         for future in results:
             yield future.result()

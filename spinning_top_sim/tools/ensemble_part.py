@@ -2,8 +2,8 @@
 """
 The runs of an ensemble: the samples of one run, and the files of a part of the dataset.
 
-A file is written in a temporary folder and then moved into the dataset, so it is never there in
-part.  A file that is there already is not computed again.
+A file is written in a temporary folder and then moved into the dataset.  A file that is there
+already is not computed again.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.provenance import version
 from spinning_top_sim.streams import journal
-from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
+from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING
@@ -37,9 +37,7 @@ EPOCH_NS = NANOSECONDS          # stamp of t = 0, the default of `simulate`
 DATA, UNFINISHED = 'data', 'unfinished'
 # Key of the metadata of a Parquet file: the reasons of the runs that failed, by run.
 FAILED = b'failed'
-# A row group has whole runs with at least so many rows.  Each group costs time, and memory holds
-# one of them.
-ROWS_IN_A_GROUP = 40_000
+ROWS_IN_A_GROUP = 40_000        # of a Parquet file
 # Names of the numbers in the fields of a topic, where they are not x, y, z and w.
 LABELS = {'joint_states': JOINTS, '~/invariants': INVARIANTS, 'ground_truth/imu_timing': TIMING}
 
@@ -63,55 +61,29 @@ def samples(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Samp
     """
     Return the samples of a run by topic, for the streams with these names.
 
-    values : checked parameters with a duration > 0; a stream that they do not enable, or that
-        `record.streams` does not choose, has no samples
+    values : checked parameters; a stream that they do not enable, or that `record.streams` does
+        not choose, has no samples
 
     Raises ValueError if no motion begins, IntegrationError if it ends early.
     """
     simulation = Simulation(values, EPOCH_NS)
     streams = [stream for stream in simulation.streams
                if stream.parameter in names and stream.parameter not in WITHOUT_COLUMNS]
-    blocks: dict[str, list[tuple[NDArray[np.int64], NDArray[np.float64]]]] = {
-        stream.topic: [] for stream in streams}
-
-    for stream in streams:
-        stream.template = _NumbersOnly(stream.template)
+    times = {stream.topic: [np.empty(0, np.int64)] for stream in streams}
+    rows = {stream.topic: [b''] for stream in streams}
     recorded = journal.recorded_streams(streams, values)
     for block in simulation.play(recorded, round(values['duration'] * NANOSECONDS)):
-        for stream, times_ns, rows in block.parts:
-            blocks[stream.topic].append((times_ns, rows))
-    return {stream.topic: _samples(stream, blocks[stream.topic]) for stream in streams}
-
-
-class _NumbersOnly(Template):
-    """A template whose messages are rows of the numbers in their fields, and not bytes."""
-
-    def __init__(self, template: Template) -> None:
-        self.counts = template.counts
-
-    def __len__(self) -> int:
-        return 8 * sum(self.counts)
-
-    def encode(self, stamps_ns: NDArray[np.int64],     # type: ignore[override]
-               *values: Field) -> NDArray[np.float64]:
-        columns = [column for field in values for column in field]
-        rows = np.empty((len(columns), len(stamps_ns)))
-        for row, column in zip(rows, columns, strict=True):
-            row[:] = column
-        return rows.T           # a column is contiguous
-
-
-def _samples(stream: Stream,
-             blocks: Sequence[tuple[NDArray[np.int64], NDArray[np.float64]]]) -> Samples:
-    """Return the samples of a stream from its blocks."""
-    names = _column_names(stream)
-    if not blocks:
-        return np.empty(0, np.int64), {name: np.empty(0) for name in names if name}
-    times, rows = blocks[0] if len(blocks) == 1 else map(np.concatenate, zip(*blocks, strict=True))
-    once = np.diff(times, prepend=-1) > 0       # a faulty sensor sends some samples twice
-    if not once.all():
-        times, rows = times[once], rows[once]
-    return times, {name: column for name, column in zip(names, rows.T, strict=True) if name}
+        for stream, times_ns, messages in block.parts:
+            times[stream.topic].append(times_ns)
+            rows[stream.topic].append(messages.tobytes())
+    found = {}
+    for stream in streams:
+        # A faulty sensor sends some samples twice.
+        times_ns, first = np.unique(np.concatenate(times[stream.topic]), return_index=True)
+        fields = stream.template.decode(b''.join(rows[stream.topic]))
+        columns = zip(_column_names(stream), np.hstack(fields)[first].T, strict=True)
+        found[stream.topic] = times_ns, {name: column for name, column in columns if name}
+    return found
 
 
 def _column_names(stream: Stream) -> Sequence[str]:
@@ -136,12 +108,7 @@ def table(specification: Specification, run: int) -> 'pyarrow.Table':
     import pyarrow as pa  # noqa: PLC0415
 
     found = samples(specification.values(run), specification.kept)
-    if not found:
-        raise ValueError(f'the streams {", ".join(specification.kept)} have no columns: only a '
-                         'log (.mcap) can have them')
-    rows_ns, *others_ns = (times_ns for times_ns, _ in found.values())
-    if not all(np.array_equal(rows_ns, times_ns) for times_ns in others_ns):
-        rows_ns = np.unique(np.concatenate((rows_ns, *others_ns)))
+    rows_ns = np.unique(np.concatenate([times_ns for times_ns, _ in found.values()]))
     columns = {'run': pa.repeat(pa.scalar(run), len(rows_ns)),
                't': pa.array(rows_ns / NANOSECONDS)}
     for name, value in specification.drawn(run).items():
@@ -149,13 +116,11 @@ def table(specification: Specification, run: int) -> 'pyarrow.Table':
         one = pa.scalar(value, pa.float64() if value is None else None)
         columns[name] = pa.repeat(one, len(rows_ns))
     for topic, (times_ns, named) in found.items():
-        missing = None if len(times_ns) == len(rows_ns) else ~np.isin(rows_ns, times_ns)
+        present = np.isin(rows_ns, times_ns)
         for name, numbers in named.items():
-            column = numbers
-            if missing is not None:
-                column = np.zeros(len(rows_ns))
-                column[~missing] = numbers
-            columns[f'{topic}.{name}'] = pa.array(column, mask=missing)
+            column = np.zeros(len(rows_ns))
+            column[present] = numbers
+            columns[f'{topic}.{name}'] = pa.array(column, mask=~present)
     return pa.table(columns)
 
 
@@ -215,25 +180,19 @@ def _write_parquet(specification: Specification, runs: Sequence[int], path: Path
     with contextlib.suppress(OSError, ValueError, KeyError):    # it is missing, or not whole
         failed: dict[str, str] = json.loads(parquet.read_metadata(path).metadata[FAILED])
         return failed
-    failed, group, writer = {}, [], None
-    constant = ['run', *specification.drawn(0)]
-    with contextlib.ExitStack() as stack:
-        for run in runs:
-            try:
-                group.append(table(specification, run))
-            except Exception as error:
-                failed[str(run)] = reason_of(error)
-            if group and (run == runs[-1] or sum(map(len, group)) >= ROWS_IN_A_GROUP):
-                rows = pa.concat_tables(group)
-                writer = writer or stack.enter_context(parquet.ParquetWriter(
-                    str(temporary), rows.schema, compression='zstd', use_dictionary=constant,
-                    write_statistics=constant, use_byte_stream_split=[
-                        name for name in rows.schema.names if name not in constant]))
-                writer.write_table(rows, row_group_size=max(len(rows), 1))
-                group.clear()
-        if writer is not None:
-            writer.add_key_value_metadata({FAILED: json.dumps(failed)})
-    if writer is not None:          # else all runs failed
+    failed, tables = {}, []
+    for run in runs:
+        try:
+            tables.append(table(specification, run))
+        except Exception as error:
+            failed[str(run)] = reason_of(error)
+    if tables:
+        rows = pa.concat_tables(tables).replace_schema_metadata({FAILED: json.dumps(failed)})
+        constant = ['run', *specification.drawn(0)]
+        parquet.write_table(
+            rows, temporary, compression='zstd', row_group_size=ROWS_IN_A_GROUP,
+            use_dictionary=constant, write_statistics=constant, use_byte_stream_split=[
+                name for name in rows.column_names if name not in constant])
         temporary.replace(path)
     return failed
 

@@ -3,7 +3,7 @@
 
 import hashlib
 import math
-import sys
+from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,19 +19,12 @@ from spinning_top_sim.tools.scene_file import parse_section, parse_yaml, read_sc
 FORMATS = ('parquet', 'mcap')
 # Streams that only a log can have, not a table.
 WITHOUT_COLUMNS = ('clock', 'markers')
+DEFAULTS = {parameter.name: parameter.default for parameter in parameters.TABLE}
 STREAMS = tuple(row[0] for row in parameters.STREAM_DEFAULTS)
 # By default a part has at most this many rows, or one run, and a large ensemble at least this
 # many parts.
 ROWS_IN_A_PART, LEAST_PARTS = 200_000, 50
 VALUES, PARAMS = 'values', 'params'
-
-
-def _uniform(random: np.random.Generator, low: float, high: float) -> float:
-    return min(low + (high - low) * random.random(), high)
-
-
-def _normal(random: np.random.Generator, mean: float, deviation: float) -> float:
-    return mean + deviation * random.standard_normal()
 
 
 def _log_uniform(random: np.random.Generator, low: float, high: float) -> float:
@@ -41,10 +34,11 @@ def _log_uniform(random: np.random.Generator, low: float, high: float) -> float:
 # By name: the function that draws from two numbers, what these must be, and the check of that.
 DISTRIBUTIONS: Mapping[str, tuple[Callable[[np.random.Generator, float, float], float], str,
                                   Callable[[float, float], bool]]] = {
-    'uniform': (_uniform, '[low, high] with low <= high and a finite difference',
+    'uniform': (np.random.Generator.uniform,
+                '[low, high] with low <= high and a finite difference',
                 lambda low, high: 0.0 <= high - low < math.inf),
-    'normal': (_normal, '[mean, deviation] with deviation >= 0',
-               lambda mean, deviation: deviation >= 0.0),
+    'normal': (np.random.Generator.normal, '[mean, deviation] with deviation >= 0',
+               lambda mean, deviation: 0.0 <= deviation < math.inf),
     'log_uniform': (_log_uniform, '[low, high] with 0 < low <= high and a finite ratio',
                     lambda low, high: 0.0 < low <= high and high / low < math.inf)}
 
@@ -54,11 +48,6 @@ def generator(seed: int, run: int, name: str) -> np.random.Generator:
     counter = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], 'little')
     return np.random.Generator(np.random.Philox(
         key=np.array([seed, run], np.uint64), counter=np.array([0, 0, 0, counter], np.uint64)))
-
-
-def run_seed(seed: int, run: int) -> int:
-    """Return the parameter `seed` of a run in an ensemble of this seed."""
-    return int(generator(seed, run, 'seed').integers(2 ** 63))
 
 
 @dataclass(frozen=True)
@@ -102,7 +91,8 @@ class Specification:
         span a grid, in which the first list changes fastest; run K takes point K modulo the size
         of the grid.  `params` is the index of the chosen set.
         """
-        found: dict[str, Any] = {'seed': run_seed(self.seed, run)}
+        found: dict[str, Any] = {
+            'seed': int(generator(self.seed, run, 'seed').integers(2 ** 63))}
         point = run
         for name, rule in (self.sample or {}).items():
             (kind, items), = rule.items()
@@ -116,32 +106,17 @@ class Specification:
     def values(self, run: int) -> dict[str, Any]:
         """Return the checked parameters of a run.  Raises ValueError as `parameters.checked`."""
         drawn = self.drawn(run)
-        values = parameters.checked({**self._given(self._sets[drawn.pop(PARAMS, 0)]), **drawn})
-        if not values['duration'] > 0.0:
-            raise ValueError(f'duration = {values["duration"]!r} s: must be > 0')
-        return values
-
-    @property
-    def _sets(self) -> Sequence[Mapping[str, Any]]:
-        """The sets of parameters that a run chooses from."""
-        rule = (self.sample or {}).get(PARAMS, {VALUES: [{}]})
-        return rule[VALUES]
-
-    def _given(self, chosen: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the given parameters of the runs with one of the sets."""
-        given: dict[str, Any] = {}
-        for some in (*self.params, chosen, {'duration': self.duration}):
-            given.update(some)
-        if self.streams:
-            given['record.streams'] = self.streams
-            given.update((f'{name}.enabled', True) for name in self.streams)
-        return given
+        return parameters.checked({**self.alternatives[drawn.pop(PARAMS, 0)], **drawn})
 
     @cached_property
     def alternatives(self) -> Sequence[Mapping[str, Any]]:
-        """The parameters of the runs with each of the sets, without the sampled ones."""
-        defaults = {parameter.name: parameter.default for parameter in parameters.TABLE}
-        return [{**defaults, **self._given(one)} for one in self._sets]
+        """The parameters of the runs with each of the sets in `sample`, before it is applied."""
+        last: dict[str, Any] = {'duration': self.duration}
+        if self.streams:
+            last['record.streams'] = self.streams
+            last.update((f'{name}.enabled', True) for name in self.streams)
+        sets = (self.sample or {}).get(PARAMS, {VALUES: [{}]})[VALUES]
+        return [dict(ChainMap(last, chosen, *reversed(self.params), DEFAULTS)) for chosen in sets]
 
     @cached_property
     def kept(self) -> Sequence[str]:
@@ -151,7 +126,8 @@ class Specification:
         The table of each run has columns for all of them, so that the files form one table.
         """
         return [name for name in STREAMS
-                if any(journal.is_recorded(name, values) for values in self.alternatives)]
+                if (self.format != 'parquet' or name not in WITHOUT_COLUMNS)
+                and any(journal.is_recorded(name, values) for values in self.alternatives)]
 
 
 def read(path: Path) -> Specification:
@@ -168,46 +144,31 @@ def parse(content: object, source: str, folder: Path = Path()) -> Specification:
     Raises OSError, or ValueError, which names the source, the value and what is allowed.
     """
     try:
-        return _parsed(content, folder)
-    except ValueError as error:
+        return _checked(Specification(**content), folder)       # type: ignore[arg-type]
+    except (TypeError, ValueError) as error:
         raise ValueError(f'{source}: {error}') from error
 
 
-def _parsed(content: object, folder: Path) -> Specification:
-    if not isinstance(content, Mapping):
-        raise ValueError('must be a mapping with runs, duration and more')
-    names = Specification.__dataclass_fields__
-    for name in content:
-        if name not in names:
-            raise ValueError(f'{name if isinstance(name, str) else shown(name)}: there is no such '
-                             f'entry; there are {", ".join(names)}')
-    for name in ('runs', 'duration'):
-        if name not in content:
-            raise ValueError(f'{name} is missing')
-    given = {'seed': 0, 'runs_per_part': 0, 'format': FORMATS[0], **content}
-    _check_numbers(given)
-    if given['format'] not in FORMATS:
-        raise ValueError(f'format = {shown(given["format"])}: must be one of {", ".join(FORMATS)}')
-    given['params'] = [_parameter_set(one, 'params', folder)
-                       for one in _list(given.get('params', []), 'params')]
-    given['streams'] = _streams(given.get('streams') or [], given['format'])
-    sample = given.get('sample') or {}
-    if not isinstance(sample, Mapping):
-        raise ValueError(f'sample = {shown(sample)}: must be a mapping of parameters')
-    given['sample'] = {name: _rule(name, rule, folder) for name, rule in sample.items()}
-    specification = Specification(**given)
-    return specification if specification.runs_per_part else replace(
-        specification, runs_per_part=_runs_per_part(specification))
-
-
-def _check_numbers(given: dict[str, Any]) -> None:
+def _checked(given: Specification, folder: Path) -> Specification:
+    """Return the specification with files read, and lists and mappings of checked values."""
     for name, least in (('runs', 1), ('seed', 0), ('runs_per_part', 0)):
-        value = given[name]
+        value = getattr(given, name)
         if type(value) is not int or not least <= value < 2 ** 63:
             raise ValueError(f'{name} = {shown(value)}: must be an integer >= {least}')
-    duration = given['duration'] = parameters.BY_NAME['duration'].check(given['duration'])
+    duration = parameters.BY_NAME['duration'].check(given.duration)
     if not duration > 0.0:
         raise ValueError(f'duration = {duration!r}: must be a number > 0')
+    if given.format not in FORMATS:
+        raise ValueError(f'format = {shown(given.format)}: must be one of {", ".join(FORMATS)}')
+    sample = given.sample or {}
+    if not isinstance(sample, Mapping):
+        raise ValueError(f'sample = {shown(sample)}: must be a mapping of parameters')
+    checked = replace(
+        given, duration=duration, streams=_streams(given.streams, given.format),
+        params=[_parameter_set(one, 'params', folder) for one in _list(given.params, 'params')],
+        sample={name: _rule(name, rule, folder) for name, rule in sample.items()})
+    return checked if checked.runs_per_part else replace(
+        checked, runs_per_part=_runs_per_part(checked))
 
 
 def _list(value: object, what: str) -> Sequence[Any]:
@@ -218,7 +179,7 @@ def _list(value: object, what: str) -> Sequence[Any]:
 
 def _parameter_set(given: object, what: str, folder: Path) -> dict[str, Any]:
     """Return checked parameters from a file or a mapping."""
-    if isinstance(given, str) and '\0' not in given:
+    if isinstance(given, str):
         beside = folder / given
         found = read_scene(beside if beside.exists() else given)
     elif isinstance(given, Mapping):
@@ -230,25 +191,24 @@ def _parameter_set(given: object, what: str, folder: Path) -> dict[str, Any]:
 
 
 def _streams(given: object, file_format: str) -> list[str]:
-    names = list(_list(given, 'streams'))
     allowed = [name for name in STREAMS if file_format != 'parquet' or name not in WITHOUT_COLUMNS]
+    names = list(_list(given, 'streams'))
     for name in names:
         if name not in allowed:
-            raise ValueError(f'streams: {shown(name)}: must be some of {", ".join(allowed)} with '
-                             f'format: {file_format}')
+            raise ValueError(f'streams: {shown(name)}: must be some of {", ".join(allowed)}')
     return names
 
 
 def _rule(name: object, rule: object, folder: Path) -> dict[str, list[Any]]:
     """Return how a parameter is sampled, checked: {distribution: [a, b]}, or {values: [...]}."""
     what, kinds = f'sample: {name}', (*DISTRIBUTIONS, VALUES)
-    if name != PARAMS:
-        _check_sampled(name)
-    if not isinstance(rule, Mapping) or len(rule) != 1:
+    if name != PARAMS and (not parse_section({name: 0.0}, 'sample') or str(name).endswith(
+            ('.enabled', 'record.streams', 'publish_clock'))):
+        raise ValueError(f'{what} must not be sampled: `streams`, or a set of `params`, says '
+                         'which streams there are')
+    if not isinstance(rule, Mapping) or len(rule) != 1 or not set(rule) <= set(kinds):
         raise ValueError(f'{what} = {shown(rule)}: must be one of {", ".join(kinds)} with a list')
     (kind, given), = rule.items()
-    if kind not in kinds:
-        raise ValueError(f'{what}: there is no distribution {kind}; there are {", ".join(kinds)}')
     items = _list(given, f'{what}: {kind}')
     if kind != VALUES:
         return {kind: _bounds(str(name), kind, items)}
@@ -258,39 +218,30 @@ def _rule(name: object, rule: object, folder: Path) -> dict[str, list[Any]]:
                    parameters.BY_NAME[str(name)].check(item) for item in items]}
 
 
-def _check_sampled(name: object) -> None:
-    """Raise ValueError for a parameter that cannot be sampled."""
-    if not parse_section({name: 0.0}, 'sample'):
-        raise ValueError(f'sample: {name} is of ROS and has no effect')
-    if str(name).endswith('.enabled') or name in ('record.streams', 'publish_clock'):
-        raise ValueError(f'sample: {name} must not be sampled: `streams`, or a set of `params`, '
-                         'says which streams there are')
-
-
 def _bounds(name: str, kind: str, items: Sequence[Any]) -> list[float]:
     """Return the two numbers of a distribution, checked."""
     if name == PARAMS or not parameters.BY_NAME[name].is_double:
         raise ValueError(f'sample: {name}: {kind}: must be values, because the parameter is no '
                          'double')
     _, allowed, is_allowed = DISTRIBUTIONS[kind]
-    if not (len(items) == 2 and all(
-            isinstance(item, int | float) and not isinstance(item, bool)
-            and abs(item) <= sys.float_info.max for item in items)
-            and is_allowed(*map(float, items))):
+    try:
+        bounds = [*map(float, items)]
+        fits = is_allowed(*bounds)
+    except (TypeError, ValueError, OverflowError):
+        fits = False
+    if not fits:
         raise ValueError(f'sample: {name}: {kind} = {shown(items)}: must be {allowed}')
-    for bound in items[:1] if kind == 'normal' else items:
+    for bound in bounds[:1] if kind == 'normal' else bounds:
         parameters.BY_NAME[name].check(bound)
-    return [float(item) for item in items]
+    return bounds
 
 
 def _runs_per_part(specification: Specification) -> int:
     """Return how many runs are worth a task."""
-    names = [name for name in specification.kept
-             if specification.format != 'parquet' or name not in WITHOUT_COLUMNS]
-    if not names:
-        raise ValueError(f'no stream is enabled; streams: must name one of {", ".join(STREAMS)}')
+    if not specification.kept:
+        raise ValueError('no stream is enabled')
     values = specification.alternatives[0]
     # A stream without a rate of its own has that of the IMU.
     rows = values['duration'] * max(
-        values.get(f'{name}.rate', values['imu.rate']) for name in names)
+        values.get(f'{name}.rate', values['imu.rate']) for name in specification.kept)
     return max(1, min(int(ROWS_IN_A_PART / max(rows, 1.0)), specification.runs // LEAST_PARTS))

@@ -8,32 +8,24 @@ aerial vehicle datasets", IJRR 35, 2016).  kalibr: imu.yaml (github.com/ethz-asl
 formats"; the matrices as its model scale-misalignment writes them).
 """
 
-from __future__ import annotations
-
 import argparse
-import errno
 import itertools
-import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
+from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.parameters import IDENTITY
 from spinning_top_sim.streams.topics import all_streams
-
-if TYPE_CHECKING:       # simulate writes tables without mcap
-    from spinning_top_sim.recording.reader import LogReader
-    from spinning_top_sim.tools.recorded_run import RunDescription
+from spinning_top_sim.tools.recorded_run import RunDescription
 
 BLOCK = 16384               # messages that are read together
 RAW, BIAS, ODOMETRY = 'imu/data_raw', 'ground_truth/imu_bias', 'ground_truth/imu_odom'
-# Parameter that enables a topic.
-SWITCHES = {RAW: 'imu.enabled', BIAS: 'imu.enabled', ODOMETRY: 'ground_truth_imu_odom.enabled'}
 KALIBR_NEEDS = tuple(f'imu.{kind}_{name}' for kind in ('accelerometer', 'gyroscope')
                      for name in ('noise_density', 'random_walk'))
 EUROC_HEAD = ('#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],'
@@ -42,18 +34,6 @@ EUROC_HEAD = ('#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],
               'b_a_RS_S_x [m s^-2],b_a_RS_S_y [m s^-2],b_a_RS_S_z [m s^-2]\n')
 EUROC_IMU_HEAD = ('#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],'
                   'a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n')
-Reals = NDArray[np.float64]
-
-
-class ExportError(ValueError):
-    """A file cannot be made of this run; the text says why."""
-
-
-class Export(NamedTuple):
-    """A file to write, and its kind, a name in KINDS."""
-
-    kind: str
-    path: Path
 
 
 def add_argument(parser: argparse.ArgumentParser) -> None:
@@ -65,35 +45,32 @@ def add_argument(parser: argparse.ArgumentParser) -> None:
         'existing file is never overwritten')
 
 
-def _parse(text: str) -> Export:
+def _parse(text: str) -> tuple[str, Path]:
     kind, colon, name = text.partition(':')
     if kind not in KINDS or not name:
         raise argparse.ArgumentTypeError(
             f'{text}: must be KIND:FILE with one of {", ".join(KINDS)}, such as tum:truth.tum')
-    return Export(kind, Path(name))
+    return kind, Path(name)
 
 
-def check(exports: Sequence[Export], topics: Collection[str], values: Mapping[str, Any]) -> None:
-    """
-    Check that these files can be made of a run with these topics and parameters.
-
-    Raises ExportError or FileExistsError.
-    """
+def check(exports: Sequence[tuple[str, Path]], topics: Collection[str],
+          values: Mapping[str, Any]) -> None:
+    """Raise ValueError or OSError if files cannot be made of a run with these parameters."""
     for kind, path in exports:
         for topic in KINDS[kind][0]:
             if topic not in topics:
-                raise ExportError(f'--export {kind}: the log has no {topic}: it must be recorded '
-                                  f'with {SWITCHES[topic]}')
+                raise ValueError(f'--export {kind}: the log has no {topic}')
         for name in KALIBR_NEEDS if kind == 'kalibr' else ():
             if not values[name] > 0.0:
-                raise ExportError(f'--export kalibr: {name} = {values[name]!r}: kalibr reads only '
+                raise ValueError(f'--export kalibr: {name} = {values[name]!r}: kalibr reads only '
                                   'what is > 0')
         if path.exists():
-            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+            raise FileExistsError(f'{path}: File exists')
 
 
-def write(reader: LogReader, run: RunDescription, exports: Sequence[Export]) -> Iterator[str]:
-    """Write the files; yield a line about each.  Raises ExportError or OSError."""
+def write(reader: LogReader, run: RunDescription,
+          exports: Sequence[tuple[str, Path]]) -> Iterator[str]:
+    """Write the files; yield a line about each.  Raises ValueError or OSError."""
     check(exports, run.topics, run.values_in_effect)
     for kind, path in exports:
         lines = KINDS[kind][1](reader, run)
@@ -115,7 +92,7 @@ def _tum(reader: LogReader, run: RunDescription) -> Iterator[str]:
 def _euroc(reader: LogReader, run: RunDescription) -> Iterator[str]:
     biases = [block for block in _blocks(reader, run, BIAS) if len(block[0])]
     if not biases:
-        raise ExportError(f'--export euroc: the log has no sample of {BIAS}')
+        raise ValueError(f'--export euroc: the log has no sample of {BIAS}')
     bias_ns = np.concatenate([stamps_ns for stamps_ns, _ in biases])
     bias = np.concatenate([np.hstack(fields[1:]) for _, fields in biases])
     yield EUROC_HEAD
@@ -134,7 +111,7 @@ def _euroc_imu(reader: LogReader, run: RunDescription) -> Iterator[str]:
         yield from _csv(stamps_ns, rates, force)
 
 
-def _csv(stamps_ns: NDArray[np.int64], *columns: Reals) -> Iterator[str]:
+def _csv(stamps_ns: NDArray[np.int64], *columns: NDArray[np.float64]) -> Iterator[str]:
     for stamp_ns, row in zip(stamps_ns.tolist(), np.hstack(columns).tolist(), strict=True):
         yield f'{stamp_ns},{",".join(map(repr, row))}\n'
 
@@ -157,7 +134,7 @@ def _matrix(rows: Sequence[float]) -> list[list[float]]:
 
 
 def _blocks(reader: LogReader, run: RunDescription, topic: str,
-            ) -> Iterator[tuple[NDArray[np.int64], tuple[Reals, ...]]]:
+            ) -> Iterator[tuple[NDArray[np.int64], tuple[NDArray[np.float64], ...]]]:
     """Yield stamps (n,) [ns] and fields of the messages of a stream, block by block."""
     template = next(stream.template for stream in all_streams(run.values_in_effect)
                     if stream.topic == topic)

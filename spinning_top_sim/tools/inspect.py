@@ -19,7 +19,6 @@ import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 
 from spinning_top_sim.recording.damage import count, seconds
@@ -31,7 +30,6 @@ from spinning_top_sim.tools.recorded_run import RunDescription
 from spinning_top_sim.tools.survey import MotionReport, Survey, survey
 from spinning_top_sim.tools.verify import Verdict, verify
 
-MOST_MOTIONS = 12           # in the text
 DEGREES = math.degrees(1.0)
 # Rows of the table of a motion: text, field of Description and Measured, factor.
 ROWS = (('nutation period [s]', 'nutation_period', 1.0),
@@ -48,15 +46,15 @@ ROWS = (('nutation period [s]', 'nutation_period', 1.0),
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
     return cli.run('inspect', __doc__, argv, _add_arguments, _run,
-                   (LogError, OSError, export.ExportError))
+                   (LogError, OSError, ValueError))
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('log', type=Path, help='an MCAP file, of this package or any other')
-    add('--plot', type=partial(_picture, ('.png', '.pdf', '.svg')), metavar='FILE',
+    add('--plot', type=Path, metavar='FILE',
         help='draw a page of figures (.png, .pdf, .svg); needs matplotlib')
-    add('--animate', type=partial(_picture, ('.gif',)), metavar='GIF',
+    add('--animate', type=Path, metavar='GIF',
         help='draw the turning top; needs matplotlib')
     add('--verify', action='store_true',
         help='compute the run again and compare every message byte for byte')
@@ -64,19 +62,12 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--json', action='store_true', help='print everything as JSON')
 
 
-def _picture(endings: tuple[str, ...], name: str) -> Path:
-    """Return the path of a picture.  Raises ArgumentTypeError if it has another ending."""
-    if Path(name).suffix.lower() not in endings:
-        raise argparse.ArgumentTypeError(f'{name}: must end in {" or ".join(endings)}')
-    return Path(name)
-
-
 def _run(arguments: argparse.Namespace) -> int:
     with LogReader(arguments.log) as reader:
         found = survey(reader)
         verdict = _verified(arguments, reader, found) if arguments.verify else None
         if arguments.export and found.run is None:
-            raise export.ExportError(f'--export: {found.foreign_reason}')
+            raise ValueError(f'--export: {found.foreign_reason}')
         exported = list(export.write(reader, found.run, arguments.export)) if found.run else []
     if arguments.json:
         print(json.dumps(_as_json(found, verdict), indent=2, allow_nan=False))
@@ -112,10 +103,11 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> bool:
             raise ValueError('nothing to draw: no attitude of a top in this log')
         from spinning_top_sim.tools import plots  # noqa: PLC0415
 
-        for path, draw in ((arguments.plot, plots.draw_page), (arguments.animate, plots.animate)):
-            if path is not None:
-                shown = draw(found, *found.shown, path)
-                cli.print_line(f'{path}: {shown}', sys.stderr if arguments.json else None)
+        motion, data = found.shown
+        if arguments.plot is not None:
+            plots.draw_page(found.path.name, motion, data, arguments.plot)
+        if arguments.animate is not None:
+            plots.animate(data, arguments.animate)
         return True
     except ImportError as error:
         reason = ("pictures need matplotlib: pip install 'spinning_top_sim[plot]', or "
@@ -140,7 +132,8 @@ def _as_json(found: Survey, verdict: Verdict | None) -> object:
         'notes': [*_broken_entries(run), *found.notes],
         'run': None, 'events': [], 'verify': None,
         'motions': [{
-            **_fields_of(motion, 'cause', 'begin_ns', 'end_ns', 'source', 'regime'),
+            **_fields_of(motion, 'cause', 'begin_ns', 'end_ns', 'source'),
+            'regime': motion.exact and motion.exact.name,
             **_fields_of(motion.segment, 'l3', 'lz', 'energy'),
             'exact': motion.exact and asdict(motion.exact),
             'measured': motion.measured and asdict(motion.measured)} for motion in found.motions],
@@ -193,10 +186,8 @@ def _as_text(found: Survey, verdict: Verdict | None) -> Iterator[str]:
            + (f', {counts["state"]} states set' if counts['state'] else ''))
     yield from _broken_entries(run)
     yield from found.notes
-    for number, motion in enumerate(found.motions[:MOST_MOTIONS], start=1):
+    for number, motion in enumerate(found.motions, start=1):
         yield from _motion(number, motion, damage.start_ns)
-    if len(found.motions) > MOST_MOTIONS:
-        yield f'and {len(found.motions) - MOST_MOTIONS} more motions (all are in --json)'
     yield from _accuracy(found)
     if verdict is not None:
         yield from _verdict(verdict)
@@ -208,15 +199,11 @@ def _accuracy(found: Survey) -> Iterator[str]:
             'largest drifts since the start of each motion, relative', ('from', 'E', 'L3', 'Lz'),
             [(topic, *(f'{series.largest:.2g}' for series in drifts.values()))
              for topic, drifts in found.drifts.items()])
-    else:
-        yield 'drifts of E, L3, Lz: no topic with rates (joint_states, ground_truth/...)'
     if found.errors:
         yield from cli.table('orientation error against the exact solution [rad]',
                              ('from', 'max', 'rms'),
                              [(topic, f'{series.largest:.3g}', f'{series.rms:.3g}')
                               for topic, series in found.errors.items()])
-    else:
-        yield 'orientation error: no topic with an attitude'
 
 
 def _topics(found: Survey) -> Iterator[str]:
@@ -239,8 +226,6 @@ def _motion(number: int, motion: MotionReport, begin_ns: int) -> Iterator[str]:
                   for at_ns in (motion.begin_ns, motion.end_ns))
     name = exact.name if exact is not None else 'beyond the closed form'
     title = f'motion {number} ({motion.cause}), {begin:.6g} to {end:.6g} s: {name}'
-    if motion.regime is not None and motion.regime != name:
-        title += f' (the data look like: {motion.regime})'
     rows = []
     for text, key, factor in ROWS:
         expected, seen = (None if value is None else value * factor for value in (
@@ -250,10 +235,8 @@ def _motion(number: int, motion: MotionReport, begin_ns: int) -> Iterator[str]:
     if measured is not None:
         yield f'measured from {motion.source}: {count(measured.nutations, "whole nutation")}'
         yield from (f'not measured: {reason}' for reason in measured.missing)
-    elif motion.source is not None:
-        yield 'not measured: too few samples'
     else:
-        yield 'not measured: no topic with an attitude (joint_states, pose, ground_truth/...)'
+        yield 'not measured: no topic with enough attitudes (joint_states, pose, ground_truth/...)'
 
 
 def _verdict(verdict: Verdict) -> Iterator[str]:

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures of a log: a page of figures, and an animation of the top."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,16 +27,14 @@ from spinning_top_sim.physics.pictures import (
     on_sphere,
     project,
 )
-from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools.analysis import Attitudes
-from spinning_top_sim.tools.survey import MotionReport, Survey
+from spinning_top_sim.tools.survey import MotionReport
 
 STYLE = {**pictures.STYLE, 'axes.prop_cycle': cycler(color=COLOURS), 'legend.fontsize': 8,
          'legend.frameon': False}
 FINER = 10                  # points of a curve for each sample
 MOST_DRAWN = 20_000         # points of a curve
 PAGE_NUTATIONS, PAGE_S = 8, 5.0      # duration of the page; in seconds without nutation
-MOST_MARKS = 30             # motions whose beginnings are marked
 FRAMES_PER_S, LONGEST_S = 20, 10.0
 
 
@@ -56,37 +53,23 @@ def tip_at(data: Attitudes, at: Column) -> tuple[NDArray[np.complex128], Column]
     return tip, height
 
 
-def draw_page(found: Survey, motion: MotionReport, data: Attitudes, path: Path) -> str:
-    """Draw a page about a log and the samples of a motion; return in words what it shows."""
+def draw_page(name: str, motion: MotionReport, data: Attitudes, path: Path) -> None:
+    """Draw a page about the first samples of a motion in the log of this name."""
     assert motion.measured is not None
     period, mean = motion.measured.nutation_period, motion.measured.mean_precession_rate
     data = data.first(PAGE_NUTATIONS * period if period else PAGE_S)
-    rows = 4 if found.readings else 3
     with rc_context(STYLE):
-        figure = Figure(figsize=(11.0, 2.4 * rows + 0.6), layout='constrained')
-        grid = figure.add_gridspec(rows, 2, height_ratios=[1.1, 1.1, 1.0, 1.0][:rows])
-        regime = motion.regime or (motion.exact.name if motion.exact else '')
-        figure.suptitle(f'{found.path.name}: {regime}', fontsize=14)
-        _tip_panel(figure.add_subplot(grid[0:2, 0]), data, period or 0.0)
+        figure = Figure(figsize=(11.0, 5.4), layout='constrained')
+        grid = figure.add_gridspec(2, 2)
+        figure.suptitle(f'{name}: {motion.exact.name if motion.exact else ""}', fontsize=14)
+        _tip_panel(figure.add_subplot(grid[:, 0]), data, period or 0.0)
         tilt = figure.add_subplot(grid[0, 1])
         time, _, height = smooth_tip(data)
         tilt.plot(time, np.degrees(np.arccos(np.clip(height, -1.0, 1.0))))
         tilt.set(title=f'nutation, period {period:.9g} s' if period else '',
                  xlabel='time [s]', ylabel='tilt θ [deg]')
         _precession_panel(figure.add_subplot(grid[1, 1], sharex=tilt), data, mean)
-        _accuracy_panels(found, *(figure.add_subplot(grid[2, column]) for column in (0, 1)))
-        if found.readings:
-            _reading_panels(found, data, [figure.add_subplot(grid[3, column])
-                                          for column in (0, 1)])
         figure.savefig(path, dpi=120)
-    return f'motion {_part(found, data, float(data.time[-1]))}; drifts and errors of all of it'
-
-
-def _part(found: Survey, data: Attitudes, duration: float) -> str:
-    """Return in words which part of the log is shown."""
-    begin = float(data.stamps_ns[0] - found.damage.start_ns) / NANOSECONDS
-    whole = (found.damage.end_ns - found.damage.start_ns) / NANOSECONDS
-    return f'from {begin:.4g} to {begin + duration:.4g} s of {whole:.4g} s in the log'
 
 
 def _tip_panel(axes: Axes, data: Attitudes, period: float) -> None:
@@ -102,63 +85,18 @@ def _tip_panel(axes: Axes, data: Attitudes, period: float) -> None:
 
 def _precession_panel(axes: Axes, data: Attitudes, mean: float | None) -> None:
     axes.set(xlabel='time [s]', ylabel="φ' [rad/s]")
-    rate = data.phi_dot
-    if rate is None or np.isnan(rate).all():
-        axes.text(0.5, 0.5, "φ': no topic with rates", ha='center', transform=axes.transAxes)
-    else:
-        axes.plot(data.time, rate, color=COLOURS[1])
-        usual = float(np.max(np.abs(np.nanpercentile(rate, (1.0, 99.0)))))
-        if np.nanmax(np.abs(rate)) > 20.0 * max(usual, 1e-3):
-            axes.set_yscale('symlog', linthresh=usual)
-        axes.axhline(0.0, color=FAINT, linewidth=0.8, zorder=0)
+    if data.phi_dot is not None:
+        axes.plot(data.time, data.phi_dot, color=COLOURS[1])
+    axes.axhline(0.0, color=FAINT, linewidth=0.8, zorder=0)
     if mean is not None:
         axes.axhline(mean, color=INK, linewidth=0.9, linestyle='--')
         axes.set_title(f'precession, mean {mean:.9g} rad/s (dashed)')
 
 
-def _accuracy_panels(found: Survey, drifts: Axes, errors: Axes) -> None:
-    """Draw the drifts and the orientation error of the most accurate topics."""
-    start_ns = found.damage.start_ns
-    if found.drifts:
-        topic = min(found.drifts, key=lambda name: found.drifts[name]['energy'].largest)
-        for series, style, label in zip(found.drifts[topic].values(), ('-', '--', ':'),
-                                        ('E', '$L_3$', '$L_z$'), strict=True):
-            stamps_ns, values = series.points
-            drifts.plot((stamps_ns - start_ns) * 1e-9, values, linestyle=style, label=label)
-        drifts.legend(loc='upper left', ncols=3)
-        drifts.margins(y=0.25)
-        drifts.set_title(f'drift of the constants, from {topic}')
-    if found.errors:
-        topic = min(found.errors, key=lambda name: found.errors[name].largest)
-        stamps_ns, values = found.errors[topic].points
-        errors.plot((stamps_ns - start_ns) * 1e-9, values, color=COLOURS[2])
-        errors.set_title(f'error against the exact solution, from {topic}')
-        errors.set_ylim(bottom=0.0)
-    for axes, quantity in ((drifts, 'relative drift'), (errors, 'orientation error [rad]')):
-        axes.set(xlabel='time in the log [s]', ylabel=quantity)
-        for later in found.motions[1:] if len(found.motions) <= MOST_MARKS else ():
-            axes.axvline((later.begin_ns - start_ns) * 1e-9, color=FAINT, linewidth=0.8, zorder=0)
-
-
-def _reading_panels(found: Survey, data: Attitudes, panels: Sequence[Axes]) -> None:
-    """Draw the readings of the IMU during the samples that are shown."""
-    # The noisy readings, else the noise-free ones, else the bias.
-    topic = min(found.readings, key=lambda name: (not name.endswith('data_raw'),
-                                                  not name.endswith('ground_truth/imu')))
-    time, *vectors = np.concatenate(found.readings[topic]).T
-    shown = time <= time[0] + float(data.time[-1])
-    for column, label in enumerate(('angular velocity [rad/s]', 'specific force [m/s²]')):
-        axes = panels[column]
-        for axis, values in zip('xyz', vectors[3 * column:], strict=False):
-            axes.plot((time - time[0])[shown], values[shown], label=axis)
-        axes.legend(loc='upper right', ncols=3)
-        axes.margins(y=0.2)
-        axes.set(title=f'{label.partition(" [")[0]}, {topic}', xlabel='time [s]', ylabel=label)
-
-
-def animate(found: Survey, _motion: MotionReport, data: Attitudes, path: Path) -> str:
+def animate(data: Attitudes, path: Path) -> None:
     """Draw the turning top as a GIF: a disc with a mark, and the trace of the tip."""
-    frames = max(2, int(min(LONGEST_S, float(data.time[-1])) * FRAMES_PER_S))
+    data = data.first(LONGEST_S)
+    frames = max(2, int(float(data.time[-1]) * FRAMES_PER_S))
     # Indices of the samples; with few samples the last frame may be later than the last of them.
     at = np.minimum(np.arange(frames) / (FRAMES_PER_S * data.period), len(data.stamps_ns) - 1)
     spin = np.interp(at, np.arange(len(data.psi)), data.psi)
@@ -187,4 +125,3 @@ def animate(found: Survey, _motion: MotionReport, data: Attitudes, path: Path) -
 
     FuncAnimation(figure, frame, frames=frames, blit=False).save(
         path, writer=PillowWriter(fps=FRAMES_PER_S))
-    return f'motion {_part(found, data, frames / FRAMES_PER_S)}'

@@ -117,8 +117,8 @@ def read_run_description(reader: LogReader) -> RunDescription:
         epoch_ns, begun_ns = int(metadata['epoch_ns']), int(metadata['begun_ns'])
         history = [_applied_before(epoch_ns, *entry) for entry in json.loads(metadata['history'])]
         times_ns = [0, *(operator.index(event.t_ns) for event in history), max(begun_ns, 0)]
-        if times_ns != sorted(times_ns) or epoch_ns < 0 or (
-                epoch_ns + times_ns[-1] > min(LATEST_NS, reader.span[1] or LATEST_NS)):
+        if times_ns != sorted(times_ns) or not 0 <= epoch_ns <= epoch_ns + times_ns[-1] <= min(
+                LATEST_NS, reader.span[1] or LATEST_NS):
             raise ValueError('times are out of order or too late')
         surroundings = {key: metadata[key] for key in ('version', 'platform', 'libraries')}
         topics = _topics(reader.topics, at_recording)
@@ -127,22 +127,28 @@ def read_run_description(reader: LogReader) -> RunDescription:
             f'its metadata {METADATA_NAME!r} cannot be used: {reason_of(error)}') from error
     commands_topic = topics.pop(journal.COMMANDS, None)
     events_topic = topics.pop(journal.EVENTS, None)
-    events: list[Event] = []
-    broken: list[tuple[int, str]] = []
-    epoch, reached_ns = epoch_ns, epoch_ns - 1
-    for message in () if events_topic is None else reader.messages(topics=[events_topic]):
+    events, broken = _journal(reader, events_topic, epoch_ns)
+    return RunDescription(at_start, at_recording, epoch_ns, begun_ns, history, surroundings,
+                          topics, commands_topic, events_topic, events, broken, reader.size)
+
+
+def _journal(reader: LogReader, topic: str | None, epoch_ns: int,
+             ) -> tuple[list[Event], list[tuple[int, str]]]:
+    """Return the events in a topic, and stamp [ns] and reason of each that cannot be one."""
+    events, broken, reached_ns = [], [], epoch_ns - 1
+    for message in () if topic is None else reader.messages(topics=[topic]):
         try:
             event = _event(message.log_time, message.data)
-            new_epoch = event.details['epoch_ns'] if event.name == 'reset' else epoch
-            if not reached_ns <= epoch + event.sent_ns <= event.stamp_ns <= LATEST_NS or not (
-                    epoch <= new_epoch <= event.stamp_ns):
+            sent_ns = epoch_ns + event.sent_ns
+            new_epoch_ns = event.details.get('epoch_ns', epoch_ns)
+            if not reached_ns <= sent_ns <= event.stamp_ns <= LATEST_NS or not (
+                    epoch_ns <= new_epoch_ns <= event.stamp_ns):
                 raise ValueError(f'sent_ns = {event.sent_ns} is out of order or too late')
-            epoch, reached_ns = new_epoch, max(epoch + event.sent_ns, new_epoch - 1)
+            epoch_ns, reached_ns = new_epoch_ns, max(sent_ns, new_epoch_ns - 1)
             events.append(event)
         except ODD as error:
             broken.append((message.log_time, reason_of(error)))
-    return RunDescription(at_start, at_recording, epoch_ns, begun_ns, history, surroundings,
-                          topics, commands_topic, events_topic, events, broken, reader.size)
+    return events, broken
 
 
 def _applied_before(epoch_ns: int, t_ns: int, *numbers: float) -> Event:
@@ -282,21 +288,18 @@ class _Rerun:
 
 
 def _apply(simulation: Simulation, event: Event) -> None:
-    """Apply an event.  Raises DepartureError where that cannot be."""
+    """Apply an event.  Raises one of ODD where that cannot be."""
     details = event.details
-    try:
-        if event.name in FIELDS_OF:
-            if event.name == 'command':
-                simulation.command(**details)
-            else:
-                simulation.set_state(State(**details))
-            applied_ns = simulation.history[-1][0]
-            if applied_ns != event.t_ns:
-                raise ValueError(f'applied at {applied_ns} ns')
-        elif event.name == 'parameters':
-            simulation.apply(details)
+    if event.name in FIELDS_OF:
+        if event.name == 'command':
+            simulation.command(**details)
         else:
-            simulation.restart(details['parameters'])
-            simulation.epoch_ns = details['epoch_ns']
-    except ODD as error:
-        raise DepartureError(f'{event.name} at t = {event.t_ns} ns: {reason_of(error)}') from error
+            simulation.set_state(State(**details))
+        applied_ns = simulation.history[-1][0]
+        if applied_ns != event.t_ns:
+            raise ValueError(f'{event.name} at t = {event.t_ns} ns: applied at {applied_ns} ns')
+    elif event.name == 'parameters':
+        simulation.apply(details)
+    else:
+        simulation.restart(details['parameters'])
+        simulation.epoch_ns = details['epoch_ns']

@@ -11,28 +11,26 @@ exit codes:
 """
 
 import argparse
-import contextlib
-import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.top import Top
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.provenance import provenance
+from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
+from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
-from spinning_top_sim.streams.simulation import MOST_RATE, Simulation
-from spinning_top_sim.streams.stream import Samples, Stream, period_ns
+from spinning_top_sim.streams.simulation import Simulation
+from spinning_top_sim.streams.stream import Encoded, Samples, Stream, period_ns
 from spinning_top_sim.tools import cli, export
+from spinning_top_sim.tools.recorded_run import read_run_description
 from spinning_top_sim.tools.scene_file import is_of_ros, parse_assignment, read_scene
 
 FORMATS = ('mcap', 'csv', 'parquet')
@@ -91,8 +89,7 @@ def _run(arguments: argparse.Namespace) -> int:
     simulation = Simulation(values, round(epoch_ns))
     export.check(arguments.export, [stream.topic for stream in journal.recorded_streams(
         simulation.streams, values)], values)
-    stops = _parse_stops(arguments.command, round(values['duration'] * NANOSECONDS),
-                         simulation.top)
+    stops = _parse_stops(arguments.command, round(values['duration'] * NANOSECONDS))
     with cli.progress('simulated', values['duration'], 's', quiet=arguments.quiet) as show:
         if file_format == 'mcap':
             summary = write_log(output, simulation, stops, show, arguments.namespace)
@@ -102,22 +99,14 @@ def _run(arguments: argparse.Namespace) -> int:
             write(output, _rows(simulation, table, stops, show))
             rows = len(table.times(-1, stops[-1][0]))
             summary = f'{rows} rows of {", ".join(UNITS)}'
-    lines = [f'{output}: {summary}', *_export(output, arguments.export)]
+    lines = [f'{output}: {summary}']
+    if arguments.export:
+        with LogReader(output) as reader:
+            lines += export.write(reader, read_run_description(reader), arguments.export)
     if not arguments.quiet:
         for line in lines:
             cli.print_line(line)
     return cli.OK
-
-
-def _export(log: Path, exports: Sequence[export.Export]) -> list[str]:
-    """Write the files for other tools from the log; return a line about each."""
-    if not exports:
-        return []
-    from spinning_top_sim.recording.reader import LogReader  # noqa: PLC0415 - needs mcap
-    from spinning_top_sim.tools.recorded_run import read_run_description  # noqa: PLC0415
-
-    with LogReader(log) as reader:
-        return list(export.write(reader, read_run_description(reader), exports))
 
 
 def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -135,27 +124,18 @@ def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
     return values
 
 
-def _parse_stops(commands: Sequence[str], duration_ns: int, top: Top) -> list[Stop]:
-    """
-    Return the commands (T:L3:LZ) in the order of their application, and the end of the run.
-
-    Raises ValueError for a command that no state of the top could take.
-    """
+def _parse_stops(commands: Sequence[str], duration_ns: int) -> list[Stop]:
+    """Return the commands (T:L3:LZ) in the order of their application, and the end of the run."""
     stops: list[Stop] = []
     for text in commands:
         try:
             t, l3, lz = map(float, text.split(':'))
-            at_ns = round(t * NANOSECONDS)
+            at_ns, *_ = map(round, (t * NANOSECONDS, l3, lz))       # round refuses inf and nan
         except (ValueError, OverflowError):
             raise ValueError(f'--command {text}: must be T:L3:LZ, three numbers') from None
         if not 0 <= at_ns <= duration_ns:
             raise ValueError(f'--command {text}: T must be from 0 to the end of the run, '
                              f'{duration_ns / NANOSECONDS:g} s')
-        # At any tilt the momentum across the axis is at least sqrt(Lz^2 - L3^2).
-        least_energy = (abs(lz) - abs(l3)) * (abs(lz) + abs(l3)) / (2.0 * top.lambda1)
-        if not (abs(l3) / top.lambda3 <= math.tau * MOST_RATE and least_energy < math.inf):
-            raise ValueError(f'--command {text}: L3 and LZ must be finite, as must be the energy, '
-                             f'and the spin at most {MOST_RATE:.2g} turns a second')
         stops.append((at_ns, (l3, lz)))
     # The sort is stable: commands at the same time keep their order.
     return [*sorted(stops, key=lambda stop: stop[0]), (duration_ns, None)]
@@ -178,69 +158,33 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
 
     After an error the log is closed and readable, and holds what was computed before.
     """
-    epoch_ns = simulation.epoch_ns
-    streams = journal.recorded_streams(simulation.streams, simulation.values)
+    values, epoch_ns = simulation.values, simulation.epoch_ns
+    streams = journal.recorded_streams(simulation.streams, values)
     commands_topic, events_topic = len(streams), len(streams) + 1
-    with contextlib.closing(_LogWriter(path, simulation, streams, namespace)) as writer:
-        writer.write(events_topic, epoch_ns, journal.event('start', 0, -1))
+    types = {stream.topic: stream.type_name for stream in streams} | dict(journal.TOPICS)
+    file = create_file(
+        path, [RecordedTopic(journal.resolve_topic(name, namespace), type_name)
+               for name, type_name in types.items()],
+        provenance(values, epoch_ns, -1, (), values), compression=values['record.compression'])
+    try:
+        file.append(events_topic, epoch_ns, journal.event('start', 0, -1))
         for stop_ns, momenta in stops:
             for block in simulation.play(streams, stop_ns):
-                writer.write_block(block)
+                file.append_rows([(streams.index(stream), epoch_ns + t_ns, rows)
+                                  for stream, t_ns, rows in block.parts])
                 show(simulation.now_ns / NANOSECONDS)
             if momenta is not None:
                 _command(simulation, *momenta)
                 t_ns, (l3, lz) = simulation.now_ns, momenta
-                writer.write(events_topic, epoch_ns + t_ns, journal.event(
+                file.append(events_topic, epoch_ns + t_ns, journal.event(
                     'command', t_ns, t_ns, l3=l3, lz=lz))
-                writer.write(commands_topic, epoch_ns + t_ns, journal.command(l3, lz))
-    return f'{sum(writer.file.message_counts.values())} messages, {writer.file.size / 1e6:.1f} MB'
-
-
-class _LogWriter:
-    """
-    Writes a log in a thread: compression and the file system leave Python to others.
-
-    A block becomes a chunk, which is compressed and written while the next block is computed.
-    Everything else waits for it, to keep the order.
-    """
-
-    def __init__(self, path: Path, simulation: Simulation, streams: Sequence[Stream],
-                 namespace: str) -> None:
-        from spinning_top_sim.recording.writer import create_file  # noqa: PLC0415 - needs mcap
-
-        values = simulation.values
-        types = {stream.topic: stream.type_name for stream in streams} | dict(journal.TOPICS)
-        topics = [RecordedTopic(journal.resolve_topic(name, namespace), type_name)
-                  for name, type_name in types.items()]
-        metadata = provenance(values, simulation.epoch_ns, -1, (), values)
-        self.file = create_file(path, topics, metadata, compression=values['record.compression'])
-        self._streams, self._epoch_ns = streams, simulation.epoch_ns
-        self._executor = ThreadPoolExecutor(1)
-        self._chunk: Future[None] = self._executor.submit(lambda: None)     # none at first
-
-    def write(self, topic_index: int, stamp_ns: int, data: bytes) -> None:
-        """Write an entry of the journal with the next chunk."""
-        self._chunk.result()
-        self.file.append(topic_index, stamp_ns, data)
-
-    def write_block(self, block: Block) -> None:
-        """Begin to write a chunk of a block.  Raises OSError of the chunk before."""
-        if block.parts:
-            chunk = self.file.chunk_of_rows([
-                (self._streams.index(stream), self._epoch_ns + t_ns, rows)
-                for stream, t_ns, rows in block.parts])
-            self._chunk.result()
-            self.file.write_chunk()         # of the journal's entries, which wait in memory
-            self._chunk = self._executor.submit(self.file.write_chunk, chunk)
-
-    def close(self) -> None:
-        """Finish the file."""
+                file.append(commands_topic, epoch_ns + t_ns, journal.command(l3, lz))
+    finally:
         try:
-            self._chunk.result()
+            file.write_chunk()
         finally:
-            self._executor.shutdown()
-            self.file.write_chunk()
-            self.file.finish()
+            file.finish()
+    return f'{sum(file.message_counts.values())} messages, {file.size / 1e6:.1f} MB'
 
 
 class Table(Stream):
@@ -251,8 +195,7 @@ class Table(Stream):
     def __init__(self, period_ns: int) -> None:
         self.period_ns = period_ns
 
-    def encode(self, samples: Samples, epoch_ns: int,
-               ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def encode(self, samples: Samples, epoch_ns: int) -> Encoded:
         states = samples.states
         columns = np.broadcast_arrays(
             samples.t_ns / NANOSECONDS, states.theta, states.theta_dot, states.phi, states.phi_dot,

@@ -31,11 +31,8 @@ from spinning_top_sim.tools.analysis import Attitudes, Measured
 from spinning_top_sim.tools.recorded_run import LATEST_NS, ODD, RunDescription, reason_of
 
 BLOCK = 16384               # messages of all topics that are analysed together
-MOST_POINTS = 20_000        # of a series that are kept for a picture
 MOST_GAPS = 10              # that are listed
 MOST_EXACT = 1000           # motions that are compared with the exact one: 10 ms each
-SHOWN_NUTATIONS, SHOWN_S = 8.0, 10.0      # duration of the pictures, the longer of both
-IMU_TOPICS = ('imu/data_raw', 'ground_truth/imu', 'ground_truth/imu_bias')
 # Streams that a motion can be measured from, the most accurate first.
 SOURCES = ('joint_states', 'ground_truth/imu', 'ground_truth/odom', 'imu/data', 'pose')
 ENOUGH_SAMPLES = 12.0       # in a nutation; a higher rate adds no accuracy
@@ -60,35 +57,25 @@ class TopicReport:
     longest_step_ns: int = 0              # between two messages
 
 
+@dataclass
 class Series:
-    """
-    The largest value and the root mean square of a long series.
+    """The largest value and the root mean square of a long series."""
 
-    points : (2, n) log times [ns] and values for a picture; at most MOST_POINTS, with the peaks
-    """
+    largest: float = 0.0
+    square_sum: float = 0.0
+    count: int = 0
 
-    def __init__(self) -> None:
-        self.points = np.empty((2, 0))
-        self.largest = self._square_sum = 0.0
-        self._count = 0
-
-    def add(self, times_ns: Stamps, values: Rows) -> None:
+    def add(self, values: Rows) -> None:
         """Append the values that are finite."""
-        points = np.stack((times_ns, values))[:, np.isfinite(values)]
-        sizes = np.abs(points[1])
+        sizes = np.abs(values[np.isfinite(values)])
         self.largest = max(self.largest, float(np.max(sizes, initial=0.0)))
-        self._square_sum += float(sizes @ sizes)
-        self._count += len(sizes)
-        self.points = np.concatenate((self.points, points), axis=1)
-        while self.points.shape[1] > MOST_POINTS:
-            # Keep the larger one of two neighbours.
-            pairs = np.abs(self.points[1, :self.points.shape[1] // 2 * 2]).reshape(-1, 2)
-            self.points = self.points[:, 2 * np.arange(len(pairs)) + np.argmax(pairs, axis=1)]
+        self.square_sum += float(sizes @ sizes)
+        self.count += len(sizes)
 
     @property
     def rms(self) -> float:
         """Root mean square; NaN without values."""
-        return math.sqrt(self._square_sum / self._count) if self._count else math.nan
+        return math.sqrt(self.square_sum / self.count) if self.count else math.nan
 
 
 @dataclass
@@ -116,7 +103,6 @@ class MotionReport:
     samples: list[tuple[Stamps, Rows]] = field(default_factory=list)
     sections: list[Section] = field(default_factory=list)
     measured: Measured | None = None      # the numbers of `exact`, from the samples
-    regime: str | None = None             # name of the motion, from the samples
 
     @property
     def begin_ns(self) -> int:
@@ -144,15 +130,7 @@ class Survey:
     errors: dict[str, Series] = field(default_factory=dict)     # of attitudes by topic [rad]
     # For pictures: the first motion with samples, and the first of these
     shown: tuple[MotionReport, Attitudes] | None = None
-    # For pictures, by topic: (n, 7) time [s], angular velocity [rad/s], specific force [m/s^2]
-    readings: dict[str, list[Rows]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-
-    @property
-    def shown_s(self) -> float:
-        """Duration of the pictures [s]."""
-        exact = self.motions[0].exact
-        return max(SHOWN_S, SHOWN_NUTATIONS * ((exact and exact.nutation_period) or 0.0))
 
 
 @np.errstate(all='ignore')                  # a log may hold any numbers
@@ -244,11 +222,6 @@ def _analyse(found: Survey, motion: MotionReport, topic: str, samples: list[LogM
     found.topics[topic].odd_size += len(samples) - len(fitting)
     stamps_ns = _stamps(fitting)
     fields = stream.template.decode(b''.join(sample.data for sample in fitting))
-    if stream.topic in IMU_TOPICS:
-        time = (stamps_ns - max(found.motions[0].begin_ns, found.damage.start_ns)) / NANOSECONDS
-        readings = np.column_stack((time, *fields[1:]))[time <= found.shown_s]
-        if len(readings):
-            found.readings.setdefault(topic, []).append(readings)
     data = analysis.attitudes_of(stream.topic, motion.imu, stamps_ns, fields)
     if data is None:
         return
@@ -259,12 +232,11 @@ def _analyse(found: Survey, motion: MotionReport, topic: str, samples: list[LogM
         drifts = found.drifts.setdefault(topic, {key: Series() for key in ('energy', 'l3', 'lz')})
         for series, value, start in zip(
                 drifts.values(), values, (segment.energy, segment.l3, segment.lz), strict=True):
-            series.add(data.stamps_ns, relative_drift(value, start))
+            series.add(relative_drift(value, start))
     if motion.exact is not None and (exact := segment.exact) is not None:
         times_ns = np.clip(data.stamps_ns - motion.origin_ns, -exact.ns_limit, exact.ns_limit)
         truth = exact.states(times_ns).rows_quaternion
-        found.errors.setdefault(topic, Series()).add(
-            data.stamps_ns, angle_between(data.quaternion, truth))
+        found.errors.setdefault(topic, Series()).add(angle_between(data.quaternion, truth))
 
 
 def _count(report: TopicReport, stamps_ns: Stamps, sections: list[Section], topic: str) -> None:
@@ -300,9 +272,9 @@ def _measure(found: Survey, motion: MotionReport) -> None:
     if data is None or len(data.stamps_ns) < 2:
         return
     try:
-        motion.measured = analysis.measure(data)
-        motion.regime = analysis.measured_regime(motion.segment.solver.top, data)
+        motion.measured = analysis.measure(
+            data, motion.exact.nutation_period if motion.exact else None)
     except ODD as error:
         found.notes.append(f'{motion.source} cannot be measured: {reason_of(error)}')
     else:
-        found.shown = found.shown or (motion, data.first(found.shown_s))
+        found.shown = found.shown or (motion, data)

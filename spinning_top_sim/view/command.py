@@ -103,14 +103,10 @@ def _open_page(arguments: argparse.Namespace, title: str) -> Page:
            'whoever reaches this address can watch and command')
     cli.print_line(f'view: {page.address} ({who}), until Ctrl-C')
     sys.stdout.flush()
-    if not arguments.no_browser and _has_desktop():
+    if not arguments.no_browser and (os.environ.get('DISPLAY') or os.environ.get(
+            'WAYLAND_DISPLAY')):
         webbrowser.open(page.address)
     return page
-
-
-def _has_desktop() -> bool:
-    return bool(os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')
-                or sys.platform == 'darwin')
 
 
 def _prepare(argv: list[str]) -> Callable[[], RunnableNode]:

@@ -4,7 +4,7 @@
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import viser
@@ -12,31 +12,25 @@ import viser
 from spinning_top_sim.physics.top import Top
 from spinning_top_sim.view.page import Page, set_value
 
-TIME_SCALES = ('0.1', '0.25', '0.5', '1', '2', '5', '10')
 STEPS = 1000                    # of a slider
 LEFT_ALONE_S = 1.0              # after that a slider follows the node again
-NO_SCENE = '(as it was started)'
 
 
 class Commands(Protocol):
     """Requests to a node; each returns the message to show, or raises with the reason."""
 
     def call(self, name: str, *on: bool) -> str: ...
-    def set_parameters_together(self, values: Mapping[str, Any]) -> str: ...
     def command(self, l3: float, lz: float) -> str: ...
-    def height(self) -> float | None: ...
-    def load_scene(self, name: str) -> str: ...
 
 
 class Controls:
     """The controls.  Their callbacks run in threads of viser; only one at a time acts."""
 
-    def __init__(self, page: Page, node: Commands, scenes: Sequence[str]) -> None:
+    def __init__(self, page: Page, node: Commands) -> None:
         self._page, self._node = page, node
         self._lock = threading.Lock()
         self._paused = False
-        self._spin: list[float] | None = None       # L3 and Lz of the node
-        self._wanted: dict[int, float] = {}         # values of moved sliders, not sent yet
+        self._spin = [0.0, 0.0]                     # L3 and Lz of the node
         self._moved_at = 0.0                        # time of the last move, monotonic clock
         self._shown = [math.nan, math.nan]          # values on the sliders
         gui = page.gui
@@ -44,23 +38,15 @@ class Controls:
             self._status = gui.add_markdown('*waiting for sim_node*')
             self._sliders = [gui.add_slider(label, -1.0, 1.0, 2.0 / STEPS, 0.0) for label in (
                 'L3 [kg m²/s]', 'Lz [kg m²/s]')]
-            rest = gui.add_button('Let go from rest', hint='Lz = L3 cos θ')
             self._pause = gui.add_button('Pause')
             step, reset = gui.add_button('Step'), gui.add_button('Reset')
             self._record = gui.add_checkbox('record', False)
-            self._time_scale = gui.add_dropdown('time scale', TIME_SCALES, initial_value='1')
-            scene = gui.add_dropdown('scene', (NO_SCENE, *scenes))
-        for k, slider in enumerate(self._sliders):
-            slider.on_update(self._on_slider(k))
-        rest.on_click(lambda _: self._act(self._let_go))
+        for slider in self._sliders:
+            slider.on_update(self._on_slider)
         self._pause.on_click(lambda _: self._act(self._switch_pause))
         step.on_click(lambda _: self._act(lambda: node.call('step')))
         reset.on_click(lambda _: self._act(lambda: node.call('reset')))
-        self._on_change(self._record, lambda: node.call('record', self._record.value))
-        self._on_change(self._time_scale, lambda: node.set_parameters_together(
-            {'time_scale': float(self._time_scale.value)}))
-        self._on_change(scene, lambda: node.load_scene(scene.value)
-                        if scene.value != NO_SCENE else '')
+        self._record.on_update(self._on_record)
 
     def _act(self, action: Callable[[], str]) -> None:
         """Act, and show the message or the reason of the refusal."""
@@ -70,46 +56,30 @@ class Controls:
             except Exception as error:
                 self._page.message.content = f'**refused:** {error}'
 
-    def _on_change(self, handle: viser.GuiInputHandle[Any], action: Callable[[], str]) -> None:
-        """Act when somebody in a browser has changed an input."""
-        @handle.on_update
-        def _(event: viser.GuiEvent[Any]) -> None:
-            if event.client is not None:
-                self._act(action)
+    def _on_record(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client is not None:        # somebody in a browser
+            self._act(lambda: self._node.call('record', self._record.value))
 
-    def _on_slider(self, number: int) -> Callable[[viser.GuiEvent[Any]], None]:
-        def _moved(event: viser.GuiEvent[Any]) -> None:
-            if event.client is not None:
-                self._moved_at = time.monotonic()
-                self._wanted[number] = float(self._sliders[number].value)
-                # A slider may move while a request waits: then only its newest value is sent.
-                self._act_on_sliders()
-        return _moved
+    def _on_slider(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client is not None:
+            self._moved_at = time.monotonic()
+            self._act(self._send)
 
-    def _act_on_sliders(self) -> None:
-        with self._lock:
-            wanted, self._wanted = self._wanted, {}
-        if wanted and self._spin is not None:
-            l3, lz = (wanted.get(k, present) for k, present in enumerate(self._spin))
-            self._act(lambda: self._command(l3, lz))
-
-    def _command(self, l3: float, lz: float) -> str:
+    def _send(self) -> str:
+        """Send the values of the sliders that somebody has moved."""
+        values = [slider.value for slider in self._sliders]
+        l3, lz = (value if abs(value - shown) > 0.5 * self._sliders[0].step else present
+                  for value, shown, present in zip(values, self._shown, self._spin, strict=True))
+        if [l3, lz] == self._spin:      # they are sent: a slider may move while a request waits
+            return self._page.message.content
         try:
             said = self._node.command(l3, lz)
         except Exception:
             self._leave_sliders()           # show the spin of the node again
-            if self._spin is not None:
-                self.show_spin(*self._spin)
+            self.show_spin(*self._spin)
             raise
-        self._spin = [l3, lz]
+        self._spin, self._shown = [l3, lz], values
         return said
-
-    def _let_go(self) -> str:
-        height = self._node.height()
-        if self._spin is None or height is None:
-            return 'there are no samples yet'
-        l3, _ = self._spin
-        return self._command(l3, l3 * height)
 
     def _switch_pause(self) -> str:
         said = self._node.call('set_pause', not self._paused)
@@ -143,15 +113,7 @@ class Controls:
                 # Setting an unchanged value would undo a move whose callback has not come yet.
                 if not abs(value - self._shown[k]) < 0.5 * slider.step:
                     set_value(slider, min(max(value, slider.min), slider.max))
-                    self._shown[k] = value
-
-    def show_values(self, values: Mapping[str, Any]) -> None:
-        """Show the parameters of the node."""
-        scale = f'{values["time_scale"]:g}'
-        if scale not in self._time_scale.options:
-            self._time_scale.options = (*TIME_SCALES, scale)
-        set_value(self._time_scale, scale)
-        self._spin = [values['spin.l3'], values['spin.lz']]
+                    self._shown[k] = slider.value
 
     def tell_status(self, message: str, numbers: Mapping[str, str]) -> None:
         """Show the content of /diagnostics."""

@@ -7,14 +7,12 @@ import threading
 import time
 import traceback
 from collections import defaultdict, deque
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
-from rcl_interfaces.msg import ParameterEvent
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.client import Client
 from rclpy.node import Node
@@ -27,7 +25,6 @@ from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes import throttle
 from spinning_top_sim.nodes.ros_parameters import SPIN
-from spinning_top_sim.nodes.worlds import OF_A_WORLD, World, scene_files
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.journal import NODE_NAME
@@ -50,8 +47,6 @@ ANSWER_S = 5.0                  # timeout of a service call
 SILENT_S = 5.0                  # timeout of /diagnostics, which come every second
 RESTART_NS = NANOSECONDS        # a step back of the stamps by more is another run
 KEPT_NS = 2 * max(WINDOW_NS, model.TRACE_NS)
-OF_THE_START = [parameter.name for parameter in parameters.TABLE
-                if parameter.effect is parameters.Effect.RESET]
 KIND_OF = {'pose': PoseStamped, 'joint_states': JointState, 'ground_truth/odom': Odometry,
            'ground_truth/imu': Imu}
 
@@ -77,7 +72,6 @@ class LiveView(Node):
         self._listeners: dict[str, Subscription] = {}
         self._sim = self.resolve_topic_name(NODE_NAME)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, QOS)
-        self.create_subscription(ParameterEvent, '/parameter_events', self._on_parameters, 10)
         self.create_timer(0.2, self._listen_as_needed)
         self._services_of_sim = {
             name: self.create_client(kind, f'{NODE_NAME}/{name}') for name, kind in (
@@ -85,15 +79,13 @@ class LiveView(Node):
                 ('set_parameters_atomically', SetParametersAtomically), ('set_pause', SetBool),
                 ('record', SetBool), ('step', Trigger), ('reset', Trigger))}
         self._track: Track | None = None
-        self._stale = True              # the parameters have to be read again
-        # Parameters that take effect at a reset are those of the motion only after a reset.
-        self._motion_is_new = True
+        self._stale = True              # the parameters have to be read, as after a reset
         self._origin_ns: int | None = None      # stamp of t = 0; unknown before /diagnostics
         self._errors: tuple[float, float] | None = None         # from /diagnostics, not drawn yet
         self._heard_at = math.inf       # when /diagnostics came last, on the monotonic clock
         self._gone = False              # whether the page says that the node has ended
         self._stopped = False
-        self._controls = Controls(page, self, sorted(scene_files()))
+        self._controls = Controls(page, self)
         self._thread = threading.Thread(target=self._draw, name='page', daemon=True)
 
     def start(self) -> None:
@@ -115,10 +107,8 @@ class LiveView(Node):
 
     def _listen_as_needed(self) -> None:
         """Subscribe to the topics that are shown only: each message costs the node some time."""
-        if self._track is None:
-            return
         needed = {'pose', 'joint_states'}
-        if self._track.values['ground_truth_odom.enabled']:     # attitude and rates in one
+        if self.count_publishers(throttle.TOPICS['ground_truth/odom']):     # both in one
             needed = {'ground_truth/odom'}
         if self._page.arrows[model.ARROWS.index('specific force')].value:
             needed |= {'ground_truth/imu'}
@@ -134,18 +124,10 @@ class LiveView(Node):
                 numbers = {pair.key: pair.value for pair in status.values}
                 self._controls.tell_status(status.message, numbers)
                 origin_ns = int(numbers['stamp of t = 0 [ns]'])
-                if self._origin_ns not in (None, origin_ns):
-                    self._expect_new_motion()
+                self._stale |= self._origin_ns not in (None, origin_ns)
                 self._origin_ns = origin_ns
                 self._errors = float(numbers['energy drift']), float(
                     numbers['orientation error [rad]'])
-
-    def _on_parameters(self, event: ParameterEvent) -> None:
-        if event.node == self._sim:
-            self._stale = True
-
-    def _expect_new_motion(self) -> None:
-        self._motion_is_new = self._stale = True
 
     # The thread of the page.
 
@@ -200,41 +182,32 @@ class LiveView(Node):
             stamps_ns = [_stamp_ns(data) for data in messages]
             known_ns = self._track.samples[topic].stamps_ns
             if len(known_ns) and stamps_ns[-1] < known_ns[-1] - RESTART_NS:
-                # The sim_node was started again; its t = 0 is not known yet.
-                self._begin_track(self._track.values)
-                self._origin_ns = None
-                self._expect_new_motion()
+                self._track.forget(known_ns[-1] + 1)        # the sim_node was started again
             self._track.add(topic, self._track.decode(topic, stamps_ns, messages))
         for topic in KIND_OF.keys() - self._listeners.keys():   # these get old
             self._track.samples[topic] = empty(topic)
 
     def _read_parameters(self) -> None:
-        """Read the parameters of the sim_node, and begin a new track if it is another top."""
+        """Read the parameters of the sim_node, and draw its top."""
         self._stale = False
-        motion_is_new, self._motion_is_new = self._motion_is_new, False
         names = [name for name in parameters.BY_NAME if name not in SPIN]
         try:
             answer = self._ask('get_parameters', GetParameters.Request(names=[*names, *SPIN]))
         except RefusedError:
-            self._stale, self._motion_is_new = True, motion_is_new
+            self._stale = True
             return
         shown = list(map(parameter_value_to_python, answer.values))
         # The present spin is not checked: it need not be possible at the start.
         values = {**parameters.checked(dict(zip(names, shown, strict=False))),
                   **dict(zip(SPIN, shown[-len(SPIN):], strict=True))}
-        self._controls.show_values(values)
-        if self._track is not None and not motion_is_new:
-            values |= {name: self._track.values[name] for name in OF_THE_START}
-        if self._track is None or _drawn(values) != _drawn(self._track.values):
-            self._begin_track(values)
-        else:
-            self._track.values = values
-
-    def _begin_track(self, values: Mapping[str, Any]) -> None:
-        """Drop all samples, and draw the top with these parameters."""
-        self._track = Track('', values)
-        self._page.set_tracks([self._track])
-        self._controls.set_range(self._track.top, *(values[name] for name in SPIN))
+        track = Track('', values)
+        if self._track is not None:
+            if all(values[name] == self._track.values[name] for name in names):
+                return
+            track.samples = self._track.samples
+        self._track = track
+        self._page.set_tracks([track])
+        self._controls.set_range(track.top, *(values[name] for name in SPIN))
 
     # Called by the page's controls, in threads of their own.
 
@@ -259,54 +232,16 @@ class LiveView(Node):
         answer = self._ask(name, request)
         if not answer.success:
             raise RefusedError(answer.message)
-        if name == 'reset':
-            self._expect_new_motion()
         return f'{name.removeprefix("set_")}: {answer.message}'
 
-    def set_parameters_together(self, values: Mapping[str, Any]) -> str:
-        """Set parameters of the sim_node, all or none; return them.  Raises RefusedError."""
+    def command(self, l3: float, lz: float) -> str:
+        """Set L3 and Lz [kg m^2/s]; return them.  Raises RefusedError."""
         result = self._ask('set_parameters_atomically', SetParametersAtomically.Request(
-            parameters=[Parameter(name, value=list(value) if isinstance(value, tuple) else value
-                                  ).to_parameter_msg() for name, value in values.items()])).result
+            parameters=[Parameter(name, value=value).to_parameter_msg()
+                        for name, value in zip(SPIN, (l3, lz), strict=True)])).result
         if not result.successful:
             raise RefusedError(result.reason)
-        return ', '.join(f'{name} = {value:.6g}' if isinstance(value, float) else
-                         f'{name} = {value}' for name, value in values.items())
-
-    def command(self, l3: float, lz: float) -> str:
-        """Set L3 and Lz [kg m^2/s].  Raises RefusedError."""
-        return self.set_parameters_together(dict(zip(SPIN, (l3, lz), strict=True)))
-
-    def height(self) -> float | None:
-        """Return cos(theta) of the newest attitude, None without samples."""
-        if self._track is None or not len(self._track.attitudes.rows):
-            return None
-        x, y, z, w = self._track.attitudes.rows[-1][:4].tolist()
-        return float(w * w + z * z - (x * x + y * y))
-
-    def load_scene(self, name: str) -> str:
-        """Restart with a scene; return what it could not change.  Raises RefusedError."""
-        try:
-            world = World.read(name)
-            values = world.values({})
-            start = parameters.start_state(values)
-        except (OSError, ValueError) as error:
-            raise RefusedError(str(error)) from error
-        # Set together with `initial.*`, the spin is that of the next start.
-        self.set_parameters_together({
-            **{key: value for key, value in values.items()
-               if key in world.given or key.startswith(OF_A_WORLD)},
-            **dict(zip(SPIN, (start.l3, start.lz), strict=True))})
-        self.call('reset')
-        return f'scene {name}' + (f'; only at the start of the node: {", ".join(world.ignored)}'
-                                  if world.ignored else '')
-
-
-def _drawn(values: Mapping[str, Any]) -> list[Any]:
-    """Return the parameters on which the drawing depends."""
-    return [value for name, value in values.items()
-            if name.startswith('top.') or name in (
-                'world_frame', 'body_frame', 'imu.frame_id', 'imu.rpy', 'imu.lever_arm')]
+        return f'spin.l3 = {l3:.6g}, spin.lz = {lz:.6g}'
 
 
 def _stamp_ns(data: bytes) -> int:

@@ -1,65 +1,45 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of one log or two: reads their tracks, and plays them."""
 
-import contextlib
-import html
 import itertools
-import math
 import time
 from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import recorded_run
-from spinning_top_sim.tools.attitudes import LAYOUTS, decode
 from spinning_top_sim.view.page import CATCH_UP_S, RATE, Page, set_value
-from spinning_top_sim.view.track import WIDTHS, DescribedMotion, Samples, Track, joined
+from spinning_top_sim.view.track import WIDTHS, DescribedMotion, Track, joined
 
 BLOCK = 16384               # messages that are decoded together
 SPEEDS = ('0.1', '0.25', '0.5', '1', '2', '4', '8')
-MOST_MARKS = 40             # of commands on the slider
 LONGEST_HTML_S = 60.0
 
 
 def read_logs(paths: Sequence[Path]) -> list[Track]:
-    """
-    Return the tracks of one log or two, which may be truncated.
-
-    A log of another program shows the top of the other log, or the default one.  Raises LogError.
-    """
-    names = [path.stem for path in paths] if len(paths) > 1 else ['']
-    others: Mapping[str, Any] = parameters.checked({})
-    for path in paths:
-        with LogReader(path) as reader, contextlib.suppress(recorded_run.ForeignLogError):
-            others = recorded_run.read_run_description(reader).values_in_effect
-    return [_read_log(path, name, others) for path, name in zip(paths, names, strict=True)]
+    """Return the tracks of one log or two, which may be truncated.  Raises LogError."""
+    return [_read_log(path, path.stem if len(paths) > 1 else '') for path in paths]
 
 
-def _read_log(path: Path, name: str, others: Mapping[str, Any]) -> Track:
-    """Return the track of a log; `others` are the parameters for the log of another program."""
+def _read_log(path: Path, name: str) -> Track:
     with LogReader(path) as reader:
         notes = [] if reader.whole else ['it is truncated: shown as far as it goes']
         try:
             run = recorded_run.read_run_description(reader)
         except recorded_run.ForeignLogError as error:
-            track = _read_foreign(reader, name, others, str(error))
-        else:
-            track = Track(name, run.values_in_effect)
-            track.origin_ns = run.epoch_ns
-            _read_samples(reader, track, run.topics)
-            try:
-                _follow_run(track, run, reader.span[1])
-            except (recorded_run.DepartureError, *recorded_run.ODD) as error:
-                notes.append(f'the run cannot be followed: {recorded_run.reason_of(error)}')
+            raise LogError(f'{path}: {error}') from error
+        track = Track(name, run.values_in_effect)
+        track.origin_ns = run.epoch_ns
+        _read_samples(reader, track, run.topics)
+        try:
+            _follow_run(track, run, reader.span[1])
+        except (recorded_run.DepartureError, *recorded_run.ODD) as error:
+            notes.append(f'the run cannot be followed: {recorded_run.reason_of(error)}')
     if not len(track.attitudes.rows):
         raise LogError(f'{path}: no attitude of a top in it')
     if notes:
@@ -93,30 +73,6 @@ def _follow_run(track: Track, run: recorded_run.RunDescription, end_ns: int) -> 
             track.commands_ns.append(begin_ns)
 
 
-def _read_foreign(reader: LogReader, name: str, values: Mapping[str, Any],
-                  reason: str) -> Track:
-    """Read the first topic that has attitudes in a log of another program."""
-    topics = [topic for topic in reader.topics if topic.type_name in LAYOUTS]
-    if not topics:
-        raise LogError(f'{reader.path}: no topic with an attitude ({", ".join(LAYOUTS)}); '
-                       f'{reason}')
-    track = Track(name, values)
-    for topic in topics:
-        stamps_ns, rows = [], []
-        for message in reader.messages(topics=[topic.name]):
-            with contextlib.suppress(ValueError):
-                attitude = decode(message.data, topic.type_name)
-                norm = math.hypot(*attitude.quaternion)
-                if 0.5 < norm < 2.0:
-                    stamps_ns.append(attitude.stamp_ns)
-                    rows.append(attitude.quaternion / norm)
-        if rows:
-            track.add('pose', Samples(np.array(stamps_ns), np.array(rows)))
-            track.origin_ns = track.span[0]
-            break
-    return track
-
-
 class Player:
     """
     Plays logs on a page.
@@ -125,11 +81,9 @@ class Player:
     """
 
     def __init__(self, page: Page, tracks: Sequence[Track]) -> None:
-        self._page, self._tracks = page, tracks
-        # Logs that overlap keep their stamps.  Otherwise t = 0 of all logs coincides.
-        (first_ns, last_ns), self._origin_ns = tracks[0].span, tracks[0].origin_ns
-        shifts_ns = [0 if track.span[0] < last_ns and first_ns < track.span[1]
-                     else track.origin_ns - self._origin_ns for track in tracks]
+        self._page = page
+        self._origin_ns = tracks[0].origin_ns       # t = 0 of all logs coincides
+        shifts_ns = [track.origin_ns - self._origin_ns for track in tracks]
         shifted = list(zip(tracks, shifts_ns, strict=True))
         self._begin_ns = min(track.span[0] - shift_ns for track, shift_ns in shifted)
         self.length = self._seconds(max(track.span[1] - shift_ns for track, shift_ns in shifted))
@@ -143,7 +97,7 @@ class Player:
             self._speed = gui.add_dropdown('speed', SPEEDS, initial_value='1')
             self._slider = gui.add_slider(
                 'time [s]', 0.0, max(self.length, 1e-3), max(self.length, 1e-3) / 10_000, 0.0,
-                marks=tuple(self._commands[:MOST_MARKS]) or None)
+                marks=tuple(self._commands) or None)
             self._next = gui.add_button('Next command', disabled=not self._commands)
         self._now, self._plays = 0.0, True
         self._button.on_click(lambda _: self._switch())
@@ -198,11 +152,6 @@ class Player:
         for picture in range(1, int(seconds * RATE) + 1):
             serializer.insert_sleep(1.0 / RATE)
             self.draw(picture / RATE)
-        motions = [motion for track in self._tracks for motion in track.motions[:1]]
-        caption = ''.join(f'<b>{html.escape(motion.words[0])}</b><br>' + ''.join(
-            f'{html.escape(words)}<br>' for words in motion.words[1:]) for motion in motions)
-        text = serializer.as_html().replace('</body>', (
-            '<div style="position:fixed;top:1em;right:1em;text-align:right;color:#333;'
-            f'font:14px sans-serif;pointer-events:none">{caption}</div></body>'))
+        text = serializer.as_html()
         path.write_text(text, encoding='utf-8')
         return f'{seconds:g} of {self.length:g} s, {len(text.encode()) / 1e6:.1f} MB'

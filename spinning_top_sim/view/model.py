@@ -31,32 +31,6 @@ Vectors = NDArray[np.float64]
 Lines = NDArray[np.float32]     # (n, 2, 3), as viser takes them
 
 
-def sector(radius: float, low: float, high: float, begin: float,
-           end: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """
-    Return vertices (n, 3) and triangles (m, 3) of a sector of a cylinder about the z axis.
-
-    The triangles are anticlockwise when seen from outside.
-
-    low, high : its ends along z;  begin, end : angles of its sides [rad], 2 pi apart for a
-    whole cylinder
-    """
-    count = max(2, math.ceil(STEPS * (end - begin) / math.tau)) + 1
-    angles = np.linspace(begin, end, count)
-    rim = radius * np.stack((np.cos(angles), np.sin(angles)), axis=-1)
-    rings = [np.column_stack((rim, np.full(count, z))) for z in (low, high)]
-    vertices = np.vstack((*rings, (0.0, 0.0, low), (0.0, 0.0, high)))
-    last, bottom, top = count - 1, 2 * count, 2 * count + 1     # bottom, top: the centres
-    faces = []
-    for a in range(last):
-        b, c, d = a + 1, a + count, a + count + 1       # the next one, and both on the upper ring
-        faces += [(a, b, d), (a, d, c), (b, a, bottom), (c, d, top)]
-    if end - begin < math.tau:          # the two plane sides
-        faces += [(bottom, 0, count), (bottom, count, top),
-                  (last, bottom, top), (last, top, last + count)]
-    return vertices.astype(np.float32), np.array(faces, np.uint32)
-
-
 def reach(track: Track) -> float:
     """Return the signed length of the drawn axis along e3 [m]; it ends outside of most bodies."""
     return REACH * track.shape.tip
@@ -75,16 +49,6 @@ def circle(radius: float, theta: float) -> Lines:
         np.full_like(phi, math.cos(theta)))))
 
 
-def meridians(radius: float) -> Lines:
-    """Return the lines of the sphere of the tip: the equator and four great circles."""
-    angle = np.linspace(0.0, math.tau, 2 * STEPS + 1)
-    x, z, zero = radius * np.cos(angle), radius * np.sin(angle), np.zeros_like(angle)
-    rings = [np.column_stack((x, z, zero))]
-    for turn in np.arange(4) * math.pi / 4.0:
-        rings.append(np.column_stack((x * math.cos(turn), x * math.sin(turn), z)))
-    return np.concatenate([segments(ring) for ring in rings])
-
-
 def trace(track: Track, stamp_ns: int) -> Lines:
     """Return the lines along which the tip has moved, up to a stamp."""
     _, axis, joined = path(track, stamp_ns - TRACE_NS, stamp_ns)
@@ -98,10 +62,7 @@ def path(track: Track, begin_ns: int, end_ns: int) -> tuple[Stamps, Vectors, NDA
     The third array, (n - 1,), is about the steps from one point to the next.  If samples are far
     apart, points between them are those of the cubic Hermite spline.
     """
-    stamps_ns, rows = track.attitudes.part(begin_ns, end_ns)
-    stride = max(1, -(-len(rows) // TRACE_POINTS))
-    last = (len(rows) - 1) % stride if len(rows) else 0         # so that the last one is kept
-    stamps_ns, rows = stamps_ns[last::stride], rows[last::stride]
+    stamps_ns, rows = track.attitudes.part(begin_ns, end_ns).thinned(TRACE_POINTS)
     x, y, z, w = rows[:, :4].T
     axis = np.column_stack(attitude.axis_in_world((x, y, z, w)))
     steps = np.diff(axis, axis=0)
@@ -162,8 +123,3 @@ def curve(track: Track, name: str, begin_ns: int, end_ns: int) -> tuple[Stamps, 
     stamps_ns, rows = track.samples['~/invariants'].part(begin_ns, end_ns).thinned(CURVE_POINTS)
     values = rows[:, ENERGY_DRIFT if name == CURVES[2] else ORIENTATION_ERROR]
     return stamps_ns, np.log10(np.maximum(np.abs(values), LEAST))
-
-
-def angle_apart(one: Vectors, other: Vectors) -> float:
-    """Return the angle between two attitudes (4,) [rad]."""
-    return float(attitude.angle_between(tuple(one[:4]), tuple(other[:4])))

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page: scene, texts and plots, made with viser; the same for logs and for a running node."""
 
-import math
 import time
 from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
+import trimesh.creation
 import viser
 from viser import uplot
 
@@ -24,7 +24,7 @@ BODY, MARK, ROD = (51, 102, 178), (242, 191, 51), (90, 90, 90)
 TRACES = ((229, 77, 51), (40, 140, 70))
 BOUNDS, SPHERE = (120, 90, 170), (205, 205, 210)
 ARROW_COLOURS = ((20, 120, 60), (190, 60, 160), (230, 130, 20))
-SIDE, ABOVE, WITH_BODY = CAMERAS = ('side', 'above', 'with the body')
+SECTIONS = 48                   # of a cylinder
 NO_LINES = np.zeros((1, 2, 3), np.float32)
 NO_SAMPLES = 'no samples yet'
 Value = TypeVar('Value')
@@ -47,18 +47,21 @@ class DrawnTop:
         self.track, self.shift_ns = track, shift_ns
         name, shape, far = f'/top{number}', track.shape, model.reach(track)
         radius = abs(far)
-        self._root = scene.add_frame(name, show_axes=False)
-        self._sphere = scene.add_line_segments(
-            f'{name}/sphere', model.meridians(radius), SPHERE, thickness=0.002 * radius)
+        self.root = scene.add_frame(name, show_axes=False)
+        self._sphere = scene.add_icosphere(f'{name}/sphere', radius, SPHERE, wireframe=True,
+                                           opacity=0.2, cast_shadow=False)
         self._body = scene.add_frame(f'{name}/body', show_axes=False)
-        low, high = shape.centre - 0.5 * shape.height, shape.centre + 0.5 * shape.height
-        for part, colour, sector in (
-                ('mark', MARK, (shape.radius, low, high, -0.3, 0.3)),
-                ('disc', BODY, (shape.radius, low, high, 0.3, math.tau - 0.3)),
-                ('rod', ROD, (0.015 * radius, min(0.0, far), max(0.0, far), 0.0, math.tau))):
-            scene.add_mesh_simple(f'{name}/body/{part}', *model.sector(*sector), color=colour,
-                                  opacity=0.35 if number else None, flat_shading=part != 'rod',
-                                  side='double')
+        for part, colour, mesh, position in (
+                ('mark', MARK, trimesh.creation.box((
+                    0.3 * shape.radius, 0.5 * shape.radius, 1.02 * shape.height)),
+                 (0.86 * shape.radius, 0.0, shape.centre)),
+                ('disc', BODY, trimesh.creation.cylinder(shape.radius, shape.height, SECTIONS),
+                 (0.0, 0.0, shape.centre)),
+                ('rod', ROD, trimesh.creation.cylinder(0.015 * radius, radius),
+                 (0.0, 0.0, 0.5 * far))):
+            scene.add_mesh_simple(f'{name}/body/{part}', mesh.vertices, mesh.faces, color=colour,
+                                  position=position, opacity=0.35 if number else None,
+                                  flat_shading=part != 'rod')
         self._trace = scene.add_line_segments(
             f'{name}/trace', NO_LINES, TRACES[number], thickness=0.012 * radius)
         self._bounds = [scene.add_line_segments(
@@ -72,13 +75,6 @@ class DrawnTop:
         self.drawn: tuple[int, model.Vectors] | None = None
         self._shown: object = None                      # stamp and switches of the picture
 
-    def remove(self) -> None:
-        self._root.remove()
-
-    def place(self, x: float) -> None:
-        """Put the pivot at (x, 0, 0)."""
-        self._root.position = (x, 0.0, 0.0)
-
     def motion(self, page_ns: int) -> DescribedMotion | None:
         """Return the motion at a stamp of the page."""
         return self.track.motion_at(page_ns + self.shift_ns)
@@ -87,7 +83,7 @@ class DrawnTop:
         """Draw the newest samples up to a stamp of the page, with some of the parts."""
         stamp_ns = page_ns + self.shift_ns
         self.drawn = sample = self.track.attitudes.at(stamp_ns)
-        self._root.visible = sample is not None
+        self.root.visible = sample is not None
         shown = sample and (sample[0], trace, bounds, arrows)
         if shown == self._shown:        # as while it is paused
             return
@@ -140,8 +136,6 @@ class Page:
             self._bounds = gui.add_checkbox('bounds of θ', True)
             self.arrows = [gui.add_checkbox(name, False) for name in model.ARROWS]
             self._over = gui.add_checkbox('one over the other', False, visible=False)
-            self._camera = gui.add_dropdown('camera', CAMERAS)
-        self._camera.on_update(lambda _: self._place_cameras())
         self._plots_folder = gui.add_folder(f'Last {WINDOW_NS // NANOSECONDS} s')
         self._plots: list[viser.GuiUplotHandle] = []
         self._tops: list[DrawnTop] = []
@@ -154,13 +148,9 @@ class Page:
         self.server.stop()
 
     def set_tracks(self, tracks: Sequence[Track], shifts_ns: Sequence[int] = (0,)) -> None:
-        """
-        Show these tops instead of the present ones.
-
-        shifts_ns : what is added to a stamp of the page to get that of each track
-        """
+        """Show these tops; a shift is added to a stamp of the page to get the track's."""
         for top in self._tops:
-            top.remove()
+            top.root.remove()
         for plot in self._plots:
             plot.remove()
         scene = self.server.scene
@@ -175,9 +165,9 @@ class Page:
                        section_size=self._reach, section_color=(200, 200, 200),
                        position=(0.0, 0.0, -1.2 * self._reach))
         camera = self.server.initial_camera
-        camera.position, camera.look_at = self._camera_position(), (0.0, 0.0, 0.0)
+        camera.position = (0.0, -2.5 * self._reach, 1.45 * self._reach)
+        camera.look_at = (0.0, 0.0, 0.0)
         camera.near, camera.far = 0.01 * self._reach, 100.0 * self._reach
-        self._place_cameras()
         empty = np.zeros(1)
         with self._plots_folder:
             self._plots = [self.gui.add_uplot(
@@ -189,22 +179,6 @@ class Page:
                 scales={'x': uplot.Scale(time=False), 'y': uplot.Scale(auto=True)},
                 height=150) for name in model.CURVES]
 
-    def _camera_position(self) -> tuple[float, float, float]:
-        """Return the position of the chosen camera; with the body it follows the precession."""
-        far = 2.9 * self._reach
-        if self._camera.value == ABOVE:
-            return 0.0, -0.01 * far, far
-        turn = 0.0
-        if self._camera.value == WITH_BODY and self._tops and self._tops[0].drawn:
-            x, y, z, w = self._tops[0].drawn[1][:4].tolist()
-            turn = math.atan2(y * z - w * x, x * z + w * y) + 0.5 * math.pi
-        return 0.87 * far * math.sin(turn), -0.87 * far * math.cos(turn), 0.5 * far
-
-    def _place_cameras(self) -> None:
-        position = self._camera_position()
-        for client in self.server.get_clients().values():
-            client.camera.position, client.camera.look_at = position, (0.0, 0.0, 0.0)
-
     def draw(self, page_ns: int, origin_ns: int) -> None:
         """
         Draw all tops at a stamp of the page [ns].
@@ -215,11 +189,9 @@ class Page:
         side = 0.0 if self._over.value else 1.3 * self._reach
         with self.server.atomic():
             for k, top in enumerate(self._tops):
-                top.place(side * (2 * k - len(self._tops) + 1))
+                top.root.position = (side * (2 * k - len(self._tops) + 1), 0.0, 0.0)
                 top.draw(page_ns, trace=self._trace.value, bounds=self._bounds.value,
                          arrows=arrows)
-        if self._camera.value == WITH_BODY:
-            self._place_cameras()
         if self._number % PLOT_EVERY == 0:
             self._plot(page_ns, origin_ns)
             self._tell(page_ns, origin_ns)
@@ -244,10 +216,6 @@ class Page:
     def _tell(self, page_ns: int, origin_ns: int) -> None:
         """Describe the motions and the samples that are drawn."""
         lines = [line for top in self._tops for line in _words_of(top, page_ns, origin_ns)]
-        drawn = [top.drawn[1] for top in self._tops if top.drawn]
-        if len(drawn) == 2:
-            lines.append(f'**angle between the two: '
-                         f'{math.degrees(model.angle_apart(*drawn)):.3g}°**')
         text = '\n'.join(lines)
         if text != self._words.content:
             self._words.content = text

@@ -17,7 +17,7 @@ from websockets.http11 import Request, Response
 
 Answer = Callable[[ServerConnection, Request], Response | None]
 
-PORTS = 100                     # tried in turn
+FIRST_PORT = 8080
 
 
 class Server(viser.ViserServer):
@@ -42,17 +42,17 @@ class Server(viser.ViserServer):
             super().stop()
 
 
-def _free_port(host: str, port: int | None, first: int = 8080) -> int:
-    """Return the port, by default the first free one.  Raises OSError if it cannot be used."""
-    for number in (range(first, first + PORTS) if port is None else (port,)):
-        try:
-            family = socket.AF_INET6 if ':' in host else socket.AF_INET
-            with socket.create_server((host, number), family=family) as server:
-                return int(server.getsockname()[1])
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE or number == port:
-                raise OSError(error.errno, f'{host} port {number}: {error.strerror}') from error
-    raise OSError(errno.EADDRINUSE, f'{host} ports {first} to {first + PORTS - 1}: in use')
+def _free_port(host: str, port: int | None) -> int:
+    """Return the port.  Raises OSError if it cannot be used; viser would try for ever."""
+    number = FIRST_PORT if port is None else port
+    try:
+        family = socket.AF_INET6 if ':' in host else socket.AF_INET
+        with socket.create_server((host, number), family=family) as server:
+            return int(server.getsockname()[1])
+    except OSError as error:
+        if port is None and error.errno == errno.EADDRINUSE:
+            return number               # viser takes the next free one
+        raise OSError(error.errno, f'{host} port {number}: {error.strerror}') from error
 
 
 def _names(host: str) -> set[str]:

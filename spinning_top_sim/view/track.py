@@ -18,7 +18,7 @@ from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.topics import all_streams
-from spinning_top_sim.tools.analysis import SNAP, attitudes_of
+from spinning_top_sim.tools.analysis import attitudes_of
 
 # Number of columns of each topic.  First come the attitude x, y, z, w and the angular velocity in
 # the body; then phi', or for the IMU the specific force.
@@ -28,6 +28,7 @@ ATTITUDES = ('pose', 'joint_states', 'ground_truth/odom', 'ground_truth/imu')   
 RATES = ('joint_states', 'ground_truth/odom')
 PRECESSION = 7              # column of RATES
 ENERGY_DRIFT, ORIENTATION_ERROR = 3, 7     # columns of ~/invariants
+SNAP = 1e-9                 # relative distance within which a motion is taken for a special one
 SAME = 1e-6                 # relative difference between the constants of one motion
 MOST_MOTIONS = 99           # that are kept
 
@@ -50,9 +51,10 @@ class Samples(NamedTuple):
         return None if index < 0 else (int(self.stamps_ns[index]), self.rows[index])
 
     def thinned(self, most: int) -> 'Samples':
-        """Return at most so many evenly chosen samples."""
+        """Return at most so many evenly chosen samples, with the last one."""
         stride = max(1, -(-len(self.rows) // most))
-        return Samples(self.stamps_ns[::stride], self.rows[::stride])
+        first = (len(self.rows) - 1) % stride
+        return Samples(self.stamps_ns[first::stride], self.rows[first::stride])
 
 
 def joined(parts: Sequence[Samples]) -> Samples:
@@ -113,11 +115,9 @@ class Track:
                            if stream.topic in WIDTHS}
 
     def decode(self, topic: str, stamps_ns: Sequence[int], messages: Sequence[bytes]) -> Samples:
-        """Return serialized messages of a topic as samples, without those of another size."""
-        template = self._templates[topic]
-        fitting = [k for k, message in enumerate(messages) if len(message) == len(template)]
-        stamps = np.array([stamps_ns[k] for k in fitting], np.int64)
-        fields = template.decode(b''.join(messages[k] for k in fitting))
+        """Return serialized messages of a topic as samples."""
+        stamps = np.array(stamps_ns, np.int64)
+        fields = self._templates[topic].decode(b''.join(messages))
         if topic == '~/invariants':
             return Samples(stamps, fields[0])
         found = attitudes_of(topic, self._imu, stamps, fields)
@@ -127,8 +127,6 @@ class Track:
             assert found.phi_dot is not None
             rows = np.column_stack((rows[:, :7], found.phi_dot))
         if topic == 'ground_truth/imu':
-            if len(rows) < len(stamps):         # an attitude of zeros
-                return empty(topic)
             # With imu.sampling = mean these are means, which are near enough for a picture.
             (_, rates), (_, force) = (self._imu.in_body(tuple(fields[0].T), tuple(field.T))
                                       for field in fields[1:3])

@@ -77,10 +77,5 @@ class Visit:
         box.fill(str(value))
         box.press('Enter')
 
-    def choose(self, label, option):
-        """Choose from a list."""
-        self.page.get_by_label(label, exact=True).click()
-        self.page.get_by_role('option', name=option, exact=True).click()
-
     def tick(self, label):
         self.page.get_by_label(label, exact=True).click()

@@ -25,7 +25,6 @@ from typing import NamedTuple
 
 from helpers.reference import ROOT
 
-LANGUAGES = {'python', 'bash', 'yaml', 'text', 'xml', 'ini'}
 FENCE = re.compile(r'^(?:<!-- (?P<mark>[^\n]*?) -->\n)?'
                    r'^```(?P<language>[^\n]*)\n(?P<text>.*?)^```$', re.MULTILINE | re.DOTALL)
 NUMBER = re.compile(r'(?<![\w.])[-+]?\d+\.?\d*(?:e[-+]?\d+)?(?![\w])')
@@ -53,11 +52,6 @@ def blocks(page):
                                match['mark'] or '', not page[end:match.start()].strip()))
         end = match.end()
     return found
-
-
-def outside(page):
-    """Return the page without its blocks."""
-    return FENCE.sub('', page)
 
 
 def left_out(block):

@@ -58,12 +58,6 @@ def _default(row: Parameter) -> float:
     return row.default if isinstance(row.default, int | float) else 1.0
 
 
-def commands(random_: random.Random) -> list[list[float]]:
-    """Return one to six messages for ~/commands: [L3, Lz] as a rule, some of another length."""
-    return [[_double(random_) for _ in range(random_.choice((2, 2, 2, 2, 2, 2, 2, 0, 1, 3)))]
-            for _ in range(random_.randint(1, 6))]
-
-
 def actions(random_: random.Random) -> list[tuple[str, object]]:
     """
     Return four to twelve things to do to a running node, one after the other.
@@ -76,7 +70,8 @@ def actions(random_: random.Random) -> list[tuple[str, object]]:
         kind = random_.choice(('set', 'set', 'command', 'pause', 'step', 'reset', 'wait'))
         found.append((kind, {
             'set': lambda: parameter_set(random_),
-            'command': lambda: commands(random_)[0],
+            'command': lambda: [_double(random_) for _ in range(
+                random_.choice((2, 2, 2, 2, 2, 2, 2, 0, 1, 3)))],
             'pause': lambda: random_.random() < 0.5,
             'wait': lambda: random_.randrange(100) / 1000.0,
         }.get(kind, lambda: None)()))

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-The node of examples/ with a fault of helpers.faulty_filters: `python faulty_node.py conjugated`.
-
-Without a name it has no fault.
-"""
+"""The node of examples/, if named with a fault of helpers.faulty_filters."""
 
 import contextlib
 import sys
@@ -20,15 +16,9 @@ from attitude_node import AttitudeNode  # noqa: E402
 from helpers.faulty_filters import MISREADINGS  # noqa: E402
 from spinning_top_sim.exam.adapters import Vqf  # noqa: E402
 
-
-def main():
-    rclpy.init()
-    node = AttitudeNode()
-    for name in sys.argv[1:]:
-        node.filter = MISREADINGS[name](partial(Vqf, magnetic=False))
-    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
-        rclpy.spin(node)
-
-
-if __name__ == '__main__':
-    main()
+rclpy.init()
+node = AttitudeNode()
+for name in sys.argv[1:]:
+    node.filter = MISREADINGS[name](partial(Vqf, magnetic=False))
+with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
+    rclpy.spin(node)

@@ -18,7 +18,7 @@ from sensor_msgs.msg import Imu, JointState
 from helpers.node_harness import LIFETIME_S
 from helpers.simulations import record
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.simulation import Simulation
+from spinning_top_sim.streams.live import LiveSimulation
 
 SECOND = 1_000_000_000
 KINDS = {'pose': PoseStamped, 'joint_states': JointState, 'imu/data_raw': Imu,
@@ -136,7 +136,7 @@ def simulated(log, metadata, until_ns):
     run = metadata['spinning_top_sim']
     assert 0 <= until_ns < LIFETIME_S * SECOND, 'the stamp of t = 0 in the log is wrong'
     epoch_ns = int(run['epoch_ns'])
-    simulation = Simulation(parameters.checked(json.loads(run['parameters'])), epoch_ns)
+    simulation = LiveSimulation(parameters.checked(json.loads(run['parameters'])), epoch_ns)
     taken = record(simulation)
     for event in events_in(log):
         if event['event'] in ('command', 'parameters'):

@@ -48,9 +48,9 @@ class OwnNode:
     def listen(self, *topics):
         """Let these streams, and no others, have a subscriber."""
         self.heard |= {topic: [] for topic in topics}
-        self.node._outputs.update_subscribers = lambda streams: [
-            setattr(one, 'publish', self.heard[one.topic].append)
-            for one in streams if one.topic in self.heard]
+        self.node._outputs.update_subscribers = lambda outputs: [
+            setattr(one, 'publish', self.heard[one.stream.topic].append)
+            for one in outputs if one.stream.topic in self.heard]
         return self
 
     def set(self, **values):

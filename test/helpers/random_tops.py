@@ -136,17 +136,9 @@ def no_spin(d):
     d.lz = d.consistent_lz(d.sign() * d.l0 * d.log(-6, 1))
 
 
-def no_lz(d):
-    d.lz = 0.0
-
-
 def planar(d):
     d.l3 = d.lz = 0.0
     d.theta_dot = d.sign() * d.w0 * d.log(-2, 1)
-
-
-def round_inertia(d):
-    d.lambda3 = d.lambda1
 
 
 def no_torque(d):
@@ -227,10 +219,9 @@ def near_sleeping(d):
         d.consistent_lz(0.0), 0.0)
 
 
-KINDS = (generic, generic, wild, wild, top_pole, bottom_pole, rest_at_a_pole, next_to_the_top,
-         next_to_the_bottom, near_pass, near_pass, crosses_the_top, crosses_the_bottom, no_spin,
-         no_lz, planar, round_inertia, no_torque, tiny_gravity, upside_down, upside_down, fast,
-         near_separatrix, near_separatrix, waking_sleeper, cusp, steady, near_hanging,
+KINDS = (generic, wild, top_pole, bottom_pole, rest_at_a_pole, next_to_the_top, next_to_the_bottom,
+         near_pass, crosses_the_top, crosses_the_bottom, no_spin, planar, no_torque, tiny_gravity,
+         upside_down, fast, near_separatrix, waking_sleeper, cusp, steady, near_hanging,
          near_sleeping)
 
 

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-The exam of a ROS node beside two busy processes: each fault is named, and no other.
-
-A node is started for each run of the exam; every fifth seed examines one that runs already.
-"""
+"""The exam of a ROS node beside two busy processes: each fault is named, and no other."""
 
 import os
 import signal

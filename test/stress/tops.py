@@ -179,13 +179,6 @@ def check_derivatives(found, case, solution):
                         rounding + (1e-10 + 2.0 * uneven) * rate)
 
 
-def check_nanoseconds(found, case, solution):
-    """Times may be integers."""
-    ns = np.unique(np.rint(INSTANTS[1:] * period_of(solution) * 1e9))
-    ns = ns[ns < min(2.0 ** 62, solution.ns_limit)].astype(np.int64)
-    check_columns(found, case, solution.states(ns))
-
-
 def check_integrations(found, cases, motions, times):
     """
     The exact solution against an independent integration, within the integration's own error.
@@ -384,7 +377,6 @@ def check_case(found, case, solution, motion, times):
     check_columns(found, case, motion)
     check_start(found, case, motion)
     check_derivatives(found, case, solution)
-    check_nanoseconds(found, case, solution)
     far = FAR * period_of(solution)
     far = far[np.abs(far) < solution.time_limit]
     check_columns(found, case, solution.states_at_seconds(far))

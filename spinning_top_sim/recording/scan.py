@@ -1,0 +1,306 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Scans the data section of an MCAP file from record to record, around what is damaged.
+
+Behind damage the scan goes on at the record to which the damaged one's length leads, or else at
+the next chunk, schema, channel or metadata that can be decoded.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable
+from typing import NamedTuple
+
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, DataEnd, McapRecord, Metadata, Schema
+from mcap.writer import MCAP0_MAGIC
+
+from spinning_top_sim.recording.chunks import time_span
+from spinning_top_sim.recording.damage import Damage, Loss, count
+from spinning_top_sim.recording.log_file import MAGIC_SIZE, LogFile, Summary, known_channels
+from spinning_top_sim.recording.mcap_writer import record_bytes
+from spinning_top_sim.recording.records import (
+    HEAD,
+    MAX_DECLARED,
+    DamagedError,
+    Messages,
+    TooLargeError,
+    check_size,
+    find_messages,
+    index_entries,
+    open_chunk,
+    size_of,
+)
+from spinning_top_sim.recording.rosbag2 import BAG_METADATA
+
+_DATA_END_SIZE = HEAD.size + 4
+_RUN_BYTES = 1 << 20    # of messages outside of chunks that are read at a time
+_BLOCK = 1 << 16        # bytes searched at a time
+# What may begin a chunk, a schema, a channel or metadata: opcode and a length below 2^40.
+# Single messages are not looked for: nothing in them tells them from chance.
+_CANDIDATE = re.compile(rb'[\x03\x04\x06\x0c](?=.{5}\x00\x00\x00)', re.DOTALL)
+# Where the length of the first text is in the content; a chunk's is followed by that of the data.
+_NAME_OFFSETS: dict[int, int] = {
+    Opcode.SCHEMA: 2, Opcode.CHANNEL: 4, Opcode.METADATA: 0, Opcode.CHUNK: 28}
+_MAX_NAME = 1 << 12
+_MAX_EFFORT = 4         # bytes of candidates read, as a multiple of the file's size
+# A recovery makes these anew, so a truncated one is no loss.
+_REPEATED = (Opcode.DATA_END, Opcode.STATISTICS, Opcode.CHUNK_INDEX,
+             Opcode.METADATA_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.SUMMARY_OFFSET, Opcode.FOOTER)
+
+
+class Part(NamedTuple):
+    """A chunk, adjacent messages outside of chunks, metadata or an attachment."""
+
+    opcode: int
+    offset: int
+    end: int
+    channel_ids: frozenset[int] = frozenset()   # of its messages
+    start_ns: int = 0                           # their earliest log time
+    end_ns: int = 0                             # the latest
+
+
+class Scan:
+    """
+    All that can be decoded of the data section, and the damage of the file.
+
+    ours : whether this package wrote the file: all messages are in chunks, all kinds are known
+    progress : is called with the offset that is reached
+    """
+
+    def __init__(self, file: LogFile, summary: Summary, *, ours: bool,
+                 progress: Callable[[int], object] = lambda offset: None) -> None:
+        self.parts: list[Part] = []                 # in file order
+        self.metadata: dict[str, dict[str, str]] = {}   # by name
+        self.schemas, self.channels = summary.schemas.copy(), summary.channels.copy()   # by id
+
+        self._file = file
+        self._summary = summary
+        self._ours = ours
+        self._all_in_chunks = ours or summary.indexes_all_messages
+        self._limit = summary.data_limit
+        self._losses: list[Loss] = []
+        self._defects: list[str] = []
+        self._found: Counter[int] = Counter()   # messages by channel id
+        self._lost = 0                  # messages of lost chunks, by their message indexes
+        self._behind_chunk = False      # only message indexes since the last chunk
+        self._is_proven = True          # all messages are in chunks with checksums
+        self._small_bytes = 0           # of schemas, channels and metadata
+        # Bytes of candidates that may be read and uncompressed, so that a search ends in time.
+        self._effort = _MAX_EFFORT * file.size
+        self._unpacking = _MAX_EFFORT * (file.size + file.max_bytes)
+
+        if file.read(0, MAGIC_SIZE) != MCAP0_MAGIC:
+            self._defects.append('the first eight bytes are not those of an MCAP file')
+        self._walk(progress)
+        self.known_channels = known_channels(self.schemas, self.channels)
+        self.damage = self._damage()
+
+    def _walk(self, progress: Callable[[int], object]) -> None:
+        offset = MAGIC_SIZE
+        # Where a summary or a footer tells the end, the last bytes can only be the data end.
+        end_is_known = not self._summary.problem
+        limit = self._limit - _DATA_END_SIZE * end_is_known
+        while offset < limit:
+            progress(offset)
+            try:
+                opcode, end = self._file.head(offset, self._limit)
+                if opcode == Opcode.DATA_END and (
+                        end == self._limit if end_is_known else end - offset == _DATA_END_SIZE):
+                    break
+                self._take(opcode, offset, end)
+            except DamagedError as damage:
+                end = self._skip(offset, damage)
+            offset = end
+        self._check_end(offset)
+
+    def _take(self, opcode: int, offset: int, end: int) -> None:
+        """Note what a record holds; raises DamagedError."""
+        record, messages = self._decode(opcode, offset, end)
+        self._check_length(record, offset, end)
+        if isinstance(record, int):
+            self._lost += 0 if self._behind_chunk else record
+            return
+        self._behind_chunk = opcode == Opcode.CHUNK
+        if isinstance(record, Schema | Channel | Metadata):
+            self._small_bytes += end - offset
+            check_size(self._small_bytes, MAX_DECLARED)
+        for declared in (record, *(messages.declared if messages else ())):
+            if isinstance(declared, Schema):
+                self.schemas.setdefault(declared.id, declared)
+            elif isinstance(declared, Channel):
+                self.channels.setdefault(declared.id, declared)
+        if isinstance(record, Metadata):
+            self.metadata[record.name] = record.metadata
+        if messages is not None and messages.entries:
+            self._is_proven &= isinstance(record, Chunk) and record.uncompressed_crc != 0
+            self._add(opcode, offset, end, messages)
+        elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
+            self.parts.append(Part(opcode, offset, end))
+
+    def _decode(self, opcode: int, offset: int, end: int,
+                ) -> tuple[McapRecord | int | None, Messages | None]:
+        """Return a record, of a message index the number of entries, and the messages in it."""
+        check_size(end - offset - HEAD.size, self._file.max_bytes)
+        if opcode > Opcode.DATA_END:    # of an application, or of a later version of the format
+            if self._ours:
+                raise DamagedError('there is no such kind of record')
+            return None, None
+        raw = self._file.raw(offset, end)
+        if opcode == Opcode.MESSAGE_INDEX:
+            return index_entries(raw), None
+        if opcode == Opcode.MESSAGE:
+            if self._all_in_chunks:
+                raise DamagedError('all messages of the file are in chunks')
+            return None, find_messages(raw)
+        record = self._file.record(offset, end)
+        if isinstance(record, Chunk):
+            return record, open_chunk(record, self._file.max_bytes)
+        return record, None
+
+    def _check_length(self, record: McapRecord | int | None, offset: int, end: int) -> None:
+        """Raise DamagedError for a length that neither its fields nor the next record prove."""
+        if isinstance(record, McapRecord):
+            is_right = end - offset == size_of(record) or self._is_record(end) or (
+                end == self._limit and not self._summary.problem)
+        else:
+            is_right = end == self._limit or self._is_head(end)
+        if not is_right:
+            raise DamagedError('its length is not that of its content')
+
+    def _is_head(self, offset: int) -> bool:
+        """Return whether a record seems to begin there, which may be truncated."""
+        head = self._file.read(offset, HEAD.size)
+        opcode, length = HEAD.unpack(head.ljust(HEAD.size, b'\0'))
+        return opcode > 0 and (offset + HEAD.size + length <= self._limit or (
+            opcode <= Opcode.DATA_END and length <= self._file.max_bytes))
+
+    def _add(self, opcode: int, offset: int, end: int, messages: Messages) -> None:
+        """Note a part with messages, or add a message to the part that ends before it."""
+        for channel_id, entries in messages.entries.items():
+            self._found[channel_id] += len(entries) // 2
+        part = Part(opcode, offset, end, frozenset(messages.entries), *time_span(messages.entries))
+        last = self.parts[-1] if self.parts else part
+        if opcode == Opcode.MESSAGE == last.opcode and (
+                last.end == offset < last.offset + _RUN_BYTES):
+            part = Part(opcode, last.offset, end, part.channel_ids | last.channel_ids,
+                        min(part.start_ns, last.start_ns), max(part.end_ns, last.end_ns))
+            self.parts.pop()
+        self.parts.append(part)
+
+    # ------------------------------------------------------------------------------- damage
+
+    def _skip(self, offset: int, damage: DamagedError) -> int:
+        """Note a damaged record, and return where the next one begins, or the limit."""
+        opcode = self._file.read(offset, 1)[0]
+        what = ('chunk' if offset in self._summary.chunks
+                else Opcode(opcode).name.lower().replace('_', ' ') if opcode in set(Opcode)
+                else 'record of unknown kind')
+        try:
+            _, stated_end = self._file.head(offset, self._limit)
+        except DamagedError:
+            stated_end = 0
+        end = (stated_end if stated_end == self._limit or self._is_record(stated_end)
+               else self._search(offset + 1))
+        is_truncated = not stated_end and not self._summary.closed and end == self._limit
+        if what == 'message index' or (
+                is_truncated and (opcode in _REPEATED or self._is_bag(offset))):
+            self._defects.append(f'{what} at byte {offset}: {damage}')
+            if offset < stated_end < end:
+                self._losses.append(Loss(stated_end, end - stated_end, 'something',
+                                         'no record can be decoded there'))
+        else:
+            self._losses.append(Loss(offset, end - offset, what, str(damage),
+                                     isinstance(damage, TooLargeError)))
+        self._behind_chunk &= opcode == Opcode.MESSAGE_INDEX
+        return end
+
+    def _is_bag(self, offset: int) -> bool:
+        """Return whether a truncated record is bag metadata, which tell nothing of their own."""
+        bag = record_bytes(Metadata(BAG_METADATA, {}))[:-4]
+        head = self._file.read(offset, len(bag))
+        return head[:1] == bag[:1] and bag.startswith(head[HEAD.size:], HEAD.size)
+
+    def _search(self, offset: int, kinds: bytes = bytes(_NAME_OFFSETS)) -> int:
+        """Return where the next record of these kinds begins that can be decoded, or the limit."""
+        while offset < self._limit:
+            block = self._file.read(offset, _BLOCK + HEAD.size)
+            for match in _CANDIDATE.finditer(block, 0, _BLOCK + HEAD.size - 1):
+                if match.group()[0] in kinds and self._is_record(offset + match.start()):
+                    return offset + match.start()
+            offset += _BLOCK
+        return self._limit
+
+    def _is_record(self, offset: int) -> bool:
+        """Return whether a record begins there that can be decoded."""
+        try:
+            opcode, end = self._file.head(offset, self._limit)
+            if opcode in _NAME_OFFSETS:
+                self._spend(opcode, offset, end)
+            _, messages = self._decode(opcode, offset, end)
+        except TooLargeError:
+            return opcode == Opcode.CHUNK
+        except DamagedError:
+            return False
+        # Zeros look like an empty chunk.
+        return opcode != Opcode.CHUNK or bool(messages and messages.plain)
+
+    def _spend(self, opcode: int, offset: int, end: int) -> None:
+        """Raise DamagedError where decoding a record is not worth the effort, or none is left."""
+        start = self._file.read(offset + HEAD.size, 64)
+        name_start = _NAME_OFFSETS[opcode] + 4
+        name_size = int.from_bytes(start[name_start - 4:name_start], 'little')
+        right = 0 < name_size < _MAX_NAME
+        if opcode == Opcode.CHUNK:
+            data_start = name_start + name_size + 8
+            data_size = int.from_bytes(start[data_start - 8:data_start], 'little')
+            right = data_size <= end - offset - HEAD.size - data_start
+            self._unpacking -= right and int.from_bytes(start[16:24], 'little')
+        self._effort -= right and end - offset
+        if not right or self._effort < 0 or self._unpacking < 0:
+            raise DamagedError('it is no record')
+
+    # ------------------------------------------------------------------------- end of the scan
+
+    def _check_end(self, offset: int) -> None:
+        """Look at the checksum in the data end, and for chunks behind it."""
+        try:
+            end = self._file.record(offset, self._limit)
+        except DamagedError:
+            end = None
+        if not isinstance(end, DataEnd):
+            if self._summary.closed:
+                self._defects.append('the end of the data section is damaged')
+            return
+        if not self._losses and end.data_section_crc not in (0, self._file.crc(offset)):
+            reason = 'the checksum of the data section is wrong'
+            if self._is_proven:
+                self._defects.append(reason)
+            else:
+                self._losses.append(Loss(0, 0, 'something', reason))
+        if self._summary.problem:
+            other = self._search(offset, bytes([Opcode.CHUNK]))
+            if other < self._limit:
+                self._losses.append(Loss(other, self._limit - other, 'another log',
+                                         'it stands behind the end of this one'))
+
+    def _damage(self) -> Damage:
+        if self._summary.problem:
+            self._defects.append(self._summary.problem)
+        found = sum(self._found[number] for number in self.known_channels)
+        unknown = self._found.total() - found
+        if unknown:
+            self._losses.append(Loss(0, 0, count(unknown, 'message'),
+                                     'no whole record declares their channels'))
+        statistics = self._summary.statistics
+        parts = [part for part in self.parts if part.channel_ids & self.known_channels]
+        return Damage(
+            truncated=not self._summary.closed, losses=tuple(self._losses),
+            defects=tuple(self._defects),
+            missing_messages=(self._lost + unknown if statistics is None
+                              else max(0, statistics.message_count - found)),
+            missing_exactly=statistics is not None,
+            start_ns=min((part.start_ns for part in parts), default=0),
+            end_ns=max((part.end_ns for part in parts), default=0))
