@@ -39,15 +39,30 @@ class ExactSolution:
     unwrapped, the quaternion's sign is continuous.  On every motion each of them is within 5e-15,
     relative to the value or to its start where these are larger than 1.
 
-    start : the state at t = 0, with theta in [0, pi]; that of a `ContinuedState` may be any number
-    nutation_period : period of theta [s], None if it is constant
-    mean_precession_rate, mean_spin_rate : means over a nutation [rad/s]
-    theta_min, theta_max : bounds of theta folded into [0, pi] [rad]
-    m, m1 : parameter of the elliptic functions and m1 = 1 - m, which is 0 on the separatrix
-    time_limit, ns_limit : the farthest time either way [s], [ns]
+    Parameters
+    ----------
+    top : Top
+        What moves.
+    start : State
+        The state at t = 0; of a `ContinuedState` theta may be any number.
 
-    Raises ValueError for motions whose constants doubles cannot hold, and, from every evaluation,
-    for times that are not of the kind that it takes or beyond the limits.
+    Attributes
+    ----------
+    nutation_period : float or None
+        Period of theta [s], None if it is constant.
+    mean_precession_rate, mean_spin_rate : float
+        Means over a nutation [rad/s].
+    theta_min, theta_max : float
+        Bounds of theta folded into [0, pi] [rad].
+    m, m1 : float
+        Parameter of the elliptic functions and m1 = 1 - m, which is 0 on the separatrix.
+    time_limit, ns_limit : float, int
+        The farthest time either way [s], [ns].
+
+    Raises
+    ------
+    ValueError
+        For motions whose constants doubles cannot hold, and from every evaluation for bad times.
     """
 
     steps = evaluations = 0
@@ -127,7 +142,14 @@ class ExactSolution:
         return across
 
     def describe(self) -> Description:
-        """Return the motion in the numbers that a physicist asks for."""
+        """
+        Return the motion in the numbers that a physicist asks for.
+
+        Returns
+        -------
+        Description
+            Name, bounds, period and mean rates.
+        """
         top, start = self.top, self.start
         rests = axis_rests(top, start)
         low, high = 2 * (start.theta,) if rests else (self.theta_min, self.theta_max)
