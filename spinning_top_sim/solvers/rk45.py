@@ -25,7 +25,7 @@ from spinning_top_sim.solvers.equations import (
 )
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.times import NANOSECONDS, Times
-from spinning_top_sim.solvers.unwrap import PhaseUnwrapper
+from spinning_top_sim.solvers.unwrap import PhaseUnwrapper, turns_to_follow
 
 # A time that so many steps of the present size do not reach is refused: minutes of work.
 MOST_STEPS = 1e7
@@ -202,7 +202,7 @@ class _TransportStates(States):
                  t: Column, rows: Rows) -> None:
         super().__init__(equations.top, start, len(t))
         self.t, self._equations = t, equations
-        self._of_alpha, self._of_beta = phases.of_alpha, phases.of_beta
+        self._polar, self._momenta = phases.polar, phases.momenta
         self._stepped: Parts = tuple(rows[:6])
         self._begins = rows[6:]
 
@@ -210,7 +210,7 @@ class _TransportStates(States):
     def _projected(self) -> Parts:
         """The unknowns on the invariants, in the body's own frame."""
         equations, y, pole_share = self._equations, self._stepped, POLE_SHARE
-        if self._of_alpha.crosses or self._of_beta.crosses:     # the meridian of the axis is known
+        if not all(self._momenta[:2]):  # the meridian of the axis is known
             y, pole_share = self._on_lines(y, equations.uniform_rates[0] * self.t), 0.0
         a, b, c, d, m_real, m_imag = equations.project_columns(y, pole_share)
         spin = 0.5 * equations.spin_rate * self.t
@@ -220,8 +220,12 @@ class _TransportStates(States):
 
     def _on_lines(self, y: Parts, uniform: Column) -> Parts:
         """Return y with alpha or beta moved onto the line through zero, and m turned with them."""
-        moved = (*self._of_alpha.on_line(y[0], y[1], uniform),
-                 *self._of_beta.on_line(y[2], y[3], -uniform))
+        moved = list(y[:4])
+        moduli, phases = self._polar(y, uniform)
+        for k, part in enumerate((uniform, -uniform)):
+            if not self._momenta[k]:
+                moved[2 * k] = moduli[k] * np.cos(phases[k] + part)
+                moved[2 * k + 1] = moduli[k] * np.sin(phases[k] + part)
         x, z = half_axis(*y[:4])
         u, v = half_axis(*moved)
         # Next to the pole m is known better than the axis.
@@ -238,14 +242,13 @@ class _TransportStates(States):
 
     @cached_property
     def angles(self) -> tuple[Column, Column, Column]:
-        a, b, c, d, *_ = self._projected
         uniform = self._equations.uniform_rates[1] * self.t
-        of_alpha, of_beta = (a, b, uniform), (c, d, -uniform)
-        half_sum = self._of_alpha.at(*of_alpha, self._begins[0])
-        half_difference = self._of_beta.at(*of_beta, self._begins[1])
-        half = np.arctan2(self._of_beta.modulus(*of_beta), self._of_alpha.modulus(*of_alpha))
+        _, phases = self._polar(self._projected, uniform)
         # theta/2 turns by less than half a turn within a step.
-        half = half + math.tau * np.rint((self._begins[2] - half) / math.tau)
+        half_sum, half_difference, half = (
+            phase + math.tau * turns_to_follow(phase, begin, momentum)
+            for phase, begin, momentum in zip(phases, self._begins, self._momenta, strict=True))
+        half_sum, half_difference = half_sum + uniform, half_difference - uniform
         return half_sum + half_difference, 2.0 * half, half_sum - half_difference
 
     @cached_property
