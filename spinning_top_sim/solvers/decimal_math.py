@@ -12,7 +12,7 @@ from decimal import Context, Decimal, getcontext, localcontext
 from functools import lru_cache
 
 ZERO, ONE = Decimal(0), Decimal(1)
-HALVINGS = 8
+HALVINGS = 5
 SMALL = Decimal('1e-9')
 
 
@@ -56,14 +56,14 @@ def sin_cos(x: Decimal) -> tuple[Decimal, Decimal]:
 
 def atan2(y: Decimal, x: Decimal) -> Decimal:
     """Return the argument of x + iy, to 80 digits at most; 0 at the origin."""
-    radius = (x * x + y * y).sqrt()
-    if not radius:
+    size = max(abs(x), abs(y))
+    if not size:
         return ZERO
-    y, x = y / radius, x / radius
+    y, x = y / size, x / size
     guess = Decimal(math.atan2(y, x))
     s, c = sin_cos(guess)
-    rest = y * c - x * s                # sine of the angle that is left, about 1e-16
-    return guess + rest + rest ** 3 / 6 + 3 * rest ** 5 / 40
+    rest = (y * c - x * s) / (x * c + y * s)    # tangent of the angle that is left, about 1e-16
+    return guess + rest - rest ** 3 / 3 + rest ** 5 / 5
 
 
 def asinh(x: Decimal) -> Decimal:

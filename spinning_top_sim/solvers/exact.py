@@ -100,7 +100,7 @@ class ExactSolution:
         self.mean_precession_rate = float(alpha.rate + beta.rate)
         self.mean_spin_rate = float(alpha.rate - beta.rate)
         self._bottom_rate, self._top_rate = float(bottom_rate), float(top_rate)
-        self._theta = ThetaFunctions(motion, start.theta)
+        self._theta = ThetaFunctions(motion)
         self.theta_min, self.theta_max = self._theta.bounds.tolist()
         # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
         self._phi_phase = float(

@@ -17,9 +17,8 @@ https://dlmf.nist.gov, ch. 19, 20 and 22.
        alpha = cos(theta/2) exp(i(phi+psi)/2),   beta = sin(theta/2) exp(i(phi-psi)/2)
 
    have |alpha|^2 = (1 + u)/2 and |beta|^2 = (1 - u)/2.  alpha vanishes where u = -1, at
-   chi = ia; beta where u = 1, at chi = K + ib.  Here a and b are real [DLMF 22.6(iv)]:
-   -sn^2(ia) = (1 + u1)/(u2 - u1), and b from the same quotient at K.  A quotient of theta
-   functions with these zeros and the poles of u differs from alpha or beta by a factor
+   chi = ia; beta where u = 1, at chi = K + ib.  Here a and b are real [DLMF 22.6(iv)].  A quotient
+   of theta functions with these zeros and the poles of u differs from alpha or beta by a factor
    exp(constant + constant * t).
 
 3. *Phase.*  Z = chi/K counts quarter periods.  N is the nearest integer and y = (pi/2) (Z - N), so
@@ -29,20 +28,16 @@ https://dlmf.nist.gov, ch. 19, 20 and 22.
 
    D is theta4(y) at even N (u near u1) and theta3(y) at odd N (u near u2).  With A = pi a/(2K),
    X is i s theta1(y - i s A) at even and theta2(y - i s A) at odd N for alpha; for beta, with b
-   for a, it is the other way round [DLMF 20.2(i), 20.2(iii)].  R and J are the series of
-   `theta_series`.
+   for a, it is the other way round [DLMF 20.2(i), 20.2(iii)].
 
-4. *Rates.*  (phi + psi)' = Omega + (Lz + L3)/(lambda1 (1 + u)) and (phi - psi)' = -Omega +
-   (Lz - L3)/(lambda1 (1 - u)), Omega = L3/lambda3 - L3/lambda1.  r is half of the mean of that
-   over a nutation: a complete elliptic integral of the third kind (`GaussMean.mean_reciprocal`).
+4. *Rates.*  r is half of the mean of Omega + (Lz + L3)/(lambda1 (1 + u)) for alpha and of
+   -Omega + (Lz - L3)/(lambda1 (1 - u)) for beta, Omega = L3/lambda3 - L3/lambda1.  X(y) turns by a
+   quarter turn from one N to the next, which r t contains already: kappa = -s takes it out again.
+   The imaginary form has kappa = s (a/K' - 1) [DLMF 20.7(viii)].
 
-5. *Drift.*  X(y) turns by a quarter turn from one N to the next, which r t contains already.
-   kappa = -s takes it out again.  The imaginary form has kappa = s (a/K' - 1), as Jacobi's
-   transformation leaves a factor exp(i s y a/K') [DLMF 20.7(viii)].
-
-6. *Poles.*  s = 0 means that the axis passes a pole exactly.  Then X is real and changes its sign
-   there, and r has no term of the third kind.  If Lz = L3 and u3 = 1, beta has no zero: it is
-   proportional to dn(chi), with theta4 and theta3 for X.
+5. *Poles.*  s = 0 means that the axis passes a pole exactly.  Then X is real and changes its sign
+   there.  If Lz = L3 and u3 = 1, beta has no zero: it is proportional to dn(chi), with theta4 and
+   theta3 for X.
 
 Everything that cancels, cancels here: next to a pole, to the separatrix, to steady precession.  So
 there are 60 digits, and more if two roots are close.  Then 40 are enough.
@@ -70,8 +65,7 @@ from spinning_top_sim.solvers.decimal_math import (
 from spinning_top_sim.solvers.elliptic import GaussMean
 from spinning_top_sim.solvers.theta_series import COS_EVEN, NOTHING, Parts, Series, ThetaForm
 
-FIRST_DIGITS = 60
-MOST_DIGITS = 480
+DIGITS_TO_TRY = 60, 120, 240, 480
 DIGITS = 40             # that are left once nothing cancels any more
 NO_GRAVITY = Decimal('1e-1000')     # so small that u3 is infinite to all digits
 
@@ -84,9 +78,9 @@ class Factor:
     rate : r [rad/s]
     phase_turns : c [turns]
     drift : kappa
-    parts : R and s J at even and at odd N
+    parts : R and s J at even and at odd N.  If it changes its sign at a pole, R is a sine series
+        at one of them, and has the factor (-1)^floor(N/2).
     sense : s
-    crosses : whether it changes its sign at a pole; R then has the factor (-1)^floor(N/2)
     start_argument : argument of (R + i s J) exp(i kappa y) at t = 0 [rad]
     """
 
@@ -95,7 +89,6 @@ class Factor:
     drift: Decimal
     parts: tuple[Parts, Parts]
     sense: int
-    crosses: bool
     start_argument: Decimal
 
 
@@ -104,7 +97,7 @@ class ThetaMotion:
     """
     A motion in theta functions; the symbols are explained above.
 
-    imaginary : whether the series are in the imaginary form, of x = stretch y
+    stretch : K/K', if the series are in the imaginary form, of x = stretch y
     quarter_rate : quarter periods per second, w/K
     quarter0, offset0 : N and 2y/pi at t = 0, offset0 accurate relative to itself
     u_dot, u_dot_series : c at even and at odd N, and theta1, of u' = c theta1(2y)/D^4
@@ -112,8 +105,7 @@ class ThetaMotion:
 
     alpha: Factor
     beta: Factor
-    imaginary: bool = False
-    stretch: Decimal = ONE
+    stretch: Decimal | None = None
     quarter_rate: Decimal = ZERO
     quarter0: int = 0
     offset0: Decimal = ZERO
@@ -127,23 +119,21 @@ def set_up(top: Top, start: State) -> ThetaMotion:
     """
     Return alpha and beta of the motion through `start` at t = 0, for the doubles as they are.
 
-    The digits are doubled until the closest roots of the cubic are told apart.  They are never
+    Raises ValueError if none of DIGITS_TO_TRY tell the roots of the cubic apart.  They are never
     equal: on the separatrix, or in steady precession with theta' != 0, cos(theta0) would be
     algebraic, and no double but 0 has an algebraic cosine.
-    Raises ValueError beyond MOST_DIGITS.
     """
-    digits = FIRST_DIGITS
-    while digits <= MOST_DIGITS:
+    for digits in DIGITS_TO_TRY:
         with precision(digits):
             try:
                 return _set_up(top, start)
             except RootsTooCloseError:
-                digits *= 2
+                continue
             except (DecimalException, OverflowError) as error:
                 raise ValueError(f'{top} from {start}: the constants are too far apart in size '
                                  f'for the exact solution ({type(error).__name__})') from error
     raise ValueError(f'{top} from {start}: closer to the separatrix or to steady precession than '
-                     f'{MOST_DIGITS} digits can tell')
+                     f'{DIGITS_TO_TRY[-1]} digits can tell')
 
 
 class _Side(NamedTuple):
@@ -192,25 +182,25 @@ def _resting(side: _Side, lambda1: Decimal) -> Factor:
     if side.momentum:
         rate += side.momentum / (4 * lambda1 * side.modulus ** 2)
     parts = Series(COS_EVEN, (side.modulus,)), NOTHING
-    return Factor(rate, side.turns, ZERO, (parts, parts), 0, False, ZERO)
+    return Factor(rate, side.turns, ZERO, (parts, parts), 0, ZERO)
 
 
 def _nutating(sides: Sides, lambda1: Decimal, sense: int,
               cubic: tuple[Decimal, Decimal, Decimal, Decimal], falling: bool) -> ThetaMotion:
     """Return a motion with P >= 0; with sense -1 that of which this is the mirror image."""
     roots, f3 = cubic_roots(*cubic), cubic[3]
-    gap21, gap31, gap32 = roots.gap21, roots.gap31, roots.gap32
-    imaginary = gap21 > gap32
+    imaginary = roots.gap21 > roots.gap32
     poles = _poles(sides, roots, lambda1 ** 2 * f3, imaginary)
     with precision(DIGITS):
-        mean = GaussMean(gap31, gap32, gap21)
-        form = ThetaForm(GaussMean(gap31, gap21, gap32) if imaginary else mean, imaginary)
-        quarter0, direction, square = _nearest_quarter(roots, falling, imaginary)
-        stretch = form.mean.mean / mean.mean if imaginary else ONE
+        a, g, c = roots.gap31.sqrt(), roots.gap32.sqrt(), roots.gap21.sqrt()
+        mean = GaussMean(a, g, c)
+        form = ThetaForm(GaussMean(a, c, g) if imaginary else mean, imaginary)
+        quarter0, direction, square = _nearest_quarter(roots, g / a, falling, imaginary)
+        stretch = form.mean.mean / mean.mean if imaginary else None
         sin = form.mean.amplitude(square, 1 if imaginary else -1)
         xi = -sin * sin if imaginary else sin * sin
         cos = (1 - xi).sqrt()
-        y0 = direction * (asinh(sin) / stretch if imaginary else atan2(sin, cos))
+        y0 = direction * (asinh(sin) / stretch if stretch else atan2(sin, cos))
         factors = []
         for side, pole in zip(sides, poles, strict=True):
             rate = side.spin / 2
@@ -218,15 +208,15 @@ def _nutating(sides: Sides, lambda1: Decimal, sense: int,
                 rate += side.momentum / lambda1 * mean.mean_reciprocal(pole.x1, pole.x2) / 2
             factors.append(_factor(form, side, pole, rate, quarter0, y0,
                                    (direction * sin, cos, xi)))
-        scale = sense * (f3 * gap31).sqrt() / 2 * gap21         # w (u2 - u1)
+        scale = sense * f3.sqrt() * a / 2 * roots.gap21         # w (u2 - u1)
         even, odd = form.slopes_of_sn2()
         alpha, beta = factors[::sense]
         return ThetaMotion(
-            alpha, beta, imaginary=imaginary, stretch=stretch,
+            alpha, beta, stretch=stretch,
             # w/K, where w = sqrt(f3 (u3 - u1))/2 and K = (pi/2) sqrt(u3 - u1)/M
             quarter_rate=f3.sqrt() * mean.mean / pi(), quarter0=quarter0, offset0=y0 * 2 / pi(),
             u_dot=(scale * even, scale * odd), u_dot_series=form.theta1,
-            m=gap21 / gap31, m1=gap32 / gap31)
+            m=roots.gap21 / roots.gap31, m1=roots.gap32 / roots.gap31)
 
 
 class _Pole(NamedTuple):
@@ -269,16 +259,19 @@ def _poles(sides: Sides, roots: Roots, scale: Decimal, imaginary: bool) -> tuple
             _Pole(True, below1, below2, beta_zero))
 
 
-def _nearest_quarter(roots: Roots, falling: bool, imaginary: bool) -> tuple[int, int, Decimal]:
+def _nearest_quarter(roots: Roots, complement: Decimal, falling: bool,
+                     imaginary: bool) -> tuple[int, int, Decimal]:
     """
     Return N at t = 0, the sign of y, and sn^2 or sn^2/cn^2 of the distance of chi from N K.
 
     The latter is -sn^2 of the distance times i, of the parameter m1 [DLMF 22.6(iv)].
+
+    complement : sqrt(m1)
     """
     sense = -1 if falling else 1
     low, high = -roots.y1, roots.y2         # u0 - u1 and u2 - u0
     # sn^2 = low/gap21, and sn(K - chi) = cn/dn.  They are equal at sn^2 (1 + sqrt(m1)) = 1.
-    if low * (roots.gap32 / roots.gap31).sqrt() < high:
+    if low * complement < high:
         return 0, sense, low / (high if imaginary else roots.gap21)
     return (sense, -sense, high * roots.gap31 / (
         low * roots.gap32 if imaginary else roots.gap21 * roots.y3))
@@ -289,11 +282,10 @@ def _factor(form: ThetaForm, side: _Side, pole: _Pole, rate: Decimal, quarters: 
     """Return alpha or beta; quarters, y, point: N, y and the arguments of `Series.at` at t = 0."""
     sense, drift, argument = int(side.momentum.compare(ZERO)), ZERO, ZERO
     scale = (max(pole.x1, pole.x2) / 2).sqrt()
-    crosses = pole.zero is not None and not sense
     starts_in_first = quarters % 2 == pole.is_beta       # the theta1 of step 3
     if pole.zero is None:           # proportional to dn
         first, second = (form.theta4, NOTHING), (form.theta3, NOTHING)
-    elif crosses:
+    elif not sense:
         first = form.theta1.scaled(-ONE if pole.is_beta else ONE), NOTHING
         second = form.theta2, NOTHING
         # The sign is that of cos(theta0/2) or sin(theta0/2), which are not negative.  Where they
@@ -315,7 +307,7 @@ def _factor(form: ThetaForm, side: _Side, pole: _Pole, rate: Decimal, quarters: 
     first_scale = scale * form.odd_over_even if pole.is_beta else scale
     parts = (_scaled(first, first_scale), _scaled(second, scale))
     return Factor(rate, side.turns - argument / (2 * pi()), drift,
-                  parts[::-1] if pole.is_beta else parts, sense, crosses, argument)
+                  parts[::-1] if pole.is_beta else parts, sense, argument)
 
 
 def _scaled(parts: Parts, scale: Decimal) -> Parts:

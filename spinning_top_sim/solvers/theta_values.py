@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.attitude import Column, Number
+from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.solvers.decimal_math import double_double, pi
 from spinning_top_sim.solvers.theta_series import SIN_ODD, Series
 from spinning_top_sim.solvers.theta_setup import Factor, ThetaMotion
@@ -51,10 +51,11 @@ class ThetaFunctions:
     zeros : of the ones that pass a pole: 0 or 1, whether R = 0 at even or at odd N and y = 0
     u_dot, u_dot_coefficients : of u', times `magnifier`, a power of 2 for small amplitudes
     bounds : the least and the greatest theta in [0, pi] [rad]
-    planar_rotation : (i, j) if both poles are passed: theta/2 then follows (pi/2) (i + j Z)
+    planar_rotation : (i, j) if both poles are passed: theta/2 is then within a quarter turn of
+        (pi/2) (i + j N)
     """
 
-    def __init__(self, motion: ThetaMotion, start_theta: float) -> None:
+    def __init__(self, motion: ThetaMotion) -> None:
         factors = motion.alpha, motion.beta
         self.rates = Rates([motion.quarter_rate, *(x.rate / pi() for x in factors)])
         whole = [motion.quarter0, *(round(2 * x.phase_turns) for x in factors)]
@@ -62,13 +63,13 @@ class ThetaFunctions:
         self.start_whole = _column(whole)
         self.offset, self.offset_rest = map(_column, zip(*map(double_double, rest), strict=True))
         self.drifts = _column(0.5 * float(factor.drift) for factor in factors)
-        self.stretch = QUARTER * float(motion.stretch) if motion.imaginary else None
+        self.stretch = QUARTER * float(motion.stretch) if motion.stretch else None
         rows = [[one[part] for one in factor.parts] for part in (0, 1) for factor in factors]
         self.prefactors = [(even.prefactor, odd.prefactor) for even, odd in rows]
         self.coefficients = _coefficients(rows)
         self.real = [k for k, factor in enumerate(factors) if not factor.sense]
-        self.zeros = {k: self.prefactors[k].index(SIN_ODD)
-                      for k, factor in enumerate(factors) if factor.crosses}
+        self.zeros = {k: pair.index(SIN_ODD) for k, pair in enumerate(self.prefactors[:2])
+                      if SIN_ODD in pair}
         smallest = min(map(_amplitude, ('alpha', 'beta'), factors))
         self.magnifier = 2.0 ** -math.frexp(smallest)[1] if smallest else 1.0
         self.u_dot = np.array([in_range("cos(theta)'", x * Decimal(self.magnifier))
@@ -80,23 +81,11 @@ class ThetaFunctions:
         self.bounds = np.sort(2.0 * np.arctan2(np.hypot(beta, beta_imag),
                                                np.hypot(alpha, alpha_imag)))
         self.planar_rotation: tuple[float, float] | None = None
-        self.turns0 = 0.0
         if len(self.zeros) == 2:
             first, second = (np.arctan2(beta, alpha) / QUARTER).tolist()
-            self.planar_rotation = first, (second - first + 2.0) % 4.0 - 2.0
-            self.turns0 = round(self.turns(motion.quarter0, float(motion.offset0),
-                                           0.5 * start_theta))
-
-    def turns(self, quarters: Number, offset: Number, half_theta: Number) -> Number:
-        """
-        Return the whole turns to add to `half_theta`, before rounding, in a planar rotation.
-
-        Through both poles theta/2 stays within a quarter turn of (pi/2) (i + j Z).
-        """
-        assert self.planar_rotation is not None
-        i, j = self.planar_rotation
-        steady = QUARTER * (i + j * quarters) + QUARTER * j * offset
-        return (steady - half_theta) / (2.0 * math.pi) - self.turns0
+            slope = (second - first + 2.0) % 4.0 - 2.0
+            start = (first + slope * motion.quarter0 + 1.0) % 4.0 - 1.0
+            self.planar_rotation = start - slope * motion.quarter0, slope
 
 
 class ThetaValues:
@@ -208,8 +197,8 @@ class ThetaValues:
         arguments[self._constants.real] = 0.0
         half = np.arctan2(self.moduli[1], self.moduli[0])
         if self._constants.planar_rotation:
-            half += 2.0 * math.pi * np.rint(self._constants.turns(
-                self._whole[0], self._offset, half))
+            i, j = self._constants.planar_rotation
+            half += math.tau * np.rint((QUARTER * (i + j * self._whole[0]) - half) / math.tau)
         found = np.empty((5, len(half)))
         found[0] = math.pi * ((alpha + beta) + (alpha_rest + beta_rest))
         found[1] = arguments[0] + arguments[1]
