@@ -6,6 +6,7 @@ A new solver is a class with the members of `Propagator`, a name in METHODS, and
 `propagate` that makes it.
 """
 
+from contextlib import suppress
 from typing import Protocol
 
 import numpy as np
@@ -57,10 +58,14 @@ class Propagator(Protocol):
         """
 
     def release(self, before_ns: int) -> None:
-        """Forget the steps that only states before this time [ns] need."""
+        """Forget the steps that only states before this time [ns] need, or more to save memory."""
 
     def states(self, times_ns: NDArray[np.int64] | range) -> States:
-        """Return the states at ascending times (n,) [ns] that are reached and not released."""
+        """
+        Return the states at ascending times (n,) [ns] that are reached.
+
+        Raises IntegrationError if the steps at one of them are forgotten.
+        """
 
     def states_at_seconds(self, t: Column) -> States:
         """Return the states at times (n,) [s] for `solve`; ascending, if it takes steps."""
@@ -109,10 +114,8 @@ def _stepped(top: Top, start: State, equations: str, rtol: float, atol: float) -
     if equations == 'euler':
         return EulerMotion(top, start, rtol, atol)
     if top.gravity_torque == 0.0 or axis_rests(top, start):
-        try:
+        with suppress(ValueError):      # beyond its range, steps go on
             return ExactSolution(top, start)
-        except ValueError:      # beyond its range, steps go on
-            pass
     return TransportMotion(top, start, rtol, atol)
 
 
