@@ -6,9 +6,14 @@ Their parts are in the order of the .msg definitions (ROS 2 Jazzy, common_interf
 compares every template with the serializer of rclpy.
 """
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Callable, Sequence
+from functools import lru_cache, wraps
+from typing import ParamSpec
 
 from spinning_top_sim.streams.cdr import CdrWriter, Template
+
+Arguments = ParamSpec('Arguments')
 
 UNKNOWN_ORIENTATION = (-1.0,) + 8 * (0.0,)      # REP-145: no orientation in this message
 # A covariance of zeros means unknown (sensor_msgs/Imu), so that exact values have this variance.
@@ -30,11 +35,23 @@ def diagonal(*variances: float) -> tuple[float, ...]:
 EXACT = diagonal(0.0, 0.0, 0.0)
 
 
+def template(build: Callable[Arguments, Template]) -> Callable[Arguments, Template]:
+    """Serialize a message once for the same arguments: ensembles make it in every run."""
+    serialized = lru_cache(64)(build)
+
+    @wraps(build)
+    def copied(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Template:
+        return copy.copy(serialized(*args, **kwargs))  # type: ignore[arg-type]
+    return copied
+
+
+@template
 def pose_stamped(frame_id: str) -> Template:
     """geometry_msgs/PoseStamped at the origin; fields: orientation x, y, z, w."""
     return Template(CdrWriter().header(frame_id).append('d', *ORIGIN).field(4))
 
 
+@template
 def joint_state(names: Sequence[str]) -> Template:
     """sensor_msgs/JointState without effort; fields: positions, velocities."""
     count = len(names)
@@ -44,6 +61,7 @@ def joint_state(names: Sequence[str]) -> Template:
     return Template(writer.append('I', 0))
 
 
+@template
 def imu(frame_id: str, *covariances: Sequence[float]) -> Template:
     """sensor_msgs/Imu; fields: orientation x, y, z, w, angular velocity, linear acceleration."""
     writer = CdrWriter().header(frame_id)
@@ -52,11 +70,13 @@ def imu(frame_id: str, *covariances: Sequence[float]) -> Template:
     return Template(writer)
 
 
+@template
 def magnetic_field(frame_id: str) -> Template:
     """sensor_msgs/MagneticField; fields: the magnetic field, its covariance."""
     return Template(CdrWriter().header(frame_id).field(3).field(9))
 
 
+@template
 def odometry(frame_id: str, child_frame_id: str, *, moves: bool = False) -> Template:
     """
     nav_msgs/Odometry with exact values.
@@ -74,11 +94,13 @@ def odometry(frame_id: str, child_frame_id: str, *, moves: bool = False) -> Temp
     return Template(writer)
 
 
+@template
 def stamped(frame_id: str, count: int) -> Template:
     """geometry_msgs/Vector3Stamped (count 3) or QuaternionStamped (4); fields: x, y, z(, w)."""
     return Template(CdrWriter().header(frame_id).field(count))
 
 
+@template
 def float64_multi_array(labels: Sequence[str]) -> Template:
     """std_msgs/Float64MultiArray, one dimension labelled with its columns; fields: the data."""
     count = len(labels)
@@ -87,11 +109,13 @@ def float64_multi_array(labels: Sequence[str]) -> Template:
                     .append('I', count, count, 0, count).field(count))
 
 
+@template
 def clock() -> Template:
     """rosgraph_msgs/Clock; no fields."""
     return Template(CdrWriter().stamp())
 
 
+@template
 def markers(frame_id: str, size: Sequence[float], lines: Sequence[float], line_width: float,
             trace_points: int) -> Template:
     """
