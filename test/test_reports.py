@@ -3,10 +3,7 @@
 
 import io
 import math
-import os
 import re
-import shlex
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -124,75 +121,13 @@ def test_the_status_line_and_what_is_told_of_a_new_motion(clock, reported):
     assert ' FAILED | ' in reported.report.status_line()
 
 
-@pytest.mark.parametrize('on_path', [False, True])
-def test_the_next_command_works_where_it_is_pasted(monkeypatch, tmp_path, on_path):
-    monkeypatch.setattr(reports.sys, 'executable', str(tmp_path / 'my bin/python'))
-    monkeypatch.setattr(reports.shutil, 'which', lambda _: '/bin/inspect' if on_path else None)
-    log = Path('/a b/run.mcap')
-    if not on_path:
-        assert reports.inspect_command(log).startswith('ros2 run spinning_top_sim inspect ')
-        (tmp_path / 'my bin').mkdir()
-        (tmp_path / 'my bin/inspect').touch()
-    program, *arguments = shlex.split(reports.inspect_command(log))
-    assert program == ('inspect' if on_path else str(tmp_path / 'my bin/inspect'))
-    assert arguments == [str(log), '--plot', 'top.png']
-
-
-class Screen(io.StringIO):
-    """A standard output that is a terminal, or none."""
-
-    def __init__(self, columns):
-        super().__init__()
-        self.columns = columns
-
-    def isatty(self):
-        return self.columns is not None
-
-
-@pytest.fixture
-def screen(monkeypatch):
-    """Return a terminal of so many columns (None: no terminal), and what is shown."""
-    def of(columns):
-        out = Screen(columns)
-        monkeypatch.setattr(reports.sys, 'stdout', out)
-        monkeypatch.setattr(reports.os, 'get_terminal_size', lambda *_: os.terminal_size(
-            (out.columns, 24)))
-        return reports.Terminal(), out
-    return of
-
-
-def test_the_status_line_fits_the_terminal_also_when_that_becomes_narrower(screen):
-    terminal, out = screen(20)
-    terminal.show('123456 | 123456 | 123456')
-    terminal.show('123456 | 12345678901 | 1')
-    out.columns = 5
-    terminal.show('123456 | 123456 | 123456')
-    assert out.getvalue().split('\r\x1b[K') == ['', '123456 | 123456', '123456', '1234']
-
-
-def test_a_line_that_stays_stands_below_the_status_line(screen):
-    terminal, out = screen(80)
-    terminal.show('one | two')
-    terminal.end()
-    terminal.end()
-    terminal.show('three')
+def test_lines_that_stay_stand_below_the_status_line_which_fits_the_terminal(monkeypatch):
+    out = io.StringIO()
+    monkeypatch.setattr(reports.sys, 'stdout', out)
+    monkeypatch.setenv('COLUMNS', '20')
+    terminal = reports.Terminal()
+    terminal.show(30 * 'a')
+    out.isatty = lambda: True
+    terminal.show(30 * 'b')
     terminal.tell('done')
-    assert out.getvalue() == '\r\x1b[Kone | two\n\r\x1b[Kthree\ndone\n'
-
-
-@pytest.mark.parametrize('columns', [None, 0, OSError(5, 'Input/output error')])
-def test_without_a_terminal_under_launch_or_when_it_is_gone_lines_are_whole(
-        screen, monkeypatch, columns):
-    terminal, out = screen(columns)
-
-    def size(*_):
-        if isinstance(columns, OSError):
-            raise columns
-        return os.terminal_size((columns, 24))
-    monkeypatch.setattr(reports.os, 'get_terminal_size', size)
-    terminal.show('a | ' * 50 + 'z')
-    terminal.show('b')
-    terminal.end()
-    assert out.getvalue() == 'a | ' * 50 + 'z\nb\n'
-    monkeypatch.setattr(reports.sys, 'stdout', None)
-    terminal.show('c')                      # a closed standard output is no terminal
+    assert out.getvalue() == f'{30 * "a"}\n\r\x1b[K{19 * "b"}\ndone\n'

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import gc
-import os
 import re
 import signal
 import sys
@@ -41,7 +40,6 @@ def run(name: str, argv: list[str],
     """
     # Nothing is open yet, and a KeyboardInterrupt is easily lost during imports.
     _handle(signal.SIGINT, lambda *_: _exit(130))
-    _open_standard_streams()
     try:
         if '--version' in argv[1:]:
             from spinning_top_sim.recording.provenance import version  # noqa: PLC0415
@@ -82,15 +80,6 @@ def run(name: str, argv: list[str],
             node.destroy_node()
         rclpy.try_shutdown()
         _ignore_signals()       # rclpy has restored the handler that it found
-
-
-def _open_standard_streams() -> None:
-    """Open the streams that the shell has closed (2>&-); otherwise a log gets their number."""
-    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
-        pass
-    os.close(descriptor)
-    if sys.stderr is None:
-        sys.stderr = open(2, 'w')       # noqa: SIM115 - rclpy needs it to the end
 
 
 def _handle(number: signal.Signals, handler: Callable[[int, object], object]) -> None:

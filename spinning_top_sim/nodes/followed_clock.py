@@ -2,11 +2,9 @@
 """The clock that dates a simulation."""
 
 import time
-from collections.abc import Callable
 
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rosgraph_msgs.msg import Clock as ClockMessage
 
 from spinning_top_sim.nodes.tick_loop import EPOCH_GRID_NS
 
@@ -25,9 +23,6 @@ class DateClock:
         self._clock = (node.get_clock() if self.follows
                        else Clock(clock_type=ClockType.SYSTEM_TIME))
         self._newest_ns, self._changed_at = 0, time.monotonic()
-        for subscription in node.subscriptions:
-            if subscription.msg_type is ClockMessage:
-                subscription.callback = _without_negative_times(subscription.callback)
 
     def now_ns(self) -> int:
         """Return the date [ns]; 0 before the first message on /clock."""
@@ -48,12 +43,3 @@ class DateClock:
         if date_ns != self._newest_ns:
             self._newest_ns, self._changed_at = date_ns, now
         return self.follows and (date_ns == 0 or now > self._changed_at + PATIENCE_S)
-
-
-def _without_negative_times(take: Callable[[ClockMessage], object],
-                            ) -> Callable[[ClockMessage], None]:
-    """Return a callback that ignores times before 0, for which rclpy raises an error."""
-    def call(message: ClockMessage) -> None:
-        if message.clock.sec >= 0:
-            take(message)
-    return call

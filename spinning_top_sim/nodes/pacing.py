@@ -15,7 +15,7 @@ SLOWEST, FASTEST = 1e-6, 1e9    # rates of a playback: recorded time over real t
 RATES = f'a number in [{SLOWEST:g}, {FASTEST:g}]'
 ROUND_GAP_NS = 10_000_000       # from the end of a round to the first message of the next
 LATE_NS = 10_000_000            # a message that is sent later than this is counted
-BATCH_BYTES, BATCH_MESSAGES, BATCHES = 256_000, 512, 16     # read ahead
+BATCH_MESSAGES, BATCHES = 64, 64        # read ahead
 
 
 class SimulatedClock:
@@ -131,34 +131,20 @@ def rounds(read: Callable[[], Iterable[Message]], span_ns: int, loop: bool) -> I
 
 
 def read_ahead(messages: Iterable[Message]) -> Generator[Message]:
-    """Yield messages that a thread reads ahead; raise its error after the last one."""
-    batches = _batches(messages)
+    """Yield messages that a thread reads ahead."""
+    source = iter(messages)
+
+    def read() -> list[Message]:
+        return list(itertools.islice(source, BATCH_MESSAGES))
+
     with ThreadPoolExecutor(1) as reader:
-        ahead: deque[Future[list[Message]]] = deque(
-            reader.submit(next, batches, []) for _ in range(BATCHES))
+        ahead: deque[Future[list[Message]]] = deque(reader.submit(read) for _ in range(BATCHES))
         try:
             while batch := ahead.popleft().result():
-                ahead.append(reader.submit(next, batches, []))
+                ahead.append(reader.submit(read))
                 yield from batch
         finally:
             reader.shutdown(wait=False, cancel_futures=True)
-
-
-def _batches(messages: Iterable[Message]) -> Iterator[list[Message]]:
-    batch: list[Message] = []
-    size = 0
-    try:
-        for message in messages:
-            batch.append(message)
-            size += len(message[2])
-            if size >= BATCH_BYTES or len(batch) >= BATCH_MESSAGES:
-                yield batch
-                batch, size = [], 0
-    except Exception:
-        if batch:
-            yield batch
-        raise
-    yield batch
 
 
 class Playback:

@@ -3,12 +3,10 @@
 
 import math
 import os
-import shlex
 import shutil
 import sys
 import time
 from operator import itemgetter
-from pathlib import Path
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -111,14 +109,6 @@ class MotionReport:
             else 'no subscribers yet', f'dE/E {simulation.energy_drift:+.0e}')))
 
 
-def inspect_command(log: Path) -> str:
-    """Return the command that inspects a log, as this user can paste it into the terminal."""
-    beside = Path(sys.executable).with_name('inspect')
-    program = ['inspect'] if shutil.which('inspect') else [str(beside)] if beside.exists() else [
-        'ros2', 'run', 'spinning_top_sim', 'inspect']
-    return shlex.join([*program, str(log), '--plot', 'top.png'])
-
-
 class Terminal:
     """Shows a status line; on a terminal each line overwrites the previous one."""
 
@@ -126,18 +116,10 @@ class Terminal:
         self._open = False              # whether the cursor is at the end of a status line
 
     def show(self, line: str) -> None:
-        """Show a status line, on a terminal as many of its parts as fit."""
-        try:
-            columns = os.get_terminal_size(1).columns if sys.stdout.isatty() else 0
-        except (AttributeError, OSError):       # standard output or the terminal is closed
-            columns = 0
-        if not columns:
-            self._write(f'{line}\n')
-            return
-        while len(line) >= columns and ' | ' in line:
-            line = line.rpartition(' | ')[0]
-        self._write(f'\r\x1b[K{line[:max(columns - 1, 1)]}')
-        self._open = True
+        """Show a status line, on a terminal as much of it as fits."""
+        self._open = sys.stdout.isatty()
+        columns = shutil.get_terminal_size().columns
+        self._write(f'\r\x1b[K{line[:columns - 1]}' if self._open else f'{line}\n')
 
     def tell(self, line: str) -> None:
         """Show a line that stays."""

@@ -2,7 +2,6 @@
 """The node `spinning_top`: connects a `Simulation` to topics, services and parameters."""
 
 import functools
-import itertools
 import sys
 import time
 import traceback
@@ -26,16 +25,10 @@ from spinning_top_sim.nodes.pacing import DeadlineThread, FairLock
 from spinning_top_sim.nodes.publishers import StreamPublishers
 from spinning_top_sim.nodes.recording_session import RecordingSession
 from spinning_top_sim.nodes.ros_parameters import SPIN
-from spinning_top_sim.nodes.tick_loop import (
-    EPOCH_GRID_NS,
-    TOO_LATE,
-    LoopState,
-    TickLoop,
-    next_epoch,
-)
+from spinning_top_sim.nodes.tick_loop import LoopState, TickLoop, next_epoch
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
+from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.streams.simulation import PoleError
 
@@ -79,7 +72,6 @@ class Simulator(Node):
                                 ('step', Trigger, self._step), ('reset', Trigger, self._reset),
                                 ('record', SetBool, self._record)):
             self.create_service(kind, f'~/{name}', functools.partial(self._serve, act))
-        self._diagnostics_count = itertools.count()
         self._steady_timer(1.0, self._publish_diagnostics)
         self._status_timer: Timer | None = None
         self._set_status_period(values['status_period'])
@@ -100,9 +92,6 @@ class Simulator(Node):
         """Start the motion once there is a date."""
         date_ns = self._date.now_ns()
         if date_ns == 0:
-            return
-        if self._date.follows and date_ns > LAST_STAMP_NS - EPOCH_GRID_NS:
-            self._log.warning(f'/clock: {TOO_LATE}', once=True)
             return
         self.destroy_timer(self._begin_timer)
         if self._values['max_error'] > 0.0:
@@ -129,8 +118,7 @@ class Simulator(Node):
         summary = self._session.stop()
         if summary:
             self._terminal.tell(summary)
-            if self._session.path.exists():
-                self._terminal.tell(f'next: {reports.inspect_command(self._session.path)}')
+            self._terminal.tell(f'next: inspect {self._session.path} --plot top.png')
 
     def finish(self) -> None:
         """End the process after the response that is being prepared."""
@@ -346,17 +334,11 @@ class Simulator(Node):
         return self.create_timer(period, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _publish_diagnostics(self) -> None:
-        """Check /clock, the recording and the names of other nodes; publish /diagnostics."""
+        """Check /clock and the recording; publish /diagnostics."""
         self._check_clock()
         self._check_recording()
         if self._session.warning:
             self._log.warning(f'recording: {self._session.warning}', throttle_duration_sec=10.0)
-        if next(self._diagnostics_count) % 10 == 1:
-            names = self.get_node_names_and_namespaces()
-            if names.count((self.get_name(), self.get_namespace())) > 1:
-                self._log.warning(
-                    f'there is another node {self.get_fully_qualified_name()}: give one of them a '
-                    'namespace, with --ros-args -r __ns:=/NAME', once=True)
         if self._report.overloaded:
             self._log.warning(
                 'this machine cannot keep up with these rates: live topics skip samples, or the '
@@ -371,12 +353,10 @@ class Simulator(Node):
         self._diagnostics.publish(message)
 
     def _check_clock(self) -> None:
-        """Warn when the /clock that is followed stops; say when it goes on."""
+        """Warn when the /clock that is followed stops."""
         waits = self._date.is_missing()
         if waits and not self._report.waits_for_clock:
             self._log.warning('waiting for /clock (use_sim_time is set)')
-        elif self._report.waits_for_clock and not waits:
-            self._log.info('/clock goes on')
         self._report.waits_for_clock = waits
 
     def _check_recording(self) -> None:

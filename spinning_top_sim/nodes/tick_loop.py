@@ -29,13 +29,12 @@ STEP_BUDGET_NS = 2_000_000_000
 LATEST_NS = 500_000_000         # samples later than this are recorded, but not published any more
 # A simulation further behind than this lets its clock slip: its real-time factor falls below 1.
 LONGEST_LAG_NS = 1_000_000_000
-TOO_LATE = 'the seconds of a ROS stamp, an int32, end in January 2038'
 
 
 def next_epoch(date_ns: int) -> int:
     """Return the first stamp from this date on [ns] that t = 0 may have.  Raises ValueError."""
     if date_ns > LAST_STAMP_NS - EPOCH_GRID_NS:
-        raise ValueError(TOO_LATE)
+        raise ValueError('the seconds of a ROS stamp, an int32, end in January 2038')
     return -(-date_ns // EPOCH_GRID_NS) * EPOCH_GRID_NS
 
 
