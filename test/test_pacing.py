@@ -113,18 +113,3 @@ def test_a_lock_is_left_to_who_waits_for_it():
     thread.join(60.0)
     assert not thread.is_alive()
     assert not any(overtaken)
-
-
-def test_simulated_time_knows_when_it_will_be_what():
-    now = [5_000]
-    clock = pacing.SimulatedClock(lambda: now[0], 2.0)
-    assert (clock.now(), clock.when(0)) == (0, None)
-    clock.set(100, running=True)
-    now[0] += 50
-    assert (clock.now(), clock.when(0), clock.when(200)) == (200, 4_950, 5_050)
-    clock.set_scale(0.5)
-    now[0] += 100
-    assert (clock.now(), clock.when(250)) == (250, 5_150)
-    clock.set(clock.now(), running=False)
-    now[0] += 100
-    assert (clock.now(), clock.when(250)) == (250, None)

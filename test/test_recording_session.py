@@ -35,12 +35,11 @@ class Recorded:
                                           **given})
         self.simulation = LiveSimulation(self.values, EPOCH_NS)
         self.lock = FairLock()
-        self.remapped = {}
         self.session = RecordingSession(self.simulation, self.lock, self.topics)
 
     def topics(self, streams):
         names = [*((stream.topic, stream.type_name) for stream in streams), *journal.TOPICS]
-        return [(f'/ns/{self.remapped.get(name, name.lstrip("~/"))}', type_name, {'depth': 10})
+        return [(f'/ns/{name.lstrip("~/")}', type_name, {'depth': 10})
                 for name, type_name in names]
 
     def start(self):

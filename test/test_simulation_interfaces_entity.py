@@ -173,16 +173,13 @@ def chosen(top, **filters):
 
 
 @pytest.mark.parametrize(('expression', 'found'), [
-    ('', True), ('spin', True), ('^spinning_top$', True), ('^top', False), ('SPIN', False),
-    ('t[[:alpha:]]p$', True), ('[[:digit:]]', False), ('(spin|roll)ning', True),
-    ('s.{3}ning', True), ('^(spin|_|ning|top)+$', True)])
+    ('', True), ('spin', True), ('^top', False), ('t[[:alpha:]]p$', True)])
 def test_names_by_regular_expressions(top, expression, found):
     assert chosen(top, filter=expression) is found
 
 
 @pytest.mark.parametrize(('expression', 'reason'), [
-    ('(', 'missing )'), ('[[:letter:]]', 'invalid character class'), ('\\', 'trailing'),
-    ('a{2,1}', 'repetition'), ('\ud800', 'surrogates')])
+    ('(', 'missing )'), ('\ud800', 'surrogates')])
 def test_bad_expressions_are_refused(top, capfd, expression, reason):
     filters = top.messages.EntityFilters(filter=expression)
     for service in ('GetEntities', 'GetEntitiesStates'):
@@ -218,5 +215,3 @@ def test_categories_and_tags(top):
         tags=tags('imu', mode=7)))
     assert (code, text) == (FAILED, 'tags.filter_mode = 7: must be 0 or 1')
 
-
-# ----------------------------------------------------------------------------------- journal
