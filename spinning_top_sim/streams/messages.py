@@ -7,7 +7,7 @@ compares every template with the serializer of rclpy.
 """
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import lru_cache, wraps
 from typing import ParamSpec
 
@@ -52,7 +52,7 @@ def pose_stamped(frame_id: str) -> Template:
 
 
 @template
-def joint_state(names: Sequence[str]) -> Template:
+def joint_state(names: tuple[str, ...]) -> Template:
     """sensor_msgs/JointState without effort; fields: positions, velocities."""
     count = len(names)
     writer = CdrWriter().header('').append('I', count).string(*names)
@@ -62,7 +62,7 @@ def joint_state(names: Sequence[str]) -> Template:
 
 
 @template
-def imu(frame_id: str, *covariances: Sequence[float]) -> Template:
+def imu(frame_id: str, *covariances: tuple[float, ...]) -> Template:
     """sensor_msgs/Imu; fields: orientation x, y, z, w, angular velocity, linear acceleration."""
     writer = CdrWriter().header(frame_id)
     for count, covariance in zip((4, 3, 3), covariances, strict=True):
@@ -101,7 +101,7 @@ def stamped(frame_id: str, count: int) -> Template:
 
 
 @template
-def float64_multi_array(labels: Sequence[str]) -> Template:
+def float64_multi_array(labels: tuple[str, ...]) -> Template:
     """std_msgs/Float64MultiArray, one dimension labelled with its columns; fields: the data."""
     count = len(labels)
     # Number of dimensions; label, size and stride; offset of the data, their number.
@@ -116,7 +116,7 @@ def clock() -> Template:
 
 
 @template
-def markers(frame_id: str, size: Sequence[float], lines: Sequence[float], line_width: float,
+def markers(frame_id: str, size: tuple[float, ...], lines: tuple[float, ...], line_width: float,
             trace_points: int) -> Template:
     """
     visualization_msgs/MarkerArray: a cylinder, lines on it, and a trace if it has points.
@@ -145,8 +145,8 @@ def _begin(writer: CdrWriter, frame_id: str, namespace: str, kind: int) -> CdrWr
     return writer.header(frame_id).string(namespace).append('i', 0, kind, 0)
 
 
-def _end(writer: CdrWriter, scale: Sequence[float], color: Sequence[float], count: int,
-         points: Sequence[float] = ()) -> None:
+def _end(writer: CdrWriter, scale: tuple[float, ...], color: tuple[float, ...], count: int,
+         points: tuple[float, ...] = ()) -> None:
     """Append the parts of a Marker behind its pose; `count` points that are not given: a field."""
     writer.append('d', *scale).append('f', *color)
     writer.append('I', 0, 0)                                # lifetime: for ever
