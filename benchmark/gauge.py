@@ -20,7 +20,7 @@ from cases import CUSP, HEAVY_TOP, LOOPING, NEAR_POLE, SLOW, TOY_60, TOY_200, Ca
 from truth import angles_between
 
 from spinning_top_sim.solvers.dormand_prince import Integrator, Interpolants, Step
-from spinning_top_sim.solvers.equations import TransportEquations, Unknowns
+from spinning_top_sim.solvers.equations import TransportEquations
 
 CASES = (CUSP, TOY_60, TOY_200, LOOPING, SLOW, NEAR_POLE, HEAVY_TOP)
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -49,7 +49,7 @@ class OnlyNormalized(TransportEquations):
 
     def project_columns(self, y):
         shrink = 1.0 / np.sqrt(sum(x * x for x in y[:4]))
-        return Unknowns(*(x * shrink for x in y[:4]), *y[4:])
+        return *(x * shrink for x in y[:4]), *y[4:]
 
 
 def main() -> None:
@@ -124,7 +124,7 @@ def between_steps(case: Case) -> tuple[float, ...]:
 
 def attitudes_of(equations: TransportEquations, rows: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Return x, y, z, w (n, 4) of unknowns (6, n) at t [s], projected, as the simulator does."""
-    a, a_imag, b, b_imag, _, _ = equations.project_columns(Unknowns(*rows))
+    a, a_imag, b, b_imag, _, _ = equations.project_columns(rows)
     spin = np.exp(0.5j * equations.spin_rate * t)
     alpha, beta = (a + 1j * a_imag) * spin, (b + 1j * b_imag) * spin.conjugate()
     return np.stack((-beta.imag, beta.real, alpha.imag, alpha.real), axis=1)

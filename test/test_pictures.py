@@ -8,9 +8,9 @@ import sys
 import numpy as np
 import pytest
 from helpers.reference import ROOT
+from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top, solve
-from spinning_top_sim.physics.placement import rotation_matrix
 
 TOP = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
 CUSP = State(theta=0.5, l3=1.6, lz=float(1.6 * np.cos(0.5)))
@@ -47,7 +47,7 @@ def test_animate_shows_samples_in_time():
     assert axes.texts[0].get_text() == 't = 1.00 s'         # the last one that was drawn
     # The mark of the disc is where the body is.
     from spinning_top_sim.physics.pictures import DISC, DISC_HEIGHT, project
-    middle = rotation_matrix(motion.quaternion[-1]) @ [DISC, 0.0, DISC_HEIGHT]
+    middle = Rotation.from_quat(motion.quaternion[-1]).apply([DISC, 0.0, DISC_HEIGHT])
     drawn = axes.patches[1].get_xy()
     assert np.min(np.linalg.norm(drawn - np.column_stack(project(middle[np.newaxis])[:2]),
                                  axis=1)) < 1e-9

@@ -16,6 +16,7 @@ import pytest
 from helpers.reference import CASES, angle, quaternion_of, scene_parameters, start_of, top_of
 
 from spinning_top_sim import State, Top, solve
+from spinning_top_sim.solvers import rk45
 from spinning_top_sim.solvers.dormand_prince import (
     ERROR,
     STAGES,
@@ -285,10 +286,23 @@ def test_steps_are_read_until_they_are_released():
     assert after.quaternion.tobytes() == before.quaternion[30:].tobytes()
     assert after.phi.tobytes() == before.phi[30:].tobytes()
     assert motion.steps == steps
-    with pytest.raises(ValueError, match='oldest'):
+    with pytest.raises(IntegrationError, match='oldest'):
         motion.states(range(SECOND, 2 * SECOND, SECOND))
     motion.release(100 * SECOND)                # the newest step stays: the next begins there
     assert len(motion._kept) == 1
+
+
+def test_so_many_steps_are_kept_at_most(monkeypatch):
+    """Whatever is asked: a fast top between two samples of a slow IMU must not fill the memory."""
+    monkeypatch.setattr(rk45, 'MOST_KEPT', 50)
+    motion = looping_motion()
+    motion.reach(60 * SECOND)
+    expected = motion.states(range(60 * SECOND, 60 * SECOND + 1)).phi
+    motion.release(0)
+    assert len(motion._kept) == 50
+    assert motion.states(range(60 * SECOND, 60 * SECOND + 1)).phi == expected
+    with pytest.raises(IntegrationError, match='oldest'):
+        motion.states(range(1))
 
 
 def test_a_limited_number_of_steps_is_taken_and_goes_on_later():

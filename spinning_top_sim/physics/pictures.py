@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures of a motion by matplotlib: the tip's path on the sphere, its curves, an animation."""
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.regimes import swing
-from spinning_top_sim.physics.top import State, Top
 
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -30,26 +30,6 @@ STYLE: dict[Any, Any] = {
     'axes.titlesize': 11, 'axes.xmargin': 0.0, 'lines.linewidth': 1.2, 'text.color': INK,
     'xtick.labelsize': 8, 'ytick.labelsize': 8}
 DISC, DISC_HEIGHT = 0.42, 0.45      # radius of the body's disc and its place on the axis
-
-
-class Motion(Protocol):
-    """The columns of `States` that are drawn."""
-
-    top: Top
-    start: State
-
-    @property
-    def t(self) -> Reals: ...
-    @property
-    def theta_folded(self) -> Reals: ...
-    @property
-    def phi_dot(self) -> Reals: ...
-    @property
-    def energy(self) -> Reals: ...
-    @property
-    def quaternion(self) -> Reals: ...
-    @property
-    def rows_axis(self) -> tuple[Reals, Reals, Reals]: ...
 
 
 def project(points: Reals) -> tuple[Reals, Reals, Reals]:
@@ -96,7 +76,7 @@ def _lowest(height: Reals) -> float:
     return -0.9 if np.min(height) > -0.2 else -1.25
 
 
-def _check(motion: Motion) -> None:
+def _check(motion: Any) -> None:
     if len(motion.t) < 2:
         raise ValueError(f't has {len(motion.t)} times: a picture must have 2 at least')
     for k in np.flatnonzero(~(np.diff(motion.t) > 0.0)).tolist():
@@ -104,8 +84,8 @@ def _check(motion: Motion) -> None:
                          f'{float(motion.t[k])!r} s')
 
 
-def plot(motion: Motion) -> Figure:
-    """Return a figure of a motion; see `States.plot`."""
+def plot(motion: Any) -> Figure:
+    """Return a figure of `States`; see `States.plot`."""
     _check(motion)
     x, y, z = motion.rows_axis
     bounds = sorted(float(np.arccos(u)) for u in swing(motion.top, motion.start))
@@ -140,8 +120,8 @@ def plot(motion: Motion) -> Figure:
     return figure
 
 
-def animate(motion: Motion, fps: float, speed: float) -> FuncAnimation:
-    """Return an animation of a motion; see `States.animate`."""
+def animate(motion: Any, fps: float, speed: float) -> FuncAnimation:
+    """Return an animation of `States`; see `States.animate`."""
     _check(motion)
     for name, value in (('fps', fps), ('speed', speed)):
         if not 0.0 < value < np.inf:
@@ -165,17 +145,10 @@ def animate(motion: Motion, fps: float, speed: float) -> FuncAnimation:
         now = shown[number]
         for points, style in ((rim, {'facecolor': '#f2e3c9', 'edgecolor': INK, 'alpha': 0.9}),
                               (mark, {'color': COLOURS[1]})):
-            axes.fill(*project(_turned(motion.quaternion[now], points))[:2], **style)
+            turned = attitude.in_world(tuple(motion.quaternion[now]), tuple(points.T))
+            axes.fill(*project(np.stack(turned, axis=1))[:2], **style)
         draw_tip(axes, tip[:now + 1], z[:now + 1])
         axes.text(-1.05, 1.15, f't = {times[now]:.2f} s', color=INK, fontsize=9)
         return []
 
     return FuncAnimation(figure, frame, frames=count, interval=1000.0 / fps, blit=False)
-
-
-def _turned(quaternion: Reals, points: Reals) -> Reals:
-    """Return points (n, 3) of the body in the world."""
-    axis, w = quaternion[:3], quaternion[3]
-    across: Reals = np.cross(axis, points)
-    turned: Reals = points + 2.0 * (w * across + np.cross(axis, across))
-    return turned

@@ -48,7 +48,7 @@ def state_of(top: Top, quaternion: Reals, angular_velocity: Reals) -> State:
         lz = top.lambda3 * wz
         return State(theta=theta, theta_dot=math.hypot(wx, wy), phi=phi, psi=psi, l3=sign * lz,
                      lz=lz)
-    columns = _columns(np.array([x, y, z, w]))
+    columns = np.array([x]), np.array([y]), np.array([z]), np.array([w])
     w1, w2, w3 = (float(part[0]) for part in attitude.in_body(columns, (wx, wy, wz)))
     z1, z2, z3 = (float(part[0]) for part in attitude.vertical_in_body(columns))
     phi, l3 = half_sum + half_difference, top.lambda3 * w3
@@ -76,8 +76,3 @@ class Box:
                    shape.centre + 0.5 * shape.height)
         return cls(np.array([-shape.radius, -shape.radius, min(heights)]),
                    np.array([shape.radius, shape.radius, max(heights)]))
-
-
-def _columns(quaternion: Reals) -> attitude.Quaternion:
-    x, y, z, w = quaternion.reshape(4, 1)
-    return x, y, z, w

@@ -88,10 +88,10 @@ def swing(top: Top, state: State) -> tuple[float, float]:
     down, up = -2.0 * cos_half ** 2, 2.0 * sin_half ** 2        # to u = -1 and u = 1
     if f0:
         low, high = _bisect(f0, f1, f2, f3, down), _bisect(f0, f1, f2, f3, up)
-    else:       # theta' = 0: one end is here, and f1 says on which side the other is
-        ahead = [y for y in _quadratic_roots(f1, f2, f3) if (y > 0.0) == (f1 > 0.0)]
-        other = min(max(min(ahead, key=abs, default=0.0), down), up) if f1 else 0.0
-        low, high = min(0.0, other), max(0.0, other)
+    elif f1 > 0.0:      # theta' = 0: one end is here, and f1 says on which side the other is
+        low, high = 0.0, _bisect(f1, f2, f3, 0.0, up)
+    else:
+        low, high = _bisect(-f1, -f2, -f3, 0.0, down) if f1 else 0.0, 0.0
     u0 = math.cos(state.theta)
     return max(u0 + low, -1.0), min(u0 + high, 1.0)
 
@@ -120,14 +120,6 @@ def nutation_cubic(lambda1: Real, torque: Real, l3: Real, lz: Real, theta_dot: R
             - 2 / lambda1 * (2 * u0 * kinetic + torque * sine * sine),
             2 / lambda1 * (2 * u0 * torque - kinetic) - (l3 / lambda1) * (l3 / lambda1),
             2 * torque / lambda1)
-
-
-def _quadratic_roots(a0: float, a1: float, a2: float) -> list[float]:
-    """Return the roots of a0 + a1 y + a2 y^2, which are real, without cancellation."""
-    if a2 == 0.0:
-        return [-a0 / a1] if a1 else []
-    q = -0.5 * (a1 + math.copysign(math.sqrt(max(a1 * a1 - 4.0 * a0 * a2, 0.0)), a1))
-    return [q / a2, a0 / q if q else 0.0]
 
 
 def _bisect(f0: float, f1: float, f2: float, f3: float, end: float) -> float:
@@ -192,9 +184,7 @@ def precession_extremes(top: Top, state: State, theta_min: float,
     rates = []
     for theta in tilts:
         cos2, sin2 = math.cos(0.5 * theta) ** 2, math.sin(0.5 * theta) ** 2
-        if theta == math.pi:
-            cos2 = 0.0
-        singular = (cos2 == 0.0 and lz + l3 != 0.0) or (sin2 == 0.0 and lz - l3 != 0.0)
+        singular = (theta == math.pi and lz + l3 != 0.0) or (sin2 == 0.0 and lz - l3 != 0.0)
         rates.append(math.copysign(math.inf, lz - l3 * math.cos(theta)) if singular
                      else attitude.precession_rate(top, l3, lz, cos2, sin2))
     return min(rates), max(rates)

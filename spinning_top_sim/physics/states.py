@@ -94,14 +94,15 @@ class States:
         raise NotImplementedError
 
     @cached_property
-    def half_angle_squares(self) -> tuple[Column, Column]:
-        """cos^2 and sin^2 of theta/2."""
-        raise NotImplementedError
-
-    @cached_property
     def transverse_velocity(self) -> tuple[Column, Column]:
         """Angular velocity about the first two body axes [rad/s]."""
         raise NotImplementedError
+
+    @cached_property
+    def half_angle_squares(self) -> tuple[Column, Column]:
+        """cos^2 and sin^2 of theta/2."""
+        x, y, z, w = self.rows_quaternion
+        return w * w + z * z, x * x + y * y
 
     @cached_property
     def l3(self) -> Column:
@@ -242,13 +243,6 @@ class States:
         -------
         matplotlib.figure.Figure
             A notebook with `%matplotlib inline` shows it; `savefig` writes it to a file.
-
-        Raises
-        ------
-        ImportError
-            Without matplotlib, the extra `plot`.
-        ValueError
-            If there are less than two times, or if they do not ascend.
         """
         return cast('Figure', _pictures().plot(self))
 
@@ -267,13 +261,6 @@ class States:
         -------
         matplotlib.animation.FuncAnimation
             `to_jshtml` makes it a part of a notebook, `save` a file.
-
-        Raises
-        ------
-        ImportError
-            Without matplotlib, the extra `plot`.
-        ValueError
-            For an argument out of range, or as `plot`.
         """
         return cast('FuncAnimation', _pictures().animate(self, fps, speed))
 

@@ -35,11 +35,6 @@ class Top:
         Signed distance from pivot to centre of mass along +e3 [m].
     gravity : float
         Acceleration of gravity [m/s^2], downwards positive.
-
-    Raises
-    ------
-    ValueError
-        For a constant that is not allowed, naming it, its value and what is allowed.
     """
 
     lambda1: float
@@ -94,11 +89,6 @@ class State:
     l3, lz : float
         Angular momentum along the body axis and along the vertical [kg m^2/s].  Where the axis
         is vertical, lz must be l3 at the top and -l3 at the bottom.
-
-    Raises
-    ------
-    ValueError
-        For a value that is not allowed, naming it and what is allowed.
     """
 
     theta: float

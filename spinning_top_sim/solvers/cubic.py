@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The roots of the nutation's cubic and their distances, in long decimals without cancellation."""
 
-from decimal import Decimal, getcontext, localcontext
+from decimal import Decimal, getcontext
 from typing import NamedTuple
 
-from spinning_top_sim.solvers.decimal_math import ONE, ZERO
+from spinning_top_sim.solvers.decimal_math import ZERO
 
-MOST_NEWTON_STEPS = 5000
+MOST_NEWTON_STEPS = 50
 KEPT_DIGITS = 40        # what must be left of the digits after the discriminant has cancelled
 SAME = Decimal('1e-35')
 
@@ -67,17 +67,17 @@ def _isolated_root(a2: Decimal, a1: Decimal, a0: Decimal) -> tuple[Decimal, int]
     """
     Return the root of y^3 + a2 y^2 + a1 y + a0 that lies alone on its side of -a2/3, and the side.
 
-    Newton's method from beyond all roots (Fujiwara's bound) approaches it monotonically.
+    It is between sqrt(3) and 2 times `radius` from there (Viete): Newton's method from the far end
+    converges quadratically.
     """
-    centre = -a2 / 3
+    centre, radius = -a2 / 3, (a2 * a2 - 3 * a1).sqrt() / 3
     side = -1 if ((centre + a2) * centre + a1) * centre + a0 > 0 else 1
-    with localcontext(prec=8):
-        y = side * Decimal('2.001') * max(abs(a2), abs(a1).sqrt(), abs(a0) ** (ONE / 3))
+    y = centre + 2 * side * radius
     resolution = Decimal(10) ** (3 - getcontext().prec)
     for _ in range(MOST_NEWTON_STEPS):
         step = (((y + a2) * y + a1) * y + a0) / ((3 * y + 2 * a2) * y + a1)
         y -= step
-        if step * side <= abs(y) * resolution:
+        if abs(step) <= abs(y) * resolution:
             return y, side
     raise RootsTooCloseError
 

@@ -12,7 +12,8 @@ from decimal import Context, Decimal, getcontext, localcontext
 from functools import lru_cache
 
 ZERO, ONE = Decimal(0), Decimal(1)
-HALVINGS = 8
+HALVINGS = 5
+SMALL = Decimal('1e-9')
 
 
 def precision(digits: int) -> AbstractContextManager[Context]:
@@ -55,20 +56,26 @@ def sin_cos(x: Decimal) -> tuple[Decimal, Decimal]:
 
 def atan2(y: Decimal, x: Decimal) -> Decimal:
     """Return the argument of x + iy, to 80 digits at most; 0 at the origin."""
-    radius = (x * x + y * y).sqrt()
-    if not radius:
+    size = max(abs(x), abs(y))
+    if not size:
         return ZERO
-    y, x = y / radius, x / radius
+    y, x = y / size, x / size
     guess = Decimal(math.atan2(y, x))
     s, c = sin_cos(guess)
-    rest = y * c - x * s                # sine of the angle that is left, about 1e-16
-    return guess + rest + rest ** 3 / 6 + 3 * rest ** 5 / 40
+    rest = (y * c - x * s) / (x * c + y * s)    # tangent of the angle that is left, about 1e-16
+    return guess + rest - rest ** 3 / 3 + rest ** 5 / 5
 
 
-def reduced_turns(radians: Decimal) -> Decimal:
-    """Return an angle of any size in turns, less its whole turns: in [-1/2, 1/2]."""
-    with localcontext(prec=getcontext().prec + max(0, radians.adjusted())):
-        rest = (radians / (2 * pi())).remainder_near(ONE)
+def asinh(x: Decimal) -> Decimal:
+    """Return the inverse of sinh for x >= 0, to 30 digits of 40."""
+    return x - x ** 3 / 6 if x < SMALL else (x + (x * x + 1).sqrt()).ln()
+
+
+def half_turns(radians: float) -> Decimal:
+    """Return half an angle of any size in turns, less whole turns: in [-1/2, 1/2]."""
+    exact = Decimal(radians)
+    with localcontext(prec=getcontext().prec + max(0, exact.adjusted())):
+        rest = (exact / (4 * pi())).remainder_near(ONE)
     return +rest
 
 

@@ -80,13 +80,9 @@ class Equations(ABC):
     def errors(self, y: Vector, y_new: Vector, difference: Vector) -> tuple[float, ...]:
         """Return each error estimate over what is tolerated: a step passes if all are <= 1."""
 
+    @abstractmethod
     def accepted(self, y: Vector, y_new: Vector) -> Vector:
-        """
-        Return the end of a step that passed, perhaps moved back onto the motion's invariants.
-
-        Raises IntegrationError if it cannot be trusted.
-        """
-        return y_new
+        """Return the end of a step, perhaps moved; IntegrationError if it cannot be trusted."""
 
 
 StepFunction = Callable[..., tuple[Vector, Vector, Vector]]

@@ -23,16 +23,14 @@ NOME_COEFFICIENTS = 1, 2, 15, 150, 1707
 
 class GaussMean:
     """
-    The arithmetic-geometric mean M of the square roots of two numbers.
+    The arithmetic-geometric mean M of two numbers.
 
     mean : M; the quarter period K(k) is (pi/2) a_0/M [DLMF 19.8.5]
 
-    a_square, g_square : a_0^2 and g_0^2
-    c_square : a_0^2 - g_0^2, which the caller knows without cancellation
+    a, g, c : a_0, g_0, and c_0, which the caller knows without cancellation
     """
 
-    def __init__(self, a_square: Decimal, g_square: Decimal, c_square: Decimal) -> None:
-        a, g, c = a_square.sqrt(), g_square.sqrt(), c_square.sqrt()
+    def __init__(self, a: Decimal, g: Decimal, c: Decimal) -> None:
         self._means, self._c = [(a, g)], [c]
         tolerance = _tolerance()
         while len(self._c) < 2 or c > a * tolerance:

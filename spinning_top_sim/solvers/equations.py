@@ -3,8 +3,8 @@
 
 import cmath
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -22,16 +22,8 @@ SMALLEST_SINE = math.sqrt(2.0 ** -53 / 1e-6)
 ADVICE = "use the regular equations (equations = 'transport') or method = 'exact'"
 
 
-class Unknowns(NamedTuple):
-    """Real and imaginary parts of alpha, beta and m, columns of shape (n,)."""
-
-    alpha_real: Column
-    alpha_imag: Column
-    beta_real: Column
-    beta_imag: Column
-    m_real: Column
-    m_imag: Column
-
+# Real and imaginary parts of alpha, beta and m.
+Parts = Sequence[Column]
 
 # The functions sqrt, copysign and where of the projection, for columns and for one state, where
 # numpy would take ten times as long.
@@ -61,9 +53,6 @@ class TransportEquations(Equations):
 
     rtol, atol : tolerated error of a step; the unknowns are scaled to 1, so the two add up
     carried_share : c/L3
-
-    Attributes
-    ----------
     spin_rate : chi [rad/s]
     uniform_rates : rate of the uniform part of alpha's phase (see `unwrap`), in the frame that is
         stepped and in the body [rad/s].  They differ by chi/2.  Those of beta have the other sign.
@@ -139,18 +128,18 @@ class TransportEquations(Equations):
         """Return y moved back onto the invariants; see `project_columns`."""
         alpha, beta, m = y
         projected = self._project((alpha.real, alpha.imag, beta.real, beta.imag, m.real, m.imag),
-                                  ONE_STATE)
+                                  ONE_STATE, POLE_SHARE)
         return complex(*projected[:2]), complex(*projected[2:4]), complex(*projected[4:])
 
-    def project_columns(self, y: Unknowns) -> Unknowns:
+    def project_columns(self, y: Parts, pole_share: float = POLE_SHARE) -> Parts:
         """Return y with |q| = 1, then L.e3 = L3, then the energy restored along theta'."""
-        return Unknowns(*self._project(y, COLUMNS))
+        return self._project(y, COLUMNS, pole_share)
 
-    def _project(self, y: tuple[Any, ...], functions: tuple[Callable[..., Any], ...],
-                 ) -> tuple[Any, ...]:
+    def _project(self, y: Sequence[Any], functions: tuple[Callable[..., Any], ...],
+                 pole_share: float) -> tuple[Any, ...]:
         # m conj(alpha beta) = u + i v, where v carries L.e3 and u the nutation rate: v follows
         # from L3 and Lz, and u^2 from |u + i v|^2, which the energy tells.
-        sqrt, _, where = functions
+        sqrt, copysign, where = functions
         alpha_real, alpha_imag, beta_real, beta_imag, m_real, m_imag = y
         cos2 = alpha_real * alpha_real + alpha_imag * alpha_imag
         sin2 = beta_real * beta_real + beta_imag * beta_imag
@@ -158,65 +147,30 @@ class TransportEquations(Equations):
         alpha_real, alpha_imag = alpha_real * inverse_norm, alpha_imag * inverse_norm
         beta_real, beta_imag = beta_real * inverse_norm, beta_imag * inverse_norm
         inverse_square = inverse_norm * inverse_norm
-        cos_theta = (cos2 - sin2) * inverse_square
-        sine_squared = cos2 * sin2 * (inverse_square * inverse_square)
-        # alpha beta = (e3_x + i e3_y)/2, of length sin(theta)/2.
-        axis_real = alpha_real * beta_real - alpha_imag * beta_imag
-        axis_imag = alpha_real * beta_imag + alpha_imag * beta_real
-        lambda1 = self.top.lambda1
-        v = 0.25 * (self.l3 - self.lz * cos_theta) / lambda1
+        cos2, sin2 = cos2 * inverse_square, sin2 * inverse_square
+        size = cos2 * sin2
+        axis_real, axis_imag = half_axis(alpha_real, alpha_imag, beta_real, beta_imag)
+        lambda1, l3, lz = self.top.lambda1, self.l3, self.lz
+        # L3 - Lz cos(theta), without cancellation at the poles
+        v = 0.25 / lambda1 * where(sin2 < cos2, (l3 - lz) + 2.0 * lz * sin2,
+                                   (l3 + lz) - 2.0 * lz * cos2)
         u = m_real * axis_real + m_imag * axis_imag
-        modulus_squared = sine_squared * (
-            self._energy - self.top.gravity_torque * cos_theta) / (2.0 * lambda1)
-        u = self._with_energy(u, modulus_squared - v * v, sine_squared, functions)
-        at_pole = sine_squared <= POLE_SHARE
-        divisor = where(at_pole, 1.0, sine_squared)
+        u_squared = size * (self._energy - self.top.gravity_torque * (cos2 - sin2)) / (
+            2.0 * lambda1) - v * v
+        # What rounding leaves of the energy does not tell u.
+        is_known = (u * u > self._large_enough * size) & (u_squared > 0.0)
+        u = where(is_known, copysign(sqrt(where(is_known, u_squared, 0.0)), u), u)
+        at_pole = size <= pole_share
+        divisor = where(at_pole, 1.0, size)
         return (
             alpha_real, alpha_imag, beta_real, beta_imag,
             where(at_pole, m_real, (u * axis_real - v * axis_imag) / divisor),
             where(at_pole, m_imag, (u * axis_imag + v * axis_real) / divisor))
 
-    def _with_energy(self, u: Any, u_squared: Any, size: Any,
-                     functions: tuple[Callable[..., Any], ...]) -> Any:
-        """Return u from its square, where that is not what rounding leaves of the energy."""
-        sqrt, copysign, where = functions
-        is_known = (u * u > self._large_enough * size) & (u_squared > 0.0)
-        return where(is_known, copysign(sqrt(where(u_squared > 0.0, u_squared, 0.0)), u), u)
 
-    def project_through_poles(self, y: Unknowns, cosine: Column, sine: Column,
-                              alpha_phase: Column, beta_phase: Column) -> Unknowns:
-        """
-        Return what `project_columns` does, for a top that passes a pole: Lz = L3 or Lz = -L3.
-
-        cosine, sine : signed moduli of alpha and beta
-        alpha_phase, beta_phase : their phases [rad].  That of a parameter which can vanish is
-            known without the steps; so the meridian of the axis is known at a pole too.
-        """
-        shrink = 1.0 / np.hypot(cosine, sine)
-        cosine, sine = cosine * shrink, sine * shrink
-        lambda1 = self.top.lambda1
-        # As above, with L3 -+ Lz cos(theta) = 2 L3 sin^2(theta/2) or 2 L3 cos^2(theta/2).
-        v = np.zeros(len(cosine))
-        if self.l3:
-            v = 0.5 * self.l3 / lambda1 * (
-                sine / cosine if self.lz == self.l3 else cosine / sine)
-        meridian = alpha_phase + beta_phase
-        meridian_cos, meridian_sin = np.cos(meridian), np.sin(meridian)
-        half_axis = cosine * sine
-        # Away from the pole the steps' own meridian goes with their m.
-        axis_real = y.alpha_real * y.beta_real - y.alpha_imag * y.beta_imag
-        axis_imag = y.alpha_real * y.beta_imag + y.alpha_imag * y.beta_real
-        away = half_axis * half_axis > POLE_SHARE
-        u = np.where(away, (y.m_real * axis_real + y.m_imag * axis_imag)
-                     / np.where(away, half_axis, 1.0),
-                     y.m_real * meridian_cos + y.m_imag * meridian_sin)
-        modulus_squared = (self._energy - self.top.gravity_torque
-                           * (cosine - sine) * (cosine + sine)) / (2.0 * lambda1)
-        u = self._with_energy(u, modulus_squared - v * v, 1.0, COLUMNS)
-        return Unknowns(
-            cosine * np.cos(alpha_phase), cosine * np.sin(alpha_phase),
-            sine * np.cos(beta_phase), sine * np.sin(beta_phase),
-            u * meridian_cos - v * meridian_sin, u * meridian_sin + v * meridian_cos)
+def half_axis(a: Any, a_imag: Any, b: Any, b_imag: Any) -> tuple[Any, Any]:
+    """Return alpha beta = (e3_x + i e3_y)/2, of length sin(theta)/2."""
+    return a * b - a_imag * b_imag, a * b_imag + a_imag * b
 
 
 class EulerEquations(Equations):

@@ -14,12 +14,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.attitude import Column, Quaternion
+from spinning_top_sim.physics.attitude import Column, Number, Quaternion
 from spinning_top_sim.physics.regimes import Description, axis_rests, precession_extremes, regime
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.decimal_math import pi, precision
-from spinning_top_sim.solvers.theta_setup import ThetaMotion, set_up
+from spinning_top_sim.solvers.theta_setup import DIGITS, ThetaMotion, set_up
 from spinning_top_sim.solvers.theta_values import MOST, ThetaFunctions, ThetaValues, in_range
 from spinning_top_sim.solvers.times import LARGEST_NS, Times
 
@@ -48,8 +48,6 @@ class ExactSolution:
 
     Attributes
     ----------
-    start : State
-        The same with theta in [0, pi].
     nutation_period : float or None
         Period of theta [s], None if it is constant.
     mean_precession_rate, mean_spin_rate : float
@@ -64,8 +62,7 @@ class ExactSolution:
     Raises
     ------
     ValueError
-        For motions whose constants doubles cannot hold, and, from every evaluation, for times that
-        are not of the kind that it takes or beyond the limits.
+        For motions whose constants doubles cannot hold, and from every evaluation for bad times.
     """
 
     steps = evaluations = 0
@@ -75,15 +72,14 @@ class ExactSolution:
         self.top = top
         self._turns = round(start.theta / math.tau)
         theta = start.theta - self._turns * math.tau
-        self._mirrored = theta < 0.0
         # A state continued through a pole is solved from the same attitude with theta in [0, pi].
-        half_turn = math.pi if self._mirrored else 0.0
-        self.start = start = State(
-            theta=min(abs(theta), math.pi),
-            theta_dot=-start.theta_dot if self._mirrored else start.theta_dot,
-            phi=start.phi + half_turn, psi=start.psi - half_turn, l3=start.l3, lz=start.lz)
-        motion = set_up(top, start)
-        with precision(motion.digits):
+        self._sign, self._half_turn = (-1.0, math.pi) if theta < 0.0 else (1.0, 0.0)
+        self.start = State(
+            theta=min(abs(theta), math.pi), theta_dot=self._sign * start.theta_dot,
+            phi=start.phi + self._half_turn, psi=start.psi - self._half_turn,
+            l3=start.l3, lz=start.lz)
+        motion = set_up(top, self.start)
+        with precision(DIGITS):
             self._take_constants(motion)
         self._check_start()
 
@@ -96,25 +92,23 @@ class ExactSolution:
         # 2 K/w, two quarter periods
         self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
         alpha, beta = motion.alpha, motion.beta
-        in_range('the rate of the nutation', motion.quarter_rate)
-        in_range('the rate of (phi + psi)/2', alpha.rate)
-        in_range('the rate of (phi - psi)/2', beta.rate)
-        self.mean_precession_rate = in_range('mean precession rate', alpha.rate + beta.rate)
-        self.mean_spin_rate = in_range('mean spin rate', alpha.rate - beta.rate)
-        self.theta_min, self.theta_max = (
-            2.0 * math.atan2(sine, cosine) for sine, cosine in motion.half_angles)
-
-        l3, lz = Decimal(start.l3), Decimal(start.lz)
-        two_lambda1, two_pi = 2 * Decimal(top.lambda1), 2 * pi()
-        self._bottom_rate = in_range('(lz + l3)/(2 lambda1)', (lz + l3) / two_lambda1)
-        self._top_rate = in_range('(lz - l3)/(2 lambda1)', (lz - l3) / two_lambda1)
-        in_range('l3/lambda3', l3 / Decimal(top.lambda3))
-        self._theta = ThetaFunctions(motion, start.theta)
+        l3, lz, two_lambda1 = Decimal(start.l3), Decimal(start.lz), 2 * Decimal(top.lambda1)
+        bottom_rate, top_rate = (lz + l3) / two_lambda1, (lz - l3) / two_lambda1
+        in_range('the fastest rate', max(map(abs, (
+            motion.quarter_rate, alpha.rate, beta.rate, bottom_rate, top_rate,
+            l3 / Decimal(top.lambda3)))))
+        self.mean_precession_rate = float(alpha.rate + beta.rate)
+        self.mean_spin_rate = float(alpha.rate - beta.rate)
+        self._bottom_rate, self._top_rate = float(bottom_rate), float(top_rate)
+        self._theta = ThetaFunctions(motion)
+        self.theta_min, self.theta_max = self._theta.bounds.tolist()
         # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
-        self._phi_phase = float(Decimal(start.phi) - alpha.start_argument - beta.start_argument)
-        self._psi_phase = float(Decimal(start.psi) - alpha.start_argument + beta.start_argument)
-        fastest = max(abs(motion.quarter_rate), abs(alpha.rate / two_pi), abs(beta.rate / two_pi),
-                      Decimal('1e-300'))
+        self._phi_phase = float(
+            Decimal(start.phi) - alpha.start_argument - beta.start_argument) - self._half_turn
+        self._psi_phase = float(
+            Decimal(start.psi) - alpha.start_argument + beta.start_argument) + self._half_turn
+        fastest = max(abs(motion.quarter_rate), abs(alpha.rate) / (2 * pi()),
+                      abs(beta.rate) / (2 * pi()), Decimal('1e-300'))
         limit = min(Decimal(MOST_TURNS) / fastest, MOST)
         self.time_limit, self.ns_limit = float(limit), min(int(limit * 10 ** 9), LARGEST_NS)
 
@@ -124,8 +118,7 @@ class ExactSolution:
         alpha, beta, theta_dot = (float(x[0]) for x in (*first.moduli, first.theta_dot))
         cosine, sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
         # Relative to the distance from either pole, and to a small velocity of the axis.
-        across = ((self._bottom_rate * (sine / cosine) if self._bottom_rate else 0.0)
-                  + (self._top_rate * (cosine / sine) if self._top_rate else 0.0))
+        across = self._across(cosine, sine)
         for name, error, size in (
                 ('theta', beta * cosine - alpha * sine, alpha * sine),
                 ('theta_dot', theta_dot - start.theta_dot,
@@ -134,6 +127,19 @@ class ExactSolution:
                 raise ValueError(f'{name} = {getattr(start, name)!r} cannot be held in doubles: '
                                  f'the constants of {self.top} and {start} are too far apart in '
                                  'size')
+
+    def _across(self, cosine: Number, sine: Number) -> Number:
+        """
+        Return phi' sin(theta) = (Lz - L3 cos(theta))/(lambda1 sin(theta)) in half angles [rad/s].
+
+        Nothing cancels, and at a pole that can be reached the singular term is absent.
+        """
+        across = 0.0 * cosine
+        if self._bottom_rate:
+            across = across + self._bottom_rate * (sine / cosine)
+        if self._top_rate:
+            across = across + self._top_rate * (cosine / sine)
+        return across
 
     def describe(self) -> Description:
         """
@@ -218,16 +224,15 @@ class _ExactStates(States):
     @cached_property
     def angles(self) -> tuple[Column, Column, Column]:
         solution = self._solution
-        half_turn = math.pi if solution._mirrored else 0.0
         precession, phi, theta, spin, psi = self._rows('angles')
-        return (precession + (phi + (solution._phi_phase - half_turn)),
-                (-theta if solution._mirrored else theta) + solution._turns * math.tau,
-                spin + (psi + (solution._psi_phase + half_turn)))
+        return (precession + (phi + solution._phi_phase),
+                solution._sign * theta + solution._turns * math.tau,
+                spin + (psi + solution._psi_phase))
 
     @cached_property
     def theta_dot(self) -> Column:
-        theta_dot: Column = self._axis_rates[0]
-        return -theta_dot if self._solution._mirrored else theta_dot
+        theta_dot: Column = self._solution._sign * self._axis_rates[0]
+        return theta_dot
 
     @cached_property
     def _axis_rates(self) -> NDArray[np.float64]:
@@ -236,19 +241,7 @@ class _ExactStates(States):
 
     @cached_property
     def transverse_velocity(self) -> tuple[Column, Column]:
-        """
-        omega_1 and omega_2 [rad/s], eq. (4) of "Analysis of Symmetric Spinning Top".
-
-        phi' sin(theta) is Lz - L3 cos(theta) over lambda1 sin(theta), in half angles: nothing
-        cancels, and at a pole that can be reached the singular term is absent.
-        """
-        solution = self._solution
+        """omega_1 and omega_2 [rad/s], eq. (4) of "Analysis of Symmetric Spinning Top"."""
         theta_dot, cos_psi, sin_psi = self._axis_rates
-        cosine, sine = self._rows('half_theta')
-        precession = 0.0 * cosine
-        if solution._bottom_rate:
-            precession = precession + solution._bottom_rate * (sine / cosine)
-        if solution._top_rate:
-            precession = precession + solution._top_rate * (cosine / sine)
-        return (theta_dot * sin_psi - precession * cos_psi,
-                theta_dot * cos_psi + precession * sin_psi)
+        across = self._solution._across(*self._rows('half_theta'))
+        return theta_dot * sin_psi - across * cos_psi, theta_dot * cos_psi + across * sin_psi

@@ -16,15 +16,23 @@ from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers import dormand_prince
 from spinning_top_sim.solvers.dormand_prince import Equations, IntegrationError, Rows
-from spinning_top_sim.solvers.equations import EulerEquations, TransportEquations, Unknowns
+from spinning_top_sim.solvers.equations import (
+    POLE_SHARE,
+    EulerEquations,
+    Parts,
+    TransportEquations,
+    half_axis,
+)
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.times import NANOSECONDS, Times
-from spinning_top_sim.solvers.unwrap import PhaseUnwrapper
+from spinning_top_sim.solvers.unwrap import PhaseUnwrapper, turns_to_follow
 
 # A time that so many steps of the present size do not reach is refused: minutes of work.
 MOST_STEPS = 1e7
 # Steps that `states_at_seconds` takes and reads together; more would only take memory.
 STEPS_TOGETHER = 256
+# Steps that `release` leaves whatever it is asked: some 50 MB.
+MOST_KEPT = 50_000
 
 
 class SteppedMotion(ABC):
@@ -62,8 +70,9 @@ class SteppedMotion(ABC):
         return True
 
     def release(self, before_ns: int) -> None:
-        self._forget(bisect_left(self._kept, before_ns / NANOSECONDS, hi=len(self._kept) - 1,
-                                 key=attrgetter('t1')))
+        count = bisect_left(self._kept, before_ns / NANOSECONDS, hi=len(self._kept) - 1,
+                            key=attrgetter('t1'))
+        self._forget(max(count, len(self._kept) - MOST_KEPT))
 
     def _forget(self, count: int) -> None:
         del self._kept[:count]
@@ -77,12 +86,12 @@ class SteppedMotion(ABC):
 
         Missing steps are taken here, STEPS_TOGETHER at a time, and forgotten once the times in
         them are computed: `solve` reads a motion of any length in bounded memory.
-        Raises ValueError if a time lies before the steps that are kept, and IntegrationError if
-        the steps cannot go on to the last time, or it is too many of them away.
+        Raises IntegrationError if a time lies before the steps that are kept, if the steps cannot
+        go on to the last time, or if it is too many of them away.
         """
         if len(t) and t[0] < self._kept[0].t0:
-            raise ValueError(f't = {float(t[0])!r} s: steps go forward, and the oldest one that '
-                             f'is kept begins at {self._kept[0].t0!r} s')
+            raise IntegrationError(f't = {float(t[0])!r} s: steps go forward, and the oldest one '
+                                   f'that is kept begins at {self._kept[0].t0!r} s')
         parts, begin = [], 0
         while begin < len(t):
             while self._kept[-1].t1 < t[-1] and len(self._kept) < STEPS_TOGETHER:
@@ -146,11 +155,6 @@ class _EulerStates(States):
         return attitude.quaternion_of_angles(*self.angles)
 
     @cached_property
-    def half_angle_squares(self) -> tuple[Column, Column]:
-        cosine, sine = np.cos(0.5 * self.theta), np.sin(0.5 * self.theta)
-        return cosine * cosine, sine * sine
-
-    @cached_property
     def transverse_velocity(self) -> tuple[Column, Column]:
         """omega_1 + i omega_2 = (-phi' sin(theta) + i theta') exp(-i psi), eq. (4)."""
         across = self.phi_dot * np.sin(self.theta)
@@ -198,58 +202,60 @@ class _TransportStates(States):
                  t: Column, rows: Rows) -> None:
         super().__init__(equations.top, start, len(t))
         self.t, self._equations = t, equations
-        self._of_alpha, self._of_beta = phases.of_alpha, phases.of_beta
-        self._stepped, self._begins = Unknowns(*rows[:6]), rows[6:]
+        self._polar, self._momenta = phases.polar, phases.momenta
+        self._stepped: Parts = tuple(rows[:6])
+        self._begins = rows[6:]
 
     @cached_property
-    def _projected(self) -> Unknowns:
+    def _projected(self) -> Parts:
         """The unknowns on the invariants, in the body's own frame."""
-        equations = self._equations
-        if self._of_alpha.crosses or self._of_beta.crosses:
-            projected = equations.project_through_poles(self._stepped, *self._moduli_and_phases(
-                self._stepped, equations.uniform_rates[0]))
-        else:
-            projected = equations.project_columns(self._stepped)
-        a, b, c, d, m_real, m_imag = projected
+        equations, y, pole_share = self._equations, self._stepped, POLE_SHARE
+        if not all(self._momenta[:2]):  # the meridian of the axis is known
+            y, pole_share = self._on_lines(y, equations.uniform_rates[0] * self.t), 0.0
+        a, b, c, d, m_real, m_imag = equations.project_columns(y, pole_share)
         spin = 0.5 * equations.spin_rate * self.t
         cosine, sine = np.cos(spin), np.sin(spin)
-        return Unknowns(a * cosine - b * sine, b * cosine + a * sine,
-                        c * cosine + d * sine, d * cosine - c * sine, m_real, m_imag)
+        return (a * cosine - b * sine, b * cosine + a * sine,
+                c * cosine + d * sine, d * cosine - c * sine, m_real, m_imag)
 
-    def _moduli_and_phases(self, y: Unknowns, uniform_rate: float,
-                           ) -> tuple[Column, Column, Column, Column]:
-        """Return signed moduli and phases of alpha and beta in a frame of this uniform rate."""
-        uniform = uniform_rate * self.t
-        of_alpha = y.alpha_real, y.alpha_imag, uniform
-        of_beta = y.beta_real, y.beta_imag, -uniform
-        return (self._of_alpha.modulus(*of_alpha), self._of_beta.modulus(*of_beta),
-                self._of_alpha.at(*of_alpha, self._begins[0]),
-                self._of_beta.at(*of_beta, self._begins[1]))
+    def _on_lines(self, y: Parts, uniform: Column) -> Parts:
+        """Return y with alpha or beta moved onto the line through zero, and m turned with them."""
+        moved = list(y[:4])
+        moduli, phases = self._polar(y, uniform)
+        for k, part in enumerate((uniform, -uniform)):
+            if not self._momenta[k]:
+                moved[2 * k] = moduli[k] * np.cos(phases[k] + part)
+                moved[2 * k + 1] = moduli[k] * np.sin(phases[k] + part)
+        x, z = half_axis(*y[:4])
+        u, v = half_axis(*moved)
+        # Next to the pole m is known better than the axis.
+        away = x * x + z * z > POLE_SHARE
+        scale = np.where(away, np.hypot(x, z) * np.hypot(u, v), 1.0)
+        cosine = np.where(away, (x * u + z * v) / scale, 1.0)
+        sine = np.where(away, (x * v - z * u) / scale, 0.0)
+        return *moved, y[4] * cosine - y[5] * sine, y[4] * sine + y[5] * cosine
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:
-        y = self._projected
-        return -y.beta_imag, y.beta_real, y.alpha_imag, y.alpha_real
-
-    @cached_property
-    def half_angle_squares(self) -> tuple[Column, Column]:
-        x, y, z, w = self.rows_quaternion
-        return w * w + z * z, x * x + y * y
+        alpha_real, alpha_imag, beta_real, beta_imag, *_ = self._projected
+        return -beta_imag, beta_real, alpha_imag, alpha_real
 
     @cached_property
     def angles(self) -> tuple[Column, Column, Column]:
-        cosine, sine, half_sum, half_difference = self._moduli_and_phases(
-            self._projected, self._equations.uniform_rates[1])
-        half = np.arctan2(sine, cosine)
+        uniform = self._equations.uniform_rates[1] * self.t
+        _, phases = self._polar(self._projected, uniform)
         # theta/2 turns by less than half a turn within a step.
-        half = half + math.tau * np.rint((self._begins[2] - half) / math.tau)
+        half_sum, half_difference, half = (
+            phase + math.tau * turns_to_follow(phase, begin, momentum)
+            for phase, begin, momentum in zip(phases, self._begins, self._momenta, strict=True))
+        half_sum, half_difference = half_sum + uniform, half_difference - uniform
         return half_sum + half_difference, 2.0 * half, half_sum - half_difference
 
     @cached_property
     def _momentum(self) -> tuple[Column, Column]:
         """L_x and L_y in the world frame [kg m^2/s]."""
-        unit = 2.0 * self.top.lambda1
-        return unit * self._projected.m_imag, -unit * self._projected.m_real
+        unit, (*_, m_real, m_imag) = 2.0 * self.top.lambda1, self._projected
+        return unit * m_imag, -unit * m_real
 
     @cached_property
     def theta_dot(self) -> Column:

@@ -61,100 +61,77 @@ class Series(NamedTuple):
         return self.polynomial[0]
 
 
+NOTHING = Series(COS_EVEN, (ZERO,))
+# A real and an imaginary part
+Parts = tuple[Series, Series]
+
+
 class ThetaForm:
     """
     The theta functions in the real or in the imaginary form.
 
     mean : of which k is the modulus of the form: k^2 is m in the real and 1 - m in the imaginary
         form, and at most 1/2
+    theta1 .. theta4 : the functions of y, or what the transformation makes of them
+    odd_over_even : the factor that the transforms of theta1 and theta4 have lost, squared; those
+        of theta2 and theta3 have not
     """
 
     def __init__(self, mean: GaussMean, imaginary: bool) -> None:
         self.mean, self.imaginary = mean, imaginary
-        self.nome = q = mean.nome()
+        q = mean.nome()
         # Terms k, of size q^(k^2 - k/2) or less beside the first one, while they are above 1e-19.
         terms = next((k for k in range(2, MOST_TERMS)
                       if q ** (2 * k * k - k) < Decimal('1e-38')), MOST_TERMS)
         self._even = [ONE, *(2 * q ** (k * k) for k in range(1, terms))]
         self._odd = [q ** (k * (k + 1)) for k in range(terms)]
-
-    def theta(self, number: int) -> Series:
-        """Return theta1 .. theta4 of y, or what the transformation makes of them."""
-        if self.imaginary:
-            number = {1: 1, 2: 4, 3: 3, 4: 2}[number]
-        if number == 1:
-            return Series.of(SIN_ODD, _alternating(self._odd))
-        if number == 2:
-            return Series.of(COS_ODD, self._odd)
-        return Series.of(COS_EVEN, self._even if number == 3 else _alternating(self._even))
-
-    def at_zero(self, number: int) -> Decimal:
-        """Return theta3 or theta4 at y = 0, or what the transformation makes of them."""
-        if number == 3:
-            return sum(self._even, ZERO)
-        return sum(self._odd if self.imaginary else _alternating(self._even), ZERO)
-
-    @property
-    def odd_over_even(self) -> Decimal:
-        """The transforms of theta1 and theta4 have lost a factor 2 q'^(1/4), of theta2 not."""
-        return 4 * self.nome.sqrt() if self.imaginary else ONE
+        self.theta1 = Series.of(SIN_ODD, _alternating(self._odd))
+        self.theta2 = Series.of(COS_ODD, self._odd)
+        self.theta3 = Series.of(COS_EVEN, self._even)
+        self.theta4 = Series.of(COS_EVEN, _alternating(self._even))
+        if imaginary:
+            self.theta2, self.theta4 = self.theta4, self.theta2
+        self.odd_over_even = 4 * q.sqrt() if imaginary else ONE
 
     def slopes_of_sn2(self) -> tuple[Decimal, Decimal]:
         """Return c with d(sn^2 chi)/dchi = c theta1(2y)/D(y)^4, for theta4 and theta3 as D."""
         # 2 sn cn dn by the quotients of DLMF 22.2 and the duplication of theta1 [DLMF 20.7.10];
         # c from the first term at y = 0, where chi = (2K/pi) y.
-        slope = sum((2 * k + 1) * x for k, x in enumerate(_alternating(self._odd)))
-        even = self.at_zero(4) ** 4 * self.mean.quarter_period / slope
-        return even, -even * (16 * self.nome if self.imaginary else 1)
+        even = self.theta4.leading ** 4 * self.mean.quarter_period / self.theta1.leading
+        return even, -even * self.odd_over_even ** 2
 
-    def shifted(self, amplitude: Decimal) -> tuple[tuple[Series, Series], tuple[Series, Series]]:
+    def shifted(self, amplitude: Decimal, sense: int) -> tuple[Parts, Parts]:
         """
-        Return the real and the imaginary part of i theta1(y - iA) and of theta2(y - iA).
+        Return the parts R and s J of i s theta1(y - i s A) and of theta2(y - i s A).
 
         amplitude : sinh A, or, in the imaginary form, sin of its transform pi a/(2K')
+        sense : s
         """
+        sines, cosines = self._multiples(amplitude)
+        theta1 = (Series.of(COS_ODD, _alternating(_products(self._odd, sines[1::2]))),
+                  Series.of(SIN_ODD, _alternating(_products(self._odd, cosines[1::2], sense))))
         if self.imaginary:
-            sines, cosines = _multiples(amplitude, 2 * len(self._odd))
-            weights = _alternating(self._odd), _alternating(self._even)
-            return ((Series.of(COS_ODD, _products(weights[0], sines[1::2])),
-                     Series.of(SIN_ODD, _products(weights[0], cosines[1::2]))),
-                    (Series.of(COS_EVEN, _products(weights[1], cosines[::2])),
-                     Series.of(SIN_EVEN, [-x for x in _products(weights[1], sines[::2])])))
-        minus, plus = self._growing_weights(amplitude)
-        return ((Series.of(COS_ODD, _alternating(minus)), Series.of(SIN_ODD, _alternating(plus))),
-                (Series.of(COS_ODD, plus), Series.of(SIN_ODD, minus)))
+            return theta1, (
+                Series.of(COS_EVEN, _alternating(_products(self._even, cosines[::2]))),
+                Series.of(SIN_EVEN, _alternating(_products(self._even, sines[::2], -sense))))
+        return theta1, (Series.of(COS_ODD, _products(self._odd, cosines[1::2])),
+                        Series.of(SIN_ODD, _products(self._odd, sines[1::2], sense)))
 
-    def _growing_weights(self, sinh: Decimal) -> tuple[list[Decimal], list[Decimal]]:
-        """Return q^(k(k+1)) times sinh and cosh of (2k+1) A, both over exp(A)."""
-        # exp((2k+1) A) q^(k(k+1)) = exp(A) q^(k^2) g^k with g = q exp(2A) <= 1: no large numbers.
-        cosh = (1 + sinh * sinh).sqrt()
-        growth = sinh + cosh
-        g = self.nome * growth * growth
-        sinh, cosh = sinh / growth, cosh / growth       # of (2k+1) A, over exp((2k+1) A)
-        sinh2, cosh2 = 2 * sinh * cosh, sinh * sinh + cosh * cosh
-        minus, plus = [], []
-        for k in range(len(self._odd)):
-            weight = self.nome ** (k * k) * g ** k
-            minus.append(weight * sinh)
-            plus.append(weight * cosh)
-            sinh, cosh = sinh * cosh2 + cosh * sinh2, cosh * cosh2 + sinh * sinh2
-        return minus, plus
-
-
-def _multiples(sin: Decimal, count: int) -> tuple[list[Decimal], list[Decimal]]:
-    """Return the sines and the cosines of 0, 1, 2... times an angle in [0, pi/2]."""
-    cos = (1 - sin * sin).sqrt()
-    sines, cosines = [ZERO], [ONE]
-    for _ in range(count - 1):
-        s, c = sines[-1], cosines[-1]
-        sines.append(s * cos + c * sin)
-        cosines.append(c * cos - s * sin)
-    return sines, cosines
+    def _multiples(self, sin: Decimal) -> tuple[list[Decimal], list[Decimal]]:
+        """Return the sines and cosines, or sinh and cosh, of 0, 1, 2... times A."""
+        square = -sin * sin if self.imaginary else sin * sin
+        cos, sines, cosines = (1 + square).sqrt(), [ZERO], [ONE]
+        sign = -1 if self.imaginary else 1
+        for _ in range(2 * len(self._odd) - 1):
+            s, c = sines[-1], cosines[-1]
+            sines.append(s * cos + c * sin)
+            cosines.append(c * cos + sign * s * sin)
+        return sines, cosines
 
 
 def _alternating(weights: Sequence[Decimal]) -> list[Decimal]:
     return [-x if k % 2 else x for k, x in enumerate(weights)]
 
 
-def _products(one: Sequence[Decimal], other: Sequence[Decimal]) -> list[Decimal]:
-    return [x * y for x, y in zip(one, other, strict=True)]
+def _products(one: Sequence[Decimal], other: Sequence[Decimal], sign: int = 1) -> list[Decimal]:
+    return [sign * x * y for x, y in zip(one, other, strict=True)]

@@ -3,9 +3,9 @@
 The exact motion at many times, in doubles; `theta_setup` explains the symbols.
 
 Three phases are products of a rate and the time, whose error does not grow with time: that of the
-nutation in quarter periods, and those of the rotations exp i(r t + c) of alpha and beta in quarter
-turns.  Each is reduced to the nearest integer.  What is left is an angle of at most pi/4 and keeps
-its relative precision: a top races past a pole that it misses by little.
+nutation in quarter periods, and those of the rotations exp i(r t + c) of alpha and beta in half
+turns.  Each is reduced to the nearest integer.  What is left is an angle of at most pi/4 or pi/2
+and keeps its relative precision: a top races past a pole that it misses by little.
 
 All arithmetic is elementwise, so that a value does not depend on the other values in its block.
 """
@@ -18,9 +18,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.attitude import Column, Number
-from spinning_top_sim.solvers.decimal_math import ZERO, double_double, pi
-from spinning_top_sim.solvers.theta_series import COS_EVEN, MOST_TERMS, SIN_ODD, Series
+from spinning_top_sim.physics.attitude import Column
+from spinning_top_sim.solvers.decimal_math import double_double, pi
+from spinning_top_sim.solvers.theta_series import SIN_ODD, Series
 from spinning_top_sim.solvers.theta_setup import Factor, ThetaMotion
 from spinning_top_sim.solvers.times import Rates, Times
 
@@ -29,12 +29,11 @@ from spinning_top_sim.solvers.times import Rates, Times
 np.empty(2 ** 22, np.uint8)
 
 Matrix = NDArray[np.float64]
-QUARTER = 0.5 * math.pi         # the angle of a quarter period or turn [rad]
-# Cosine and sine of 0, 1, 2 and 3 quarter turns.
-COSINES, SINES = np.array(((1.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, -1.0)))
+QUARTER = 0.5 * math.pi         # the angle of a quarter period [rad]
+SIGNS = np.array((1.0, -1.0))   # of an even and of an odd number of half turns
+HALF_ANGLES = 0.5 * math.pi * np.array([[0.5], [1.0], [1.0]])       # of the three phases' units
 # Smaller amplitudes leave no room for their products in doubles, larger numbers none for halves.
 LEAST_AMPLITUDE, MOST = Decimal('1e-290'), Decimal('1e290')
-NOTHING = Series(COS_EVEN, (ZERO,))
 
 
 class ThetaFunctions:
@@ -43,61 +42,50 @@ class ThetaFunctions:
 
     Raises ValueError if doubles cannot hold an amplitude or a rate.
 
-    rates, offset, offset_rest, start_quarters : of the three phases, (3, 1).  At t = 0 a phase is
-        start_quarters + offset + offset_rest.
-    drifts : kappa of alpha and beta, (2, 1)
+    rates, offset, offset_rest, start_whole : of the three phases, (3, 1).  At t = 0 a phase is
+        start_whole + offset + offset_rest.
+    drifts : kappa/2 of alpha and beta, (2, 1)
     prefactors : at even and at odd N, of the rows R of alpha, R of beta, s J of alpha, s J of beta
     coefficients : of the polynomials, highest power first, by row, at even and at odd N, (k, 4, 2)
     real : the numbers, 0 and 1, of those of alpha and beta that have s = 0
     zeros : of the ones that pass a pole: 0 or 1, whether R = 0 at even or at odd N and y = 0
     u_dot, u_dot_coefficients : of u', times `magnifier`, a power of 2 for small amplitudes
+    bounds : the least and the greatest theta in [0, pi] [rad]
+    planar_rotation : (i, j) if both poles are passed: theta/2 is then within a quarter turn of
+        (pi/2) (i + j N)
     """
 
-    def __init__(self, motion: ThetaMotion, start_theta: float) -> None:
+    def __init__(self, motion: ThetaMotion) -> None:
         factors = motion.alpha, motion.beta
-        self.rates = Rates([motion.quarter_rate, *(x.rate * 2 / pi() for x in factors)])
-        rotations = [factor.phase_turns * 4 for factor in factors]
-        whole = [x.to_integral_value() for x in rotations]
-        self.start_quarters = _column((motion.quarter0, *(int(x) % 4 for x in whole)))
-        offsets = [motion.offset0, *(x - y for x, y in zip(rotations, whole, strict=True))]
-        self.offset, self.offset_rest = map(
-            _column, zip(*map(double_double, offsets), strict=True))
-        self.drifts = _column(float(factor.drift) for factor in factors)
-        self.stretch = QUARTER * float(motion.stretch) if motion.imaginary else None
-        self._take_series(motion)
-        self.planar_rotation = motion.planar_rotation
-        self.turns0 = 0.0
-        if motion.planar_rotation:
-            self.turns0 = round(self.turns(motion.quarter0, float(motion.offset0),
-                                           0.5 * start_theta))
-
-    def _take_series(self, motion: ThetaMotion) -> None:
-        factors = motion.alpha, motion.beta
-        rows = [[one[part] or NOTHING for one in factor.parts]
-                for part in (0, 1) for factor in factors]
-        signs = [[x.sign] for x in factors] + [[x.sense] for x in factors]
+        self.rates = Rates([motion.quarter_rate, *(x.rate / pi() for x in factors)])
+        whole = [motion.quarter0, *(round(2 * x.phase_turns) for x in factors)]
+        rest = [motion.offset0, *(2 * x.phase_turns - round(2 * x.phase_turns) for x in factors)]
+        self.start_whole = _column(whole)
+        self.offset, self.offset_rest = map(_column, zip(*map(double_double, rest), strict=True))
+        self.drifts = _column(0.5 * float(factor.drift) for factor in factors)
+        self.stretch = QUARTER * float(motion.stretch) if motion.stretch else None
+        rows = [[one[part] for one in factor.parts] for part in (0, 1) for factor in factors]
         self.prefactors = [(even.prefactor, odd.prefactor) for even, odd in rows]
-        self.coefficients = (np.array(signs)[:, :, np.newaxis]
-                             * np.array([_coefficients(row) for row in rows])).transpose(2, 0, 1)
+        self.coefficients = _coefficients(rows)
         self.real = [k for k, factor in enumerate(factors) if not factor.sense]
-        self.zeros = {k: self.prefactors[k].index(SIN_ODD)
-                      for k, factor in enumerate(factors) if factor.crosses}
+        self.zeros = {k: pair.index(SIN_ODD) for k, pair in enumerate(self.prefactors[:2])
+                      if SIN_ODD in pair}
         smallest = min(map(_amplitude, ('alpha', 'beta'), factors))
         self.magnifier = 2.0 ** -math.frexp(smallest)[1] if smallest else 1.0
         self.u_dot = np.array([in_range("cos(theta)'", x * Decimal(self.magnifier))
                                for x in motion.u_dot])
-        self.u_dot_coefficients = np.array(_coefficients([motion.u_dot_series])).T
-
-    def turns(self, quarters: Number, offset: Number, half_theta: Number) -> Number:
-        """
-        Return the whole turns to add to `half_theta`, before rounding, in a planar rotation.
-
-        Through both poles theta/2 stays within a quarter turn of (pi/2) (i + j Z).
-        """
-        assert self.planar_rotation is not None
-        i, j = self.planar_rotation
-        steady = QUARTER * (i + j * quarters) + QUARTER * j * offset
-        return (steady - half_theta) / (2.0 * math.pi) - self.turns0
+        self.u_dot_coefficients = _coefficients([[motion.u_dot_series]])[:, 0]
+        # The rows where y = 0, at N = 0 and N = 1.
+        alpha, beta, alpha_imag, beta_imag = np.where(
+            np.array(self.prefactors) < SIN_ODD, self.coefficients[-1], 0.0)
+        self.bounds = np.sort(2.0 * np.arctan2(np.hypot(beta, beta_imag),
+                                               np.hypot(alpha, alpha_imag)))
+        self.planar_rotation: tuple[float, float] | None = None
+        if len(self.zeros) == 2:
+            first, second = (np.arctan2(beta, alpha) / QUARTER).tolist()
+            slope = (second - first + 2.0) % 4.0 - 2.0
+            start = (first + slope * motion.quarter0 + 1.0) % 4.0 - 1.0
+            self.planar_rotation = start - slope * motion.quarter0, slope
 
 
 class ThetaValues:
@@ -117,13 +105,13 @@ class ThetaValues:
         half -= constants.offset
         part -= half
         part += rest + constants.offset_rest
-        self._quarters = whole.astype(np.int64)
-        shift += constants.start_quarters
-        self._quarters += shift.astype(np.int64)
+        self._whole = whole.astype(np.int64)
+        shift += constants.start_whole
+        self._whole += shift.astype(np.int64)
         self._offset = part[0].copy()
         part[1:] += constants.drifts * self._offset
         # Cosine and sine by the tangent of half the angle, which is at most 1.
-        part *= 0.5 * QUARTER
+        part *= HALF_ANGLES
         tangent = np.tan(part, out=part)
         square = tangent * tangent
         self._cos = 1.0 - square
@@ -135,14 +123,14 @@ class ThetaValues:
 
     def _evaluate(self) -> None:
         """Compute R and s J of alpha and beta, (2, n) each."""
-        constants, quarters = self._constants, self._quarters[0]
+        constants, quarters = self._constants, self._whole[0]
         if constants.stretch is None:
-            sin, cos = self._sin[0], self._cos[0]
+            sin = self._sin[0]
             xi = sin * sin
         else:
             sin = np.sinh(constants.stretch * self._offset)
             xi = -sin * sin
-            cos = np.sqrt(1.0 - xi)
+        cos = np.sqrt(1.0 - xi)
         self._parity, self._xi = quarters & 1, xi
         odd = self._parity.astype(bool)
         rows = _horner(constants.coefficients.take(self._parity, axis=2), xi)
@@ -174,10 +162,8 @@ class ThetaValues:
     @cached_property
     def _rotations(self) -> tuple[Matrix, Matrix]:
         """Cosines and sines of r t + c + kappa y of alpha and beta, (2, n)."""
-        place = self._quarters[1:] & 3
-        whole_cos, whole_sin, cos, sin = (
-            COSINES.take(place), SINES.take(place), self._cos[1:], self._sin[1:])
-        return whole_cos * cos - whole_sin * sin, whole_sin * cos + whole_cos * sin
+        sign = SIGNS.take(self._whole[1:] & 1)
+        return sign * self._cos[1:], sign * self._sin[1:]
 
     @cached_property
     def _alpha_beta(self) -> tuple[Matrix, Matrix]:
@@ -207,17 +193,17 @@ class ThetaValues:
         """
         (_, alpha, beta), (_, alpha_rest, beta_rest) = self._turned, self._turned_rest
         arguments = np.arctan2(self._imag, self._real)
-        arguments += (QUARTER * self._constants.drifts) * self._offset
+        arguments += (math.pi * self._constants.drifts) * self._offset
         arguments[self._constants.real] = 0.0
         half = np.arctan2(self.moduli[1], self.moduli[0])
         if self._constants.planar_rotation:
-            half += 2.0 * math.pi * np.rint(self._constants.turns(
-                self._quarters[0], self._offset, half))
+            i, j = self._constants.planar_rotation
+            half += math.tau * np.rint((QUARTER * (i + j * self._whole[0]) - half) / math.tau)
         found = np.empty((5, len(half)))
-        found[0] = QUARTER * ((alpha + beta) + (alpha_rest + beta_rest))
+        found[0] = math.pi * ((alpha + beta) + (alpha_rest + beta_rest))
         found[1] = arguments[0] + arguments[1]
         found[2] = 2.0 * half
-        found[3] = QUARTER * ((alpha - beta) + (alpha_rest - beta_rest))
+        found[3] = math.pi * ((alpha - beta) + (alpha_rest - beta_rest))
         found[4] = arguments[0] - arguments[1]
         return found
 
@@ -263,7 +249,7 @@ def in_range(name: str, value: Decimal) -> float:
 
 def _amplitude(name: str, factor: Factor) -> float:
     """Return the lesser of the largest coefficients at even and at odd N."""
-    sizes = [[max(map(abs, part.polynomial)) for part in parts if part] for parts in factor.parts]
+    sizes = [[max(map(abs, part.polynomial)) for part in parts] for parts in factor.parts]
     for real, *_ in sizes:
         if 0 < real < LEAST_AMPLITUDE:
             raise ValueError(f'the amplitude of {name} is {real:.3e}: the start is too close to a '
@@ -271,10 +257,11 @@ def _amplitude(name: str, factor: Factor) -> float:
     return float(min(map(max, sizes)))
 
 
-def _coefficients(row: Sequence[Series]) -> list[list[float]]:
-    """Return the polynomials' coefficients in doubles, highest power first, (len(row), k)."""
-    return [[0.0] * (MOST_TERMS - len(x.polynomial)) + [*map(float, reversed(x.polynomial))]
-            for x in row]
+def _coefficients(rows: Sequence[Sequence[Series]]) -> NDArray[np.float64]:
+    """Return the polynomials' coefficients in doubles, highest of at least 2 powers first."""
+    size = max(2, *(len(x.polynomial) for row in rows for x in row))
+    return np.array([[(size - len(x.polynomial)) * [0.0] + [*map(float, x.polynomial[::-1])]
+                      for x in row] for row in rows]).transpose(2, 0, 1)
 
 
 def _column(values: Iterable[float]) -> Matrix:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from decimal import Decimal
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,11 +75,6 @@ class Times:
         """(n,) [s]."""
         return self.high if self.unit == 's' else self.high / 1e9 + self.low / 1e9
 
-    @cached_property
-    def halves(self) -> tuple[Column, Column]:
-        """The nearest doubles, split; see `halves`."""
-        return halves(self.high)
-
     def __len__(self) -> int:
         return len(self.high)
 
@@ -103,7 +97,7 @@ class Rates:
     def products(self, times: Times) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return rate * t, (k, n), as nearest doubles and what they leave out."""
         rate, r1, r2, rate_low = self._constants[times.unit]
-        t1, t2 = times.halves
+        t1, t2 = halves(times.high)
         high = rate * times.high
         # Exact up to the last product of halves (Dekker).
         rest = r1 * t1

@@ -16,7 +16,7 @@ through zero, and its modulus changes sign where the axis passes that pole.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,12 +32,8 @@ def turns_to_follow(phase: Column, before: Column, momentum: float) -> Column:
     In the sense of `momentum` it then lies within (-pi/2, 3 pi/2) from there: backwards by
     rounding at most.  Without a sense (momentum 0) it is the nearest.
     """
-    turned = phase - before
-    if momentum > 0.0:
-        return 0.0 - np.floor((turned + 0.5 * math.pi) / math.tau)
-    if momentum < 0.0:
-        return 0.0 - np.ceil((turned - 0.5 * math.pi) / math.tau)
-    return 0.0 - np.rint(turned / math.tau)
+    ahead = 0.5 * math.pi * ((momentum > 0.0) - (momentum < 0.0))
+    return 0.0 - np.rint((phase - before - ahead) / math.tau)
 
 
 def unwrap(phases: Column, before: float, momentum: float) -> Column:
@@ -46,80 +42,49 @@ def unwrap(phases: Column, before: float, momentum: float) -> Column:
     return phases + math.tau * np.cumsum(turns_to_follow(phases, previous, momentum))
 
 
-@dataclass(frozen=True)
-class Phase:
-    """
-    The phase and the signed modulus of alpha or beta.
-
-    The methods take the real and the imaginary part in some frame, and `uniform`, the uniform part
-    of the phase in that frame [rad].
-
-    momentum : Lz + L3 of alpha, Lz - L3 of beta; its sign is the sense of turning
-    sign : of the modulus, where theta is continued out of [0, pi]
-    start : phase at t = 0 [rad]
-    """
-
-    momentum: float
-    sign: float
-    start: float
-
-    @property
-    def crosses(self) -> bool:
-        """Whether the parameter can vanish: it then moves on a line through zero."""
-        return self.momentum == 0.0
-
-    def modulus(self, real: Column, imag: Column, uniform: Column) -> Column:
-        if self.crosses:
-            phase = self.start + uniform
-            return real * np.cos(phase) + imag * np.sin(phase)
-        return self.sign * np.hypot(real, imag)
-
-    def at(self, real: Column, imag: Column, uniform: Column, begin: Column) -> Column:
-        """Return the phase [rad]; begin: that at the begin of the step, less its uniform part."""
-        if self.crosses:
-            return self.start + uniform
-        argument = self._argument(real, imag)
-        return argument + math.tau * turns_to_follow(argument, begin + uniform, self.momentum)
-
-    def at_begins(self, real: Column, imag: Column, uniform: Column, before: float) -> Column:
-        """Return the phases at the begins of steps after `before`, less their uniform parts."""
-        if self.crosses:
-            return np.full(len(real), self.start)
-        return unwrap(self._argument(real, imag) - uniform, before, self.momentum)
-
-    def _argument(self, real: Column, imag: Column) -> Column:
-        return np.arctan2(self.sign * imag, self.sign * real)
-
-
 class PhaseUnwrapper:
     """
     The phases of alpha and beta of a motion at the begins of its steps.
 
     uniform_rate : of alpha's phase in the frame that is stepped; minus that of beta's [rad/s]
+    momenta : Lz + L3, Lz - L3 and 0: their signs are the senses of turning
     begins : (3, n) phases of alpha and beta, less their uniform parts, and theta/2 [rad]
     """
 
     def __init__(self, start: State, uniform_rate: float) -> None:
         half = 0.5 * start.theta
-        self.of_alpha = Phase(start.lz + start.l3, math.copysign(1.0, math.cos(half)),
-                              0.5 * start.phi + 0.5 * start.psi)
-        self.of_beta = Phase(start.lz - start.l3, math.copysign(1.0, math.sin(half)),
-                             0.5 * start.phi - 0.5 * start.psi)
         self._uniform_rate = uniform_rate
-        self.begins = np.array([[self.of_alpha.start], [self.of_beta.start], [half]])
+        self.momenta = start.lz + start.l3, start.lz - start.l3, 0.0
+        # Of the moduli, where theta is continued out of [0, pi].
+        self._signs = math.copysign(1.0, math.cos(half)), math.copysign(1.0, math.sin(half))
+        self._starts = 0.5 * start.phi + 0.5 * start.psi, 0.5 * start.phi - 0.5 * start.psi
+        self.begins = np.array([*self._starts, half])[:, np.newaxis]
+
+    def polar(self, y: Sequence[Column], uniform: Column) -> tuple[list[Column], list[Column]]:
+        """
+        Return the signed moduli of alpha and beta, and phases as in `begins`, up to whole turns.
+
+        y : real and imaginary parts of alpha and beta, and more
+        uniform : the uniform part of alpha's phase in the same frame [rad]
+        """
+        moduli, phases = [], []
+        for k, part in enumerate((uniform, -uniform)):
+            real, imag, sign, start = y[2 * k], y[2 * k + 1], self._signs[k], self._starts[k]
+            if self.momenta[k]:
+                moduli.append(sign * np.hypot(real, imag))
+                phases.append(np.arctan2(sign * imag, sign * real) - part)
+            else:       # it moves on a line through zero
+                moduli.append(real * np.cos(start + part) + imag * np.sin(start + part))
+                phases.append(np.full(len(part), start))
+        return moduli, [*phases, np.arctan2(moduli[1], moduli[0])]
 
     def extend(self, t: Column, alpha: NDArray[np.complex128],
                beta: NDArray[np.complex128]) -> None:
         """Follow the phases over the begins of further steps at t [s]."""
-        uniform = self._uniform_rate * t
-        of_alpha = alpha.real.copy(), alpha.imag.copy(), uniform
-        of_beta = beta.real.copy(), beta.imag.copy(), -uniform
-        before = self.begins[:, -1]
-        half_theta = np.arctan2(self.of_beta.modulus(*of_beta), self.of_alpha.modulus(*of_alpha))
-        self.begins = np.concatenate((self.begins, (
-            self.of_alpha.at_begins(*of_alpha, before[0]),
-            self.of_beta.at_begins(*of_beta, before[1]),
-            unwrap(half_theta, before[2], 0.0))), axis=1)
+        parts = [x.copy() for x in (alpha.real, alpha.imag, beta.real, beta.imag)]
+        _, phases = self.polar(parts, self._uniform_rate * t)
+        self.begins = np.concatenate((self.begins, [*map(
+            unwrap, phases, self.begins[:, -1], self.momenta)]), axis=1)
 
     def forget(self, count: int) -> None:
         """Forget the oldest steps."""
