@@ -158,7 +158,7 @@ stress: dependencies
 	    "EXAMPLES=$(EXAMPLES) '$(VENV)/bin/pytest' -q -n $(WORKERS) --max-worker-restart=0 \
 	        --hypothesis-seed=$$seed \
 	        $(addprefix test/test_,properties.py properties_logs.py ranges.py extremes.py)" \
-	    $(foreach part,logs nodes services disk sensor, \
+	    $(foreach part,logs nodes disk sensor, \
 	        "'$(VENV)/bin/python' test/stress $(part) --seconds $(SECONDS)") \
 	    "'$(VENV)/bin/python' test/stress exam --count $(EXAMS)" \
 	    "'$(VENV)/bin/python' test/stress tops --count $(STRESS)"

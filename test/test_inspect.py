@@ -409,7 +409,7 @@ def test_a_torn_file_is_told_and_what_is_left_verifies(columns, tmp_path, capsys
     code, content = as_json(capsys, torn)
     assert code == 1 and not content['whole'] and content['damage']['torn']
     assert content['damage']['lost_bytes'] > 0
-    assert content['motions'][1]['measured']['nutations'] > 3
+    assert content['motions'][0]['measured']['nutations'] > 3
 
 
 def test_an_incomplete_log_is_told_in_the_same_words_before_and_after_recover(

@@ -15,7 +15,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import yaml  # type: ignore[import-untyped]
 from helpers.reference import ROOT
 
 from spinning_top_sim import nodes
@@ -118,18 +117,6 @@ def links_of(node):
 # ------------------------------------------------------------------------------------- sim.launch
 
 
-@pytest.mark.parametrize('name', ['sim', 'replay'])
-def test_every_argument_says_what_it_is(installed, name):
-    arguments, _ = described(name)
-    assert len(arguments) >= 8
-    for key, argument in arguments.items():
-        assert len(argument.description) > 5, key
-        if getattr(argument, 'choices', None):
-            assert argument.choices == ['true', 'false']
-    text = (ROOT / 'launch' / f'{name}.launch.py').read_text()
-    assert all(f"'{key}'" in text.partition('_nodes(context')[2] for key in arguments)
-
-
 def test_a_scene_is_started_with_its_parameters(installed):
     scene = 'looping'
     run = started('sim', scene=scene)
@@ -223,21 +210,6 @@ def log(tmp_path):
     return path
 
 
-def test_the_page_is_started_beside_the_node_when_asked_for(installed):
-    assert 'spinning_top_sim/view' not in started('sim').nodes
-    view = started('sim', namespace='left', view='true').nodes['spinning_top_sim/view']
-    assert view.namespace == 'left'
-
-
-def test_without_rviz_a_warning_names_the_package_and_all_else_starts(installed, log):
-    installed.discard('rviz2')
-    for run in (started('sim', rviz='true'), started('replay', file=str(log), rviz='true')):
-        (warning,) = run.said
-        assert warning.startswith('WARNING: no RViz: ')
-        assert 'sudo apt install ros-$ROS_DISTRO-rviz2' in warning
-        assert f'{RSP}/{RSP}' in run.nodes and len(run.nodes) == 2
-
-
 def test_overrides_win_over_integers_in_files(installed, tmp_path):
     """Between parameter files rcl takes an integer, wherever it stands, and drops a double."""
     for name, value in (('scene', '2'), ('second', '2.5')):
@@ -277,39 +249,7 @@ def test_a_log_is_replayed_with_the_frames_that_it_was_recorded_with(installed, 
     assert ('/markers', '/a/b/markers') in run.nodes['rviz2/rviz2'].remappings
 
 
-def test_the_clock_is_off_on_or_of_a_rate(installed, log):
-    for clock, rate in (('false', 0.0), ('true', 40.0), ('7.5', 7.5)):
-        run = started('replay', file=str(log), clock=clock)
-        assert options_of(run.nodes['spinning_top_sim/replay_node']).clock == rate
-        assert run.nodes[f'{RSP}/{RSP}'].parameters[0]['use_sim_time'] is bool(rate)
-
-
-def test_what_is_no_log_of_ours_is_left_to_the_node(installed, tmp_path):
-    run = started('replay', file=str(tmp_path / 'none.mcap'))
-    assert set(run.nodes) == {'spinning_top_sim/replay_node'}
-    assert 'none.mcap' in run.said[0]
-
-
-@pytest.mark.parametrize(('name', 'value'), [('rate', 'x'), ('clock', 'inf')])
-def test_bad_numbers_of_replay_are_left_to_the_node_which_names_them(
-        installed, log, capsys, name, value):
-    run = started('replay', file=str(log), **{name: value})
-    with pytest.raises(SystemExit, match='2'):
-        options_of(run.nodes['spinning_top_sim/replay_node'])
-    assert re.search(f'argument .*--{name}: .*{value}', capsys.readouterr().err)
-
-
 # ------------------------------------------------------------------------------------------- rviz
-
-
-def test_the_rviz_page_shows_topics_that_there_are():
-    page = yaml.safe_load((ROOT / 'rviz/spinning_top.rviz').read_text())['Visualization Manager']
-    displays = {display['Class'].split('/')[1]: display for display in page['Displays']}
-    assert displays['MarkerArray']['Topic']['Value'] == '/markers'
-    robot = displays['RobotModel']['Description Topic']
-    assert robot['Value'] == '/robot_description'
-    assert robot['Durability Policy'] == 'Transient Local', 'it is published once'
-    assert page['Global Options']['Fixed Frame'] == parameters.checked({})['world_frame']
 
 
 # ---------------------------------------------------------------------------------- the real thing

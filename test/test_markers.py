@@ -170,7 +170,8 @@ def test_bodies_and_lines_are_drawn_to_the_scale_of_the_top():
     corners = ((0.0, 0.0), (0.0, shape.tip), (0.0, far), (rim, far), (rim, far), (rim, near),
                (rim, near), (0.0, near))
     assert run.sent[0] == messages.markers(
-        'map', size, [part for x, z in corners for part in (x, 0.0, z)], -0.02 * shape.tip, 41,
+        'map', size, tuple(part for x, z in corners for part in (x, 0.0, z)),
+        -0.02 * shape.tip, 41,
     ).encode_one(EPOCH_NS, *run.stream.template.decode(run.sent[0]))
 
 
@@ -201,5 +202,5 @@ def test_the_message_is_what_ros_serializes(frame, count, stamp_ns):
         marker.points = [Point(x=x, y=y, z=z) for x, y, z in np.reshape(points, (-1, 3)).tolist()]
         expected.markers.append(marker)
     del expected.markers[2 + bool(count):]
-    assert_same(messages.markers(frame, size, lines, 0.0625, count).encode_one(
+    assert_same(messages.markers(frame, size, tuple(lines), 0.0625, count).encode_one(
         stamp_ns, centre, body, axis, *([trace] if count else [])), expected)

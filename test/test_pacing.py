@@ -3,7 +3,6 @@
 
 import threading
 import time
-from types import SimpleNamespace
 
 import pytest
 
@@ -67,18 +66,6 @@ def test_a_late_tick_comes_at_once_what_has_passed_is_skipped_and_the_grid_stays
     assert Run(monkeypatch, 5, {1: 3.75}).seen == [1.0, 2.0, 5.75, 6.0, 7.0]
 
 
-def test_ticks_that_take_longer_than_a_period_follow_each_other(monkeypatch):
-    seen = Run(monkeypatch, 5, dict.fromkeys(range(5), 1.5)).seen
-    assert seen == [1.0, 2.5, 4.0, 5.5, 7.0]
-
-
-def test_the_grid_is_aligned_with_a_time_before_or_after(monkeypatch):
-    for origin in (-7.5, 0.5, 12.5):
-        def align(run, origin=origin):
-            run.origin = BEGIN + origin * PERIOD
-        assert Run(monkeypatch, 5, at={1: align}).seen == [1.0, 2.0, 2.5, 3.5, 4.5]
-
-
 def test_a_new_rate_holds_from_the_next_deadline_on(monkeypatch):
     def set_period(period):
         return lambda run: setattr(run, 'period', period)
@@ -87,12 +74,6 @@ def test_a_new_rate_holds_from_the_next_deadline_on(monkeypatch):
     assert seen == [1.0, 2.0, 4.0, 6.0, 8.0, 10.0]
     seen = Run(monkeypatch, 4, at={1: set_period(0.5 * PERIOD)}).seen
     assert seen == [1.0, 2.0, 2.5, 3.0]
-
-
-def test_idle_work_begins_a_moment_after_the_tick_that_asks_for_it(monkeypatch):
-    run = Run(monkeypatch, 5, wants={1, 3})
-    assert run.seen == [1.0, 2.0, 3.0, 4.0, 5.0]
-    assert run.idled == pytest.approx([2.25 + run.thread.NAP, 4.25 + run.thread.NAP])
 
 
 def test_the_thread_tells_of_errors_and_goes_on(monkeypatch):
@@ -108,12 +89,6 @@ def test_the_thread_tells_of_errors_and_goes_on(monkeypatch):
     run = Failing(monkeypatch, 5)
     assert told == ['2', '3']
     assert len(run.seen) == 5
-
-
-def test_a_far_deadline_is_waited_for_in_pieces(monkeypatch):
-    run = Run(monkeypatch, 2, at={0: lambda run: setattr(run, 'period', 1.0)})
-    assert max(run.time.naps) <= run.thread.LONGEST_SLEEP
-    assert run.seen[1] * PERIOD == pytest.approx(1.0)
 
 
 def test_a_lock_is_left_to_who_waits_for_it():
@@ -138,63 +113,3 @@ def test_a_lock_is_left_to_who_waits_for_it():
     thread.join(60.0)
     assert not thread.is_alive()
     assert not any(overtaken)
-
-
-def test_simulated_time_knows_when_it_will_be_what():
-    now = [5_000]
-    clock = pacing.SimulatedClock(lambda: now[0], 2.0)
-    assert (clock.now(), clock.when(0)) == (0, None)
-    clock.set(100, running=True)
-    now[0] += 50
-    assert (clock.now(), clock.when(0), clock.when(200)) == (200, 4_950, 5_050)
-    clock.set_scale(0.5)
-    now[0] += 100
-    assert (clock.now(), clock.when(250)) == (250, 5_150)
-    clock.set(clock.now(), running=False)
-    now[0] += 100
-    assert (clock.now(), clock.when(250)) == (250, None)
-
-
-def test_a_shorter_period_ends_a_long_sleep(monkeypatch):
-    clock, grid, seen = Time(), [BEGIN, 100.0], []
-
-    def sleep(seconds):
-        clock.now += seconds
-        if clock.now > BEGIN + 1.0:
-            grid[:] = BEGIN, PERIOD
-
-    def tick():
-        seen.append(clock.now)
-        thread._stopped = len(seen) == 3
-
-    clock.sleep = sleep
-    monkeypatch.setattr(pacing, 'time', clock)
-    thread = pacing.DeadlineThread(tick, pytest.fail, lambda: tuple(grid), pytest.fail)
-    thread.run()
-    assert BEGIN + 1.0 < seen[0] < BEGIN + 1.0 + 2 * thread.LONGEST_SLEEP
-    assert [later - seen[0] for later in seen] == pytest.approx([0.0, PERIOD, 2 * PERIOD])
-
-
-@pytest.mark.parametrize('change', [
-    lambda player: player.set_rate(1.0), lambda player: (player.pause(True), player.pause(False))])
-def test_a_playback_that_cannot_keep_up_goes_on_from_what_is_sent(monkeypatch, change):
-    now_ns, sent = 0, []
-
-    def wait(seconds):
-        nonlocal now_ns
-        now_ns += round(seconds * 1e9)
-
-    monkeypatch.setattr(pacing.time, 'monotonic_ns', lambda: now_ns)
-    player = pacing.Playback(0)
-    player._changed = SimpleNamespace(wait=wait, clear=lambda: None, set=lambda: None)
-    player.set_rate(1e9)
-
-    def messages():
-        nonlocal now_ns
-        yield 0, lambda _: sent.append(now_ns), b''
-        now_ns += 1000                  # a second of the log
-        change(player)
-        yield 2_000_000_000, lambda _: sent.append(now_ns), b''
-
-    player.run(messages())
-    assert sent[1] - sent[0] >= (2_000_000_000 if player._clock._scale == 1.0 else 1002)

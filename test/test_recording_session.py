@@ -2,7 +2,6 @@
 """The recording of a running simulation: opening beside the ticks, names, failures."""
 
 import json
-import os
 import threading
 import time
 from types import SimpleNamespace
@@ -11,7 +10,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from helpers.node_harness import PATIENCE_S, wait_for
+from helpers.node_harness import PATIENCE_S
 from helpers.node_logs import events_in, log_of
 from std_srvs.srv import SetBool
 
@@ -22,7 +21,6 @@ from spinning_top_sim.recording import provenance, writer
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.live import LiveSimulation
-from spinning_top_sim.tools import inspect
 
 EPOCH_NS = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000
@@ -37,12 +35,11 @@ class Recorded:
                                           **given})
         self.simulation = LiveSimulation(self.values, EPOCH_NS)
         self.lock = FairLock()
-        self.remapped = {}
         self.session = RecordingSession(self.simulation, self.lock, self.topics)
 
     def topics(self, streams):
         names = [*((stream.topic, stream.type_name) for stream in streams), *journal.TOPICS]
-        return [(f'/ns/{self.remapped.get(name, name.lstrip("~/"))}', type_name, {'depth': 10})
+        return [(f'/ns/{name.lstrip("~/")}', type_name, {'depth': 10})
                 for name, type_name in names]
 
     def start(self):
@@ -113,23 +110,6 @@ def test_ticks_and_commands_go_on_while_a_log_is_being_opened_and_are_in_it(
     assert [at - EPOCH_NS for at, _ in log['/ns/commands']] == [2 * SECOND]
 
 
-def test_what_waits_for_the_file_is_bounded(tmp_path, slow_disk, monkeypatch):
-    monkeypatch.setattr('spinning_top_sim.nodes.recording_session.MOST_PENDING', 10)
-    recorded = Recorded(tmp_path)
-    opening = threading.Thread(target=recorded.start, daemon=True)
-    opening.start()
-    assert slow_disk.opening.wait(PATIENCE_S)
-    assert recorded.session.has_room()
-    with recorded.lock:
-        recorded.simulation.advance(SECOND)
-    assert not recorded.session.has_room()
-    slow_disk.go_on.set()
-    opening.join(PATIENCE_S)
-    assert recorded.session.has_room()
-    log, _ = recorded.stop()
-    assert len(log['/ns/pose']) == 101
-
-
 def test_two_nodes_that_start_in_the_same_second_take_different_names(tmp_path, monkeypatch):
     monkeypatch.setattr(time, 'strftime', lambda _: 'spinning_top_2000-01-01_00-00-00')
     nodes = [Recorded(tmp_path) for _ in range(2)]
@@ -163,72 +143,6 @@ def test_a_file_that_is_named_is_never_overwritten_and_nothing_is_kept(tmp_path)
     recorded.simulation.advance(SECOND)
     assert recorded.session.stop() is None
     assert recorded.session.numbers() == {'recorder': 'off'}
-
-
-def test_topics_of_one_name_are_refused_and_nothing_is_kept(tmp_path):
-    """As two topics are that were remapped to the same name."""
-    recorded = Recorded(tmp_path)
-    recorded.remapped['joint_states'] = 'pose'
-    with pytest.raises(RecordingError, match="'/ns/pose' is listed twice"):
-        recorded.start()
-    assert list(tmp_path.iterdir()) == []
-    assert not any(output.is_used for output in recorded.simulation.outputs)
-    assert recorded.session.stop() is None
-
-
-def test_a_disk_that_is_too_slow_is_told_with_what_may_be_lost(tmp_path, monkeypatch):
-    recorded = Recorded(tmp_path, record__max_loss=0.02)
-    assert recorded.session.warning is None
-    recorded.start()
-    disk_is_back, fsync = threading.Event(), os.fsync
-    monkeypatch.setattr(os, 'fsync', lambda fd: (disk_is_back.wait(PATIENCE_S), fsync(fd)))
-    recorded.simulation.advance(SECOND)
-    wait_for('the warning', lambda: recorded.session.warning)
-    assert 'max_loss = 0.02 s' in recorded.session.warning
-    numbers = recorded.session.numbers()
-    assert numbers['recorder'] == 'recording'
-    assert float(numbers['possible loss [s]']) >= 0.02      # rounded to 1 ms
-    disk_is_back.set()
-    log, _ = recorded.stop()
-    assert len(log['/ns/pose']) == 101
-
-
-@pytest.mark.parametrize(('before', 'change', 'begin_ns'), [
-    ({}, {'increments.enabled': True}, 1_003_000_000),
-    ({'imu.sampling': 'mean'}, {'imu.rate': 300.0}, 1_007_500_000),
-    ({'increments.enabled': True, 'imu.rate': 2.0}, {'imu.rate': 125.0}, 1_300_000_000)])
-def test_a_log_that_begins_within_an_interval_of_the_imu_verifies(
-        tmp_path, capsys, before, change, begin_ns):
-    recorded = Recorded(tmp_path / 'one.mcap', **before)
-    simulation = recorded.simulation
-    simulation.advance(1_003_000_000)
-    simulation.apply(change)
-    recorded.values |= change
-    simulation.advance(begin_ns)
-    recorded.start()
-    simulation.advance(2 * SECOND)
-    recorded.session.stop()
-    assert inspect.main([str(tmp_path / 'one.mcap'), '--verify']) == 0
-    assert 'verify: identical' in capsys.readouterr().out
-
-
-def test_a_recording_that_fails_at_its_end_says_why(tmp_path, monkeypatch):
-    recorded = Recorded(tmp_path)
-    recorded.start()
-    recorded.simulation.advance(SECOND)
-
-    def full(_):
-        raise OSError('no room')
-
-    monkeypatch.setattr(os, 'fsync', full)
-    with pytest.raises(RecordingError, match=r'stopped early: .*no room'):
-        Simulator._record(SimpleNamespace(_session=recorded.session), SetBool.Request(data=False))
-    monkeypatch.undo()
-    assert 'no room' in recorded.session.error
-    assert recorded.session.numbers() == {'recorder': 'failed'}
-    recorded.start()
-    assert recorded.session.error is None
-    recorded.stop()
 
 
 def test_a_recording_that_has_failed_gives_way_to_the_next(tmp_path):

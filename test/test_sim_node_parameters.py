@@ -14,10 +14,8 @@ from helpers.own_node import OwnNode
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
-from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.topics import INVARIANTS
-from spinning_top_sim.tools.recorded_run import read_run_description
 
 PERIOD_NS = 10_000_000
 LAMBDA1, LAMBDA3 = 0.123, parameters.checked({})['top.lambda3']
@@ -174,52 +172,6 @@ def test_at_a_pole_only_the_possible_commands_are_taken(node, capfd):
 
 # ------------------------------------------------------------------ the spin and the start
 
-def test_parameters_are_checked_where_the_top_is_now_not_where_it_began(node):
-    """Begun upright but falling: off the pole Lz is free, and other parameters go on changing."""
-    assert node.set(initial__theta=0.0, initial__theta_dot=1.0, spin__l3=0.5,
-                    spin__lz=0.5).successful
-    assert node.trigger('reset').success
-    node.step(30)
-    as_parameters(node, 2.0, 0.3)
-    assert node.get('spin.l3', 'spin.lz') == [2.0, 0.3]
-    assert node.set(pose__rate=50.0).successful
-    assert node.trigger('reset').success
-    assert node.get('spin.l3', 'spin.lz') == [0.5, 0.5]
-
-
-def test_an_unset_lz_is_the_cusp_of_the_tilt_at_the_reset(node):
-    for theta in (1.0, 0.0):
-        assert node.set(initial__theta=theta).successful
-        assert node.trigger('reset').success
-        assert node.get('spin.lz') == [1.6 * math.cos(theta)]
-
-
-def test_a_spin_with_the_initial_state_is_that_of_the_next_start(node):
-    commands = node.loop.commands
-    # Upright, where the present Lz is impossible; and away from the pole, where 2.0 is now.
-    for theta, l3, lz in ((0.0, 2.0, 2.0), (0.5, 1.0, 0.4)):
-        result = node.set(initial__theta=theta, spin__l3=l3, spin__lz=lz)
-        assert result.successful, result.reason
-        assert node.trigger('reset').success
-        assert node.get('initial.theta', 'spin.l3', 'spin.lz') == [theta, l3, lz]
-    assert 'pole' in node.set(initial__theta=0.0, spin__l3=1.0).reason
-    assert node.loop.commands == commands
-    as_parameters(node, 2.0, 0.3)         # without `initial.*`, a command
-    assert node.loop.commands == commands + 1
-    assert node.trigger('reset').success
-    assert node.get('spin.l3', 'spin.lz') == [1.0, 0.4]
-
-
-def test_a_log_can_be_read_that_begins_between_a_new_start_and_its_reset(node):
-    # Upright; what moves now has an Lz that is not possible there.
-    assert node.set(initial__theta=0.0).successful
-    assert node.switch('record', True).success
-    assert node.trigger('reset').success
-    assert node.switch('record', False).success
-    with LogReader(node.get('record.uri')[0]) as reader:
-        assert read_run_description(reader).values_at_recording['initial.theta'] == 0.0
-
-
 # ------------------------------------------------------------------------ other parameters
 
 def test_a_new_rate_holds_on_its_grid_at_once(node):
@@ -240,32 +192,6 @@ def test_texts_that_are_numbers_are_taken_as_ros2_param_sends_them(node):
                     imu__lever_arm=['1e-2', '0', '2e0']).successful
     assert node.get('max_error', 'imu.gyroscope_noise_density', 'duration') == [1e-9, 5e-5, 0.0]
     assert list(node.get('imu.lever_arm')[0]) == [0.01, 0.0, 2.0]
-
-
-def test_what_waits_for_a_reset_or_a_recording_is_said_when_it_is_set(node, capfd):
-    assert node.set(top__mass=2.5, initial__phi=1.0, pose__rate=50.0,
-                    record__max_loss=1.0).successful
-    said = capfd.readouterr().err
-    assert 'initial.phi, top.mass: a change takes effect at the next ~/reset' in said
-    assert 'record.max_loss: a change takes effect at the next start of a recording' in said
-    assert 'pose.rate' not in said
-    assert node.set(top__mass=2.5, imu__lever_arm=[0.0, 0.0, 1.0]).successful
-    assert ': imu.lever_arm: a change takes' in capfd.readouterr().err, 'mass is not new'
-
-
-def test_means_or_increments_in_use_keep_the_imu_at_a_hertz(node):
-    for before, after in (({'imu__sampling': 'mean'}, {'imu__sampling': 'instant'}),
-                          ({'increments__enabled': True}, {'increments__enabled': False})):
-        assert node.set(**before).successful
-        assert node.trigger('reset').success
-        assert node.switch('record', True).success
-        assert node.set(**after).successful
-        assert 'imu.rate = 0.5: must be >= 1 while means' in node.set(imu__rate=0.5).reason
-        assert node.switch('record', False).success
-        assert node.set(record__uri=node.get('record.uri')[0] + '.2').successful
-        assert node.trigger('reset').success
-        assert node.set(imu__rate=0.5).successful
-        assert node.set(imu__rate=200.0).successful
 
 
 def test_streams_can_be_switched_off_and_on_and_only_subscribers_make_work(node):

@@ -272,7 +272,7 @@ def test_a_full_disk_leaves_a_readable_log(tmp_path):
 
     def small_files():
         # Here the chunk that does not fit leaves enough room for the summary.
-        resource.setrlimit(resource.RLIMIT_FSIZE, (950_000, 950_000))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (3_000_000, 3_000_000))
     run = subprocess.run(
         [sys.executable, '-c', 'import signal, sys\nsignal.signal(signal.SIGXFSZ, signal.SIG_IGN)'
          '\nfrom spinning_top_sim.tools.simulate import main\nsys.exit(main())',

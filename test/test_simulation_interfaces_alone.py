@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """simulation_interfaces of nodes that end, or that have not begun; and where it is offered."""
 
-from types import SimpleNamespace
 
 import pytest
 
@@ -56,21 +55,3 @@ def test_it_is_offered_where_it_is_installed_and_not_switched_off(
         assert offered == ([node] if installed and wanted else [])
         node.stop()
         node.destroy_node()
-
-
-def test_services_and_action_are_created_as_far_as_the_package_has_them(monkeypatch):
-    """An older version lacks some services."""
-    created, servers = [], []
-    package = {f'simulation_interfaces.{part}': SimpleNamespace(**content) for part, content in {
-        'msg': {}, 'srv': {'GetEntities': 'kind', 'StepSimulation': 'kind'},
-        'action': {'SimulateSteps': 'kind'}}.items()}
-    monkeypatch.setattr(simulation_handlers.importlib, 'import_module', package.__getitem__)
-    monkeypatch.setattr(simulation_handlers, 'SimulationHandlers', lambda *_: SimpleNamespace(
-        serve=lambda name, *_: name, simulate_steps='steps'))
-    monkeypatch.setattr(simulation_handlers, 'ActionServer', lambda *given, **_: servers.append(
-        given))
-    node = SimpleNamespace(create_service=lambda *given: created.append(given))
-    simulation_handlers.offer(node)
-    assert [(name, serve(None, None)) for _, name, serve in created] == [
-        ('step_simulation', 'StepSimulation'), ('get_entities', 'GetEntities')]
-    assert servers == [(node, 'kind', 'simulate_steps', 'steps')]

@@ -23,14 +23,12 @@ from helpers.node_logs import (
     settled,
     stamp_of,
     stamps_of,
-    the_log,
     xyzw,
 )
 from nav_msgs.msg import Odometry
 from rclpy.action import ActionClient
 
-from spinning_top_sim.nodes.simulation_standard import SERVICES, service_name
-from spinning_top_sim.tools import inspect
+from spinning_top_sim.nodes.simulation_standard import service_name
 
 UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
 STOPPED, PLAYING, PAUSED, QUITTING = range(4)
@@ -69,17 +67,6 @@ def resolved(future):
     future.add_done_callback(lambda _: done.set())
     assert done.wait(PATIENCE_S)
     return future.result()
-
-
-def test_all_services_are_there_in_the_namespace(peer, served):
-    names = {f'/standard/{service_name(name)}': [f'simulation_interfaces/srv/{name}']
-             for name in SERVICES}
-    wait_for('the services', lambda: names.items() <= dict(
-        peer.node.get_service_names_and_types()).items())
-    features = call(peer, served, 'GetSimulatorFeatures').features
-    known = simulation_interfaces.msg.SimulatorFeatures
-    assert {known.STEP_SIMULATION_ACTION, known.WORLD_LOADING, known.ENTITY_STATE_SETTING} <= set(
-        features.features)
 
 
 def test_steps_publish_and_the_state_is_that_of_the_last_sample(peer, served):
@@ -156,18 +143,3 @@ def test_play_load_a_world_and_quit(peer, served):
     assert call(peer, served, 'ResetSimulation', scope=4).result.result == UNSUPPORTED
     assert set_state(peer, served, QUITTING) == OK
     assert_clean_end(served.node, served.node.wait())
-
-
-def test_a_signal_ends_the_steps_and_the_node(peer, tmp_path):
-    with SimNode(tmp_path, {**QUIET, 'start_paused': True, 'record.enabled': True,
-                            'record.min_free_bytes': 0}, namespace='/signal') as node:
-        served, feedback = SimpleNamespace(node=node), []
-        client = ActionClient(peer.node, simulation_interfaces.action.SimulateSteps,
-                              node.topic('simulate_steps'))
-        assert client.wait_for_server(PATIENCE_S)
-        assert set_state(peer, served, PAUSED) == OK
-        client.send_goal_async(simulation_interfaces.action.SimulateSteps.Goal(steps=10 ** 12),
-                               feedback_callback=feedback.append)
-        wait_for('feedback', lambda: feedback)
-        assert_clean_end(node, node.end())
-        assert inspect.main([str(the_log(node.folder)), '--verify']) == 0

@@ -17,7 +17,6 @@ from rclpy.serialization import deserialize_message
 from spinning_top_sim.nodes.entity import is_found
 from spinning_top_sim.nodes.simulation_standard import UnsupportedError
 from spinning_top_sim.physics.placement import Box
-from spinning_top_sim.tools import inspect
 
 UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
 PAUSED, INVALID_POSE = 2, 101
@@ -74,17 +73,6 @@ def test_the_state_is_what_is_published_at_its_stamp(top, tmp_path):
         assert np.allclose(numbers(state)[4:7], turned_rates, rtol=1e-14, atol=1e-14)
 
 
-def test_the_acceleration_is_the_change_of_the_twist(top):
-    assert top.set(step__dt=1e-5).successful
-    top.done('StepSimulation', steps=20_000)
-    states = []
-    for _ in range(3):
-        states.append(numbers(state_of(top)))
-        top.done('StepSimulation', steps=1)
-    change = (states[2][4:7] - states[0][4:7]) / 2e-5
-    assert np.allclose(change, states[1][7:], rtol=1e-6, atol=1e-6)
-
-
 @pytest.mark.parametrize('which', ['pose', 'twist', 'both'])
 def test_a_state_that_is_set_is_the_state(top, which):
     top.done('StepSimulation', steps=20)
@@ -113,17 +101,6 @@ def test_a_state_that_is_set_is_the_state(top, which):
     # A reset is back at the start.
     top.done('ResetSimulation', scope=0)
     assert top.get('spin.l3') == [1.6]
-
-
-def test_a_state_goes_through_a_client_unchanged(top):
-    """What GetEntityState has said can be set."""
-    top.done('StepSimulation', steps=30)
-    state = state_of(top)
-    response = top.done('SetEntityState', entity=NAME, state=state, set_pose=True,
-                        set_twist=True, set_acceleration=True)
-    assert 'acceleration follows' in response.result.error_message
-    again = numbers(state_of(top))
-    assert np.allclose(again, numbers(state), rtol=1e-12, atol=1e-12)
 
 
 def upright(top, **changes):
@@ -164,15 +141,6 @@ def test_a_bad_state_changes_nothing(top, changes, code, text):
     assert top.simulation.segment is segment
 
 
-def test_what_is_not_set_is_not_looked_at(top):
-    state = upright(top, twist__linear__y=0.5)
-    top.done('SetEntityState', entity=NAME, state=state, set_pose=True)
-    state = upright(top, pose__position__y=0.5, header__frame_id='world')
-    top.done('SetEntityState', entity=NAME, state=state, set_twist=True)
-    code, text = top.refused('SetEntityState', entity=NAME, state=upright(top))
-    assert (code, 'one of them must be true' in text) == (FAILED, True)
-
-
 @pytest.mark.parametrize(('service', 'name'), [
     ('GetEntityState', ''), ('SetEntityState', 'Spinning_top'),
     ('GetEntityInfo', '/spinning_top'), ('GetEntityBounds', 'top')])
@@ -205,20 +173,13 @@ def chosen(top, **filters):
 
 
 @pytest.mark.parametrize(('expression', 'found'), [
-    ('', True), ('spin', True), ('^spinning_top$', True), ('^top', False), ('SPIN', False),
-    ('t[[:alpha:]]p$', True), ('[[:digit:]]', False), ('(spin|roll)ning', True),
-    ('s.{3}ning', True), ('^(spin|_|ning|top)+$', True)])
+    ('', True), ('spin', True), ('^top', False), ('t[[:alpha:]]p$', True)])
 def test_names_by_regular_expressions(top, expression, found):
     assert chosen(top, filter=expression) is found
 
 
-def test_no_expression_takes_for_ever():
-    assert not is_found('.*' * 120 + 'x1', NAME)
-
-
 @pytest.mark.parametrize(('expression', 'reason'), [
-    ('(', 'missing )'), ('[[:letter:]]', 'invalid character class'), ('\\', 'trailing'),
-    ('a{2,1}', 'repetition'), ('\ud800', 'surrogates')])
+    ('(', 'missing )'), ('\ud800', 'surrogates')])
 def test_bad_expressions_are_refused(top, capfd, expression, reason):
     filters = top.messages.EntityFilters(filter=expression)
     for service in ('GetEntities', 'GetEntitiesStates'):
@@ -254,25 +215,3 @@ def test_categories_and_tags(top):
         tags=tags('imu', mode=7)))
     assert (code, text) == (FAILED, 'tags.filter_mode = 7: must be 0 or 1')
 
-
-def test_filters_by_bounds_are_not_supported(top):
-    for kind in ('BOX', 'SPHERE'):
-        bounds = top.messages.Bounds(type=getattr(top.messages.Bounds, f'TYPE_{kind}'))
-        code, text = top.refused('GetEntities', filters=top.messages.EntityFilters(bounds=bounds))
-        assert (code, f'bounds.type = {bounds.type}: must be 0' in text) == (UNSUPPORTED, True)
-
-
-# ----------------------------------------------------------------------------------- journal
-
-def test_a_log_with_a_damaged_state_does_not_verify(top, tmp_path):
-    """The states before a recording are in its metadata."""
-    for name, code in (('first', 0), ('later', 1)):
-        assert top.set(record__uri=str(tmp_path / f'{name}.mcap')).successful
-        assert top.switch('record', True).success
-        top.done('StepSimulation', steps=3)
-        top.done('SetEntityState', entity=NAME, state=upright(top, twist__angular__z=20.0),
-                 set_twist=True)
-        top.simulation.history[-1] = (*top.simulation.history[-1][:-1], 5.0)
-        top.done('StepSimulation', steps=3)
-        assert top.switch('record', False).success
-        assert inspect.main([f'{tmp_path}/{name}.mcap', '--verify']) == code

@@ -13,7 +13,7 @@ from stress.disk import NO_COMPILER
 
 
 @pytest.mark.parametrize(('part', 'first', 'count'), [
-    ('logs', 4, 1), ('nodes', 0, 1), ('services', 0, 1), ('disk', 0, 1), ('sensor', 1, 1)])
+    ('logs', 4, 1), ('nodes', 0, 1), ('disk', 0, 1), ('sensor', 1, 1)])
 def test_a_few_seeds(part, first, count):
     result = runner.run(part, first, count)
     assert not result.failures, '\n'.join(result.failures)

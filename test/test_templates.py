@@ -118,12 +118,12 @@ def test_a_template_is_what_ros_serializes(number):
         names, values = [f'{frame}{index}' for index in range(count)], numbers(2 * count)
         joints = JointState(name=names, position=values[:count], velocity=values[count:])
         set_stamp(joints.header.stamp, stamp_ns)
-        assert_same(messages.joint_state(names).encode_one(
+        assert_same(messages.joint_state(tuple(names)).encode_one(
             stamp_ns, values[:count], values[count:]), joints)
     labels = ('a' + frame, 'b')
     array = Float64MultiArray(data=numbers(2))
     array.layout.dim = [MultiArrayDimension(label=','.join(labels), size=2, stride=2)]
-    assert_same(messages.float64_multi_array(labels).encode_one(0, numbers(2)), array)
+    assert_same(messages.float64_multi_array(tuple(labels)).encode_one(0, numbers(2)), array)
     clock = Clock()
     set_stamp(clock.clock, stamp_ns)
     assert_same(messages.clock().encode_one(stamp_ns), clock)

@@ -10,7 +10,6 @@ from helpers.reference import ROOT, scene_parameters
 from helpers.simulations import record
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.physics.top import Shape
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.live import LiveSimulation
@@ -84,18 +83,6 @@ def links(values):
     return [link.get('name') for link in element(values).iter('link')]
 
 
-def test_frames_are_those_of_the_parameters():
-    assert links({}) == ['world', 'precession_link', 'nutation_link', 'base_link', 'imu_link']
-    assert links({'world_frame': 'map', 'body_frame': 'a/b/wheel', 'imu.frame_id': 'a/sensor'}
-                 ) == ['map', 'a/b/precession_link', 'a/b/nutation_link', 'a/b/wheel', 'a/sensor']
-
-
-def test_an_imu_in_the_body_frame_has_no_frame_of_its_own():
-    assert links({'imu.frame_id': 'base_link'})[-1] == 'base_link'
-    with pytest.raises(ValueError, match=r"imu\.frame_id = 'base_link'.*lever_arm"):
-        described({'imu.frame_id': 'base_link', **MOUNTED})
-
-
 @pytest.mark.parametrize(('values', 'named'), [
     ({'world_frame': ''}, "world_frame = ''"), ({'body_frame': '/base'}, "body_frame = '/base'"),
     ({'imu.frame_id': '${1}'}, r'imu\.frame_id'), ({'world_frame': 'base_link'}, 'world_frame'),
@@ -133,28 +120,7 @@ def test_an_inertia_that_no_body_has_is_left_out_with_a_warning(name):
     assert 'lambda3 <= 2' in warning
 
 
-@pytest.mark.parametrize('values', [{}, *ILLEGAL.values(), {'top.com_distance': -0.1},
-                                    {'top.com_distance': 0.0}, scene_parameters('wavy')])
-def test_it_looks_as_the_markers_do(values):
-    shape = Shape(parameters.top_of(parameters.checked(values)))
-    visuals = {visual.get('name'): visual for visual in element(values).iter('visual')}
-    body, axis = (visuals[name].find('geometry/cylinder') for name in ('body', 'axis'))
-    found = [float(body.get('radius')), float(body.get('length')),
-             *(float(visuals[name].find('origin').get('xyz').split()[2])
-               for name in ('body', 'axis')), float(axis.get('length'))]
-    expected = [shape.radius, shape.height, shape.centre, 0.5 * shape.tip, abs(shape.tip)]
-    assert found == pytest.approx(expected, rel=1e-12)
-
-
 # -------------------------------------------------------------------------------------- files
-
-
-def test_the_defaults_of_the_xacro_file_are_the_nodes():
-    import xacro
-
-    bare = xacro.process_file(str(ROOT / 'urdf' / urdf.XACRO_FILE)).documentElement.toxml()
-    full = ElementTree.canonicalize(described({}), strip_text=True)
-    assert ElementTree.canonicalize(bare, strip_text=True) == full
 
 
 def test_the_plain_file_is_written_from_the_xacro_file():

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Callable
 from importlib.util import find_spec
 
-from spinning_top_sim.nodes.executable import RunnableNode, one_line, run
+from spinning_top_sim.nodes.executable import RunnableNode, run
 
 USAGE = """usage: sim_node [--help] [--version]
                 [--ros-args -p NAME:=VALUE --params-file FILE ...]
@@ -48,12 +48,7 @@ def _prepare(argv: list[str]) -> Callable[[], RunnableNode] | None:
             print(textwrap.indent(textwrap.fill(parameter.describe(), 74), 6 * ' '))
         return None
     from rclpy.utilities import remove_ros_args  # noqa: PLC0415
-    try:
-        stray = ' '.join(remove_ros_args(argv)[1:])
-    except RuntimeError as error:
-        if not str(error).startswith('['):      # else these are words behind --ros-args
-            raise
-        stray = one_line(error)
+    stray = ' '.join(remove_ros_args(argv)[1:])
     if stray:
         raise ValueError(f'{stray!r} is not expected here; the form is: sim_node --ros-args '
                          '-p NAME:=VALUE --params-file FILE')

@@ -96,8 +96,6 @@ class SimulationHandlers:
         known = self._messages.SimulatorFeatures
         response.features.features = sorted(
             getattr(known, name) for name in names if hasattr(known, name))
-        response.features.custom_info = (
-            'spinning_top_sim, docs/simulation_interfaces.md; a step is the parameter step.dt')
 
     def _state(self) -> int:
         """Return the constant of SimulationState; the caller holds the lock."""

@@ -18,7 +18,6 @@ from spinning_top_sim.tools.scene_file import is_of_ros, known, parse_scene
 
 # The parameters of a world.  Those of them that a file does not set get their defaults.
 OF_A_WORLD = ('top.', 'initial.', 'spin.', 'solver.')
-LONGEST_TEXT = 1_000_000        # characters: parsing more would stop the node for minutes
 
 
 class FormatError(ValueError):
@@ -56,8 +55,6 @@ class World:
     def parse(cls, text: str, uri: str = '') -> Self:
         """Return the world that a text describes.  Raises ValueError for any other text."""
         source = uri or 'resource_string'
-        if len(text) > LONGEST_TEXT:
-            raise FormatError(f'{source}: must have at most {LONGEST_TEXT} characters')
         found = parse_scene(text, source)
         usable = {name: value for name, value in found.items() if name in parameters.BY_NAME
                   and parameters.BY_NAME[name].effect is not parameters.Effect.START}
@@ -84,10 +81,7 @@ class World:
                                     f'{", ".join(scenes)}')
         if path.suffix not in ('.yaml', '.yml'):
             raise FormatError(f'{uri}: must be a parameter file of ROS 2, *.yaml')
-        name = str(path.absolute())
-        name.encode()           # raises ValueError for a name that no message can hold
-        with path.open(encoding='utf-8') as file:
-            return cls.parse(file.read(LONGEST_TEXT + 1), name)
+        return cls.parse(path.read_text('utf-8'), str(path.absolute()))
 
     def values(self, present: Mapping[str, Any]) -> dict[str, Any]:
         """Return the present parameters with those of the world.  Raises ValueError."""

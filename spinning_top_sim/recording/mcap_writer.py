@@ -148,11 +148,7 @@ class McapWriter:
             self._next_sequence[channel_id] += len(rows)
         self._queue(chunk)
 
-    def chunk_of_rows(self, blocks: Iterable[chunks.RowBlock]) -> object:
-        """Call `append_rows`."""
-        return self.append_rows(blocks)  # type: ignore[func-returns-value]
-
-    def write_chunk(self, _: object = None) -> None:
+    def write_chunk(self) -> None:
         """Write the chunk in memory, if it holds anything, after those of `append_rows`."""
         self._wait()
         if self._chunk.size:

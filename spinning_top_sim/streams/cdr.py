@@ -121,7 +121,7 @@ class Template:
         """Return one message; see `encode`."""
         return self.encode(np.array([stamp_ns]), *values).tobytes()
 
-    def decode(self, data: bytes) -> tuple[NDArray[np.float64], ...]:
+    def decode(self, data: bytes | NDArray[np.uint8]) -> tuple[NDArray[np.float64], ...]:
         """Return the fields, (n, count) each, of n concatenated messages."""
         rows = np.frombuffer(data, self._row_type)
         return tuple(rows[f'field{i}'] for i in range(len(self._fields)))

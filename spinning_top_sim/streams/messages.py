@@ -6,9 +6,14 @@ Their parts are in the order of the .msg definitions (ROS 2 Jazzy, common_interf
 compares every template with the serializer of rclpy.
 """
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Callable
+from functools import lru_cache, wraps
+from typing import ParamSpec
 
 from spinning_top_sim.streams.cdr import CdrWriter, Template
+
+Arguments = ParamSpec('Arguments')
 
 UNKNOWN_ORIENTATION = (-1.0,) + 8 * (0.0,)      # REP-145: no orientation in this message
 # A covariance of zeros means unknown (sensor_msgs/Imu), so that exact values have this variance.
@@ -30,12 +35,24 @@ def diagonal(*variances: float) -> tuple[float, ...]:
 EXACT = diagonal(0.0, 0.0, 0.0)
 
 
+def template(build: Callable[Arguments, Template]) -> Callable[Arguments, Template]:
+    """Serialize a message once for the same arguments: ensembles make it in every run."""
+    serialized = lru_cache(64)(build)
+
+    @wraps(build)
+    def copied(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Template:
+        return copy.copy(serialized(*args, **kwargs))  # type: ignore[arg-type]
+    return copied
+
+
+@template
 def pose_stamped(frame_id: str) -> Template:
     """geometry_msgs/PoseStamped at the origin; fields: orientation x, y, z, w."""
     return Template(CdrWriter().header(frame_id).append('d', *ORIGIN).field(4))
 
 
-def joint_state(names: Sequence[str]) -> Template:
+@template
+def joint_state(names: tuple[str, ...]) -> Template:
     """sensor_msgs/JointState without effort; fields: positions, velocities."""
     count = len(names)
     writer = CdrWriter().header('').append('I', count).string(*names)
@@ -44,7 +61,8 @@ def joint_state(names: Sequence[str]) -> Template:
     return Template(writer.append('I', 0))
 
 
-def imu(frame_id: str, *covariances: Sequence[float]) -> Template:
+@template
+def imu(frame_id: str, *covariances: tuple[float, ...]) -> Template:
     """sensor_msgs/Imu; fields: orientation x, y, z, w, angular velocity, linear acceleration."""
     writer = CdrWriter().header(frame_id)
     for count, covariance in zip((4, 3, 3), covariances, strict=True):
@@ -52,11 +70,13 @@ def imu(frame_id: str, *covariances: Sequence[float]) -> Template:
     return Template(writer)
 
 
+@template
 def magnetic_field(frame_id: str) -> Template:
     """sensor_msgs/MagneticField; fields: the magnetic field, its covariance."""
     return Template(CdrWriter().header(frame_id).field(3).field(9))
 
 
+@template
 def odometry(frame_id: str, child_frame_id: str, *, moves: bool = False) -> Template:
     """
     nav_msgs/Odometry with exact values.
@@ -74,12 +94,14 @@ def odometry(frame_id: str, child_frame_id: str, *, moves: bool = False) -> Temp
     return Template(writer)
 
 
+@template
 def stamped(frame_id: str, count: int) -> Template:
     """geometry_msgs/Vector3Stamped (count 3) or QuaternionStamped (4); fields: x, y, z(, w)."""
     return Template(CdrWriter().header(frame_id).field(count))
 
 
-def float64_multi_array(labels: Sequence[str]) -> Template:
+@template
+def float64_multi_array(labels: tuple[str, ...]) -> Template:
     """std_msgs/Float64MultiArray, one dimension labelled with its columns; fields: the data."""
     count = len(labels)
     # Number of dimensions; label, size and stride; offset of the data, their number.
@@ -87,12 +109,14 @@ def float64_multi_array(labels: Sequence[str]) -> Template:
                     .append('I', count, count, 0, count).field(count))
 
 
+@template
 def clock() -> Template:
     """rosgraph_msgs/Clock; no fields."""
     return Template(CdrWriter().stamp())
 
 
-def markers(frame_id: str, size: Sequence[float], lines: Sequence[float], line_width: float,
+@template
+def markers(frame_id: str, size: tuple[float, ...], lines: tuple[float, ...], line_width: float,
             trace_points: int) -> Template:
     """
     visualization_msgs/MarkerArray: a cylinder, lines on it, and a trace if it has points.
@@ -121,8 +145,8 @@ def _begin(writer: CdrWriter, frame_id: str, namespace: str, kind: int) -> CdrWr
     return writer.header(frame_id).string(namespace).append('i', 0, kind, 0)
 
 
-def _end(writer: CdrWriter, scale: Sequence[float], color: Sequence[float], count: int,
-         points: Sequence[float] = ()) -> None:
+def _end(writer: CdrWriter, scale: tuple[float, ...], color: tuple[float, ...], count: int,
+         points: tuple[float, ...] = ()) -> None:
     """Append the parts of a Marker behind its pose; `count` points that are not given: a field."""
     writer.append('d', *scale).append('f', *color)
     writer.append('I', 0, 0)                                # lifetime: for ever

@@ -69,21 +69,27 @@ def samples(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Samp
     simulation = Simulation(values, EPOCH_NS)
     streams = [stream for stream in simulation.streams
                if stream.parameter in names and stream.parameter not in WITHOUT_COLUMNS]
-    times = {stream.topic: [np.empty(0, np.int64)] for stream in streams}
-    rows = {stream.topic: [b''] for stream in streams}
+    parts: dict[str, list[Samples]] = {stream.topic: [] for stream in streams}
     recorded = journal.recorded_streams(streams, values)
     for block in simulation.play(recorded, round(values['duration'] * NANOSECONDS)):
-        for stream, times_ns, messages in block.parts:
-            times[stream.topic].append(times_ns)
-            rows[stream.topic].append(messages.tobytes())
-    found = {}
-    for stream in streams:
-        # A faulty sensor sends some samples twice.
-        times_ns, first = np.unique(np.concatenate(times[stream.topic]), return_index=True)
-        fields = stream.template.decode(b''.join(rows[stream.topic]))
-        columns = zip(_column_names(stream), np.hstack(fields)[first].T, strict=True)
-        found[stream.topic] = times_ns, {name: column for name, column in columns if name}
-    return found
+        for stream, times_ns, rows in block.parts:
+            once = np.diff(times_ns, prepend=-1) > 0        # a faulty sensor sends some twice
+            numbers = np.array([column for field in stream.template.decode(rows)
+                                for column in field.T])
+            if not once.all():
+                numbers = numbers[:, once]
+            parts[stream.topic].append((times_ns[once], {
+                name: column for name, column in zip(_column_names(stream), numbers, strict=True)
+                if name}))
+    return {stream.topic: _joined(parts[stream.topic], stream) for stream in streams}
+
+
+def _joined(parts: Sequence[Samples], stream: Stream) -> Samples:
+    if len(parts) == 1:
+        return parts[0]
+    return np.concatenate([np.empty(0, np.int64), *(times_ns for times_ns, _ in parts)]), {
+        name: np.concatenate([np.empty(0), *(columns[name] for _, columns in parts)])
+        for name in _column_names(stream) if name}
 
 
 def _column_names(stream: Stream) -> Sequence[str]:
@@ -108,7 +114,9 @@ def table(specification: Specification, run: int) -> 'pyarrow.Table':
     import pyarrow as pa  # noqa: PLC0415
 
     found = samples(specification.values(run), specification.kept)
-    rows_ns = np.unique(np.concatenate([times_ns for times_ns, _ in found.values()]))
+    rows_ns, *others_ns = (times_ns for times_ns, _ in found.values())
+    if not all(np.array_equal(rows_ns, times_ns) for times_ns in others_ns):
+        rows_ns = np.unique(np.concatenate((rows_ns, *others_ns)))
     columns = {'run': pa.repeat(pa.scalar(run), len(rows_ns)),
                't': pa.array(rows_ns / NANOSECONDS)}
     for name, value in specification.drawn(run).items():
@@ -116,11 +124,14 @@ def table(specification: Specification, run: int) -> 'pyarrow.Table':
         one = pa.scalar(value, pa.float64() if value is None else None)
         columns[name] = pa.repeat(one, len(rows_ns))
     for topic, (times_ns, named) in found.items():
-        present = np.isin(rows_ns, times_ns)
-        for name, numbers in named.items():
-            column = np.zeros(len(rows_ns))
-            column[present] = numbers
-            columns[f'{topic}.{name}'] = pa.array(column, mask=~present)
+        if len(times_ns) < len(rows_ns):
+            present = np.isin(rows_ns, times_ns)
+            for name, numbers in named.items():
+                column = np.zeros(len(rows_ns))
+                column[present] = numbers
+                columns[f'{topic}.{name}'] = pa.array(column, mask=~present)
+        else:
+            columns |= {f'{topic}.{name}': numbers for name, numbers in named.items()}
     return pa.table(columns)
 
 

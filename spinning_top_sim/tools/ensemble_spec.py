@@ -110,13 +110,13 @@ class Specification:
 
     @cached_property
     def alternatives(self) -> Sequence[Mapping[str, Any]]:
-        """The parameters of the runs with each of the sets in `sample`, before it is applied."""
+        """The parameters given for the runs with each set in `sample`, before it is applied."""
         last: dict[str, Any] = {'duration': self.duration}
         if self.streams:
             last['record.streams'] = self.streams
             last.update((f'{name}.enabled', True) for name in self.streams)
         sets = (self.sample or {}).get(PARAMS, {VALUES: [{}]})[VALUES]
-        return [dict(ChainMap(last, chosen, *reversed(self.params), DEFAULTS)) for chosen in sets]
+        return [dict(ChainMap(last, chosen, *reversed(self.params))) for chosen in sets]
 
     @cached_property
     def kept(self) -> Sequence[str]:
@@ -127,7 +127,8 @@ class Specification:
         """
         return [name for name in STREAMS
                 if (self.format != 'parquet' or name not in WITHOUT_COLUMNS)
-                and any(journal.is_recorded(name, values) for values in self.alternatives)]
+                and any(journal.is_recorded(name, {**DEFAULTS, **values})
+                        for values in self.alternatives)]
 
 
 def read(path: Path) -> Specification:
@@ -240,7 +241,7 @@ def _runs_per_part(specification: Specification) -> int:
     """Return how many runs are worth a task."""
     if not specification.kept:
         raise ValueError('no stream is enabled')
-    values = specification.alternatives[0]
+    values = {**DEFAULTS, **specification.alternatives[0]}
     # A stream without a rate of its own has that of the IMU.
     rows = values['duration'] * max(
         values.get(f'{name}.rate', values['imu.rate']) for name in specification.kept)

@@ -61,61 +61,78 @@ class Verdict:
 def verify(reader: LogReader, run: RunDescription, end_ns: int,
            show: Callable[[int], None]) -> Verdict:
     """Compute a run again up to a log time, and compare; `show` takes the one reached [ns]."""
-    commands = run.commands_topic
-    verdict = Verdict({topic: 0 for topic in (*run.topics.values(), commands)
-                       if topic is not None}, warnings=_warnings(run))
-    for stamp_ns, reason in run.broken:
-        verdict.different += 1
-        verdict.note(Difference(stamp_ns, run.events_topic or '', 'entry', reason, 'an entry'))
-    # What has not been met in the log, by stamp and topic: several commands may have the same.
-    computed: defaultdict[tuple[int, str], deque[tuple[Stream | None, bytes]]] = defaultdict(deque)
+    return _Comparison(run).compare(reader, end_ns, show)
 
-    def take(stream: Stream, stamps_ns: NDArray[np.int64], rows: NDArray[np.uint8]) -> None:
-        for stamp_ns, row in zip(stamps_ns.tolist(), rows, strict=True):
-            computed[stamp_ns, run.topics[stream.topic]].append((stream, row.tobytes()))
 
-    def computing() -> Iterator[float]:
+class _Comparison:
+    """Computes the run of a log while the log is read in the order of time."""
+
+    def __init__(self, run: RunDescription) -> None:
+        self._run = run
+        topics = (*run.topics.values(), run.commands_topic)
+        self._verdict = Verdict(dict.fromkeys(filter(None, topics), 0), warnings=_warnings(run))
+        # What has not been met in the log, by stamp and topic: several commands may have the same.
+        self._computed: defaultdict[
+            tuple[int, str], deque[tuple[Stream | None, bytes]]] = defaultdict(deque)
+
+    def compare(self, reader: LogReader, end_ns: int, show: Callable[[int], None]) -> Verdict:
+        run, verdict = self._run, self._verdict
+        for stamp_ns, reason in run.broken:
+            verdict.different += 1
+            verdict.note(Difference(stamp_ns, run.events_topic or '', 'entry', reason, 'an entry'))
+        progress, before_ns = self._compute(end_ns, show), -math.inf
+        for message in reader.messages(topics=verdict.compared):
+            while message.log_time >= before_ns:
+                before_ns = next(progress)
+                self._miss(message.log_time)
+            self._meet((message.log_time, message.topic), message.data)
+        for _ in progress:
+            self._miss(math.inf)
+        self._miss(math.inf)
+        return verdict
+
+    def _compute(self, end_ns: int, show: Callable[[int], None]) -> Iterator[float]:
         """Compute the run; yield the log times before which all is computed, at last infinity."""
+        commands = self._run.commands_topic
         try:
-            for simulation, event in rerun(run, end_ns, take):
+            for simulation, event in rerun(self._run, end_ns, self._take):
                 if commands is not None and event is not None and event.name == 'command':
-                    computed[event.stamp_ns, commands].append(
+                    self._computed[event.stamp_ns, commands].append(
                         (None, journal.command(event.details['l3'], event.details['lz'])))
                 reached_ns = simulation.epoch_ns + simulation.now_ns
                 show(reached_ns)
                 # Not up to it: another command at this very time may follow.
                 yield reached_ns
         except DepartureError as error:
-            verdict.stopped = str(error)
+            self._verdict.stopped = str(error)
         yield math.inf
 
-    def miss(before_ns: float) -> None:
-        """Count what the log, which is read in the order of time, does not have before a time."""
-        for key in [key for key in computed if key[0] < before_ns]:
-            verdict.missing += len(computed.pop(key))
-            verdict.note(Difference(*key, 'message', 'no such message', 'there'))
+    def _take(self, stream: Stream, stamps_ns: NDArray[np.int64],
+              rows: NDArray[np.uint8]) -> None:
+        for stamp_ns, row in zip(stamps_ns.tolist(), rows, strict=True):
+            self._computed[stamp_ns, self._run.topics[stream.topic]].append(
+                (stream, row.tobytes()))
 
-    progress, before_ns = computing(), -math.inf
-    for message in reader.messages(topics=verdict.compared):
-        while message.log_time >= before_ns:
-            before_ns = next(progress)
-            miss(message.log_time)
-        key = message.log_time, message.topic
-        if key in computed:
-            stream, expected = computed[key].popleft()
-            if not computed[key]:
-                del computed[key]
-            verdict.compared[message.topic] += 1
-            if message.data != expected:
-                verdict.different += 1
-                verdict.note(_difference(key, stream, message.data, expected))
-        else:
+    def _meet(self, key: tuple[int, str], data: bytes) -> None:
+        """Compare a message of the log with the computed one of its stamp and topic."""
+        verdict = self._verdict
+        if key not in self._computed:
             verdict.unexpected += 1
             verdict.note(Difference(*key, 'message', 'there', 'no such message'))
-    for _ in progress:
-        miss(math.inf)
-    miss(math.inf)
-    return verdict
+            return
+        stream, expected = self._computed[key].popleft()
+        if not self._computed[key]:
+            del self._computed[key]
+        verdict.compared[key[1]] += 1
+        if data != expected:
+            verdict.different += 1
+            verdict.note(_difference(key, stream, data, expected))
+
+    def _miss(self, before_ns: float) -> None:
+        """Count the computed messages before a time that the log does not have."""
+        for key in [key for key in self._computed if key[0] < before_ns]:
+            self._verdict.missing += len(self._computed.pop(key))
+            self._verdict.note(Difference(*key, 'message', 'no such message', 'there'))
 
 
 def _difference(key: tuple[int, str], stream: Stream | None, logged: bytes,

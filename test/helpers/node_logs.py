@@ -2,9 +2,7 @@
 """Reading what a node has published and recorded, and what tests of it share."""
 
 import json
-import math
 import time
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -74,36 +72,6 @@ def about_z(angle):
 def about_y(angle):
     zero = np.zeros_like(angle)
     return np.stack([zero, np.sin(angle / 2), zero, np.cos(angle / 2)], axis=-1)
-
-
-def about_x(angle):
-    zero = np.zeros_like(angle)
-    return np.stack([np.sin(angle / 2), zero, zero, np.cos(angle / 2)], axis=-1)
-
-
-def central_weights(order, reach=5):
-    """Weights of the 10th-order central difference, from the conditions on polynomials."""
-    points = range(-reach, reach + 1)
-    rows = [[Fraction(p) ** power for p in points] for power in range(2 * reach + 1)]
-    for row, power in zip(rows, range(2 * reach + 1), strict=True):
-        row.append(Fraction(math.factorial(order) if power == order else 0))
-    for column in range(len(rows)):
-        pivot = next(r for r in range(column, len(rows)) if rows[r][column])
-        rows[column], rows[pivot] = rows[pivot], rows[column]
-        rows[column] = [value / rows[column][column] for value in rows[column]]
-        for other in range(len(rows)):
-            if other != column:
-                factor = rows[other][column]
-                rows[other] = [a - factor * b
-                               for a, b in zip(rows[other], rows[column], strict=True)]
-    return np.array([float(row[-1]) for row in rows])
-
-
-def difference(values, step, order=1):
-    """Return the derivative of rows `step` seconds apart; five are lost at both ends."""
-    weights = central_weights(order)
-    n = len(values) - 10
-    return sum(w * values[k:k + n] for k, w in enumerate(weights)) / step ** order
 
 
 def in_common(*topics):
