@@ -15,7 +15,6 @@ import numpy as np
 import rclpy
 from numpy.typing import NDArray
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -28,6 +27,11 @@ from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.trial import NodeError
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools.attitudes import NO_ORIENTATION
+
+try:                            # takes least processor time
+    from rclpy.experimental import EventsExecutor as Executor
+except ImportError:
+    from rclpy.executors import SingleThreadedExecutor as Executor
 
 IMU_TOPIC, FIELD_TOPIC = 'imu/data_raw', 'imu/mag'
 PATIENCE_S = 20.0               # for a node to start, and for an answer
@@ -75,7 +79,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         rclpy.init(context=self._context)
         self._node = Node(NAME, context=self._context, parameter_overrides=[
             Parameter('use_sim_time', value=False)])
-        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor = Executor(context=self._context)
         self._executor.add_node(self._node)
         profile = QoSProfile(depth=100)
         self._clock, self._imu, self._field = (

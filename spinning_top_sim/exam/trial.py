@@ -195,7 +195,7 @@ def _covariance_of(filter_: Filter) -> Reals | float:
     if not np.any(covariance):      # ROS messages mark an unknown covariance by zeros
         return math.nan
     if is_indefinite(covariance):
-        raise InvalidOutputError(f'covariance is {_short(covariance.tolist())}: must have no '
+        raise InvalidOutputError(f'covariance is {covariance.tolist()}: must have no '
                                  'negative eigenvalue')
     return covariance
 
@@ -214,7 +214,7 @@ def _numbers(what: str, value: object, shape: tuple[int, ...]) -> Reals:
     except (TypeError, ValueError):
         numbers = np.empty(0)
     if numbers.shape != shape or not np.all(np.isfinite(numbers)):
-        raise InvalidOutputError(f'{what} {_short(value)}: must be '
+        raise InvalidOutputError(f'{what} {one_line(value)[:80]}: must be '
                                  f'{" x ".join(map(str, shape))} finite numbers')
     return numbers
 
@@ -222,8 +222,3 @@ def _numbers(what: str, value: object, shape: tuple[int, ...]) -> Reals:
 def one_line(value: object) -> str:
     """Return the text of a value as one printable line."""
     return printable(' '.join(str(value).split()))
-
-
-def _short(value: object) -> str:
-    text = one_line(value)
-    return text if len(text) < 80 else f'{text[:77]}...'
