@@ -204,12 +204,12 @@ class _Exam:
             self._add(Fault('invalid_output', str(error)))
 
     def _run(self, scenario: Scenario, change: ChangeReadings | None = None,
-             magnetometer: bool = True) -> Outcome:
-        """Return the outcome of a scenario with the first seed."""
-        return self._subject.follow(self._record(scenario), change, magnetometer)
+             magnetometer: bool = True, seed: int | None = None) -> Outcome:
+        """Return the outcome of a scenario, by default with the first seed."""
+        return self._subject.follow(self._record(scenario, seed), change, magnetometer)
 
-    def _record(self, scenario: Scenario) -> Run:
-        return scenarios.record(scenario, self._imu, self._seeds[0])
+    def _record(self, scenario: Scenario, seed: int | None = None) -> Run:
+        return scenarios.record(scenario, self._imu, self._seeds[0] if seed is None else seed)
 
     def _ask_for_field(self) -> None:
         """Find out whether the filter uses the field: only then its heading can be judged."""
@@ -236,8 +236,7 @@ class _Exam:
         done = {}
         for seed in self._seeds:
             with self._guarded():
-                done[seed] = self._subject.follow(
-                    scenarios.record(scenarios.SLOW, self._imu, seed))
+                done[seed] = self._run(scenarios.SLOW, seed=seed)
         self._seeds = list(done)
         return list(done.values())
 

@@ -15,7 +15,6 @@ import numpy as np
 import rclpy
 from numpy.typing import NDArray
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -25,12 +24,18 @@ from sensor_msgs.msg import Imu, MagneticField
 
 from spinning_top_sim.exam.examiner import examine
 from spinning_top_sim.exam.report import Report
-from spinning_top_sim.exam.trial import NodeError
+from spinning_top_sim.exam.trial import INTERRUPTED, NodeError
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools.attitudes import NO_ORIENTATION
 
+try:                            # takes least processor time
+    from rclpy.experimental import EventsExecutor as Executor
+except ImportError:
+    from rclpy.executors import SingleThreadedExecutor as Executor
+
 IMU_TOPIC, FIELD_TOPIC = 'imu/data_raw', 'imu/mag'
 PATIENCE_S = 20.0               # for a node to start, and for an answer
+DISCOVERY_S = 1.0               # other publishers are found later than the node
 FIRST_PATIENCE_S, UNANSWERED = 1.0, 5       # some nodes do not answer their first samples
 START_NS = NANOSECONDS          # in ROS a stamp of 0 means "no time"
 # A running node must never see time go back, not even from one exam to the next.  So the first
@@ -75,7 +80,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         rclpy.init(context=self._context)
         self._node = Node(NAME, context=self._context, parameter_overrides=[
             Parameter('use_sim_time', value=False)])
-        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor = Executor(context=self._context)
         self._executor.add_node(self._node)
         profile = QoSProfile(depth=100)
         self._clock, self._imu, self._field = (
@@ -98,6 +103,8 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         if self._command is not None:
             self._process = subprocess.Popen(self._command, start_new_session=True)
         there = self._wait(self.is_there, PATIENCE_S)
+        if there and self._process is None:
+            self._wait(lambda: False, DISCOVERY_S)
         self._find_others()
         if not there:
             text = (f'no node reads {IMU_TOPIC} and publishes {self._topic} within '
@@ -159,15 +166,17 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
     def _find_others(self) -> None:
         """Raise NodeError if a topic of the exam has several publishers."""
         for name in ('/clock', IMU_TOPIC, FIELD_TOPIC, self._topic):
-            nodes = [one.node_name for one in self._node.get_publishers_info_by_topic(name)]
-            if len(nodes) > 1:
-                raise NodeError(f'{name} is published by {" and ".join(sorted(nodes))}: end the '
-                                'others, because the exam needs the topic alone')
+            if (count := self._node.count_publishers(name)) > 1:
+                raise NodeError(f'{name} has {count} publishers: end the others, because the exam '
+                                'needs the topic alone')
 
     def _wait(self, condition: Callable[[], object], seconds: float) -> bool:
         """Spin until a condition holds; return False on timeout.  Raise if the node has ended."""
         end = time.monotonic() + seconds
         while not condition():
+            if INTERRUPTED.is_set():
+                INTERRUPTED.clear()
+                raise KeyboardInterrupt
             if time.monotonic() > end:
                 return False
             if self._process is not None and self._process.poll() is not None:

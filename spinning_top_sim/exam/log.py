@@ -6,6 +6,7 @@ The filter cannot get the readings again, so only the attitudes are judged: misr
 wrong stamps, the covariance and divergence.
 """
 
+import itertools
 import json
 import math
 from dataclasses import replace
@@ -90,11 +91,10 @@ def _topic(reader: LogReader, name: str) -> LogTopic:
 
 
 def _first_truth(reader: LogReader, examined: LogTopic) -> LogTopic:
-    for name in TRUTHS:
-        for topic in reader.topics:
-            if (f'/{topic.name}'.endswith(f'/{name}') and topic.type_name in LAYOUTS
-                    and topic.name != examined.name):
-                return topic
+    for name, topic in itertools.product(TRUTHS, reader.topics):
+        if (f'/{topic.name}'.endswith(f'/{name}') and topic.type_name in LAYOUTS
+                and topic.name != examined.name):
+            return topic
     raise ValueError(f'{reader.path} has no other topic {", ".join(TRUTHS)} with attitudes: name '
                      'one by --truth')
 

@@ -2,6 +2,7 @@
 """Feeds a filter with the readings of a run, and checks what it returns."""
 
 import math
+import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -16,6 +17,7 @@ from spinning_top_sim.tools.cli import printable
 # Covariance and bias are read after every tenth update.
 READ_EVERY = 10
 NORM_TOLERANCE = 1e-3
+INTERRUPTED = threading.Event()     # ends the exam of a node; rclpy loses KeyboardInterrupts
 
 
 class Filter(Protocol):
@@ -30,23 +32,12 @@ class Filter(Protocol):
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> ArrayLike:
         """
-        Take the readings of a step; return the attitude at its end.
+        Take the readings of a step of `dt` seconds; return the attitude at its end.
 
-        Parameters
-        ----------
-        gyroscope : (3,) array
-            Mean angular velocity over the step [rad/s].
-        accelerometer : (3,) array
-            Specific force at its end [m/s^2], +g upwards at rest.
-        magnetometer : (3,) array or None
-            Field at its end [T].
-        dt : float
-            Length of the step [s].
-
-        Returns
-        -------
-        (4,) array_like
-            q(world <- sensor) as x, y, z, w; x of the world is east, y north and z up.
+        The gyroscope reads the mean angular velocity over the step [rad/s]; the accelerometer
+        reads the specific force at its end [m/s^2], +g upwards at rest, and the magnetometer, if
+        there is one, the field [T].  The attitude is q(world <- sensor) as x, y, z, w; x of the
+        world is east, y north and z up.
         """
 
 
@@ -195,7 +186,7 @@ def _covariance_of(filter_: Filter) -> Reals | float:
     if not np.any(covariance):      # ROS messages mark an unknown covariance by zeros
         return math.nan
     if is_indefinite(covariance):
-        raise InvalidOutputError(f'covariance is {_short(covariance.tolist())}: must have no '
+        raise InvalidOutputError(f'covariance is {covariance.tolist()}: must have no '
                                  'negative eigenvalue')
     return covariance
 
@@ -214,7 +205,7 @@ def _numbers(what: str, value: object, shape: tuple[int, ...]) -> Reals:
     except (TypeError, ValueError):
         numbers = np.empty(0)
     if numbers.shape != shape or not np.all(np.isfinite(numbers)):
-        raise InvalidOutputError(f'{what} {_short(value)}: must be '
+        raise InvalidOutputError(f'{what} {one_line(value)[:80]}: must be '
                                  f'{" x ".join(map(str, shape))} finite numbers')
     return numbers
 
@@ -222,8 +213,3 @@ def _numbers(what: str, value: object, shape: tuple[int, ...]) -> Reals:
 def one_line(value: object) -> str:
     """Return the text of a value as one printable line."""
     return printable(' '.join(str(value).split()))
-
-
-def _short(value: object) -> str:
-    text = one_line(value)
-    return text if len(text) < 80 else f'{text[:77]}...'

@@ -24,7 +24,6 @@ BODY, MARK, ROD = (51, 102, 178), (242, 191, 51), (90, 90, 90)
 TRACES = ((229, 77, 51), (40, 140, 70))
 BOUNDS, SPHERE = (120, 90, 170), (205, 205, 210)
 ARROW_COLOURS = ((20, 120, 60), (190, 60, 160), (230, 130, 20))
-SECTIONS = 48                   # of a cylinder
 NO_LINES = np.zeros((1, 2, 3), np.float32)
 NO_SAMPLES = 'no samples yet'
 Value = TypeVar('Value')
@@ -55,7 +54,7 @@ class DrawnTop:
                 ('mark', MARK, trimesh.creation.box((
                     0.3 * shape.radius, 0.5 * shape.radius, 1.02 * shape.height)),
                  (0.86 * shape.radius, 0.0, shape.centre)),
-                ('disc', BODY, trimesh.creation.cylinder(shape.radius, shape.height, SECTIONS),
+                ('disc', BODY, trimesh.creation.cylinder(shape.radius, shape.height, 48),
                  (0.0, 0.0, shape.centre)),
                 ('rod', ROD, trimesh.creation.cylinder(0.015 * radius, radius),
                  (0.0, 0.0, 0.5 * far))):
