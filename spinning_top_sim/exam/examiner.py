@@ -76,6 +76,16 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     restart : bool, optional
         If False, one filter is made, in this process, and used for all runs.
 
+    Returns
+    -------
+    Report
+        Faults with their evidence, and measures.
+
+    Raises
+    ------
+    ValueError
+        If the level, a parameter or a seed is not allowed.
+
     Notes
     -----
     The same arguments give the same report, unless the filter itself is random.  A filter that

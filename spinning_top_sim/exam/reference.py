@@ -25,10 +25,12 @@ class ReferenceFilter:
 
     Parameters
     ----------
-    gyroscope_density, accelerometer_density, field_density : float
-        White noise [rad/s/sqrt(Hz)], [m/s^2/sqrt(Hz)], [T/sqrt(Hz)].
+    gyroscope_density, accelerometer_density : float
+        White noise [rad/s/sqrt(Hz)], [m/s^2/sqrt(Hz)].
     field : tuple of three float
         Magnetic field in the world: east, north, up [T].
+    field_density : float
+        White noise of the magnetometer [T/sqrt(Hz)].
     bias_stddev : float
         Initial standard deviation of the gyroscope bias [rad/s].
     """
@@ -55,7 +57,23 @@ class ReferenceFilter:
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
-        """Take the readings of a step; return the attitude at its end, see `trial.Filter`."""
+        """
+        Take the readings of a step; return the attitude at its end.
+
+        Parameters
+        ----------
+        gyroscope, accelerometer : (3,) array
+            Mean rate over the step [rad/s], and specific force at its end [m/s^2].
+        magnetometer : (3,) array or None
+            Field at the end of the step [T].
+        dt : float
+            Length of the step [s].
+
+        Returns
+        -------
+        (4,) array
+            q(world <- sensor) as x, y, z, w.
+        """
         if not len(self._quaternion):
             self._quaternion = from_two_vectors(accelerometer, magnetometer)
         else:

@@ -16,9 +16,16 @@ class Report:
     """
     The result of an exam; `str(report)` is readable.
 
-    found : the faults with their evidence
-    measures : by name, as defined in docs/exam.md; NaN: could not be measured
-    outcomes : output of the filter in the runs, for pictures
+    Parameters
+    ----------
+    subject : str
+        Name of the filter.
+    found : sequence of Fault
+        The faults with their evidence.
+    measures : mapping
+        Measures by name, as docs/exam.md defines them; NaN: could not be measured.
+    outcomes : sequence of Outcome
+        Output of the filter in the runs, for pictures.
     """
 
     subject: str
@@ -48,7 +55,14 @@ class Report:
                 if not math.isnan(value)]
 
     def as_json(self) -> str:
-        """Return a JSON object of subject, passed, faults, evidence and measures, null for NaN."""
+        """
+        Return the report as JSON.
+
+        Returns
+        -------
+        str
+            An object of subject, passed, faults, evidence and measures, null for NaN.
+        """
         return json.dumps({
             'subject': self.subject, 'passed': self.passed, 'faults': self.faults,
             'evidence': dict(self.found),
@@ -56,7 +70,14 @@ class Report:
                          for name, value in self.measures.items()}}, indent=2)
 
     def as_junit(self) -> str:
-        """Return JUnit XML: a test suite with a test case for each fault of FAULTS."""
+        """
+        Return the report as JUnit XML.
+
+        Returns
+        -------
+        str
+            A test suite with a test case for each fault of FAULTS.
+        """
         suite = ElementTree.Element('testsuite', name=f'examine {self.subject}',
                                     tests=str(len(FAULTS)), failures=str(len(self.found)),
                                     errors='0', skipped='0')

@@ -32,12 +32,23 @@ class Filter(Protocol):
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> ArrayLike:
         """
-        Take the readings of a step of `dt` seconds; return the attitude at its end.
+        Take the readings of a step; return the attitude at its end.
 
-        The gyroscope reads the mean angular velocity over the step [rad/s]; the accelerometer
-        reads the specific force at its end [m/s^2], +g upwards at rest, and the magnetometer, if
-        there is one, the field [T].  The attitude is q(world <- sensor) as x, y, z, w; x of the
-        world is east, y north and z up.
+        Parameters
+        ----------
+        gyroscope : (3,) array
+            Mean angular velocity over the step [rad/s].
+        accelerometer : (3,) array
+            Specific force at its end [m/s^2], +g upwards at rest.
+        magnetometer : (3,) array or None
+            Field at its end [T].
+        dt : float
+            Length of the step [s].
+
+        Returns
+        -------
+        (4,) array_like
+            q(world <- sensor) as x, y, z, w; x of the world is east, y north and z up.
         """
 
 

@@ -36,26 +36,60 @@ _STREAM_BYTES = 1 << 12     # that an open chunk costs besides its content, abou
 
 @dataclass(frozen=True)
 class LogTopic:
-    """A channel of a log."""
+    """
+    A channel of a log.
 
-    name: str                   # of the topic
-    type_name: str              # such as 'sensor_msgs/msg/Imu', empty without schema
-    schema: str                 # the definition with its dependencies
-    schema_encoding: str        # its format, such as 'ros2msg'
-    encoding: str               # of the messages, such as 'cdr'
-    qos: tuple[Qos, ...]        # offered profiles, each with the keys of `rosbag2.DEFAULT_QOS`
-    metadata: Mapping[str, str]     # of the channel
-    channel_id: int             # its number in the file
+    Parameters
+    ----------
+    name : str
+        Name of the topic.
+    type_name : str
+        Such as 'sensor_msgs/msg/Imu', empty without schema.
+    schema, schema_encoding : str
+        The definition with its dependencies, and its format, such as 'ros2msg'.
+    encoding : str
+        Encoding of the messages, such as 'cdr'.
+    qos : tuple of mapping
+        Offered profiles, each with the keys of `rosbag2.DEFAULT_QOS`.
+    metadata : mapping
+        Metadata of the channel.
+    channel_id : int
+        Number of the channel in the file.
+    """
+
+    name: str
+    type_name: str
+    schema: str
+    schema_encoding: str
+    encoding: str
+    qos: tuple[Qos, ...]
+    metadata: Mapping[str, str]
+    channel_id: int
 
 
 class LogMessage(NamedTuple):
-    """A message of a log."""
+    """
+    A message of a log.
+
+    Parameters
+    ----------
+    topic : str
+        Name of the topic.
+    log_time, publish_time : int
+        Times of the record [ns].
+    sequence : int
+        Number in its channel.
+    data : bytes
+        The serialized message.
+    channel_id : int
+        Number of its channel.
+    """
 
     topic: str
-    log_time: int               # [ns]
-    publish_time: int           # [ns]
-    sequence: int               # number in its channel
-    data: bytes                 # the serialized message
+    log_time: int
+    publish_time: int
+    sequence: int
+    data: bytes
     channel_id: int
 
 
