@@ -180,7 +180,7 @@ def test_errors_add_up():
     alone = [read({name: value for name, value in errors.items() if name.endswith(end)}, times)[0]
              for end in ('_walk', '_stddev', '_turn_on_bias', '_instability', '_density')]
     assert all(np.all(np.std(one, axis=0) + np.abs(one[0]) > 0.0) for one in alone)
-    assert read(errors, times)[0] == pytest.approx(sum(alone), abs=1e-15)
+    assert read(errors, times)[0] == pytest.approx(sum(alone), rel=3e-16, abs=1e-15)
 
 
 def test_a_change_of_the_rate_leaves_the_bias_on_its_path():
