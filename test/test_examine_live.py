@@ -55,8 +55,7 @@ def test_a_node_that_runs_gets_one_run_after_the_other(run, running, monkeypatch
         assert np.max(np.abs(outcome.estimates[1:] - direct.estimates)) < 1e-9
         # Another source of samples is told.
         assert main(['--topic', 'imu/data']) == 1
-        assert ('/clock is published by examine and examine: end the others'
-                in capfd.readouterr().err)
+        assert '/clock has 2 publishers: end the others' in capfd.readouterr().err
     with live.NodeExam('imu/data') as node:          # later than the first one, for the node
         filter_ = node.start()
         readings = run.gyroscope[0], run.accelerometer[0], run.magnetometer[0], 0.01
@@ -68,6 +67,12 @@ def test_a_node_that_runs_gets_one_run_after_the_other(run, running, monkeypatch
         monkeypatch.setattr(live, 'PATIENCE_S', 0.1)
         with pytest.raises(NodeError, match='publishes imu/data has gone'):
             filter_.update(*readings)
+
+
+def test_an_interrupt_ends_the_exam(monkeypatch, capfd):
+    monkeypatch.setattr(live.NodeExam, 'is_there', lambda _: signal.raise_signal(signal.SIGINT))
+    assert main(['--topic', '/imu/data']) == 130
+    assert 'examine: interrupted' in capfd.readouterr().err
 
 
 def test_a_node_that_does_not_run_is_told(monkeypatch, capfd):

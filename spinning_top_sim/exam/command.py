@@ -18,6 +18,7 @@ The faults and the measures are defined in docs/exam.md.
 """
 
 import argparse
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,7 +28,7 @@ from spinning_top_sim.exam.adapters import FILTERS
 from spinning_top_sim.exam.examiner import SEEDS, examine
 from spinning_top_sim.exam.log import NORTHS, examine_log
 from spinning_top_sim.exam.report import Report
-from spinning_top_sim.exam.trial import NodeError
+from spinning_top_sim.exam.trial import INTERRUPTED, NodeError
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.tools import cli
 
@@ -103,9 +104,13 @@ def _report(arguments: argparse.Namespace) -> Report:
         make_filter = FILTERS[arguments.filter]
         make_filter()           # imports its package once, before the runs fork
         return examine(make_filter, subject=arguments.filter, **options)
-    from spinning_top_sim.exam.live import examine_node  # noqa: PLC0415 - needs ROS
+    before = signal.signal(signal.SIGINT, lambda *_: INTERRUPTED.set())
+    try:
+        from spinning_top_sim.exam.live import examine_node  # noqa: PLC0415 - needs ROS
 
-    return examine_node(command=arguments.node, **options)
+        return examine_node(command=arguments.node, **options)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 if __name__ == '__main__':

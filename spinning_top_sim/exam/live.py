@@ -24,7 +24,7 @@ from sensor_msgs.msg import Imu, MagneticField
 
 from spinning_top_sim.exam.examiner import examine
 from spinning_top_sim.exam.report import Report
-from spinning_top_sim.exam.trial import NodeError
+from spinning_top_sim.exam.trial import INTERRUPTED, NodeError
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools.attitudes import NO_ORIENTATION
 
@@ -35,6 +35,7 @@ except ImportError:
 
 IMU_TOPIC, FIELD_TOPIC = 'imu/data_raw', 'imu/mag'
 PATIENCE_S = 20.0               # for a node to start, and for an answer
+DISCOVERY_S = 1.0               # other publishers are found later than the node
 FIRST_PATIENCE_S, UNANSWERED = 1.0, 5       # some nodes do not answer their first samples
 START_NS = NANOSECONDS          # in ROS a stamp of 0 means "no time"
 # A running node must never see time go back, not even from one exam to the next.  So the first
@@ -107,6 +108,8 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         if self._command is not None:
             self._process = subprocess.Popen(self._command, start_new_session=True)
         there = self._wait(self.is_there, PATIENCE_S)
+        if there and self._process is None:
+            self._wait(lambda: False, DISCOVERY_S)
         self._find_others()
         if not there:
             text = (f'no node reads {IMU_TOPIC} and publishes {self._topic} within '
@@ -168,15 +171,17 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
     def _find_others(self) -> None:
         """Raise NodeError if a topic of the exam has several publishers."""
         for name in ('/clock', IMU_TOPIC, FIELD_TOPIC, self._topic):
-            nodes = [one.node_name for one in self._node.get_publishers_info_by_topic(name)]
-            if len(nodes) > 1:
-                raise NodeError(f'{name} is published by {" and ".join(sorted(nodes))}: end the '
-                                'others, because the exam needs the topic alone')
+            if (count := self._node.count_publishers(name)) > 1:
+                raise NodeError(f'{name} has {count} publishers: end the others, because the exam '
+                                'needs the topic alone')
 
     def _wait(self, condition: Callable[[], object], seconds: float) -> bool:
         """Spin until a condition holds; return False on timeout.  Raise if the node has ended."""
         end = time.monotonic() + seconds
         while not condition():
+            if INTERRUPTED.is_set():
+                INTERRUPTED.clear()
+                raise KeyboardInterrupt
             if time.monotonic() > end:
                 return False
             if self._process is not None and self._process.poll() is not None:

@@ -2,6 +2,7 @@
 """Feeds a filter with the readings of a run, and checks what it returns."""
 
 import math
+import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -16,6 +17,7 @@ from spinning_top_sim.tools.cli import printable
 # Covariance and bias are read after every tenth update.
 READ_EVERY = 10
 NORM_TOLERANCE = 1e-3
+INTERRUPTED = threading.Event()     # ends the exam of a node; rclpy loses KeyboardInterrupts
 
 
 class Filter(Protocol):
