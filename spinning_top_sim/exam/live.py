@@ -35,7 +35,7 @@ except ImportError:
 
 IMU_TOPIC, FIELD_TOPIC = 'imu/data_raw', 'imu/mag'
 PATIENCE_S = 20.0               # for a node to start, and for an answer
-DISCOVERY_S = 1.0               # other publishers are found later than the node
+DISCOVERY_S = 3.0               # other publishers are found later than the node
 FIRST_PATIENCE_S, UNANSWERED = 1.0, 5       # some nodes do not answer their first samples
 START_NS = NANOSECONDS          # in ROS a stamp of 0 means "no time"
 # A running node must never see time go back, not even from one exam to the next.  So the first
