@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures of the tests that talk to running nodes, and the order of many workers."""
 
+import signal
+
 import helpers.own_domain  # noqa: F401, before any node starts
 import pytest
 
@@ -12,6 +14,16 @@ def pytest_xdist_make_scheduler(config, log):
     from helpers.scheduling import BySharedFixture
 
     return BySharedFixture(config, log)
+
+
+@pytest.fixture(autouse=True)
+def _signals():
+    """Restore what a command that is called in this process leaves ignored."""
+    handlers = {number: signal.getsignal(number)
+                for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture(scope='module')

@@ -211,19 +211,23 @@ class Peer:
         self.node = Node(name, context=context)
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self.node)
+        self._closed = False
         self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
         self._clients = {}
         self._publishers = {}
 
     def _spin(self):
+        # Not spin(): shutdown() may destroy its guard condition before it waits for it.
         with contextlib.suppress(ExternalShutdownException):
-            self._executor.spin()
+            while not self._closed:
+                self._executor.spin_once(timeout_sec=0.5)
 
     def close(self):
-        self._executor.shutdown()
+        self._closed = True
         self._thread.join(PATIENCE_S)
         assert not self._thread.is_alive(), 'the peer still listens'
+        self._executor.shutdown()
         self.node.destroy_node()
 
     def __enter__(self):
