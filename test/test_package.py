@@ -5,11 +5,15 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 from catkin_pkg.changelog import get_changelog_from_path
 from catkin_pkg.package import parse_package
+
+from spinning_top_sim.__main__ import COMMANDS
 
 NAME = 'spinning_top_sim'
 ROOT = Path(__file__).parents[1]
@@ -20,14 +24,8 @@ NOT_SOURCES = {'build', 'install', 'log', 'logs'}
 
 
 @pytest.fixture(scope='module')
-def setup_py():
-    """Return what setup.py says, as setuptools understands it."""
-    pytest.importorskip('setuptools')
-    from distutils.core import run_setup  # setuptools has it where Python has not
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(ROOT)
-        return run_setup('setup.py', stop_after='init')
+def project():
+    return tomllib.loads((ROOT / 'pyproject.toml').read_text(encoding='utf-8'))['project']
 
 
 @pytest.fixture(scope='module')
@@ -86,10 +84,11 @@ def test_the_manifest_names_every_ros_package_that_is_imported():
     assert {'launch', 'launch_ros', 'xacro'} <= ros
 
 
-def test_versions_agree(setup_py):
+def test_versions_agree(project):
     package = parse_package(str(ROOT / 'package.xml'))
     newest = next(get_changelog_from_path(str(ROOT), NAME).foreach_version(reverse=True))[0]
-    assert package.version == newest == setup_py.get_version()
+    citation = yaml.safe_load((ROOT / 'CITATION.cff').read_text(encoding='utf-8'))
+    assert package.version == newest == project['version'] == citation['version']
 
 
 def test_no_private_name_of_rclpy_is_used():
@@ -107,16 +106,10 @@ def test_no_private_name_of_rclpy_is_used():
 # -------------------------------------------------------------------------------- executables
 
 
-def test_every_script_is_installed_as_data_and_as_a_command(setup_py):
-    names = {path.name for path in SCRIPTS}
-    assert 'sim_node' in names
-    commands = dict(line.split(' = ') for line in setup_py.entry_points['console_scripts'])
-    assert set(commands) == names
-    assert set(dict(setup_py.data_files)[f'lib/{NAME}']) == {f'scripts/{name}' for name in names}
-    for name, target in commands.items():
-        module, function = target.split(':')
-        assert (ROOT / f'{module.replace(".", "/")}.py').is_file()
-        assert f'from {module} import {function}\n' in (ROOT / 'scripts' / name).read_text()
+def test_one_command_is_on_path_and_every_script_is_a_part_of_it(project):
+    assert project['scripts'] == {'spinning-top': f'{NAME}.__main__:main'}
+    called = [re.search(r"main\(\['(\w+)', \*sys", path.read_text())[1] for path in SCRIPTS]
+    assert sorted(called) == sorted(COMMANDS)
 
 
 def test_ctrl_c_during_the_imports_of_a_tool_is_quiet():
@@ -134,13 +127,13 @@ def test_ctrl_c_during_the_imports_of_a_tool_is_quiet():
 
 @pytest.mark.parametrize('script', SCRIPTS, ids=lambda path: path.name)
 def test_an_installed_executable_tells_its_version_where_ros2_run_looks(
-        script, prefix, setup_py):
+        script, prefix, project):
     installed = prefix / 'lib' / NAME / script.name
     search_path = f'{Path(sys.executable).parent}{os.pathsep}{os.environ.get("PATH", "")}'
     done = subprocess.run([installed, '--version'], env={**os.environ, 'PATH': search_path},
                           capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stderr) == (0, '')
-    assert done.stdout.split() == [script.name, setup_py.get_version()]
+    assert done.stdout.split()[-1] == project['version']
 
 
 # ------------------------------------------------------------------------------ what is there
@@ -157,13 +150,13 @@ def test_the_share_folder_is_complete(prefix):
         assert there == {path.name for path in (ROOT / folder).glob(pattern)}, folder
 
 
-def test_manifest_and_setup_py_require_the_same(setup_py):
+def test_the_manifest_requires_what_ubuntu_has_of_what_pip_installs(project):
     keys = {'python3-numpy': 'numpy', 'python3-scipy': 'scipy', 'python3-tqdm': 'tqdm',
-            'python3-yaml': 'PyYAML', 'mcap-ros2-support': 'mcap'}
+            'python3-yaml': 'PyYAML'}
     declared = {keys[dependency.name] for dependency in
                 parse_package(str(ROOT / 'package.xml')).exec_depends if dependency.name in keys}
-    required = {re.split('[<>]', line)[0] for line in setup_py.install_requires}
-    assert declared == required == set(keys.values())
+    required = {re.split('[<>]', line)[0] for line in project['dependencies']}
+    assert declared == set(keys.values()) == required - {'mcap', 'rosbags'}     # pip has these
 
 
 def make(*arguments):
@@ -181,24 +174,6 @@ def test_make_refuses_a_ros_that_has_no_wheels_here_and_a_second_one_in_an_envir
             (('dependencies', 'ROS=kilted', f'VENV={tmp_path}'), 'has another ROS than kilted')):
         made = make(*arguments)
         assert made.returncode == 2 and said in made.stderr
-
-
-@pytest.mark.parametrize(('scene', 'file'), [
-    ('wavy', 'config/wavy.yaml'),
-    (str(ROOT / 'config/wavy.yaml'), str(ROOT / 'config/wavy.yaml'))])
-def test_make_run_takes_a_scene_by_name_or_path(scene, file):
-    assert f"--params-file '{file}'" in make('--dry-run', 'run', f'SCENE={scene}').stdout
-
-
-@pytest.mark.parametrize(('scene', 'said'), [
-    ('nothing', 'There is no scene "nothing"'),
-    ('config/nothing.yaml', 'There is no scene "config/nothing.yaml"'),
-    ('imu/bmi088', 'bmi088.yaml is no scene but an IMU'),
-    (str(ROOT / 'config/imu/bmi088.yaml'), "ARGS='--params-file ")])
-def test_make_run_refuses_what_is_no_scene_and_names_the_scenes(scene, said):
-    made = make('run', f'SCENE={scene}')
-    assert made.returncode == 2 and 'Creating' not in made.stdout
-    assert said in made.stderr and 'looping' in made.stderr
 
 
 def test_make_help_fits_into_80_columns_and_names_every_scene():

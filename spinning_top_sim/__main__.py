@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+# PYTHON_ARGCOMPLETE_OK
+"""The command `spinning-top`, which is `python -m spinning_top_sim` as well."""
+
+import argparse
+import contextlib
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
+from types import ModuleType
+
+# Name: the module that has it, and what it does.
+COMMANDS = {
+    'node': ('nodes.sim_node', 'simulate a top in real time as a ROS 2 node'),
+    'replay': ('nodes.replay_node', 'publish the messages of a log as a ROS 2 node'),
+    'simulate': ('tools.simulate', 'simulate a top as fast as possible and write a log or table'),
+    'inspect': ('tools.inspect', 'say what is in a log; verify, plot or export it'),
+    'recover': ('tools.recover', 'copy what is left of a damaged log'),
+    'ensemble': ('tools.ensemble', 'simulate many tops with sampled parameters'),
+    'examine': ('exam.command', 'examine an attitude filter'),
+    'view': ('view.command', 'show a running node or a log in the browser'),
+}
+INTERRUPTED = 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command with these arguments, by default the program's; return its exit code."""
+    argv = sys.argv[1:] if argv is None else argv
+    if '_ARGCOMPLETE' in os.environ:
+        _complete()
+    name = _parser().parse_args(argv[:1]).command
+    with _quiet_interrupt():
+        command: Callable[[Sequence[str]], int] = _module(name).main
+    return command(argv[1:])
+
+
+def _module(name: str) -> ModuleType:
+    return import_module(f'spinning_top_sim.{COMMANDS[name][0]}')
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        'spinning-top', description='Simulate the heavy symmetric top, with exact truth.',
+        epilog='spinning-top COMMAND --help tells the options of a command.')
+    parser.add_argument('--version', action=_Version, nargs=0, help='print the version, then end')
+    commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
+    for name, (_, what) in COMMANDS.items():
+        commands.add_parser(name, help=what, add_help=False)
+    return parser
+
+
+class _Version(argparse.Action):
+    def __call__(self, *_: object) -> None:
+        from spinning_top_sim.recording.provenance import version  # noqa: PLC0415
+        print('spinning-top', version('spinning_top_sim'))
+        sys.exit()
+
+
+def _complete() -> None:
+    """Print what completes the command line in COMP_LINE, and exit."""
+    import argcomplete  # noqa: PLC0415
+    parser = argparse.ArgumentParser()
+    commands = parser.add_subparsers()
+    for name in COMMANDS:
+        options = commands.add_parser(name)
+        if name in os.environ.get('COMP_LINE', '').split():
+            _module(name).add_arguments(options)
+    argcomplete.autocomplete(parser)
+
+
+@contextlib.contextmanager
+def _quiet_interrupt() -> Iterator[None]:
+    """End at once if Ctrl-C comes during imports, where a KeyboardInterrupt may be lost."""
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.default_int_handler:
+        signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The wheel, in an environment that has its dependencies and nothing else: no ROS, no extras."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from spinning_top_sim.__main__ import main
+
+ROOT = Path(__file__).parents[1]
+SDIST = 'import sys, setuptools.build_meta; setuptools.build_meta.build_sdist(sys.argv[1])'
+
+
+def run(*command, cwd=ROOT, **variables):
+    """Run a command in an environment that knows nothing of this one."""
+    done = subprocess.run(
+        [*map(str, command)], cwd=cwd, capture_output=True, text=True, timeout=120, check=False,
+        env={'PATH': '/usr/bin:/bin', 'HOME': str(cwd), **variables})
+    return done.returncode, done.stdout, done.stderr
+
+
+def pip(*arguments, **variables):
+    code, _, err = run(sys.executable, '-m', 'pip', '--disable-pip-version-check', *arguments,
+                       **variables)
+    assert code == 0, err
+
+
+@pytest.fixture(scope='module')
+def wheels(tmp_path_factory):
+    """Return the wheels that are made of the sources, and of the source distribution."""
+    folder = tmp_path_factory.mktemp('build')
+    settings = folder / 'setup.cfg'
+    settings.write_text(f'[build]\nbuild_base={folder}/build\n[egg_info]\negg_base={folder}\n')
+    code, _, err = run(sys.executable, '-c', SDIST, folder, DIST_EXTRA_CONFIG=str(settings))
+    assert code == 0, err
+    (archive,) = folder.glob('*.tar.gz')
+    with tarfile.open(archive) as sdist:
+        sdist.extractall(folder, filter='data')
+    (unpacked,) = folder.glob('spinning_top_sim-*/')
+    made = []
+    for name, sources in (('checkout', ROOT), ('sdist', unpacked)):
+        pip('wheel', '--no-deps', '--no-build-isolation', '--no-index', '-w', folder / name,
+            sources, DIST_EXTRA_CONFIG=str(settings))
+        made += (folder / name).glob('*.whl')
+    return made
+
+
+def dependencies(name):
+    """Yield the distributions that one needs, and itself."""
+    yield metadata.distribution(name)
+    for line in metadata.requires(name) or ():
+        if 'extra ==' not in line and 'python_version <' not in line:
+            yield from dependencies(re.match(r'[\w.-]+', line)[0])
+
+
+@pytest.fixture(scope='module')
+def empty(tmp_path_factory, wheels):
+    """Return an environment with the wheel and its dependencies."""
+    folder = tmp_path_factory.mktemp('empty')
+    code, _, err = run(sys.executable, '-m', 'venv', '--without-pip', folder)
+    assert code == 0, err
+    pip('--python', folder / 'bin/python', 'install', '--no-deps', '--no-index', wheels[0])
+    (packages,) = folder.glob('lib/python*/site-packages')
+    for distribution in dependencies('spinning_top_sim'):
+        tops = {file.parts[0] for file in distribution.files if file.parts[0] != '..'}
+        for top in tops - {'__pycache__'}:
+            if not (packages / top).exists():
+                (packages / top).symlink_to(distribution.locate_file(top))
+    return folder
+
+
+def test_the_wheels_of_checkout_and_source_distribution_are_the_same(wheels):
+    def content(path):
+        with zipfile.ZipFile(path) as wheel:
+            return {name: wheel.read(name) for name in wheel.namelist()}
+
+    of_checkout, of_sdist = map(content, wheels)
+    assert of_checkout == of_sdist
+    assert 'spinning_top_sim/py.typed' in of_checkout
+
+
+def test_one_command_is_on_path(empty):
+    there = {path.name for path in (empty / 'bin').iterdir()}
+    assert {name for name in there if not re.match('python|[Aa]ctivate|𝜋thon', name)} == {
+        'spinning-top'}
+
+
+def test_without_ros_a_scene_is_simulated_and_verified_with_the_same_bytes(empty, tmp_path):
+    command = empty / 'bin/spinning-top'
+    arguments = ['simulate', '--scene', 'wavy', '--imu', 'bmi088', '--duration', '1', '--quiet',
+                 '-o']
+    code, _, err = run(command, *arguments, 'a.mcap', cwd=tmp_path)
+    assert (code, err) == (0, '')
+    code, out, err = run(command, 'inspect', 'a.mcap', '--verify', cwd=tmp_path)
+    assert (code, err) == (0, '')
+    assert re.search(r'^verify: identical, all \d+ messages', out, re.MULTILINE)
+    assert main([*arguments, str(tmp_path / 'b.mcap')]) == 0    # here, with the files of ROS
+    assert (tmp_path / 'a.mcap').read_bytes() == (tmp_path / 'b.mcap').read_bytes()
+
+
+@pytest.mark.parametrize('name', ['', 'node', 'replay', 'simulate', 'inspect', 'recover',
+                                  'ensemble', 'examine', 'view'])
+def test_help_needs_nothing(empty, tmp_path, name):
+    code, out, err = run(empty / 'bin/spinning-top', *name.split(), '--help', cwd=tmp_path)
+    assert (code, err) == (0, '')
+    assert out.startswith(f'usage: spinning-top {name}')
+
+
+@pytest.mark.parametrize(('arguments', 'remedy'), [
+    (['node'], "pip install 'ros-jazzy-rclpy"),
+    (['replay', 'a.mcap'], "pip install 'ros-jazzy-rclpy"),
+    (['view'], "pip install 'ros-jazzy-rclpy"),
+    (['view', 'a.mcap'], "pip install 'viser"),
+    (['inspect', 'a.mcap', '--plot', 'a.png'], "pip install 'matplotlib"),
+    (['inspect', 'a.mcap', '--export', 'a.parquet'], "pip install 'pyarrow"),
+    (['examine', '--filter', 'vqf'], "pip install 'vqf"),
+    (['ensemble', 'e.yaml', '-o', 'runs'], "pip install 'distributed"),
+])
+def test_what_is_missing_is_told_with_its_remedy(empty, tmp_path, arguments, remedy):
+    assert main(['simulate', '--duration', '0.1', '--quiet', '-o', str(tmp_path / 'a.mcap')]) == 0
+    shutil.copy(ROOT / 'examples/ensemble.yaml', tmp_path / 'e.yaml')
+    code, out, err = run(empty / 'bin/spinning-top', *arguments, cwd=tmp_path)
+    assert (code, out) in ((1, ''), (2, ''))
+    assert err.startswith(f'spinning-top {arguments[0]}: ') and err.count('\n') == 1
+    assert f'{empty}/bin/python -m {remedy}' in err
+
+
+def test_python_m_is_the_same_command(empty, tmp_path):
+    code, out, _ = run(empty / 'bin/python', '-m', 'spinning_top_sim', '--version', cwd=tmp_path)
+    assert (code, out) == (0, f'spinning-top {metadata.version("spinning_top_sim")}\n')
+
+
+def test_the_shell_completes_commands_and_options(empty):
+    def completed(line):
+        _, out, _ = run('sh', '-c', f'"{sys.executable}" -m spinning_top_sim 8>&1 9>/dev/null',
+                        _ARGCOMPLETE='1', _ARGCOMPLETE_IFS='\n', COMP_LINE=line,
+                        COMP_POINT=str(len(line)))
+        return out.split()
+
+    pytest.importorskip('argcomplete')
+    assert completed('spinning-top in') == ['inspect']
+    assert '--verify' in completed('spinning-top inspect --ve')
+
+
+def test_extremes_of_names_are_told(tmp_path, capsys):
+    assert main(['simulate', '--scene', 'cups', '-o', str(tmp_path / 'a.mcap')]) == 2
+    assert 'spinning-top simulate: --scene cups: must be the path of a file, or one of cusp' in (
+        capsys.readouterr().err)
+    assert not os.listdir(tmp_path)
