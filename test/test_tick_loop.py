@@ -143,12 +143,12 @@ def test_a_step_is_exact_also_after_a_pause_in_mid_run_while_clocks_go_on(time_s
     run.ticks(7)
     run.clock.step_ns = 1_333                       # any code takes time
     run.loop.pause()
-    for count, dt in ((7, 0.03), (1, 0.01), (3, 1.0 / 3.0), (1_000, 1e-9), (10, 1e-10)):
+    for length_ns in (210_000_000, 10_000_000, 333_333_333, 1):
         run.ticks(5)
         before = run.loop.now_ns
-        run.loop.step(count, dt)
+        run.loop.step(length_ns)
         run.ticks(5)
-        assert run.loop.now_ns - before == round(count * dt * 1e9)
+        assert run.loop.now_ns - before == length_ns
     run.loop.pause()
     run.loop.resume()
     run.ticks(3)
@@ -160,7 +160,7 @@ def test_a_step_that_takes_too_long_says_what_is_left(monkeypatch):
     run = started(start_paused=True)
     run.clock.step_ns = 100_000
     with pytest.raises(RuntimeError, match=r'takes too long, \d\.\d+ s are left') as error:
-        run.loop.step(1, 10.0)
+        run.loop.step(10 * SECOND)
     now_ns = run.loop.now_ns
     assert 0 < now_ns < 10 * SECOND
     left = float(str(error.value).split()[-4])
@@ -169,7 +169,7 @@ def test_a_step_that_takes_too_long_says_what_is_left(monkeypatch):
     assert run.loop.now_ns == now_ns
     run.loop.resume()
     with pytest.raises(RuntimeError, match='while paused'):
-        run.loop.step(1, 10.0)
+        run.loop.step(10 * SECOND)
 
 
 LAST_S = 2 ** 31 - 1
@@ -196,7 +196,7 @@ def test_a_date_that_no_stamp_can_have_is_refused(date_ns):
 def test_started_paused_nothing_moves():
     run = started(start_paused=True).ticks(5)
     assert run.stamps == [] and run.loop.now_ns == 0
-    run.loop.step(1, 0.01)
+    run.loop.step(POSE_NS)
     assert run.stamps == [0, POSE_NS]
     run.loop.resume()
     run.tick(2 * TICK_NS)
@@ -319,7 +319,7 @@ def test_after_a_failure_a_step_is_refused_and_sends_nothing(paused):
     run.loop.fail('for a test')
     sent = len(run.stamps)
     with pytest.raises(RuntimeError, match='stands still: for a test'):
-        run.loop.step(1, 0.5)
+        run.loop.step(SECOND // 2)
     assert len(run.stamps) == sent
 
 

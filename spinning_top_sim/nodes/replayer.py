@@ -4,6 +4,7 @@
 import argparse
 import contextlib
 import importlib
+import itertools
 import os
 import re
 import sys
@@ -137,8 +138,7 @@ class Replayer(Node):
                     publisher.get_subscription_count() for publisher in self._senders
                     ) < self._options.wait_for_subscribers):
                 pass
-            with contextlib.closing(pacing.read_ahead(pacing.rounds(
-                    self._messages, self._span_ns, self._options.loop))) as messages:
+            with contextlib.closing(pacing.read_ahead(self._messages())) as messages:
                 self._playback.run(messages)
             # Best-effort subscribers read shared memory, which ends with its sender.
             self._stopping.wait(0.3)
@@ -157,13 +157,20 @@ class Replayer(Node):
             self.finished.set_result(code)
 
     def _messages(self) -> Iterator[pacing.Message]:
+        """Yield the messages to play, in endless repetition with --loop."""
         names = {channel.name for channel in self._reader.topics
                  if channel.channel_id in self._outputs}
         start = self._begin_ns if self._options.start else None
-        for message in self._reader.messages(names, start):
-            at_ns = message.log_time or self._begin_ns      # 0: before the first /clock
-            if message.channel_id in self._outputs:
-                yield at_ns, self._outputs[message.channel_id].publish, message.data
+        for number in itertools.count():
+            shift_ns, is_empty = number * (self._span_ns + pacing.ROUND_GAP_NS), True
+            for message in self._reader.messages(names, start):
+                at_ns = message.log_time or self._begin_ns      # 0: before the first /clock
+                if message.channel_id in self._outputs:
+                    is_empty = False
+                    yield (at_ns + shift_ns, self._outputs[message.channel_id].publish,
+                           message.data)
+            if is_empty or not self._options.loop:
+                return
 
     def _tell_damage(self) -> bool:
         """Return whether messages are missing unexpectedly; say so once."""

@@ -2,26 +2,22 @@
 """Scenes as worlds: parameter files with which a running node can start again."""
 
 import contextlib
-import itertools
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
-from urllib.parse import unquote, urlsplit
+from urllib.parse import unquote
 
-import yaml
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 
+from spinning_top_sim.nodes.simulation_standard import RefusedError
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.scene_file import is_of_ros, known, parse_scene
 
 # The parameters of a world.  Those of them that a file does not set get their defaults.
 OF_A_WORLD = ('top.', 'initial.', 'spin.', 'solver.')
-
-
-class FormatError(ValueError):
-    """A resource is not a parameter file."""
+NOT_FOUND, UNSUPPORTED_FORMAT = 2, 101      # of Result and LoadWorld
 
 
 def scene_files() -> dict[str, Path]:
@@ -71,16 +67,17 @@ class World:
         """
         Return the world of a scene's name, a path or a file URI.
 
-        Raises FileNotFoundError, FormatError for what is not a parameter file, OSError, or
-        ValueError for a file with another content.
+        Raises RefusedError for what is no parameter file, OSError, or ValueError for its content.
         """
         scenes = scene_files()
-        path = scenes.get(uri) or local_path(uri)
+        path = scenes.get(uri) or Path(
+            unquote(uri.removeprefix('file://')) if uri.startswith('file://') else uri)
         if not path.is_file():
-            raise FileNotFoundError(f'{uri}: there is no such scene or file; there are the scenes '
-                                    f'{", ".join(scenes)}')
+            raise RefusedError(NOT_FOUND, f'{uri}: there is no such scene or file; there are the '
+                               f'scenes {", ".join(scenes)}')
         if path.suffix not in ('.yaml', '.yml'):
-            raise FormatError(f'{uri}: must be a parameter file of ROS 2, *.yaml')
+            raise RefusedError(UNSUPPORTED_FORMAT,
+                               f'{uri}: must be a parameter file of ROS 2, *.yaml')
         return cls.parse(path.read_text('utf-8'), str(path.absolute()))
 
     def values(self, present: Mapping[str, Any]) -> dict[str, Any]:
@@ -89,39 +86,9 @@ class World:
                     if parameter.name.startswith(OF_A_WORLD)}
         return parameters.checked({**present, **defaults, **self.given})
 
-    def is_that_of(self, values: Mapping[str, Any]) -> bool:
-        """Return whether a motion with these parameters starts as this world does."""
-        try:
-            wanted = self.values(values)
-        except ValueError:      # it contradicts parameters that are not part of a world
-            return False
-        return all(values[name] == value for name, value in wanted.items())
-
 
 def scenes() -> Iterator[World]:
     """Yield the installed scenes that can be read."""
     for path in scene_files().values():
         with contextlib.suppress(OSError, ValueError):      # somebody has changed the file
             yield World.read(str(path))
-
-
-def present_world(values: Mapping[str, Any], loaded: World | None) -> World:
-    """
-    Return the world that starts with these parameters.
-
-    It is the world that was loaded last, an installed scene, or a text with the parameters.
-    """
-    for world in itertools.chain([loaded] if loaded else [], scenes()):
-        if world.is_that_of(values):
-            return world
-    given = {name: value for name, value in values.items()
-             if name.startswith(OF_A_WORLD) and value is not None}
-    return World.parse(yaml.safe_dump({'/**': {'ros__parameters': given}}))
-
-
-def local_path(uri: str) -> Path:
-    """Return the path of a file URI, or of a path.  Raises FormatError for other URIs."""
-    parts = urlsplit(uri)
-    if parts.scheme and not (parts.scheme == 'file' and parts.netloc in ('', 'localhost')):
-        raise FormatError(f'{uri!r}: must be the name of a scene, a path or a file:// URI')
-    return Path(unquote(parts.path) if parts.scheme else uri)

@@ -32,10 +32,6 @@ OFFLINE_BYTES, LONGEST_OFFLINE_NS, MOST_BLOCKS = 4 << 20, 100 * NANOSECONDS, 20_
 MOST_RATE = MOST_TURNS / SHORTEST_RUN_NS * NANOSECONDS
 
 
-class PoleError(ValueError):
-    """A command that is impossible with the axis at a pole, where Lz must be L3 or -L3."""
-
-
 class Simulation:
     """
     One top in motion.  Times are integer nanoseconds since the start.
@@ -184,7 +180,7 @@ class Simulation:
         """
         Let L3 and Lz jump now [kg m^2/s]: an impulsive torque.  Angles and theta' stay.
 
-        Raises ValueError naming what is off, at a pole PoleError; the motion goes on unchanged.
+        Raises ValueError naming what is off; the motion goes on unchanged.
         """
         for name, value in (('l3', l3), ('lz', lz)):
             if not math.isfinite(value):
@@ -194,7 +190,7 @@ class Simulation:
         theta = float(now.theta[0])
         pole = pole_momentum(abs(theta), l3)
         if pole is not None and lz != pole:
-            raise PoleError(
+            raise ValueError(
                 f'lz = {lz!r} kg m^2/s with l3 = {l3!r}: the axis is at a pole (theta = '
                 f'{theta!r} rad), where lz must equal {pole!r}; command both together')
         self._go_on_from(ContinuedState(

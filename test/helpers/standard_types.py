@@ -8,7 +8,7 @@ support: they cannot be sent.  Where the package is installed, a test compares t
 
 from types import MappingProxyType, ModuleType, SimpleNamespace
 
-from geometry_msgs.msg import Accel, Pose, Twist, Vector3
+from geometry_msgs.msg import Accel, Pose, Twist
 from std_msgs.msg import Header
 
 
@@ -67,8 +67,7 @@ SimulatorFeatures = message(
 EntityCategory = message('EntityCategory', {'category': int}, CATEGORY_DYNAMIC_OBJECT=4,
                          CATEGORY_STATIC_OBJECT=5,
                          **numbered('CATEGORY_OBJECT CATEGORY_ROBOT CATEGORY_HUMAN'))
-Bounds = message('Bounds', {'type': int, 'points': [Vector3]}, **numbered(
-    'TYPE_EMPTY TYPE_BOX TYPE_CONVEX_HULL TYPE_SPHERE'))
+Bounds = message('Bounds', {'type': int}, TYPE_EMPTY=0)
 TagsFilter = message('TagsFilter', {'tags': [str], 'filter_mode': int}, **numbered(
     'FILTER_MODE_ANY FILTER_MODE_ALL'))
 EntityFilters = message('EntityFilters', {
@@ -99,7 +98,6 @@ SERVICES = {
     'SetEntityState': service({**NAMED, 'state': EntityState, 'set_pose': bool, 'set_twist': bool,
                                'set_acceleration': bool}, codes={'INVALID_POSE': 101}),
     'GetEntityInfo': service(NAMED, {'info': EntityInfo}),
-    'GetEntityBounds': service(NAMED, {'bounds': Bounds}),
     'GetAvailableWorlds': service(
         {'additional_sources': [str], 'filter': TagsFilter, 'offline_only': bool,
          'continue_on_error': bool}, {'worlds': [WorldResource]},
