@@ -98,10 +98,7 @@ def test_the_worst_problem_is_the_level_and_the_message(reported):
     assert level == 1 and 'more than max_error = 1e-300 rad' in message
 
 
-def test_the_status_line_and_what_is_told_of_a_new_motion(clock, reported):
-    told = reported.report.new_motion()
-    assert 'cusp' in told and max(map(len, told.splitlines())) <= 80
-    assert reported.report.new_motion() is None
+def test_the_status_line(clock, reported):
     line = reported.report.status_line()
     assert line.startswith('t      1.25 s paused | ') and ' | x' not in line
     assert 'L3 1.6 Lz 1.386' in line and 'no subscribers yet' in line
@@ -109,7 +106,6 @@ def test_the_status_line_and_what_is_told_of_a_new_motion(clock, reported):
     status_of(reported)
     reported.session.size = '1.2 MB'
     reported.loop.command(2.0, 1.0)
-    assert reported.report.new_motion() is not None
     assert ' | log 1.2 MB | ' in reported.report.status_line()
     reported.simulation.outputs[0].sent = 12
     assert ' | 12 messages | ' in reported.report.status_line()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The top as the one entity of a simulator, in messages of simulation_interfaces."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -38,11 +38,12 @@ def fill_state(message: Message, states: States, stamp_ns: int, frame: str) -> N
             setattr(target, name, float(column[0]))
 
 
-def changed_state(request: Message, top: Top, frame: str) -> Callable[[States], State]:
+def asked_state(request: Message, top: Top, frame: str, now: States) -> State:
     """
-    Return a function that computes the state a SetEntityState request asks for.
+    Return the state that a SetEntityState request asks for.
 
-    The function takes the present state (n = 1), which holds for what the request does not set.
+    now : the present state (n = 1), which holds for what the request does not set
+
     Raises RefusedError or ValueError, which name the value and what is allowed.
     """
     wanted, asked_frame = request.state, request.state.header.frame_id
@@ -54,24 +55,20 @@ def changed_state(request: Message, top: Top, frame: str) -> Callable[[States], 
     if asked_frame not in ('', frame):
         raise RefusedError(
             UNSUPPORTED, f'header.frame_id = {asked_frame!r}: must be {frame!r} or empty')
-    rotation = _numbers(wanted.pose.orientation, 'xyzw')
-    rates = _numbers(wanted.twist.angular, 'xyz')
+    rotation = np.concatenate(now.rows_quaternion)
+    rates = np.concatenate(attitude.in_world(now.rows_quaternion, now.rows_angular_velocity))
     if sets_pose:
+        rotation = _numbers(wanted.pose.orientation, 'xyzw')
         _check_pose(_numbers(wanted.pose.position, 'xyz'), rotation)
     if sets_twist:
+        rates = _numbers(wanted.twist.angular, 'xyz')
         velocity = _numbers(wanted.twist.linear, 'xyz')
         if not np.all(np.abs(velocity) <= SMALLEST_SPEED):
             raise ValueError(f'twist.linear = {velocity.tolist()} m/s: must be 0, as the pivot '
                              f'is fixed (within {SMALLEST_SPEED:g})')
         if not np.all(np.isfinite(rates)):
             raise ValueError(f'twist.angular = {rates.tolist()} rad/s: must be finite')
-
-    def change(now: States) -> State:
-        present = np.concatenate(now.rows_quaternion)
-        spin = rates if sets_twist else np.concatenate(attitude.in_world(
-            now.rows_quaternion, tuple(now.angular_velocity.T)))
-        return state_of(top, rotation if sets_pose else present, spin)
-    return change
+    return state_of(top, rotation, rates)
 
 
 def _check_pose(position: NDArray[np.float64], rotation: NDArray[np.float64]) -> None:

@@ -97,15 +97,9 @@ class Replayer(Node):
             raise LookupError('--clock publishes another /clock')
         if topic.encoding != 'cdr':
             raise LookupError(f'its messages are encoded as {topic.encoding!r}, not as CDR')
-        kind = message_class(topic.type_name)
-        try:
-            qos = qos_profile((topic.qos or [DEFAULT_QOS])[0])
-        except ValueError as error:
-            self.get_logger().warning(f'{topic.name} is published with default QoS, not with '
-                                      f'the recorded one: {error}')
-            qos = qos_profile(DEFAULT_QOS)
         return self.create_publisher(
-            kind, topic.name, qos,
+            message_class(topic.type_name), topic.name,
+            qos_profile((topic.qos or [DEFAULT_QOS])[0]),
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
     def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
@@ -231,12 +225,8 @@ def message_class(type_name: str) -> type:
 
 def qos_profile(recorded: Mapping[str, Any]) -> QoSProfile:
     """Return a recorded QoS.  Raises ValueError if no publisher can offer it."""
-    policies: dict[str, Any] = {}
-    for key, value in recorded.items():
-        timed = isinstance(value, Mapping)
-        number = value['sec'] * NANOSECONDS + value['nsec'] if timed else value
-        if number < 0:
-            raise ValueError(f'{key} = {number}: must be >= 0')
-        policies[key] = Duration(nanoseconds=min(number, 2 ** 63 - 1)) if timed else number
+    policies = {
+        key: Duration(nanoseconds=min(value['sec'] * NANOSECONDS + value['nsec'], 2 ** 63 - 1))
+        if isinstance(value, Mapping) else value for key, value in recorded.items()}
     policies['depth'] = min(policies['depth'], 2 ** 31 - 1) or DEFAULT_QOS['depth']
     return QoSProfile(**policies)

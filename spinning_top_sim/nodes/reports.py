@@ -26,7 +26,6 @@ class MotionReport:
         self._simulation, self._loop, self._session = simulation, loop, session
         self._speed = math.nan                  # simulated time over real time
         self._read_at, self._read_ns = time.monotonic(), 0
-        self._described: object = None          # the motion that was described last
         self.waits_for_clock = False            # whether /clock has not begun, or has stopped
 
     def diagnostics(self, stamp: Time, name: str, max_error: float) -> DiagnosticArray:
@@ -81,16 +80,6 @@ class MotionReport:
             self._speed = (now_ns - since_ns) / NANOSECONDS / elapsed
             self._read_at, self._read_ns = self._read_at + elapsed, now_ns
         return self._speed
-
-    def new_motion(self) -> str | None:
-        """Return a description of the present motion, once for each motion."""
-        simulation = self._simulation
-        if simulation.segment is self._described:
-            return None
-        self._described = simulation.segment
-        description = simulation.describe()
-        return None if description is None else '\n  '.join(
-            ['the motion:', *str(description).split('; ')])
 
     def status_line(self) -> str:
         """Return the line for the terminal, with the angle in degrees."""

@@ -80,10 +80,10 @@ class SimulationHandlers:
         return getattr(error, 'code', self._results.RESULT_OPERATION_FAILED), text
 
     def _get_simulator_features(self, _: Any, response: Any) -> None:
-        names = dict.fromkeys(name for row in FEATURES.values() for name in row)
         known = self._messages.SimulatorFeatures
-        response.features.features = sorted(
-            getattr(known, name) for name in names if hasattr(known, name))
+        response.features.features = sorted({
+            getattr(known, name) for row in FEATURES.values() for name in row
+            if hasattr(known, name)})
 
     def _state(self) -> int:
         """Return the constant of SimulationState; the caller holds the lock."""
@@ -225,12 +225,10 @@ class SimulationHandlers:
         """Raise RefusedError before the motion begins, and when the process ends."""
         with self._lock:
             quits = self._state() == self._states.STATE_QUITTING
-        try:
-            self._node.check_started()
-            if quits:
-                raise RuntimeError('the simulator is quitting')
-        except RuntimeError as error:
-            raise RefusedError(self._results.RESULT_INCORRECT_STATE, error) from error
+        error, reason = self._node.outcome(self._node.check_started)
+        if quits or error:
+            raise RefusedError(self._results.RESULT_INCORRECT_STATE,
+                               reason or 'the simulator is quitting')
 
     def _reset_simulation(self, request: Any, _: Any) -> None:
         time_and_state = request.SCOPE_TIME | request.SCOPE_STATE
@@ -272,9 +270,8 @@ class SimulationHandlers:
 
     def _get_entities_states(self, request: Any, response: Any) -> None:
         self._get_entities(request, response)
-        response.states = [self._messages.EntityState() for _ in response.entities]
-        for message in response.states:
-            self._fill_state(message)
+        response.states = [self._messages.EntityState()]
+        self._fill_state(response.states[0])
 
     def _get_entity_state(self, request: Any, response: Any) -> None:
         self._check_entity(request.entity)
@@ -283,10 +280,9 @@ class SimulationHandlers:
     def _set_entity_state(self, request: Any, _: Any) -> None:
         self._check_entity(request.entity)
         self._check_runs()
-        change = entity.changed_state(request, self._simulation.top,
-                                      self._node.values['world_frame'])
+        top, frame = self._simulation.top, self._node.values['world_frame']
         with self._lock:
-            self._loop.set_state(change)
+            self._loop.set_state(lambda now: entity.asked_state(request, top, frame, now))
         self._node.show_spin()
 
     def _get_entity_info(self, request: Any, response: Any) -> None:

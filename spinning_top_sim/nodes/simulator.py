@@ -349,11 +349,10 @@ class Simulator(Node):
     def _check_clock(self) -> None:
         """Warn when the /clock that is followed stops; say when it goes on."""
         waits = self._date.is_missing()
-        if waits and not self._report.waits_for_clock:
-            self._log.warning('waiting for /clock (use_sim_time is set)')
-        elif self._report.waits_for_clock and not waits:
-            self._log.info('/clock goes on')
-        self._report.waits_for_clock = waits
+        if waits != self._report.waits_for_clock:
+            self._report.waits_for_clock = waits
+            self._log.warning('waiting for /clock (use_sim_time is set)' if waits else
+                              '/clock goes on')
 
     def _check_recording(self) -> None:
         reason = self._session.check()
@@ -361,9 +360,6 @@ class Simulator(Node):
             self._log.error(f'recording stopped: {reason}; the simulation goes on')
 
     def _show_status(self) -> None:
-        _ = self.simulation.segment.exact
         with self.lock:
-            motion, line = self._report.new_motion(), self._report.status_line()
-        if motion and self.context.ok():        # a signal may have shut it down
-            self._log.info(motion)
+            line = self._report.status_line()
         self._terminal.show(line)
