@@ -21,7 +21,7 @@ pytest.importorskip('rclpy')
 
 import rclpy
 from helpers.node_harness import SimNode, wait_for
-from helpers.own_node import run_main
+from helpers.own_node import InThisProcess, run_main
 from mcap.writer import Writer as McapWriter
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
@@ -126,19 +126,11 @@ def test_what_is_late_is_sent_at_once_and_counted_and_later_deadlines_stay():
 
 
 def test_a_pause_shifts_what_follows_and_catches_nothing_up():
-    offsets = [0, 100, 200, 300]
-    sent, player, _ = play(messages_at(*offsets), plan={
-        150: lambda p: p.pause(True), 5_000: lambda p: p.pause(True),
-        1_000_150: lambda p: p.pause(False), 1_000_160: lambda p: p.pause(False)})
-    assert [at for _, at in sent] == [0, 100, 1_000_200, 1_000_300]
+    sent, player, _ = play(messages_at(0, 100, 200, 300), paused=True, plan={
+        1_000: lambda p: p.pause(False), 1_150: lambda p: p.pause(True),
+        5_000: lambda p: p.pause(True), 1_000_150: lambda p: p.pause(False)})
+    assert [at for _, at in sent] == [1_000, 1_100, 1_000_200, 1_000_300]
     assert player.late == 0
-
-
-def test_started_paused_nothing_goes_out_before_the_resume():
-    sent, player, _ = play(messages_at(10), paused=True, plan={
-        10_000_000: lambda p: p.pause(False)})
-    assert [at for _, at in sent] == [10_000_010]
-    assert not player.paused
 
 
 def test_a_new_rate_holds_from_its_moment_on():
@@ -243,7 +235,7 @@ class Sink:
         return 0
 
 
-class OwnReplay:
+class OwnReplay(InThisProcess):
     """A replay without an executor; `raw` are the messages by topic, in the order of `topics`."""
 
     def __init__(self, file, *options, topics=OURS, arguments=()):
@@ -256,15 +248,6 @@ class OwnReplay:
             self.node._outputs[channel] = sink
         self.node._senders = set(sinks.values())
         self.sinks = [sinks[name] for name, _ in topics]
-
-    def __enter__(self):
-        self.node.start()
-        return self
-
-    def __exit__(self, *_):
-        self.node.stop()
-        self.node.destroy_node()
-        rclpy.try_shutdown()
 
     @property
     def raw(self):

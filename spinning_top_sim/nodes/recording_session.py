@@ -37,7 +37,6 @@ class RecordingSession:
     def __init__(self, simulation: LiveSimulation, lock: FairLock,
                  topics: Callable[[Sequence[Stream]], list[Topic]]) -> None:
         self.error: str | None = None       # why the last recording stopped early or did not start
-        self.path = Path()                  # of the last recording
         self._simulation, self._lock, self._topics = simulation, lock, topics
         self._recorder: McapRecorder | None = None
         self._pending: list[tuple[Sequence[Entry], int]] = []   # while a log is being opened
@@ -79,7 +78,7 @@ class RecordingSession:
             with self._lock:
                 for messages in self._pending:
                     recorder.write_all(*messages)
-                self._recorder, self.path, self.error = recorder, recorder.path, None
+                self._recorder, self.error = recorder, None
                 self._feed(recorder.write_all, streams)
         return f'recording to {recorder.path}'
 

@@ -31,13 +31,12 @@ LATEST_NS = 500_000_000         # samples later than this are recorded, but not 
 LONGEST_LAG_NS = 1_000_000_000
 # No motion begins later than a day before the stamps end.
 LAST_EPOCH_NS = LAST_STAMP_NS - 86_400 * NANOSECONDS
-TOO_LATE = 'the seconds of a ROS stamp, an int32, end in January 2038'
 
 
 def next_epoch(date_ns: int) -> int:
     """Return the first stamp from this date on [ns] that t = 0 may have.  Raises ValueError."""
     if date_ns > LAST_EPOCH_NS:
-        raise ValueError(TOO_LATE)
+        raise ValueError('the seconds of a ROS stamp, an int32, end in January 2038')
     return -(-date_ns // EPOCH_GRID_NS) * EPOCH_GRID_NS
 
 

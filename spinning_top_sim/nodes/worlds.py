@@ -2,14 +2,13 @@
 """Scenes as worlds: parameter files with which a running node can start again."""
 
 import contextlib
+import os
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 from urllib.parse import unquote
-
-from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 
 from spinning_top_sim.nodes.simulation_standard import RefusedError
 from spinning_top_sim.streams import parameters
@@ -22,11 +21,10 @@ NOT_FOUND, UNSUPPORTED_FORMAT = 2, 101      # of Result and LoadWorld
 
 def scene_files() -> dict[str, Path]:
     """Return the installed scenes by name."""
-    folders = [Path(sys.prefix) / 'share/spinning_top_sim', Path(__file__).parents[2]]
-    # OSError: AMENT_PREFIX_PATH is not set, as in an environment of pip.
-    with contextlib.suppress(PackageNotFoundError, OSError):
-        folders.insert(0, Path(get_package_share_directory('spinning_top_sim')))
-    found = (sorted((folder / 'config').glob('*.yaml')) for folder in folders)
+    prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
+    folders = [Path(prefix, 'share/spinning_top_sim') for prefix in filter(None, prefixes)]
+    found = (sorted((folder / 'config').glob('*.yaml'))
+             for folder in (*folders, Path(__file__).parents[2]))
     return {path.stem: path for path in next(filter(None, found), ())}
 
 
