@@ -32,7 +32,7 @@ def reported():
     """A report of a paused simulation that stands at 1.25 s, and what it is about."""
     values = parameters.checked({'start_paused': True})
     simulation = LiveSimulation(values)
-    session = SimpleNamespace(error=None, warning=None, size='',
+    session = SimpleNamespace(error=None, warning=None,
                               numbers=lambda: {'recorder': 'off'}, has_room=lambda: True,
                               write_command=print, write_event=lambda *_, **__: None)
     loop = TickLoop(simulation, values, session, update_subscribers=lambda: None, tell=print)
@@ -104,9 +104,7 @@ def test_the_status_line(clock, reported):
     assert 'L3 1.6 Lz 1.386' in line and 'no subscribers yet' in line
     clock.now += 1.0
     status_of(reported)
-    reported.session.size = '1.2 MB'
     reported.loop.command(2.0, 1.0)
-    assert ' | log 1.2 MB | ' in reported.report.status_line()
     reported.simulation.outputs[0].sent = 12
     assert ' | 12 messages | ' in reported.report.status_line()
     reported.loop.resume()

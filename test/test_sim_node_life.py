@@ -219,7 +219,7 @@ def test_an_error_that_nobody_expects_stops_the_motion_loudly_until_a_reset(
     with OwnNode(tmp_path, status_period=0.05, record__enabled=True) as node:
         node.listen('pose')
         wait_for('samples', lambda: len(node.heard['pose']) > 5)
-        wait_for('a recording', lambda: node.node._session.size)
+        wait_for('a recording', lambda: node.node._session._recorder)
         owner, name = path.split('.')
         with monkeypatch.context() as patch:
             patch.setattr(getattr(node.node, owner), name, broken)

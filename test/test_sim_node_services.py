@@ -56,24 +56,18 @@ def time_in(answer):
 
 def test_a_pause_is_a_pause_and_a_resume_catches_nothing_up(peer, diagnostics, served):
     node, pose = served.node, served.pose
-    for _ in range(2):                                              # idempotent
-        answer = peer.switch(node, 'set_pause', True)
-        assert answer.success
-        assert 'paused at t = ' in answer.message
-    paused_at = answer.message
+    paused_at = peer.switch(node, 'set_pause', True).message
+    assert 'paused at t = ' in paused_at
     count = settled(pose)
-    last = stamp_of(pose.raw[-1])
-    assert peer.switch(node, 'set_pause', True).message == paused_at
+    assert peer.switch(node, 'set_pause', True).message == paused_at        # idempotent
     assert len(pose.raw) == count
-    for _ in range(2):
-        begun = time.monotonic_ns()
-        assert peer.switch(node, 'set_pause', False).success
+    begun = time.monotonic_ns()
+    assert peer.switch(node, 'set_pause', False).success
     pose.wait(count + 30)
     passed = time.monotonic_ns() - begun
     stamps = stamps_of(pose)[count - 1:]
-    assert stamps[30] - last <= passed + SECOND // 2, 'no burst'
+    assert stamps[30] - stamps[0] <= passed + SECOND // 2, 'no burst'
     # The grid goes on where it stopped.
-    assert stamps[0] == last
     assert_steps(stamps, PERIODS_NS['pose'], diagnostics.next(node)['skipped samples'])
 
 

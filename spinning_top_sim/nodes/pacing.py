@@ -18,11 +18,7 @@ BATCH_BYTES, BATCH_MESSAGES, BATCHES = 256_000, 512, 16     # read ahead
 
 
 class SimulatedClock:
-    """
-    Maps a source clock [ns] to simulated time [ns]: `scale` times as fast, with pauses.
-
-    Calls from several threads need a lock around them.
-    """
+    """Maps a source clock [ns] to simulated time [ns]: `scale` times as fast, with pauses."""
 
     def __init__(self, source: Callable[[], int], scale: float) -> None:
         self._source, self._scale = source, scale

@@ -46,10 +46,9 @@ class RecordingSession:
 
     def start(self, values: Mapping[str, Any]) -> Callable[[], str]:
         """
-        Begin to record into memory; return a function that opens the log.
+        Begin to record into memory; return a function that opens the log, before the next start.
 
-        The function returns a text with the path, or raises RecordingError and records nothing.
-        It must run before the next start.
+        It returns a text with the path, or raises RecordingError and records nothing.
         """
         if self._recorder is not None:
             path = self._recorder.path
@@ -104,10 +103,10 @@ class RecordingSession:
     def check(self) -> str | None:
         """Close a recording that has failed; return the reason."""
         recorder = self._recorder
-        if recorder is None or recorder.error is None:
-            return None
-        self.stop(recorder.error)
-        return recorder.error
+        reason = recorder.error if recorder else None
+        if reason:
+            self.stop(reason)
+        return reason
 
     def write_command(self, l3: float, lz: float) -> None:
         """Record a command that is applied now, as a message and as an event."""
@@ -139,13 +138,7 @@ class RecordingSession:
     def warning(self) -> str | None:
         """A text for the user while the disk is too slow for `record.max_loss`."""
         recorder = self._recorder
-        return None if recorder is None else recorder.warning
-
-    @property
-    def size(self) -> str:
-        """Size of the log for the user, empty without a log."""
-        recorder = self._recorder
-        return '' if recorder is None else f'{recorder.counters.bytes / 1e6:.1f} MB'
+        return recorder.warning if recorder else None
 
     def numbers(self) -> dict[str, object]:
         """Return the values for /diagnostics."""

@@ -43,10 +43,10 @@ class Replayer(Node):
         self.finished: Future = Future()    # completes with the exit code when all is played
         self._reader, self._options = log, options
         self._terminal = reports.Terminal()
-        self._log_begin_ns, self._end_ns = log.span
-        self._begin_ns = self._log_begin_ns + round(options.start * NANOSECONDS)
-        self._span_ns = self._end_ns - self._begin_ns
-        self._length_s = (self._end_ns - self._log_begin_ns) / NANOSECONDS
+        log_begin_ns, end_ns = log.span
+        self._begin_ns = log_begin_ns + round(options.start * NANOSECONDS)
+        self._span_ns = end_ns - self._begin_ns
+        self._length_s = (end_ns - log_begin_ns) / NANOSECONDS
         if self._span_ns < 0:
             raise ValueError(f'--start {options.start:g}: the log lasts {self._length_s:.3f} s')
         self._outputs = self._open_publishers()     # by channel
@@ -58,9 +58,6 @@ class Replayer(Node):
             additional_constraints=f'must be {pacing.RATES}', dynamic_typing=True))
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         if options.clock:
-            if self._end_ns > LAST_STAMP_NS:
-                raise ValueError('--clock: the log has times after January 2038, which a stamp '
-                                 'cannot be')
             clock = self.create_publisher(ClockMessage, '/clock', 10)
             self._senders.add(clock)
             self.create_timer(1.0 / max(options.clock, pacing.SLOWEST), lambda: clock.publish(
@@ -185,9 +182,8 @@ class Replayer(Node):
         number, within = divmod(self._playback.now() - self._begin_ns,
                                 self._span_ns + pacing.ROUND_GAP_NS)
         at = self._options.start + min(within, self._span_ns) / NANOSECONDS
-        percent = 100.0 * at / self._length_s if self._length_s else 100.0
         which = f' of round {number + 1}' if self._options.loop else ''
-        return f'{at:.2f} of {self._length_s:.2f} s, {percent:.0f} %{which}'
+        return f'{at:.2f} of {self._length_s:.2f} s{which}'
 
     def _show_status(self) -> None:
         self._tell_damage()

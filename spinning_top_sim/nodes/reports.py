@@ -83,15 +83,15 @@ class MotionReport:
 
     def status_line(self) -> str:
         """Return the line for the terminal, with the angle in degrees."""
-        simulation, loop, size = self._simulation, self._loop, self._session.size
+        simulation, loop = self._simulation, self._loop
         theta, sent = math.degrees(float(simulation.state().theta[0])), self._total('sent')
         flag = (' FAILED' if loop.failure else ' waiting for /clock' if self.waits_for_clock
                 else ' paused' if loop.paused else '')
         is_running = loop.state is LoopState.RUNNING and not math.isnan(self._speed)
-        # The most important parts come first: a terminal shows as many as fit.
+        # The most important parts come first: a terminal shows as much as fits.
         return ' | '.join(filter(None, (
             f't {loop.now_ns / NANOSECONDS:9.2f} s{flag}', f'theta {theta:6.2f} deg',
-            f'x{self._speed:.2f}' if is_running else '', f'log {size}' if size else '',
+            f'x{self._speed:.2f}' if is_running else '',
             f'L3 {simulation.l3:.4g} Lz {simulation.lz:.4g}', f'{sent} messages' if sent
             else 'no subscribers yet', f'dE/E {simulation.energy_drift:+.0e}')))
 

@@ -25,11 +25,7 @@ from spinning_top_sim.streams.cdr import NANOSECONDS
 
 
 def offer(node: Simulator) -> None:
-    """
-    Create the services and the action server, in the namespace of the node.
-
-    Services that the installed version of simulation_interfaces lacks are left out.
-    """
+    """Create the services that are installed, and the action server, in the node's namespace."""
     messages, services, actions = (importlib.import_module(f'simulation_interfaces.{kind}')
                                    for kind in ('msg', 'srv', 'action'))
     handlers = SimulationHandlers(node, messages, actions)
