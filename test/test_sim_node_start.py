@@ -53,14 +53,12 @@ def test_the_version_and_the_help_are_printed_and_nothing_runs(main, capfd):
 
 
 STARTS_REFUSED = {
-    'negative inertia': (['-p', 'top.lambda1:=-1.0'], ('top.lambda1', '-1.0', '> 0')),
     'nan': (['-p', 'spin.l3:=.nan'], ('spin.l3', 'nan', 'a number')),
     'pole': (['-p', 'initial.theta:=0.0', '-p', 'spin.lz:=1.0'], ('lz', '1.0', '1.6')),
     'too fast': (['-p', 'spin.l3:=1.0e20'], ('l3', '1e+20')),
     'missing file': (['--params-file', 'nowhere.yaml'], ('nowhere.yaml', 'Error opening YAML')),
     'no YAML': (['--params-file', 'bad.yaml'], ('bad.yaml', 'Error at line 1')),
     'use_sim_time': (['-p', 'use_sim_time:=perhaps'], ('use_sim_time', 'perhaps')),
-    'bad remapping': (['-r', 'pose:='], ('pose:=',)),
     'bad qos': (['-p', 'qos_overrides./pose.publisher.reliability:=often'], ('often',)),
 }
 

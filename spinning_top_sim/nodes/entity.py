@@ -81,12 +81,5 @@ def _check_pose(position: NDArray[np.float64], rotation: NDArray[np.float64]) ->
                            f'{length!r}: must be 1 (within {LENGTH_ERROR:g})')
 
 
-def describe(top: Top) -> str:
-    """Return a description of the top in words."""
-    return (f'heavy symmetric top on a fixed pivot: mass {top.mass:g} kg, centre of mass '
-            f'{top.com_distance:g} m from the pivot, moments of inertia {top.lambda1:g} and '
-            f'{top.lambda3:g} kg m^2')
-
-
 def _numbers(message: Message, names: Sequence[str]) -> NDArray[np.float64]:
     return np.array([getattr(message, name) for name in names], float)

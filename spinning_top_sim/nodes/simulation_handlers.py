@@ -284,7 +284,11 @@ class SimulationHandlers:
     def _get_entity_info(self, request: Any, response: Any) -> None:
         self._check_entity(request.entity)
         response.info.category.category = self._category
-        response.info.description = entity.describe(self._simulation.top)
+        top = self._simulation.top
+        response.info.description = (
+            f'heavy symmetric top on a fixed pivot: mass {top.mass:g} kg, centre of mass '
+            f'{top.com_distance:g} m from the pivot, moments of inertia {top.lambda1:g} and '
+            f'{top.lambda3:g} kg m^2')
         response.info.tags = list(entity.TAGS)
 
     def _filled(self, message: Any, world: World) -> Any:
