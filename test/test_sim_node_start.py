@@ -101,7 +101,7 @@ def test_a_run_tells_where_its_log_is(main, monkeypatch, tmp_path):
     path = the_log(tmp_path)
     assert len(log_of(path)[0]['/pose']) == 31
     assert f'recording to {path}' in run.err
-    assert ' s | theta' in run.out and '\x1b' not in run.out and '\r' not in run.out
+    assert ' s | cusps | theta' in run.out and '\x1b' not in run.out and '\r' not in run.out
 
 
 # ----------------------------------------------------------- values that are given twice

@@ -25,6 +25,8 @@ class MotionReport:
                  session: RecordingSession) -> None:
         self._simulation, self._loop, self._session = simulation, loop, session
         self._speed = math.nan                  # simulated time over real time
+        self._described: object = None          # the segment that `_regime` names
+        self._regime = ''
         self._read_at, self._read_ns = time.monotonic(), 0
         self.waits_for_clock = False            # whether /clock has not begun, or has stopped
 
@@ -84,13 +86,16 @@ class MotionReport:
     def status_line(self) -> str:
         """Return the line for the terminal, with the angle in degrees."""
         simulation, loop = self._simulation, self._loop
+        if simulation.segment is not self._described:
+            self._described, motion = simulation.segment, simulation.describe()
+            self._regime = motion.name if motion else ''
         theta, sent = math.degrees(float(simulation.state().theta[0])), self._total('sent')
         flag = (' FAILED' if loop.failure else ' waiting for /clock' if self.waits_for_clock
                 else ' paused' if loop.paused else '')
         is_running = loop.state is LoopState.RUNNING and not math.isnan(self._speed)
         # The most important parts come first: a terminal shows as much as fits.
         return ' | '.join(filter(None, (
-            f't {loop.now_ns / NANOSECONDS:9.2f} s{flag}', f'theta {theta:6.2f} deg',
+            f't {loop.now_ns / NANOSECONDS:9.2f} s{flag}', self._regime, f'theta {theta:6.2f} deg',
             f'x{self._speed:.2f}' if is_running else '',
             f'L3 {simulation.l3:.4g} Lz {simulation.lz:.4g}', f'{sent} messages' if sent
             else 'no subscribers yet', f'dE/E {simulation.energy_drift:+.0e}')))
