@@ -15,11 +15,10 @@ from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse
 
-from spinning_top_sim.nodes import entity, worlds
+from spinning_top_sim.nodes import entity
 from spinning_top_sim.nodes.simulation_standard import FEATURES, RefusedError, service_name
 from spinning_top_sim.nodes.simulator import Simulator
 from spinning_top_sim.nodes.tick_loop import LoopState
-from spinning_top_sim.nodes.worlds import World
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 
@@ -53,7 +52,6 @@ class SimulationHandlers:
         self._results, self._states = messages.Result, messages.SimulationState
         self._name = node.get_name()            # of the entity
         self._category = messages.EntityCategory.CATEGORY_ROBOT
-        self._world: World | None = None        # the world that was loaded last
         self._pause_at_start = -1               # `loop.interruptions` when PAUSED was set at t = 0
         self._quits = self._steps = False
 
@@ -290,44 +288,6 @@ class SimulationHandlers:
             f'{top.com_distance:g} m from the pivot, moments of inertia {top.lambda1:g} and '
             f'{top.lambda3:g} kg m^2')
         response.info.tags = list(entity.TAGS)
-
-    def _filled(self, message: Any, world: World) -> Any:
-        """Return a WorldResource that describes a world."""
-        message.name, message.world_resource.uri = world.name, world.uri
-        message.world_resource.resource_string = '' if world.uri else world.text
-        return message
-
-    def _get_available_worlds(self, request: Any, response: Any) -> None:
-        if request.filter.tags or request.additional_sources:
-            raise self._unsupported('filter.tags and additional_sources must be empty')
-        for world in worlds.scenes():
-            response.worlds.append(self._filled(self._messages.WorldResource(), world))
-
-    def _load_world(self, request: Any, response: Any) -> str:
-        resource = request.world_resource
-        if not (resource.uri or resource.resource_string):
-            raise RefusedError(response.NO_RESOURCE, 'uri and resource_string are empty: one of '
-                               'them must be a world')
-        try:
-            world = (World.read(resource.uri) if resource.uri
-                     else World.parse(resource.resource_string))
-            values = world.values(self._node.values)
-        except ValueError as error:
-            raise RefusedError(response.RESOURCE_PARSE_ERROR, error) from error
-        ignored = (f'not used, as no parameters that a running node can change: '
-                   f'{", ".join(world.ignored)}' if world.ignored else '')
-        if ignored and request.fail_on_unsupported_element:
-            raise RefusedError(response.UNSUPPORTED_ELEMENTS, ignored)
-        self._check_runs()
-        self._node.start_again(values, paused=True)
-        self._world = world
-        self._filled(response.world, world)
-        return ignored
-
-    def _get_current_world(self, _: Any, response: Any) -> None:
-        if self._world is None:
-            raise RefusedError(response.NO_WORLD_LOADED, 'no world has been loaded')
-        self._filled(response.world, self._world)
 
 
 @types.coroutine

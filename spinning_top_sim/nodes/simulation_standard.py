@@ -17,9 +17,6 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
     'GetEntityState': ('ENTITY_STATE_GETTING',),
     'SetEntityState': ('ENTITY_STATE_SETTING',),
     'GetEntityInfo': ('ENTITY_INFO_GETTING',),
-    'GetAvailableWorlds': ('AVAILABLE_WORLDS',),
-    'LoadWorld': ('WORLD_LOADING', 'WORLD_RESOURCE_STRING'),
-    'GetCurrentWorld': ('WORLD_INFO_GETTING',),
 }
 
 
