@@ -45,11 +45,12 @@ class McapWriter:
 
     def __init__(self, path: Path, *, header: bytes, compression: str) -> None:
         self._path = path
-        self._compression = compression
         self._chunk = PlainChunk(compression)       # of messages that come one by one
         # Chunks of rows: one is filled while the others are compressed.
         self._spare_chunks: queue.SimpleQueue[PlainChunk] = queue.SimpleQueue()
-        self._pool: ThreadPoolExecutor | None = None
+        for _ in range(_COMPRESSING + 1):
+            self._spare_chunks.put(PlainChunk(compression))
+        self._pool = ThreadPoolExecutor(_COMPRESSING, 'chunks')     # has no threads before rows
         self._queued = _NOTHING                     # the last chunk of rows
 
         self.message_counts: dict[int, int] = {}    # messages in the file by channel id
@@ -132,10 +133,6 @@ class McapWriter:
         the order in which they came.  This waits while both are busy, and raises the OSError of
         an earlier chunk.
         """
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(_COMPRESSING, 'chunks')
-            for _ in range(_COMPRESSING + 1):
-                self._spare_chunks.put(PlainChunk(self._compression))
         if self._queued.done():
             self._wait()
         if self._chunk.size:
@@ -194,22 +191,17 @@ class McapWriter:
             raise OSError(f'{free} bytes are free on the disk, fewer than min_free_bytes = '
                           f'{min_free_bytes}')
 
-    def finish(self, *, bag: bool = True, file_name: str = '') -> None:
-        """
-        Write the summary, bring all to the disk and close the file.
-
-        bag : whether to write a `rosbag2` record, which names `file_name`, default: this file
-        """
+    def finish(self, *, bag: bool = True) -> None:
+        """Write the `rosbag2` record and the summary, bring all to the disk, close the file."""
         try:
-            if self._pool is not None:
-                self._pool.shutdown()
+            self._pool.shutdown()
             if bag:
                 topics = [(channel, self._type_names.get(channel.schema_id, ''),
                            self.message_counts[channel.id])
                           for channel in self._channels.values()]
                 self.write(records.Metadata(BAG_METADATA, {
                     'serialized_metadata': bag_metadata_yaml(
-                        topics, file_name=file_name or self._path.name, start_ns=self._start_ns,
+                        topics, file_name=self._path.name, start_ns=self._start_ns,
                         end_ns=self._end_ns)}))
             self._write([record_bytes(records.DataEnd(self._end[1]))])
             self._write([self._summary()])
@@ -220,7 +212,6 @@ class McapWriter:
 
     def _queue(self, chunk: PlainChunk) -> None:
         """Have a chunk compressed in a thread, and written after those queued before."""
-        assert self._pool is not None
         self._queued = self._pool.submit(self._write_in_turn, chunk, self._queued)
 
     def _wait(self) -> None:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from spinning_top_sim.recording.errors import RecordingError, no_place_in
+from spinning_top_sim.recording.errors import RecordingError, why_not_written
 from spinning_top_sim.recording.provenance import version
 from spinning_top_sim.recording.rosbag2 import RecordedTopic, find_definition, offered_qos_yaml
 
@@ -184,7 +184,7 @@ class McapRecorder:
             self.state = 'closed'
         except Exception as error:  # whatever it is, the simulation goes on without a log
             self._accepting = False
-            self.error = f'recording to {self.path} stopped: {_reason(error)}'
+            self.error = f'recording to {self.path} stopped: {why_not_written(self.path, error)}'
             self._queue.clear()
             self._bytes_out = self._bytes_in
             self._taken.set()
@@ -287,18 +287,6 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
                               'topic_type_hash': definitions[topic.type_name].type_hash}))
             file.sync()
             sync_directory(path.parent)
-    except FileExistsError as error:
-        raise RecordingError(f'cannot record to {path}: it exists, and a recording '
-                             'overwrites nothing') from error
-    except FileNotFoundError as error:
-        raise RecordingError(f'cannot record to {path}: {no_place_in(path.parent)}') from error
     except (OSError, ValueError) as error:
-        raise RecordingError(f'cannot record to {path}: {_reason(error)}') from error
+        raise RecordingError(f'cannot record to {path}: {why_not_written(path, error)}') from error
     return file
-
-
-def _reason(error: Exception) -> str:
-    """Return what went wrong, without the path that OSError adds."""
-    if isinstance(error, OSError):
-        return error.strerror or str(error)
-    return f'{type(error).__name__}: {error}'
