@@ -6,7 +6,6 @@ The files are built record by record with mcap's record classes.
 """
 
 import os
-import signal
 import struct
 import subprocess
 import sys
@@ -25,7 +24,6 @@ from mcap.records import (
     Attachment,
     Channel,
     Chunk,
-    ChunkIndex,
     DataEnd,
     Footer,
     Header,
@@ -33,7 +31,6 @@ from mcap.records import (
     MessageIndex,
     Metadata,
     Schema,
-    Statistics,
 )
 from mcap.writer import MCAP0_MAGIC
 from test_recover import (
@@ -169,30 +166,6 @@ def test_a_chunk_that_holds_more_than_it_says_is_not_believed(tmp_path):
     path.write_bytes(closed(HEADER, RAW_CHANNEL, record_bytes(chunk)))
     with LogReader(path) as reader:
         assert not list(reader.messages()) and reader.damage.lost_chunks == 1
-
-
-def test_a_chunk_that_is_indexed_twice_is_read_once(tmp_path, monkeypatch):
-    """Also where the statistics count it twice."""
-    path = tmp_path / 'a.mcap'
-    for chunk_count in (1, 2):
-        start = MCAP0_MAGIC + HEADER + RAW_CHANNEL
-        chunk = chunk_of(message(5, b'x'))
-        index = record_bytes(MessageIndex(1, [(5, 0)]))
-        data = start + chunk + index
-        data += record_bytes(DataEnd(0))
-        chunk_index = record_bytes(ChunkIndex(
-            chunk_length=len(chunk), chunk_start_offset=len(start), compression='',
-            compressed_size=32, message_end_time=5, message_start_time=5,
-            message_index_length=len(index), uncompressed_size=32,
-            message_index_offsets={1: len(start) + len(chunk)}))
-        statistics = record_bytes(Statistics(
-            attachment_count=0, channel_count=1, channel_message_counts={1: 1},
-            chunk_count=chunk_count, message_count=1, message_end_time=5, message_start_time=5,
-            metadata_count=0, schema_count=0))
-        path.write_bytes(b''.join([
-            data, RAW_CHANNEL, statistics, chunk_index, chunk_index,
-            record_bytes(Footer(len(data), 0, 0)), MCAP0_MAGIC]))
-        assert seen_by_us(path) == [('/a', 5, b'x')]
 
 
 def test_a_whole_log_is_read_by_its_indexes(tmp_path, monkeypatch):
@@ -545,31 +518,3 @@ def test_the_output_has_the_mode_of_the_log(tmp_path):
     write_log(path)
     path.chmod(0o400)
     assert recover(path).stat().st_mode & 0o777 == 0o400
-
-
-def test_a_signal_leaves_nothing_behind(tmp_path):
-    """test_recover.py has Ctrl-C."""
-    path = tmp_path / 'a.mcap'
-    write_log(path)
-    child = subprocess.Popen(
-        [sys.executable, '-c',
-         'import sys, time\n'
-         'from spinning_top_sim.recording.mcap_writer import McapWriter\n'
-         'from spinning_top_sim.tools.recover import main\n'
-         'def finish(self, **options):\n'
-         '    print("ready", flush=True)\n'
-         '    time.sleep(60)\n'
-         'McapWriter.finish = finish\n'
-         f'sys.exit(main([{str(path)!r}]))'],
-        env=os.environ | {'PYTHONPATH': str(ROOT)}, stdout=subprocess.PIPE, text=True)
-    try:
-        assert child.stdout.readline() == 'ready\n'
-        assert len(list(tmp_path.iterdir())) == 2
-        child.send_signal(signal.SIGTERM)
-        assert child.wait(timeout=20) == 143
-    finally:
-        child.kill()
-        child.communicate()
-    assert [item.name for item in tmp_path.iterdir()] == ['a.mcap']
-
-

@@ -43,7 +43,7 @@ class McapWriter:
     compression : of the chunks, 'zstd', 'lz4' or 'none'
     """
 
-    def __init__(self, path: Path, *, header: bytes, compression: str) -> None:
+    def __init__(self, path: Path, *, header: records.Header, compression: str) -> None:
         self._path = path
         self._chunk = PlainChunk(compression)       # of messages that come one by one
         # Chunks of rows: one is filled while the others are compressed.
@@ -55,7 +55,7 @@ class McapWriter:
 
         self.message_counts: dict[int, int] = {}    # messages in the file by channel id
         self.chunk_count = 0
-        self._start_ns = self._end_ns = 0           # earliest and latest stamp; 0 without messages
+        self._times_ns: list[int] = []              # earliest and latest stamp of each chunk
         self._end = 0, 0    # size and checksum of the file; one assignment, so always consistent
         self._next_sequence: dict[int, int] = {}
         self._type_names: dict[int, str] = {}       # by schema id
@@ -67,12 +67,17 @@ class McapWriter:
 
         self._file = open(path, 'xb', buffering=0)  # noqa: SIM115
         with self.discarded_on_failure():
-            self._write([MCAP0_MAGIC, header])
+            self._write([MCAP0_MAGIC, record_bytes(header)])
 
     @property
     def size(self) -> int:
         """Size of the file, all of it whole records [bytes]."""
         return self._end[0]
+
+    @property
+    def messages(self) -> int:
+        """Number of messages in the file."""
+        return sum(self.message_counts.values())
 
     @contextlib.contextmanager
     def discarded_on_failure(self) -> Iterator[None]:
@@ -169,10 +174,7 @@ class McapWriter:
         self._summary_records[Opcode.CHUNK_INDEX].append(chunk_index)
         self.chunk_count += 1
         if indexes:
-            empty = not any(self.message_counts.values())
-            start_ns = chunk.message_start_time
-            self._start_ns = start_ns if empty else min(self._start_ns, start_ns)
-            self._end_ns = max(self._end_ns, chunk.message_end_time)
+            self._times_ns += chunk.message_start_time, chunk.message_end_time
             for channel_id in indexes:
                 self.message_counts[channel_id] += len(entries[channel_id]) // 2
 
@@ -201,8 +203,9 @@ class McapWriter:
                           for channel in self._channels.values()]
                 self.write(records.Metadata(BAG_METADATA, {
                     'serialized_metadata': bag_metadata_yaml(
-                        topics, file_name=self._path.name, start_ns=self._start_ns,
-                        end_ns=self._end_ns)}))
+                        topics, file_name=self._path.name,
+                        start_ns=min(self._times_ns, default=0),
+                        end_ns=max(self._times_ns, default=0))}))
             self._write([record_bytes(records.DataEnd(self._end[1]))])
             self._write([self._summary()])
             self.sync()
@@ -234,11 +237,12 @@ class McapWriter:
         """Return the summary section, the footer and the closing magic."""
         groups = self._summary_records
         groups[Opcode.STATISTICS] = [record_bytes(records.Statistics(
-            message_count=sum(self.message_counts.values()),
+            message_count=self.messages,
             schema_count=len(groups[Opcode.SCHEMA]), channel_count=len(groups[Opcode.CHANNEL]),
             attachment_count=len(groups[Opcode.ATTACHMENT_INDEX]),
             metadata_count=len(groups[Opcode.METADATA_INDEX]), chunk_count=self.chunk_count,
-            message_start_time=self._start_ns, message_end_time=self._end_ns,
+            message_start_time=min(self._times_ns, default=0),
+            message_end_time=max(self._times_ns, default=0),
             channel_message_counts=self.message_counts))]
         summary = bytearray()
         offsets = bytearray()

@@ -3,38 +3,25 @@
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from mcap.opcode import Opcode
 from mcap.records import Chunk, Header, Metadata
 
-from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.errors import LogError, why_not_written
-from spinning_top_sim.recording.mcap_writer import McapWriter, record_bytes
+from spinning_top_sim.recording.mcap_writer import McapWriter
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA
 from spinning_top_sim.recording.scan import Part, Scan
 
 
-@dataclass(frozen=True)
-class Recovered:
-    """What a recovery wrote."""
-
-    path: Path
-    bytes: int
-    messages: int
-    chunks: int
-    damage: Damage  # of the old file
-
-
 def recover(reader: LogReader, output: str | os.PathLike[str],
-            progress: Callable[[int, int], None] = lambda done, total: None) -> Recovered:
+            progress: Callable[[float], object] = lambda done: None) -> McapWriter:
     """
-    Write everything that can be decoded of a log into a new file.
+    Write everything that can be decoded of a log into a new file; return what has written it.
 
     output : must not exist; is removed again where the recovery fails
-    progress : is called with the number of bytes that are done, and that of all
+    progress : is called with the number of bytes that are done
 
     Chunks of messages are copied as they are, other messages are put into new chunks; message
     indexes, statistics, summary and the `rosbag2` record are made anew.
@@ -48,15 +35,14 @@ def recover(reader: LogReader, output: str | os.PathLike[str],
 
 
 def _recover(reader: LogReader, output: Path,
-             progress: Callable[[int, int], None]) -> Recovered:
-    size = reader.size
-    writer = McapWriter(output, header=record_bytes(Header(reader.profile, reader.library)),
+             progress: Callable[[float], object]) -> McapWriter:
+    writer = McapWriter(output, header=Header(reader.profile, reader.library),
                         compression='zstd')
     with writer.discarded_on_failure():
-        scan = reader.scan(lambda offset: progress(offset // 2, size))
+        scan = reader.scan(lambda offset: progress(offset / 2))
         declared = False
         for part in scan.parts:
-            progress((size + part.offset) // 2, size)
+            progress((reader.size + part.offset) / 2)
             if part.channel_ids:
                 if not declared:        # channels stand before the messages, metadata as it stood
                     _declare(scan, writer)
@@ -67,13 +53,12 @@ def _recover(reader: LogReader, output: Path,
         writer.write_chunk()
         if not declared:
             _declare(scan, writer)
-        messages = sum(writer.message_counts.values())
-        if not messages and not reader.whole:
+        if not writer.messages and not reader.whole:
             raise LogError(f'nothing to save in {reader.path}: there is no whole message in it')
         os.chmod(output, reader.file.mode)
         writer.finish(bag=reader.profile == 'ros2' or BAG_METADATA in scan.metadata)
-    progress(size, size)
-    return Recovered(output, writer.size, messages, writer.chunk_count, scan.damage)
+    progress(reader.size)
+    return writer
 
 
 def _declare(scan: Scan, writer: McapWriter) -> None:

@@ -25,7 +25,7 @@ from spinning_top_sim.recording.rosbag2 import RecordedTopic, find_definition, o
 try:
     from mcap.records import Channel, Header, Metadata, Schema
 
-    from spinning_top_sim.recording.mcap_writer import McapWriter, record_bytes, sync_directory
+    from spinning_top_sim.recording.mcap_writer import McapWriter, sync_directory
 except ImportError as error:
     raise RecordingError(
         f'recording needs the Python package mcap with zstandard and lz4: {error}') from error
@@ -268,23 +268,22 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f'topic {name!r} is listed twice: once is allowed')
-    definitions = {
+    definitions = {     # text and type hash
         name: find_definition(name) for name in dict.fromkeys(topic.type_name for topic in topics)}
     try:
         header = Header(profile='ros2', library=OUR_LIBRARY + version('spinning_top_sim'))
-        file = McapWriter(path, header=record_bytes(header), compression=compression)
+        file = McapWriter(path, header=header, compression=compression)
         with file.discarded_on_failure():
             file.check_disk(min_free_bytes)
             file.write(Metadata(METADATA_NAME, dict(metadata)))
-            for number, (name, definition) in enumerate(definitions.items(), start=1):
-                file.write(Schema(
-                    id=number, name=name, encoding='ros2msg', data=definition.text.encode()))
+            for number, (name, (text, _)) in enumerate(definitions.items(), start=1):
+                file.write(Schema(id=number, name=name, encoding='ros2msg', data=text.encode()))
             for number, topic in enumerate(topics, start=1):
                 file.write(Channel(
                     id=number, topic=topic.name, message_encoding='cdr',
                     schema_id=1 + list(definitions).index(topic.type_name),
                     metadata={'offered_qos_profiles': offered_qos_yaml(topic),
-                              'topic_type_hash': definitions[topic.type_name].type_hash}))
+                              'topic_type_hash': definitions[topic.type_name][1]}))
             file.sync()
             sync_directory(path.parent)
     except (OSError, ValueError) as error:
