@@ -31,7 +31,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Channel as ChannelRecord
-from mcap.records import Chunk, Message, MessageIndex, SummaryOffset
+from mcap.records import Chunk, DataEnd, Message, MessageIndex, SummaryOffset
 from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Qos, QosHistory, QosReliability
@@ -146,44 +146,27 @@ def test_rosbags_reads_every_message(tmp_path, compression, default_typestore):
             assert value == number
 
 
-def test_all_checksums_and_indexes_are_there(tmp_path):
-    record(tmp_path / 'run.mcap', some_messages(20_000))
-    with open(tmp_path / 'run.mcap', 'rb') as file:
-        summary = make_reader(file, validate_crcs=True).get_summary()
-        file.seek(0)
-        records = list(StreamReader(file, emit_chunks=True, validate_crcs=True).records)
-    end = next(item for item in records if type(item).__name__ == 'DataEnd')
-    footer = records[-1]
+def test_checksums_are_there_and_indexes_lead_to_the_messages(tmp_path):
+    """Chunk index -> message index -> message, by the offsets, as rosbag2 goes."""
+    path = tmp_path / 'run.mcap'
+    record(path, some_messages(20_000), max_loss=60.0)
+    content = path.read_bytes()
+    records = list(StreamReader(io.BytesIO(content), emit_chunks=True, validate_crcs=True).records)
+    summary = make_reader(io.BytesIO(content), validate_crcs=True).get_summary()
+    (end,) = (item for item in records if isinstance(item, DataEnd))
     assert end.data_section_crc != 0
-    content = (tmp_path / 'run.mcap').read_bytes()
-    assert footer.summary_crc == zlib.crc32(content[footer.summary_start:-12])
+    assert records[-1].summary_crc == zlib.crc32(content[records[-1].summary_start:-12])
     assert summary.statistics.message_start_time == EPOCH_NS
     assert summary.statistics.message_end_time == EPOCH_NS + 19_999 * 1_000_000
     for group in (item for item in records if isinstance(item, SummaryOffset)):
         assert content[group.group_start] == group.group_opcode
         assert content[group.group_start + group.group_length] in SUMMARY_OPCODES
-    chunks = [item for item in records if isinstance(item, Chunk)]
-    assert len(chunks) > 1
-    assert summary.statistics.chunk_count == len(chunks) == len(summary.chunk_indexes)
-    for chunk, index in zip(chunks, summary.chunk_indexes, strict=True):
-        assert chunk.uncompressed_crc != 0
-        assert chunk.uncompressed_size <= CHUNK_BYTES + 200
-        assert index.message_index_length > 0
-        breakup_chunk(chunk, validate_crc=True)
-
-
-def test_message_indexes_lead_to_the_messages(tmp_path):
-    """Chunk index -> message index -> message, by the offsets, as rosbag2 goes."""
-    path = tmp_path / 'run.mcap'
-    record(path, some_messages(20_000), max_loss=60.0)
-    with open(path, 'rb') as file:
-        summary = make_reader(file).get_summary()
-    content = path.read_bytes()
-    assert len(summary.chunk_indexes) > 1
+    assert summary.statistics.chunk_count == len(summary.chunk_indexes) > 1
     found = []
     for chunk_index in summary.chunk_indexes:
-        start = chunk_index.chunk_start_offset
-        plain = get_chunk_data_stream(record_at(content, start, Chunk))[0].read(2 * CHUNK_BYTES)
+        chunk = record_at(content, chunk_index.chunk_start_offset, Chunk)
+        assert chunk.uncompressed_crc != 0 and chunk.uncompressed_size <= CHUNK_BYTES + 200
+        plain = get_chunk_data_stream(chunk, validate_crc=True)[0].read(2 * CHUNK_BYTES)
         assert sorted(chunk_index.message_index_offsets) == [1, 2]
         for channel_id, offset in chunk_index.message_index_offsets.items():
             index = record_at(content, offset, MessageIndex)
@@ -703,20 +686,6 @@ def test_a_sync_that_hangs_does_not_hang_the_end(tmp_path, slow_disk):
     assert is_indexed(recorder.close(timeout=PATIENCE_S).path)
 
 
-@pytest.mark.parametrize(('what', 'when'), [('file', 'recording'), ('folder', 'closing')])
-def test_a_log_that_is_deleted_is_an_error(tmp_path, what, when):
-    path = tmp_path / 'logs' / 'run.mcap'
-    path.parent.mkdir()
-    recorder = McapRecorder(path, TOPICS, METADATA, min_free_bytes=0,
-                                 max_loss=0.02 if when == 'recording' else 60.0)
-    recorder.write(0, 1, pose_cdr(1))
-    path.unlink() if what == 'file' else shutil.rmtree(path.parent)
-    if when == 'recording':
-        eventually(lambda: recorder.state == 'failed')
-    assert recorder.close().error == f'recording to {path} stopped: the file was deleted'
-    assert recorder.state == 'failed'
-
-
 # Disks that fail
 
 @pytest.fixture
@@ -758,35 +727,38 @@ def test_a_full_disk_stops_the_recording_and_costs_what_is_not_written(
     assert numbers_in(path) == list(range(kept)) and summary.bytes == path.stat().st_size
 
 
-def test_a_failing_disk_stops_the_recording(tmp_path, monkeypatch):
-    recorder = McapRecorder(
-        tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02, min_free_bytes=0)
-    monkeypatch.setattr(os, 'fsync', refuse_to_sync)
-    for message in some_messages(50):
-        recorder.write(*message)
-    eventually(lambda: recorder.state == 'failed')
-    assert recorder.error == (
-        f'recording to {tmp_path / "run.mcap"} stopped: Input/output error')
-    recorder.write(0, 0, b'late')
-    assert recorder.room
-    assert recorder.close().error == recorder.error
-    assert recorder.counters.lost + recorder.counters.messages == 51
-    assert len(complete_messages(tmp_path / 'run.mcap')) == recorder.counters.messages
+FAULTS = {
+    'the file was deleted': lambda path, patch: path.unlink(),
+    'the file was deleted ': lambda path, patch: shutil.rmtree(path.parent),
+    'Input/output error': lambda path, patch: patch.setattr(os, 'fsync', refuse_to_sync),
+    '0 bytes are free on the disk, fewer than min_free_bytes = 1': lambda path, patch: (
+        patch.setattr(os, 'fstatvfs', lambda _: SimpleNamespace(f_bavail=0, f_frsize=4096))),
+}
 
 
-def test_a_disk_that_runs_short_stops_the_recording_in_good_order(tmp_path, monkeypatch):
-    recorder = McapRecorder(
-        tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02, min_free_bytes=1)
-    monkeypatch.setattr(os, 'fstatvfs', lambda fd: SimpleNamespace(f_bavail=0, f_frsize=4096))
-    recorder.write(0, 7, pose_cdr(7))
+@pytest.mark.parametrize('reason', FAULTS)
+def test_a_fault_stops_the_recording_with_its_reason(tmp_path, monkeypatch, reason):
+    path = tmp_path / 'logs' / 'run.mcap'
+    path.parent.mkdir()
+    recorder = McapRecorder(path, TOPICS, METADATA, max_loss=0.02, min_free_bytes=1)
+    recorder.write(0, 0, pose_cdr(0))
+    FAULTS[reason](path, monkeypatch)
+    recorder.write(0, 1, pose_cdr(1))
     eventually(lambda: recorder.state == 'failed')
-    assert recorder.error == (
-        f'recording to {tmp_path / "run.mcap"} stopped: '
-        '0 bytes are free on the disk, fewer than min_free_bytes = 1')
+    recorder.write(0, 2, b'late')
     summary = recorder.close()
-    assert (is_indexed(summary.path), summary.lost) == (True, 0)
-    with Reader(tmp_path / 'run.mcap') as reader:
-        assert [stamp for _, stamp, _ in reader.messages()] == [7]
+    assert recorder.error == summary.error == f'recording to {path} stopped: {reason.strip()}'
+    assert recorder.room and summary.messages + summary.lost == 3 and summary.lost >= 1
+    if path.exists():
+        assert is_indexed(path) and numbers_in(path) == list(range(summary.messages))
+
+
+def test_a_message_that_cannot_be_packed_is_no_exception_for_the_simulation(tmp_path):
+    recorder = McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+    recorder.write(0, -1, b'')
+    summary = recorder.close()
+    assert recorder.state == 'failed' and 'stopped: error:' in (summary.error or '')
+    assert (is_indexed(summary.path), summary.lost) == (True, 1)
 
 
 def test_an_interrupted_write_shifts_nothing(tmp_path, monkeypatch):
@@ -816,14 +788,5 @@ def test_an_interrupted_write_shifts_nothing(tmp_path, monkeypatch):
         stream.seek(0)
         assert len(list(make_reader(stream, validate_crcs=True).iter_messages())) == 100
     assert len(complete_messages(path)) == 100
-
-
-def test_a_message_that_cannot_be_packed_is_no_exception_for_the_simulation(tmp_path):
-    recorder = McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
-    recorder.write(0, -1, b'')
-    summary = recorder.close()
-    assert recorder.state == 'failed'
-    assert 'stopped: error:' in (summary.error or '')
-    assert (is_indexed(summary.path), summary.lost) == (True, 1)
 
 
