@@ -277,6 +277,22 @@ def test_a_summary_behind_a_damaged_end_of_the_data_is_no_data(tmp_path, truncat
         assert len(list(make_reader(file).iter_attachments())) == 1
 
 
+@pytest.mark.parametrize('zeros', [9, (1 << 16) - 5])
+def test_the_search_finds_every_kind_of_record(tmp_path, zeros):
+    """Also across two blocks, and behind a chunk of a wild size; truncated metadata are lost."""
+    path = tmp_path / 'a.mcap'
+    note = record_bytes(Metadata('note', {'a': 'b'}))
+    wild = bytearray(zstd_chunk(message(5, b'x')))
+    struct.pack_into('<Q', wild, 9 + 16, 1 << 62)
+    parts = (bytes(wild), SCHEMA, CHANNEL, note, chunk_of(message(5, b'1')),
+             zstd_chunk(message(6, b'2')) + note[:-1])
+    path.write_bytes(MCAP0_MAGIC + HEADER + b''.join(bytes(zeros) + part for part in parts))
+    with LogReader(path) as reader:
+        assert [message.data for message in reader.messages()] == [b'1', b'2']
+        assert (reader.metadata, reader.topics[0].type_name) == ({'note': {'a': 'b'}}, 'thing')
+        assert reader.damage.lost_bytes == 6 * zeros + len(wild) + len(note) - 1
+
+
 def test_a_channel_without_its_schema_is_not_written(tmp_path):
     """Readers refuse the whole file for it; schema 0 means that there is none."""
     path = tmp_path / 'a.mcap'

@@ -105,9 +105,8 @@ class McapWriter:
         elif isinstance(record, records.Attachment):
             self._summary_records[Opcode.ATTACHMENT_INDEX].append(
                 record_bytes(records.AttachmentIndex(
-                    offset=offset, length=len(raw), log_time=record.log_time,
-                    create_time=record.create_time, data_size=len(record.data), name=record.name,
-                    media_type=record.media_type)))
+                    offset, len(raw), record.log_time, record.create_time, len(record.data),
+                    record.name, record.media_type)))
         elif isinstance(record, records.Schema):
             self._type_names[record.id] = record.name
             self._summary_records[Opcode.SCHEMA].append(raw)
