@@ -51,14 +51,14 @@ def _run(arguments: argparse.Namespace) -> int:
     output: Path = arguments.output or log.parent / f'{log.stem}_recovered.mcap'
     with LogReader(log) as reader, cli.progress(
             'recovered', reader.size, 'bytes', quiet=reader.size < PROGRESS_BYTES) as show:
-        recovered = recover(reader, output, lambda done, total: show(done))
-    lossless = recovered.damage.lossless
-    for line in recovered.damage.lines():
+        recovered = recover(reader, output, show)
+    damage = reader.damage
+    for line in damage.lines():
         cli.print_line(line)
-    cli.print_line(f'kept{" all" * lossless}: {count(recovered.messages, "message")} in '
-               f'{count(recovered.chunks, "chunk")}, {count(recovered.bytes, "byte")} in '
-               f'{recovered.path}')
-    return cli.OK if lossless else SOME_LOST
+    cli.print_line(f'kept{" all" * damage.lossless}: {count(recovered.messages, "message")} in '
+                   f'{count(recovered.chunk_count, "chunk")}, {count(recovered.size, "byte")} in '
+                   f'{output}')
+    return cli.OK if damage.lossless else SOME_LOST
 
 
 if __name__ == '__main__':

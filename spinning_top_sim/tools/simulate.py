@@ -184,7 +184,7 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
             file.write_chunk()
         finally:
             file.finish()
-    return f'{sum(file.message_counts.values())} messages, {file.size / 1e6:.1f} MB'
+    return f'{file.messages} messages, {file.size / 1e6:.1f} MB'
 
 
 class Table(Stream):
