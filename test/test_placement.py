@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.placement import POLE, Box, state_of
+from spinning_top_sim.physics.placement import POLE, state_of
 from spinning_top_sim.physics.top import Shape, State, Top
 from spinning_top_sim.solvers.propagator import propagate
 
@@ -59,11 +59,11 @@ def test_at_a_pole_what_is_not_spin_is_nutation(tilt, inverted, rates):
 @pytest.mark.parametrize('distance', [0.15, 0.0, -0.4])
 def test_the_box_holds_the_body_the_pivot_and_the_tip(distance):
     top = Top(lambda1=0.5, lambda3=0.15, mass=2.0, com_distance=distance, gravity=9.8)
-    box, shape = Box.of(top), Shape(top)
-    assert box.upper[:2].tolist() == (-box.lower[:2]).tolist() == 2 * [shape.radius]
+    shape = Shape(top)
+    assert shape.upper[:2] == tuple(-x for x in shape.lower[:2]) == 2 * (shape.radius,)
     for height in (0.0, shape.tip, shape.centre - shape.height / 2,
                    shape.centre + shape.height / 2):
-        assert box.lower[2] <= height <= box.upper[2]
-    assert {*box.lower, *box.upper} <= {
+        assert shape.lower[2] <= height <= shape.upper[2]
+    assert {*shape.lower, *shape.upper} <= {
         -shape.radius, shape.radius, 0.0, shape.tip, shape.centre - shape.height / 2,
         shape.centre + shape.height / 2}

@@ -16,7 +16,7 @@ from rclpy.serialization import deserialize_message
 
 from spinning_top_sim.nodes.entity import is_found
 from spinning_top_sim.nodes.simulation_standard import UnsupportedError
-from spinning_top_sim.physics.placement import Box
+from spinning_top_sim.physics.top import Shape
 
 UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
 PAUSED, INVALID_POSE = 2, 101
@@ -155,9 +155,9 @@ def test_what_the_entity_is(top):
     assert 'mass 2 kg' in info.description
     assert list(info.tags) == ['spinning_top', 'heavy_symmetric_top', 'imu']
     bounds = top.done('GetEntityBounds', entity=NAME).bounds
-    box = Box.of(top.simulation.top)
+    shape = Shape(top.simulation.top)
     assert bounds.type == top.messages.Bounds.TYPE_BOX
-    assert [xyz(point) for point in bounds.points] == [tuple(box.upper), tuple(box.lower)]
+    assert [xyz(point) for point in bounds.points] == [shape.upper, shape.lower]
 
 
 # ----------------------------------------------------------------------------------- filters

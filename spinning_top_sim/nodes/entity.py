@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.nodes.simulation_standard import UnsupportedError
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.placement import Box, state_of
+from spinning_top_sim.physics.placement import state_of
 from spinning_top_sim.physics.states import States
-from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.physics.top import Shape, State, Top
 from spinning_top_sim.streams.cdr import NANOSECONDS
 
 Message = Any           # message packages have no types
@@ -131,10 +131,10 @@ def is_found(expression: str, name: str) -> bool:
 
 def fill_bounds(bounds: Message, top: Top) -> None:
     """Write the box around the top into Bounds, in the body frame: upper corner, lower corner."""
-    box = Box.of(top)
+    shape = Shape(top)
     bounds.type = bounds.TYPE_BOX
-    bounds.points = [Vector3(**dict(zip('xyz', corner.tolist(), strict=True)))
-                     for corner in (box.upper, box.lower)]
+    bounds.points = [Vector3(**dict(zip('xyz', corner, strict=True)))
+                     for corner in (shape.upper, shape.lower)]
 
 
 def describe(top: Top) -> str:

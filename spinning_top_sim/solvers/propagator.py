@@ -70,9 +70,6 @@ class Propagator(Protocol):
     def states_at_seconds(self, t: Column) -> States:
         """Return the states at times (n,) [s] for `solve`; ascending, if it takes steps."""
 
-    def exact_solution(self) -> ExactSolution | None:
-        """Return the closed form of the same motion; None where doubles cannot hold it."""
-
 
 def propagate(top: Top, start: State, *, method: str, equations: str = 'transport',
               rtol: float = 1e-11, atol: float = 1e-12) -> Propagator:

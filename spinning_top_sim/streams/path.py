@@ -2,6 +2,7 @@
 """The motion of a run: segments of one solution each, joined by commands."""
 
 import math
+from contextlib import suppress
 from functools import cached_property, reduce
 from itertools import pairwise
 
@@ -40,9 +41,14 @@ class Segment:
 
     @cached_property
     def exact(self) -> ExactSolution | None:
-        """The exact solution of the same motion; None where it ends before SHORTEST_RUN_NS."""
-        exact = self.solver.exact_solution()
-        return exact if exact and exact.ns_limit >= SHORTEST_RUN_NS else None
+        """The closed form; None where doubles cannot hold it, or not for SHORTEST_RUN_NS."""
+        if isinstance(self.solver, ExactSolution):
+            return self.solver
+        with suppress(ValueError):
+            exact = ExactSolution(self.solver.top, self.solver.start)
+            if exact.ns_limit >= SHORTEST_RUN_NS:
+                return exact
+        return None
 
     def reach(self, t_ns: int, max_steps: int) -> bool:
         """
