@@ -115,17 +115,6 @@ def test_products_and_angles_of_rotations():
             small, abs=2e-15)
 
 
-def at_rest(theta):
-    return solve(Top(**TOP), State(theta=theta, l3=0.0, lz=0.0), [0.0])
-
-
-def test_hanging_at_rest_an_accelerometer_reads_g_upwards():
-    hanging = at_rest(math.pi).specific_force((0.1, 0.0, 0.2))
-    assert np.array(hanging)[:, 0] == pytest.approx((0.0, 0.0, -TOP['gravity']))
-    upright = at_rest(0.0).specific_force((0.0, 0.0, 0.0))
-    assert tuple(float(x[0]) for x in upright) == (0.0, 0.0, TOP['gravity'])
-
-
 NAMES = {
     'loop-c-thd+': 'loops', 'wavy-a': 'waves', 'fast-1e+08-cusp': 'cusps',
     'cross-top-a': 'through the top', 'cross-bottom-a': 'through the bottom',

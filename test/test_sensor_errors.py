@@ -65,12 +65,6 @@ def test_a_sensor_with_one_error_is_not_perfect(error):
     assert not np.array_equal(rows, np.broadcast_to((0.8, 0.9, 1.1, 0.7, 0.8, 1.2), (20, 6)))
 
 
-@pytest.mark.parametrize('band', [(2.0, 1.0), (3.0, 3.0)])
-def test_a_band_that_does_not_ascend_is_refused(band):
-    with pytest.raises(ValueError, match=r'imu\.bias_instability_band = \[\d.0, \d.0\]: the sec'):
-        parameters.checked({'imu.bias_instability_band': band})
-
-
 # ------------------------------------------------------------------------------------ the bias
 
 def test_the_bias_begins_with_the_turn_on_bias_and_walks_with_its_density():
