@@ -175,19 +175,6 @@ def test_the_gyroscopic_ratio_by_hand():
     assert described(**top, top__com_distance=0.0)[0].gyroscopic_ratio == math.inf
 
 
-def test_the_extremes_of_the_precession_by_hand():
-    """
-    It is least inside the swing, where L3 u^2 - 2 Lz u + L3 = 0 with u = cos(theta).
-
-    For L3 = 0.3 and Lz = 0.5 that is u = 1/3, and phi' = (0.5 - 0.1)/(lambda1 8/9).
-    """
-    description, top, _ = described(initial__theta=0.5 * math.pi, spin__l3=0.3, spin__lz=0.5,
-                                    top__com_distance=-0.15)
-    assert description.theta_max == pytest.approx(0.5 * math.pi, abs=1e-15)
-    assert description.theta_min < math.acos(1.0 / 3.0)
-    assert description.precession_min == pytest.approx(0.45 / top.lambda1, rel=1e-14)
-
-
 @pytest.mark.parametrize(('theta', 'theta_dot', 'l3', 'lz'), [
     (0.6, 0.0, 1.6, 1.0), (1.2, 0.5, 0.3, 0.5), (1.2, 0.5, 0.3, -0.5), (1.2, 0.5, -0.3, 0.5),
     (1.0, 2.0, -0.3, -0.6), (2.0, 1.0, 0.3, -0.5), (2.0, 0.0, 0.5, -0.7), (0.9, 0.0, 1.6, 1.6)])

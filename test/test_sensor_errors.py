@@ -127,14 +127,6 @@ def test_a_gauss_markov_bias_is_stationary_at_any_time(time):
     assert correlation == pytest.approx(math.exp(-1.0 / time), abs=4.0 / math.sqrt(len(rows)))
 
 
-def test_gauss_markov_has_no_seam_between_its_blocks():
-    """Steps across the seams of 512 are distributed as all others."""
-    path = noise.Path(3, noise.Purpose.GAUSS_MARKOV, (120 * (0.2,),), (120 * (1.0,),))
-    steps = np.diff(path.at(np.arange(51_200) * noise.STEP_NS), axis=1)[:, 511::512]
-    expected = math.sqrt(-2.0 * math.expm1(-0.001 / 0.2))
-    assert np.std(steps) == pytest.approx(expected, rel=4.0 / math.sqrt(2.0 * steps.size))
-
-
 def test_the_allan_deviation_of_a_flicker_bias_is_flat_over_its_band():
     """Within 10 % of the parameter."""
     _, found = statistics.flicker(0)

@@ -111,13 +111,6 @@ def test_stamps_stay_within_what_a_message_holds():
         2 ** 31 * SECOND - 1)
 
 
-def test_without_faults_the_labels_say_so():
-    stamps, true, copies = labels(run({'imu.rate': 100.0}, SECOND, LABELS)[1])
-    assert np.array_equal(stamps, true)
-    assert np.array_equal(true, EPOCH_NS + 10_000_000 * np.arange(101))
-    assert copies.tolist() == 101 * [1]
-
-
 # -------------------------------------------------------------------------------------------- live
 
 def test_a_node_with_all_errors_records_a_log_that_is_verified(peer, tmp_path):
