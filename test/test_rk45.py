@@ -49,7 +49,7 @@ LOOPING = CASES['loop-a']
 
 def fixed_steps(equations, count, t_end):
     """Return y after `count` equal steps, without step control or projection."""
-    step = unrolled_step(len(equations.start), equations.is_complex)
+    step = unrolled_step(len(equations.start), isinstance(equations.start[0], complex))
     y, derivative = equations.start, equations.derivative(*equations.start)
     for _ in range(count):
         y, derivative, _ = step(equations.derivative, t_end / count, y, derivative)

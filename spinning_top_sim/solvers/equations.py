@@ -58,9 +58,6 @@ class TransportEquations(Equations):
         stepped and in the body [rad/s].  They differ by chi/2.  Those of beta have the other sign.
     """
 
-    name = 'transport'
-    is_complex = True
-
     def __init__(self, top: Top, start: State, rtol: float, atol: float,
                  carried_share: float = 0.5) -> None:
         lambda1, l3, lz, torque = top.lambda1, start.l3, start.lz, top.gravity_torque
@@ -179,9 +176,6 @@ class EulerEquations(Equations):
     pole, and phi and psi drift off while every error estimate is small.  So these equations stop
     with an error there.
     """
-
-    name = 'euler'
-    is_complex = False
 
     def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
         self.top, self.l3, self.lz = top, start.l3, start.lz

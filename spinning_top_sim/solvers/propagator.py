@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-What every solver has, the choice among them, and `solve`, which reads a motion at given times.
-
-A new solver is a class with the members of `Propagator`, a name in METHODS, and a branch in
-`propagate` that makes it.
-"""
+"""What every solver has, the choice among them, and `solve`, which reads a motion at times."""
 
 from contextlib import suppress
 from typing import Protocol

@@ -104,8 +104,7 @@ class Imu:
 
     def motion(self, states: States) -> tuple[Vector, Vector]:
         """Return position in the world [m], and velocity in the frame of the IMU [m/s]."""
-        x, y, z, w = states.rows_quaternion
-        return (attitude.in_body((-x, -y, -z, w), self._lever_arm),
+        return (attitude.in_world(states.rows_quaternion, self._lever_arm),
                 self._from_body(states.velocity(self._lever_arm)))
 
     def _from_body(self, vector: Vector) -> Vector:

@@ -268,10 +268,9 @@ class Markers(Stream):
     """
     The top and the trace of its tip for Foxglove and RViz, in the world frame.
 
-    A line along the axis and down the side of the body shows the spin.  Every message has the
-    whole trace, so that it is complete wherever a viewer starts or jumps in a log.  The points of
-    the trace are on the exact path, at multiples of a fixed time step before the sample; the last
-    point is the tip of the body.  With a coarse `solver.rtol` the body leaves the path visibly.
+    Every message has the whole trace, so that it is complete wherever a viewer starts or jumps in
+    a log.  Its points are on the exact path, at multiples of a fixed time step; the last one is
+    the tip of the body.
     """
 
     parameter, topic, type_name = 'markers', 'markers', 'visualization_msgs/msg/MarkerArray'
