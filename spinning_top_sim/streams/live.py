@@ -88,8 +88,8 @@ class LiveSimulation(Simulation):
         self._write: Write = lambda entries, size: None
         self._queue: deque[tuple[int, Instant]] = deque()       # by time [ns]
         self._used: list[Output] = []               # those whose samples are in the queue
-        # `version`, `epoch_ns` and the use of the outputs for which the queue was computed.
-        self._holds_for: tuple[int, int, list[tuple[bool, int | None]]] = -1, 0, []
+        # `version`, `epoch_ns`, and which outputs had no subscribers, when the queue was computed.
+        self._holds_for: tuple[int, int, list[bool]] = -1, 0, []
         self._work: Iterator[Block | None] | None = None
         self._block = SMALLEST_BLOCK
 
@@ -109,6 +109,7 @@ class LiveSimulation(Simulation):
             self._write = write
         for output in self.outputs:
             output.log_index = streams.index(output.stream) if output.stream in streams else None
+        self.version += 1
 
     def lowest_imu_rate(self, *, restarted: bool) -> float:
         """
@@ -176,8 +177,8 @@ class LiveSimulation(Simulation):
 
     def _refresh(self) -> None:
         """Empty the queue if the motion or the outputs have changed."""
-        holds_for = self.version, self.epoch_ns, [
-            (output.publish is None, output.log_index) for output in self.outputs]
+        holds_for = (self.version, self.epoch_ns,
+                     [output.publish is None for output in self.outputs])
         if holds_for != self._holds_for:
             self._holds_for = holds_for
             self._used = [output for output in self.outputs if output.is_used]

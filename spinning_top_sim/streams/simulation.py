@@ -48,7 +48,7 @@ class Simulation:
     history : what was applied since the start: commands as (t_ns, l3, lz), states that were set as
         t_ns and the fields of `State`, changes of `imu.rate` as (t_ns, rate)
     epoch_ns : stamp of t = 0 [ns]
-    version : changes with the motion and the streams, as they are after `now_ns`
+    version : changes with all but `epoch_ns` that makes samples after `now_ns` other ones
 
     Raises ValueError where there is no motion from the start state.
     """
