@@ -42,7 +42,7 @@ def is_a_line(text):
 
 # ------------------------------------------------------------------------------------ parameters
 
-@examples(150)
+@examples(100)
 @given(NAMES | LISTS, ANYTHING)
 def test_any_value_of_a_parameter_is_taken_or_refused_by_its_name(name, value):
     try:
