@@ -559,7 +559,7 @@ def test_pictures_are_drawn(stepped, tmp_path, capsys):
     pixels = np.asarray(image.open(page).convert('L'))
     assert min(pixels.shape) > 600 and 0.02 < np.mean(pixels < 250) < 0.5
     frames = image.open(film)
-    assert frames.n_frames == 19 and frames.info['duration'] == 50
+    assert frames.n_frames == 20 and frames.info['duration'] == 50
     assert film.stat().st_size < 400_000
     shown = []
     for number in (0, 10):

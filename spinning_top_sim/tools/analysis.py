@@ -60,9 +60,8 @@ class Attitudes:
         else:
             self.phi, self.psi = (np.unwrap(np.angle(tip)) for tip in (self.tip, self.body_tip))
 
-    def first(self, seconds: float) -> Attitudes:
-        """Return the samples of the first seconds, at least two."""
-        count = max(2, int(np.searchsorted(self.time, seconds, 'right')))
+    def first(self, count: int) -> Attitudes:
+        """Return the first samples."""
         return Attitudes(self.stamps_ns[:count], self.rows[:, :count])
 
     def constants(self, top: Top) -> tuple[Column, Column, Column] | None:

@@ -107,7 +107,7 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> bool:
         if arguments.plot is not None:
             plots.draw_page(found.path.name, motion, data, arguments.plot)
         if arguments.animate is not None:
-            plots.animate(data, arguments.animate)
+            plots.animate(motion, data, arguments.animate)
         return True
     except ImportError as error:
         reason = ("pictures need matplotlib: pip install 'spinning_top_sim[plot]', or "
