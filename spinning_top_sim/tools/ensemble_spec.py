@@ -16,11 +16,9 @@ from spinning_top_sim.physics.top import shown
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.tools.scene_file import parse_section, parse_yaml, read_scene
 
-FORMATS = ('parquet', 'mcap')
-# Streams that only a log can have, not a table.
-WITHOUT_COLUMNS = ('clock', 'markers')
 DEFAULTS = {parameter.name: parameter.default for parameter in parameters.TABLE}
-STREAMS = tuple(row[0] for row in parameters.STREAM_DEFAULTS)
+# Streams that a table can have; only a log has the others.
+STREAMS = tuple(row[0] for row in parameters.STREAM_DEFAULTS if row[0] not in ('clock', 'markers'))
 # By default a part has at most this many rows, or one run, and a large ensemble at least this
 # many parts.
 ROWS_IN_A_PART, LEAST_PARTS = 200_000, 50
@@ -60,8 +58,7 @@ class Specification:
     params : mappings of parameters; a later one overrides those before it
     sample : name of a parameter to {distribution: [a, b]}, or to {values: [...]}
     streams : names of the streams to keep; empty: those that the parameters of a run enable
-    format : 'parquet' or 'mcap'
-    runs_per_part : runs that are computed by one task, and in Parquet share a file
+    runs_per_part : runs that are computed by one task, and share a file
     """
 
     runs: int
@@ -70,7 +67,6 @@ class Specification:
     params: Sequence[Mapping[str, Any]] = ()
     sample: Mapping[str, Mapping[str, Sequence[Any]]] | None = None
     streams: Sequence[str] = ()
-    format: str = 'parquet'
     runs_per_part: int = 0
 
     @property
@@ -125,10 +121,8 @@ class Specification:
 
         The table of each run has columns for all of them, so that the files form one table.
         """
-        return [name for name in STREAMS
-                if (self.format != 'parquet' or name not in WITHOUT_COLUMNS)
-                and any(journal.is_recorded(name, {**DEFAULTS, **values})
-                        for values in self.alternatives)]
+        return [name for name in STREAMS if any(
+            journal.is_recorded(name, {**DEFAULTS, **values}) for values in self.alternatives)]
 
 
 def read(path: Path) -> Specification:
@@ -159,13 +153,11 @@ def _checked(given: Specification, folder: Path) -> Specification:
     duration = parameters.BY_NAME['duration'].check(given.duration)
     if not duration > 0.0:
         raise ValueError(f'duration = {duration!r}: must be a number > 0')
-    if given.format not in FORMATS:
-        raise ValueError(f'format = {shown(given.format)}: must be one of {", ".join(FORMATS)}')
     sample = given.sample or {}
     if not isinstance(sample, Mapping):
         raise ValueError(f'sample = {shown(sample)}: must be a mapping of parameters')
     checked = replace(
-        given, duration=duration, streams=_streams(given.streams, given.format),
+        given, duration=duration, streams=_streams(given.streams),
         params=[_parameter_set(one, 'params', folder) for one in _list(given.params, 'params')],
         sample={name: _rule(name, rule, folder) for name, rule in sample.items()})
     return checked if checked.runs_per_part else replace(
@@ -191,12 +183,11 @@ def _parameter_set(given: object, what: str, folder: Path) -> dict[str, Any]:
     return {name: parameters.BY_NAME[name].check(value) for name, value in found.items()}
 
 
-def _streams(given: object, file_format: str) -> list[str]:
-    allowed = [name for name in STREAMS if file_format != 'parquet' or name not in WITHOUT_COLUMNS]
+def _streams(given: object) -> list[str]:
     names = list(_list(given, 'streams'))
     for name in names:
-        if name not in allowed:
-            raise ValueError(f'streams: {shown(name)}: must be some of {", ".join(allowed)}')
+        if name not in STREAMS:
+            raise ValueError(f'streams: {shown(name)}: must be some of {", ".join(STREAMS)}')
     return names
 
 

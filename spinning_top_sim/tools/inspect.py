@@ -64,11 +64,12 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     with LogReader(arguments.log) as reader:
-        found = survey(reader)
-        verdict = _verified(arguments, reader, found) if arguments.verify else None
-        if arguments.export and found.run is None:
-            raise ValueError(f'--export: {found.foreign_reason}')
-        exported = list(export.write(reader, found.run, arguments.export)) if found.run else []
+        found, verdict = survey(reader), None
+        exported: list[str] = []
+        if found.run is not None:
+            if arguments.verify:
+                verdict = _verified(arguments, reader, found, found.run)
+            exported += export.write(reader, found.run, arguments.export)
     if arguments.json:
         print(json.dumps(_as_json(found, verdict), indent=2, allow_nan=False))
     else:
@@ -76,46 +77,38 @@ def _run(arguments: argparse.Namespace) -> int:
             cli.print_line(line)
     for line in exported:
         cli.print_line(line, sys.stderr if arguments.json else None)
-    drawn = _draw(arguments, found)
-    verified = not arguments.verify or (verdict is not None and verdict.identical)
-    passed = found.whole and not found.damage.defects and verified and drawn
+    for option in ('verify', 'export'):
+        if found.run is None and getattr(arguments, option):
+            raise LogError(f'--{option}: {found.foreign_reason}')
+    if arguments.plot is not None or arguments.animate is not None:
+        _draw(arguments, found)
+    passed = found.whole and not found.damage.defects and (verdict is None or verdict.identical)
     return cli.OK if passed else cli.FAILED
 
 
-def _verified(arguments: argparse.Namespace, reader: LogReader, found: Survey) -> Verdict | None:
-    """Return the result of --verify, None for a log of another program."""
-    if found.run is None:
-        cli.print_line(f'inspect: --verify: {found.foreign_reason}', sys.stderr)
-        return None
+def _verified(arguments: argparse.Namespace, reader: LogReader, found: Survey,
+              run: RunDescription) -> Verdict:
     begin_ns, end_ns = found.damage.start_ns, found.end_ns
     with cli.progress('verified', (end_ns - begin_ns) / NANOSECONDS, 's',
                       quiet=arguments.json) as show:
-        return verify(reader, found.run, end_ns,
+        return verify(reader, run, end_ns,
                       lambda stamp_ns: show((stamp_ns - begin_ns) / NANOSECONDS))
 
 
-def _draw(arguments: argparse.Namespace, found: Survey) -> bool:
-    """Draw the pictures; return whether there was no error."""
-    if arguments.plot is None and arguments.animate is None:
-        return True
+def _draw(arguments: argparse.Namespace, found: Survey) -> None:
+    """Draw the pictures.  Raises LogError, or OSError or ValueError for the name of a file."""
+    if found.shown is None:
+        raise LogError('nothing to draw: no attitude of a top in this log')
     try:
-        if found.shown is None:
-            raise ValueError('nothing to draw: no attitude of a top in this log')
         from spinning_top_sim.tools import plots  # noqa: PLC0415
-
-        motion, data = found.shown
-        if arguments.plot is not None:
-            plots.draw_page(found.path.name, motion, data, arguments.plot)
-        if arguments.animate is not None:
-            plots.animate(motion, data, arguments.animate)
-        return True
     except ImportError as error:
-        reason = ("pictures need matplotlib: pip install 'spinning_top_sim[plot]', or "
-                  f'apt install python3-matplotlib ({error})')
-    except (OSError, ValueError) as error:
-        reason = str(error)
-    cli.print_line(f'inspect: {reason}', sys.stderr)
-    return False
+        raise LogError("pictures need matplotlib: pip install 'spinning_top_sim[plot]', or "
+                       f'apt install python3-matplotlib ({error})') from error
+    motion, data = found.shown
+    if arguments.plot is not None:
+        plots.draw_page(found.path.name, motion, data, arguments.plot)
+    if arguments.animate is not None:
+        plots.animate(motion, data, arguments.animate)
 
 
 def _as_json(found: Survey, verdict: Verdict | None) -> object:
@@ -129,8 +122,7 @@ def _as_json(found: Survey, verdict: Verdict | None) -> object:
         'duration': (damage.end_ns - damage.start_ns) / NANOSECONDS,
         'topics': {name: asdict(topic) for name, topic in found.topics.items()},
         'ours': run is not None, 'why_not_ours': found.foreign_reason or None,
-        'notes': [*_broken_entries(run), *found.notes],
-        'run': None, 'events': [], 'verify': None,
+        'notes': found.notes, 'run': None, 'events': [], 'verify': None,
         'motions': [{
             **_fields_of(motion, 'cause', 'begin_ns', 'end_ns', 'source'),
             'regime': motion.exact and motion.exact.name,
@@ -157,11 +149,6 @@ def _fields_of(source: object, *names: str) -> dict[str, object]:
     return {name: getattr(source, name) for name in names}
 
 
-def _broken_entries(run: RunDescription | None) -> list[str]:
-    return [f'journal, entry at {seconds(stamp_ns)}: {reason}'
-            for stamp_ns, reason in (run.broken if run else ())]
-
-
 def _as_text(found: Survey, verdict: Verdict | None) -> Iterator[str]:
     """Yield the findings as lines of text."""
     damage, run = found.damage, found.run
@@ -184,7 +171,6 @@ def _as_text(found: Survey, verdict: Verdict | None) -> Iterator[str]:
            f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
            f'{counts["parameters"]} changes of parameters'
            + (f', {counts["state"]} states set' if counts['state'] else ''))
-    yield from _broken_entries(run)
     yield from found.notes
     for number, motion in enumerate(found.motions, start=1):
         yield from _motion(number, motion, damage.start_ns)

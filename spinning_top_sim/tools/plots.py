@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of the samples in a log, drawn as `States.plot` and `States.animate` draw a solution."""
+"""Pictures of the samples in a log, as `States.plot` and `States.animate` draw a solution."""
 
 from pathlib import Path
 from types import SimpleNamespace

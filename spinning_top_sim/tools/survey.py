@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.attitude import angle_between
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import relative_drift
-from spinning_top_sim.recording.damage import Damage
+from spinning_top_sim.recording.damage import Damage, seconds
 from spinning_top_sim.recording.reader import LogMessage, LogReader
+from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.path import Segment
@@ -54,7 +55,6 @@ class TopicReport:
     # The first gaps: log times of the first and the last missing sample [ns]
     gaps_ns: list[tuple[int, int]] = field(default_factory=list)
     odd_size: int = 0                     # messages that do not have the size of the stream
-    longest_step_ns: int = 0              # between two messages
 
 
 @dataclass
@@ -159,13 +159,15 @@ def survey(reader: LogReader) -> Survey:
 
 
 def _follow_run(found: Survey, run: RunDescription) -> None:
-    """Compute the motions of a run; add a note if it cannot be followed to its end."""
+    """Compute the motions of a run; add notes about what cannot be followed."""
+    found.notes += [f'journal, entry at {seconds(stamp_ns)}: {reason}'
+                    for stamp_ns, reason in run.broken]
     for name, topic in run.topics.items():
         found.topics[topic].stream = name
     motions = found.motions
     try:
         for simulation, event in recorded_run.rerun(run, found.damage.end_ns):
-            if event is None:
+            if isinstance(event, Block):
                 continue
             if motions:
                 last = motions[-1].sections[-1]
@@ -243,7 +245,6 @@ def _count(report: TopicReport, stamps_ns: Stamps, sections: list[Section], topi
     """Count the messages of a topic; compare those of a stream with the grid of each section."""
     report.count = len(stamps_ns)
     if report.count > 1:
-        report.longest_step_ns = int(np.max(np.diff(stamps_ns)))
         duration_ns = int(stamps_ns[-1] - stamps_ns[0])
         report.rate = (report.count - 1) / duration_ns * 1e9 if duration_ns else None
     for section in sections:
