@@ -339,8 +339,8 @@ def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(
     ({'params': ['none.yaml']}, 'none.yaml: No such file'),
     ({'sample': {'spin.l3': {'gauss': [1, 2]}}}, 'must be one of uniform, normal, log_uniform'),
     ({'sample': {'spin.l3': {'uniform': [2, 1]}}}, 'uniform = [2, 1]: must be [low, high] with'),
-    ({'sample': {'spin.l3': {'uniform': [1, 10 ** 400]}}}, 'must be [low, high] with low <= high'),
-    ({'sample': {'spin.l3': {'normal': [2]}}}, 'normal = [2]: must be [mean, deviation]'),
+    ({'sample': {'spin.l3': {'uniform': [1, 10 ** 400]}}}, 'must be a list of 2 numbers'),
+    ({'sample': {'spin.l3': {'normal': [2]}}}, 'normal = [2]: must be a list of 2 numbers'),
     ({'sample': {'top.mass': {'log_uniform': [0, 1]}}}, '0 < low <= high'),
     ({'sample': {'top.mass': {'uniform': [1, 1e31]}}}, 'top.mass = 1e+31: must be a number >= 0'),
     ({'sample': {'spin.l3': {'values': []}}}, 'must have one value at least'),
@@ -349,7 +349,7 @@ def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(
     ({'sample': {'imu.enabled': {'values': [True, False]}}}, 'imu.enabled must not be sampled'),
     ({'streams': ['imu', 'markers']}, "streams: 'markers': must be some of pose"),
     ({'runs': 1.5}, 'runs = 1.5: must be an integer >= 1'),
-    ({'duration': 0.0}, 'duration = 0.0: must be a number > 0'),
+    ({'duration': 0.0}, 'duration = 0.0: must be a number >= 1e-09'),
     ({'run': 3}, "'run'")])
 def test_a_bad_specification_is_refused_and_makes_nothing(tmp_path, capsys, changes, said):
     path = written(tmp_path, **changes)

@@ -80,8 +80,7 @@ def _run(arguments: argparse.Namespace) -> int:
     for option in ('verify', 'export'):
         if found.run is None and getattr(arguments, option):
             raise LogError(f'--{option}: {found.foreign_reason}')
-    if arguments.plot is not None or arguments.animate is not None:
-        _draw(arguments, found)
+    _draw(arguments, found)
     passed = found.whole and not found.damage.defects and (verdict is None or verdict.identical)
     return cli.OK if passed else cli.FAILED
 
@@ -97,6 +96,8 @@ def _verified(arguments: argparse.Namespace, reader: LogReader, found: Survey,
 
 def _draw(arguments: argparse.Namespace, found: Survey) -> None:
     """Draw the pictures.  Raises LogError, or OSError or ValueError for the name of a file."""
+    if arguments.plot is None and arguments.animate is None:
+        return
     if found.shown is None:
         raise LogError('nothing to draw: no attitude of a top in this log')
     try:
