@@ -135,8 +135,7 @@ def with_flipped_bit(data, byte, bit=0):
 
 
 @pytest.mark.parametrize(('scene', 'method'), [
-    *((scene, 'exact') for scene in SCENES), ('cusp', 'rk45'), ('planar_pendulum', 'rk45'),
-    ('sleeping', 'rk45')])
+    *((scene, 'exact') for scene in SCENES), ('cusp', 'rk45')])
 def test_every_scene_is_measured_from_its_data(tmp_path, scene, method):
     duration = 20 if scene in ('near_separatrix', 'waking_sleeper') else 4
     found = surveyed(log_of(
@@ -199,8 +198,8 @@ def test_any_topic_with_an_attitude_measures_a_motion(tmp_path, topic):
     for name in ('nutation_period', 'mean_precession_rate', 'mean_spin_rate'):
         assert getattr(motion.measured, name) == pytest.approx(
             getattr(motion.exact, name), rel=1e-9), name
-    assert max(curve.largest for curve in found.errors.values()) < 1e-14
-    drifts = [curve.largest for curves in found.drifts.values() for curve in curves.values()]
+    assert max(found.errors.values()) < 1e-14
+    drifts = [drift for drifts in found.drifts.values() for drift in drifts.values()]
     assert len(drifts) == (3 if topic.startswith('ground_truth') else 0)
     assert all(drift < 1e-14 for drift in drifts)
 
@@ -222,7 +221,6 @@ def test_errors_and_drifts_are_those_in_the_data(stepped, tmp_path, capsys):
     errors = content['orientation_error']
     assert errors['/a/b/pose']['max'] == pytest.approx(1e-6, rel=1e-3)
     assert errors['/a/b/joint_states']['max'] < 1e-9
-    assert errors['/a/b/pose']['rms'] == pytest.approx(1e-6 / np.sqrt(298), rel=1e-2)
     for drifts in content['drifts'].values():
         assert 0.0 < drifts['energy'] < 1e-11 and drifts['l3'] < 1e-13
     assert content['motions'][-1]['measured']['nutations'] >= 1
@@ -292,12 +290,6 @@ def test_offline_logs_verify_and_a_changed_bit_is_found_wherever_it_is(
     assert not (verdict['missing'] or verdict['unexpected'])
     assert first['byte'] == places[first['topic']][0]
     assert first['logged'] != first['computed']
-
-
-def test_a_command_exactly_at_the_end_verifies(tmp_path, capsys):
-    verdict = verified(capsys, log_of(tmp_path / 'run.mcap', '--duration', 0.5, '--command',
-                                      '0.5:2.0:1.5'))
-    assert verdict['identical'] and verdict['compared']['/spinning_top/commands'] == 1
 
 
 def test_a_difference_names_field_stamp_and_both_values(short, tmp_path, capsys):
@@ -503,8 +495,7 @@ def test_a_reader_that_leaves_is_no_error(short, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(('key', 'text'), [
-    ('parameters', '[' * 100_000), ('parameters', '{"world_frame": "\\ud800"}'),
-    ('parameters_now', ''), ('parameters', '{"top.lambda1": 1e-320}'), ('epoch_ns', '-1'),
+    ('parameters', '[' * 100_000), ('parameters', '{"top.lambda1": 1e-320}'),
     ('begun_ns', str(10 ** 18)), ('history', '[[5, 1.0, 1.0], [4, 1.0, 1.0]]'),
     ('history', '[[1e300, 1.0, 1.0]]'), ('history', '[[0, 1, NaN]]')])
 def test_odd_metadata_end_in_words(short, tmp_path, capsys, key, text):
@@ -579,10 +570,11 @@ def test_without_matplotlib_there_is_a_hint(short, tmp_path, capsys, monkeypatch
     assert 'motion 2' in out                            # the rest is told all the same
 
 
-def test_neither_ros_nor_pictures_are_imported_unasked(short):
-    code = ('import sys\nfrom spinning_top_sim.tools.inspect import main\n'
+def test_neither_ros_nor_scipy_nor_pictures_are_imported_unasked(short, tmp_path):
+    code = ('import sys\nfrom spinning_top_sim.tools import inspect, simulate\n'
+            f'simulate.main(["-o", {str(tmp_path / "run.csv")!r}, "--duration", "1"])\n'
             'early = sorted({"scipy"} & set(sys.modules))\n'
-            f'main([{str(short)!r}, "--verify"])\n'
+            f'inspect.main([{str(short)!r}, "--verify"])\n'
             'print("loaded:", early, sorted({"rclpy", "matplotlib"} & set(sys.modules)))')
     run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                          timeout=60, check=True)

@@ -10,7 +10,7 @@ formats").
 
 import argparse
 import itertools
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -82,10 +82,8 @@ def write(reader: LogReader, run: RunDescription,
 
 def _tum(reader: LogReader, run: RunDescription) -> Iterator[str]:
     for stamps_ns, (position, orientation, *_) in _blocks(reader, run, ODOMETRY):
-        for stamp_ns, row in zip(stamps_ns.tolist(), np.hstack((position, orientation)).tolist(),
-                                 strict=True):
-            seconds, rest_ns = divmod(stamp_ns, 10 ** 9)
-            yield f'{seconds}.{rest_ns:09d} {" ".join(map(repr, row))}\n'
+        stamps = (f'{stamp_ns // 10 ** 9}.{stamp_ns % 10 ** 9:09d}' for stamp_ns in stamps_ns)
+        yield from _rows(' ', stamps, position, orientation)
 
 
 def _euroc(reader: LogReader, run: RunDescription) -> Iterator[str]:
@@ -99,19 +97,20 @@ def _euroc(reader: LogReader, run: RunDescription) -> Iterator[str]:
         world = attitude.in_world(tuple(orientation.T), tuple(velocity.T))
         # The bias of the last reading before the sample.
         newest = np.maximum(np.searchsorted(bias_ns, stamps_ns, 'right') - 1, 0)
-        yield from _csv(stamps_ns, position, np.roll(orientation, 1, axis=1),
+        yield from _rows(',', stamps_ns, position, np.roll(orientation, 1, axis=1),
                         np.column_stack(world), bias[newest])
 
 
 def _euroc_imu(reader: LogReader, run: RunDescription) -> Iterator[str]:
     yield EUROC_IMU_HEAD
     for stamps_ns, (_, rates, force) in _blocks(reader, run, RAW):
-        yield from _csv(stamps_ns, rates, force)
+        yield from _rows(',', stamps_ns, rates, force)
 
 
-def _csv(stamps_ns: NDArray[np.int64], *columns: NDArray[np.float64]) -> Iterator[str]:
-    for stamp_ns, row in zip(stamps_ns.tolist(), np.hstack(columns).tolist(), strict=True):
-        yield f'{stamp_ns},{",".join(map(repr, row))}\n'
+def _rows(separator: str, stamps: Iterable[object],
+          *columns: NDArray[np.float64]) -> Iterator[str]:
+    for stamp, row in zip(stamps, np.hstack(columns).tolist(), strict=True):
+        yield f'{stamp}{separator}{separator.join(map(repr, row))}\n'
 
 
 def _kalibr(_: LogReader, run: RunDescription) -> Iterator[str]:

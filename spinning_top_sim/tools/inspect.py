@@ -28,7 +28,7 @@ from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import cli, export
 from spinning_top_sim.tools.recorded_run import RunDescription
 from spinning_top_sim.tools.survey import MotionReport, Survey, survey
-from spinning_top_sim.tools.verify import Verdict, verify
+from spinning_top_sim.tools.verify import Comparison, Verdict
 
 DEGREES = math.degrees(1.0)
 # Rows of the table of a motion: text, field of Description and Measured, factor.
@@ -90,8 +90,8 @@ def _verified(arguments: argparse.Namespace, reader: LogReader, found: Survey,
     begin_ns, end_ns = found.damage.start_ns, found.end_ns
     with cli.progress('verified', (end_ns - begin_ns) / NANOSECONDS, 's',
                       quiet=arguments.json) as show:
-        return verify(reader, run, end_ns,
-                      lambda stamp_ns: show((stamp_ns - begin_ns) / NANOSECONDS))
+        return Comparison(run).compare(
+            reader, end_ns, lambda stamp_ns: show((stamp_ns - begin_ns) / NANOSECONDS))
 
 
 def _draw(arguments: argparse.Namespace, found: Survey) -> None:
@@ -130,10 +130,8 @@ def _as_json(found: Survey, verdict: Verdict | None) -> object:
             **_fields_of(motion.segment, 'l3', 'lz', 'energy'),
             'exact': motion.exact and asdict(motion.exact),
             'measured': motion.measured and asdict(motion.measured)} for motion in found.motions],
-        'drifts': {topic: {name: series.largest for name, series in drifts.items()}
-                   for topic, drifts in found.drifts.items()},
-        'orientation_error': {topic: {'max': series.largest, 'rms': series.rms}
-                              for topic, series in found.errors.items()}}
+        'drifts': found.drifts,
+        'orientation_error': {topic: {'max': error} for topic, error in found.errors.items()}}
     if run is not None:
         content['run'] = {'parameters': run.values_at_start, 'seed': run.values_at_start['seed'],
                           **_fields_of(run, 'epoch_ns', 'begun_ns'), **run.surroundings}
@@ -175,22 +173,15 @@ def _as_text(found: Survey, verdict: Verdict | None) -> Iterator[str]:
     yield from found.notes
     for number, motion in enumerate(found.motions, start=1):
         yield from _motion(number, motion, damage.start_ns)
-    yield from _accuracy(found)
+    if found.errors or found.drifts:
+        yield from cli.table(
+            'largest relative drifts in a motion, orientation error against the exact solution '
+            '[rad]', ('from', 'E', 'L3', 'Lz', 'error'),
+            [(topic, *(_number(found.drifts.get(topic, {}).get(name), 2)
+                       for name in ('energy', 'l3', 'lz')), _number(found.errors.get(topic), 3))
+             for topic in found.topics if topic in {**found.drifts, **found.errors}])
     if verdict is not None:
         yield from _verdict(verdict)
-
-
-def _accuracy(found: Survey) -> Iterator[str]:
-    if found.drifts:
-        yield from cli.table(
-            'largest drifts since the start of each motion, relative', ('from', 'E', 'L3', 'Lz'),
-            [(topic, *(f'{series.largest:.2g}' for series in drifts.values()))
-             for topic, drifts in found.drifts.items()])
-    if found.errors:
-        yield from cli.table('orientation error against the exact solution [rad]',
-                             ('from', 'max', 'rms'),
-                             [(topic, f'{series.largest:.3g}', f'{series.rms:.3g}')
-                              for topic, series in found.errors.items()])
 
 
 def _topics(found: Survey) -> Iterator[str]:
@@ -203,8 +194,6 @@ def _topics(found: Survey) -> Iterator[str]:
             yield f'gap: {name} from {seconds(begin)} to {seconds(end)}'
         if topic.off_grid:
             yield f'{name}: {topic.off_grid} stamps are not on the grid'
-        if topic.odd_size:
-            yield f'{name}: {topic.odd_size} messages do not have the size of this stream'
 
 
 def _motion(number: int, motion: MotionReport, begin_ns: int) -> Iterator[str]:

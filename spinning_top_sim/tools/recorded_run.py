@@ -57,10 +57,6 @@ class ForeignLogError(Exception):
     """A log lacks what is needed to compute its run again; the text says what."""
 
 
-class DepartureError(Exception):
-    """The computation cannot follow the journal; the text says where."""
-
-
 @dataclass(frozen=True)
 class Event:
     """An entry of the journal."""
@@ -170,14 +166,8 @@ def _topics(topics: Sequence[LogTopic], values: Mapping[str, Any]) -> dict[str, 
     if [topic.type_name for topic in topics] == [type_name for _, type_name in recorded]:
         return {name: topic.name for topic, (name, _) in zip(topics, recorded, strict=True)}
     known = [*((stream.topic, stream.type_name) for stream in every), *journal.TOPICS]
-    found: dict[str, str] = {}
-    for topic in topics:
-        names = [name for name, type_name in known
-                 if type_name == topic.type_name and name not in found
-                 and topic.name.endswith('/' + name.lstrip('~/'))]
-        if names:
-            found[max(names, key=len)] = topic.name
-    return found
+    return {name: topic.name for topic in reversed(topics) for name, type_name in known
+            if type_name == topic.type_name and topic.name.endswith('/' + name.lstrip('~/'))}
 
 
 def _event(stamp_ns: int, data: bytes) -> Event:
@@ -209,13 +199,10 @@ def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
     end_ns : log time of the end [ns]
     samples : yield the messages of the log's streams in blocks; else only motions are computed
 
-    Raises DepartureError where there is no motion with these parameters and commands, or where it
+    Raises one of ODD where there is no motion with these parameters and commands, or where it
     takes far more work than a run that fits into the log.
     """
-    try:
-        yield from _Rerun(run, samples).events(end_ns)
-    except ODD as error:
-        raise DepartureError(reason_of(error)) from error
+    return _Rerun(run, samples).events(end_ns)
 
 
 class _Rerun:
@@ -261,13 +248,13 @@ class _Rerun:
         simulation, log_bytes = self._simulation, self._run.log_bytes
         self._samples_left -= sum(len(one.times(simulation.now_ns, t_ns)) for one in streams)
         if self._samples_left < 0:
-            raise DepartureError(f'a log of {log_bytes} bytes lacks most samples of this run')
+            raise ValueError(f'a log of {log_bytes} bytes lacks most samples of this run')
         with contextlib.suppress(IntegrationError):
             for block in simulation.play(streams, t_ns):
                 yield simulation, block
                 if simulation.steps > self._most_steps:
-                    raise DepartureError(f'over {self._most_steps} integration steps are too many '
-                                         f'for a log of {log_bytes} bytes')
+                    raise ValueError(f'over {self._most_steps} integration steps are too many for '
+                                     f'a log of {log_bytes} bytes')
 
 
 def _apply(simulation: Simulation, event: Event) -> None:

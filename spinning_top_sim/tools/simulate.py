@@ -97,8 +97,7 @@ def _run(arguments: argparse.Namespace) -> int:
             table = Table(period_ns(values['pose.rate']))
             write = _write_csv if file_format == 'csv' else _write_parquet
             write(output, _rows(simulation, table, stops, show))
-            rows = len(table.times(-1, stops[-1][0]))
-            summary = f'{rows} rows of {", ".join(UNITS)}'
+            summary = ', '.join(UNITS)
     lines = [f'{output}: {summary}']
     if arguments.export:
         with LogReader(output) as reader:

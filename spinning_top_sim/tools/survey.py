@@ -54,28 +54,6 @@ class TopicReport:
     off_grid: int = 0                     # stamps beside the grid
     # The first gaps: log times of the first and the last missing sample [ns]
     gaps_ns: list[tuple[int, int]] = field(default_factory=list)
-    odd_size: int = 0                     # messages that do not have the size of the stream
-
-
-@dataclass
-class Series:
-    """The largest value and the root mean square of a long series."""
-
-    largest: float = 0.0
-    square_sum: float = 0.0
-    count: int = 0
-
-    def add(self, values: Rows) -> None:
-        """Append the values that are finite."""
-        sizes = np.abs(values[np.isfinite(values)])
-        self.largest = max(self.largest, float(np.max(sizes, initial=0.0)))
-        self.square_sum += float(sizes @ sizes)
-        self.count += len(sizes)
-
-    @property
-    def rms(self) -> float:
-        """Root mean square; NaN without values."""
-        return math.sqrt(self.square_sum / self.count) if self.count else math.nan
 
 
 @dataclass
@@ -125,9 +103,10 @@ class Survey:
     run: RunDescription | None = None     # None for a log that this package did not record
     foreign_reason: str = ''              # why it is None
     motions: list[MotionReport] = field(default_factory=list)
-    # Drifts of energy, l3 and lz since the begin of the motion by topic, relative if not from 0
-    drifts: dict[str, dict[str, Series]] = field(default_factory=dict)
-    errors: dict[str, Series] = field(default_factory=dict)     # of attitudes by topic [rad]
+    # By topic, the largest drifts of energy, l3 and lz since the begin of the motion, relative if
+    # not from 0, and the largest error of an attitude [rad]
+    drifts: dict[str, dict[str, float]] = field(default_factory=dict)
+    errors: dict[str, float] = field(default_factory=dict)
     # For pictures: the first motion with samples, and the first of these
     shown: tuple[MotionReport, Attitudes] | None = None
     notes: list[str] = field(default_factory=list)
@@ -183,7 +162,7 @@ def _follow_run(found: Survey, run: RunDescription) -> None:
                     Imu(simulation.values)))
             motions[-1].sections.append(Section(begin_ns, begin_ns, simulation.epoch_ns, {
                 topic: stream.period_ns for topic, stream in streams.items()}))
-    except (recorded_run.DepartureError, *ODD) as error:
+    except ODD as error:
         found.notes.append(f'the run cannot be followed beyond here: {reason_of(error)}')
     if len(motions) > MOST_EXACT:
         found.notes.append(f'only the first {MOST_EXACT} motions are compared with the exact one')
@@ -221,7 +200,6 @@ def _analyse(found: Survey, motion: MotionReport, topic: str, samples: list[LogM
     """Compare samples of a stream with their motion."""
     stream, segment = motion.streams[topic], motion.segment
     fitting = [sample for sample in samples if len(sample.data) == len(stream.template)]
-    found.topics[topic].odd_size += len(samples) - len(fitting)
     stamps_ns = _stamps(fitting)
     fields = stream.template.decode(b''.join(sample.data for sample in fitting))
     data = analysis.attitudes_of(stream.topic, motion.imu, stamps_ns, fields)
@@ -231,14 +209,20 @@ def _analyse(found: Survey, motion: MotionReport, topic: str, samples: list[LogM
         motion.samples.append((data.stamps_ns, data.rows))
     values = data.constants(segment.solver.top)
     if values is not None and stream.topic != 'imu/data':       # which is noisy
-        drifts = found.drifts.setdefault(topic, {key: Series() for key in ('energy', 'l3', 'lz')})
-        for series, value, start in zip(
-                drifts.values(), values, (segment.energy, segment.l3, segment.lz), strict=True):
-            series.add(relative_drift(value, start))
+        drifts = found.drifts.setdefault(topic, {'energy': 0.0, 'l3': 0.0, 'lz': 0.0})
+        for (name, largest), value in zip(drifts.items(), values, strict=True):
+            drift = relative_drift(value, getattr(segment, name))
+            drifts[name] = max(largest, _largest(drift))
     if motion.exact is not None and (exact := segment.exact) is not None:
         times_ns = np.clip(data.stamps_ns - motion.origin_ns, -exact.ns_limit, exact.ns_limit)
         truth = exact.states(times_ns).rows_quaternion
-        found.errors.setdefault(topic, Series()).add(angle_between(data.quaternion, truth))
+        error = _largest(angle_between(data.quaternion, truth))
+        found.errors[topic] = max(found.errors.get(topic, 0.0), error)
+
+
+def _largest(values: Rows) -> float:
+    """Return the largest absolute value of those that are finite, 0 without any."""
+    return float(np.max(np.abs(values), where=np.isfinite(values), initial=0.0))
 
 
 def _count(report: TopicReport, stamps_ns: Stamps, sections: list[Section], topic: str) -> None:

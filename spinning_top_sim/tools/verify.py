@@ -14,12 +14,7 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.stream import Stream
-from spinning_top_sim.tools.recorded_run import (
-    DepartureError,
-    RunDescription,
-    field_names,
-    rerun,
-)
+from spinning_top_sim.tools.recorded_run import ODD, RunDescription, field_names, reason_of, rerun
 
 
 class Difference(NamedTuple):
@@ -55,13 +50,7 @@ class Verdict:
         self.first = min(self.first or this, this, key=operator.attrgetter('stamp_ns'))
 
 
-def verify(reader: LogReader, run: RunDescription, end_ns: int,
-           show: Callable[[int], None]) -> Verdict:
-    """Compute a run again up to a log time, and compare; `show` takes the one reached [ns]."""
-    return _Comparison(run).compare(reader, end_ns, show)
-
-
-class _Comparison:
+class Comparison:
     """Computes the run of a log while the log is read in the order of time."""
 
     def __init__(self, run: RunDescription) -> None:
@@ -73,6 +62,7 @@ class _Comparison:
             tuple[int, str], deque[tuple[Stream | None, bytes]]] = defaultdict(deque)
 
     def compare(self, reader: LogReader, end_ns: int, show: Callable[[int], None]) -> Verdict:
+        """Return the result up to a log time; `show` takes the one reached [ns]."""
         run, verdict = self._run, self._verdict
         for stamp_ns, reason in run.broken:
             verdict.different += 1
@@ -105,8 +95,8 @@ class _Comparison:
                 show(reached_ns)
                 # Not up to it: another command at this very time may follow.
                 yield reached_ns
-        except DepartureError as error:
-            self._verdict.stopped = str(error)
+        except ODD as error:
+            self._verdict.stopped = reason_of(error)
         yield math.inf
 
     def _meet(self, key: tuple[int, str], data: bytes) -> None:
