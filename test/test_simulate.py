@@ -116,16 +116,8 @@ def test_a_table_of_the_truth(tmp_path):
     assert table == pytest.approx(np.loadtxt(exact, delimiter=',', skiprows=1), abs=1e-9)
 
 
-@pytest.fixture
-def parquet():
-    try:
-        from pyarrow import parquet
-    except ImportError as error:        # absent, or made for another NumPy
-        pytest.skip(str(error))
-    return parquet
-
-
-def test_parquet(tmp_path, parquet):
+def test_parquet(tmp_path):
+    parquet = pytest.importorskip('pyarrow.parquet', exc_type=ImportError)
     path = simulate(tmp_path / 'truth.parquet', '--duration', 1)
     table = parquet.read_table(path)
     assert table.num_rows == 101 and table.column_names[:2] == ['t', 'theta']
@@ -185,12 +177,12 @@ def test_wrong_arguments_are_told_in_a_line_and_leave_no_file(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(('arguments', 'message'), [
-    (['-p', 'initial.theta:=0.0', '-p', 'solver.method:=exact', '--command', '0.5:2.0:1.0'],
+@pytest.mark.parametrize(('name', 'arguments', 'message'), [
+    ('run.mcap', ['-p', 'initial.theta:=0.0', '-p', 'solver.method:=exact',
+                  '--command', '0.5:2.0:1.0'],
      'simulate: --command 0.5:2.0:1.0: lz = 1.0 kg m^2/s with l3 = 2.0: the axis is at a pole'),
-    (['-p', 'solver.method:=exact', '--command', '0.5:1.0:1e18'],
+    ('run.csv', ['-p', 'solver.method:=exact', '--command', '0.5:1.0:1e18'],
      'simulate: --command 0.5:1.0:1e+18: no motion from')])
-@pytest.mark.parametrize('name', ['run.mcap', 'run.csv'])
 def test_a_command_that_the_state_refuses_ends_the_run_there(
         tmp_path, capsys, name, arguments, message):
     path = tmp_path / name
@@ -204,12 +196,13 @@ def test_a_command_that_the_state_refuses_ends_the_run_there(
         assert np.loadtxt(path, delimiter=',', skiprows=1)[-1, 0] == 0.5
 
 
-def test_a_table_holds_the_rows_up_to_where_the_equations_end(tmp_path, capsys):
+def test_log_and_table_hold_the_run_up_to_where_the_equations_end(tmp_path, capsys):
     """The paper's equations end at the pole, which the wheel that stands upright falls through."""
     given = ['--quiet', '--duration', '5', '-p', 'solver.equations:=euler', '-p', 'spin.lz:=1.6',
              '-p', 'pose.rate:=2000.0']
     assert [main(['-o', str(tmp_path / name), *given]) for name in ('a.mcap', 'a.csv')] == [1, 1]
     assert capsys.readouterr().err.count('a step leapt over a pole') == 2
+    assert inspect.main([str(tmp_path / 'a.mcap'), '--verify']) == 0
     log, _ = read(tmp_path / 'a.mcap')
     times = np.loadtxt(tmp_path / 'a.csv', delimiter=',', skiprows=1)[:, 0]
     assert np.round(times * 1e9).tolist() == sorted(log['/pose'])

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.provenance import version
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -129,18 +128,18 @@ def write_row(specification: Specification, run: int, path: Path) -> None:
     """
     Compute one run into a new file, .mcap or .parquet.
 
-    Raises RecordingError for a file that exists, and ValueError or IntegrationError as `table`.
+    Raises RecordingError or OSError if it exists, ValueError or IntegrationError as `table` does.
     """
     from pyarrow import parquet  # noqa: PLC0415
 
-    if path.exists() or not path.parent.is_dir():
-        raise RecordingError(f'{path}: must not exist, and its folder must')
     if path.suffix == '.mcap':
         values = specification.values(run)
         write_log(path, Simulation(values, EPOCH_NS),
                   [(round(values['duration'] * NANOSECONDS), None)], lambda done: None, '/')
     else:
-        parquet.write_table(table(specification, run), path)
+        rows = table(specification, run)
+        with open(path, 'xb') as file:
+            parquet.write_table(rows, file)
 
 
 def compute_part(specification: Specification, part: int, folder: str,

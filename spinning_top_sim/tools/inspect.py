@@ -192,8 +192,6 @@ def _topics(found: Survey) -> Iterator[str]:
     for name, topic in found.topics.items():
         for begin, end in topic.gaps_ns:
             yield f'gap: {name} from {seconds(begin)} to {seconds(end)}'
-        if topic.off_grid:
-            yield f'{name}: {topic.off_grid} stamps are not on the grid'
 
 
 def _motion(number: int, motion: MotionReport, begin_ns: int) -> Iterator[str]:

@@ -51,7 +51,6 @@ class TopicReport:
     rate: float | None = None             # mean [Hz]
     grid_rate: float | None = None        # by the parameters [Hz]
     missing: int | None = None            # samples of the grid that are not in the log
-    off_grid: int = 0                     # stamps beside the grid
     # The first gaps: log times of the first and the last missing sample [ns]
     gaps_ns: list[tuple[int, int]] = field(default_factory=list)
 
@@ -239,7 +238,6 @@ def _count(report: TopicReport, stamps_ns: Stamps, sections: list[Section], topi
                        for at_ns in (section.begin_ns, section.end_ns))
         is_on_grid = (here - epoch_ns) % period_ns == 0
         report.grid_rate = NANOSECONDS / period_ns
-        report.off_grid += int(np.count_nonzero(~is_on_grid))
         # A sample that is there twice does not replace a missing one.
         report.missing = (report.missing or 0) + last - first - len(np.unique(here[is_on_grid]))
         edges_ns = np.array([first * period_ns + epoch_ns, *here,
