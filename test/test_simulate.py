@@ -20,11 +20,6 @@ from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools import cli, inspect
 from spinning_top_sim.tools.simulate import main
 
-EVERYTHING = ['-p', 'imu_data.enabled:=true', '-p', 'clock.enabled:=true',
-              '-p', 'markers.enabled:=true',
-              '-p', 'imu.gyroscope_noise_density:=0.001', '-p', 'imu.lever_arm:=[0.1, 0.0, 0.2]',
-              '-p', 'imu.accelerometer_random_walk:=0.01', '-p', 'imu.rpy:=[0.1, 0.2, 0.3]']
-
 
 def simulate(path, *arguments):
     assert main(['-o', str(path), '--quiet', *map(str, arguments)]) == 0
@@ -68,10 +63,11 @@ def in_memory(values, commands, duration_ns):
 
 
 EPOCH_NS = 1_000_000_000        # as `simulate` has it unasked
-SCENE = {'spin.l3': 1.6, 'imu_data.enabled': True, 'clock.enabled': True,
-         'markers.enabled': True,
-         'imu.gyroscope_noise_density': 0.001, 'imu.lever_arm': (0.1, 0.0, 0.2),
-         'imu.accelerometer_random_walk': 0.01, 'imu.rpy': (0.1, 0.2, 0.3)}
+SCENE = {'imu_data.enabled': True, 'clock.enabled': True, 'markers.enabled': True,
+         'imu.gyroscope_noise_density': 0.001, 'imu.lever_arm': [0.1, 0.0, 0.2],
+         'imu.accelerometer_random_walk': 0.01, 'imu.rpy': [0.1, 0.2, 0.3]}
+EVERYTHING = [text for name, value in SCENE.items()
+              for text in ('-p', f'{name}:={str(value).lower()}')]
 COMMANDS = [(700_000_001, 2.0, 1.5), (1_234_567_890, -1.0, 0.5)]
 
 
