@@ -120,8 +120,6 @@ class Measured:
     nutation_period: float | None
     mean_precession_rate: float | None
     mean_spin_rate: float | None
-    precession_min: float | None
-    precession_max: float | None
     missing: tuple[str, ...]              # why numbers are None
 
 
@@ -148,11 +146,8 @@ def measure(data: Attitudes, expected: float | None = None) -> Measured:
                         for angle, tip in ((data.phi, data.tip), (data.psi, data.body_tip)))
     if not reason and None in (precession, spin):
         reason = 'phi or psi cannot be unwrapped: a pole, or too few samples in a turn'
-    slowest = fastest = None
-    if data.phi_dot is not None and np.isfinite(data.phi_dot).all():
-        slowest, fastest = float(np.min(data.phi_dot)), float(np.max(data.phi_dot))
-    return Measured(count, nutations, None if reason else period, precession, spin, slowest,
-                    fastest, (reason,) if reason else ())
+    return Measured(count, nutations, None if reason else period, precession, spin,
+                    (reason,) if reason else ())
 
 
 def _spline(values: NDArray[np.generic], index: float) -> BSpline:

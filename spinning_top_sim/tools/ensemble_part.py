@@ -52,8 +52,7 @@ class EnsembleError(Exception):
 def versions() -> dict[str, str]:
     """Return the versions on which the bytes of a dataset depend."""
     return {'python': platform.python_version(), 'machine': platform.machine(),
-            **{name: version(name) for name in (
-                'spinning_top_sim', 'numpy', 'pyarrow', 'mcap', 'rclpy', 'zstandard', 'lz4')}}
+            **{name: version(name) for name in ('spinning_top_sim', 'numpy', 'pyarrow')}}
 
 
 def samples(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Samples]:
