@@ -235,12 +235,12 @@ def test_a_full_disk_leaves_a_readable_log(tmp_path):
     path = tmp_path / 'run.mcap'
 
     def small_files():
-        # Here the chunk that does not fit leaves enough room for the summary.
-        resource.setrlimit(resource.RLIMIT_FSIZE, (3_000_000, 3_000_000))
+        # The first chunk of 4 MB fits; the second leaves enough room for the summary.
+        resource.setrlimit(resource.RLIMIT_FSIZE, (6_000_000, 6_000_000))
     run = subprocess.run(
         [sys.executable, '-c', 'import signal, sys\nsignal.signal(signal.SIGXFSZ, signal.SIG_IGN)'
          '\nfrom spinning_top_sim.tools.simulate import main\nsys.exit(main())',
-         '-o', path, '--duration', '200', '--quiet', '-p', 'solver.method:=exact'],
+         '-o', path, '--duration', '40', '--quiet', '-p', 'record.compression:=none'],
         preexec_fn=small_files, capture_output=True, text=True, timeout=120, check=False)
     assert run.returncode == 1 and 'Traceback' not in run.stderr
     assert 'File too large' in run.stderr
