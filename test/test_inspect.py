@@ -24,7 +24,7 @@ from spinning_top_sim import tools
 from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.tools import inspect, recover, simulate
+from spinning_top_sim.tools import inspect, recorded_run, recover, simulate
 from spinning_top_sim.tools.survey import survey
 
 NAMES = {'cusp': 'cusps', 'fast_gyroscope': 'cusps', 'free_top': 'free top', 'heavy_top': 'loops',
@@ -496,12 +496,29 @@ def test_an_odd_entry_of_the_journal_is_told(short, tmp_path, capsys, event):
                for note in content['notes'])
 
 
-def test_a_run_that_no_log_of_its_size_holds_is_not_computed(short, tmp_path, capsys):
-    """A stamp of the year 2096 would need 10^12 samples."""
+def test_a_run_that_no_log_of_its_size_holds_is_not_computed(
+        short, tmp_path, capsys, monkeypatch):
+    """A stamp of the year 2096: neither 10^12 samples nor 10^12 steps."""
     path = rewritten(short, tmp_path / 'late.mcap', stamp=lambda topic, number, stamp_ns: (
         4 * 10 ** 18 if (topic, number) == ('/pose', 50) else stamp_ns))
     code, out, _ = told(capsys, path, '--verify')
     assert code == 1 and 'lacks most samples of this run' in out
+    monkeypatch.setattr(recorded_run, 'STEPS_A_BYTE', 0)        # they would take a minute
+    t_ns = 3_999_999_998_000_000_000
+    far = journal.event('command', t_ns, t_ns, l3=1.7, lz=1.4)
+    path = rewritten(short, tmp_path / 'far.mcap', lambda topic, number, data: (
+        far if topic.endswith('/events') and number == 1 else data),
+        stamp=lambda topic, number, stamp_ns: (
+            4 * 10 ** 18 if topic.endswith('/events') and number == 1 else stamp_ns))
+    assert 'integration steps are too many' in told(capsys, path)[1]
+
+
+def test_topics_are_known_by_their_names_in_a_log_put_together_anew(stepped):
+    with LogReader(stepped) as reader:
+        run = recorded_run.read_run_description(reader)
+        found = recorded_run._topics(reader.topics[::-1], run.values_at_recording)
+    assert found.items() > run.topics.items()
+    assert {*found} - {*run.topics} == {'~/commands', '~/events'}
 
 
 # ---------------------------------------------------------------------------------- pictures
