@@ -213,7 +213,7 @@ def test_other_scopes_are_not_supported(top):
 
 @pytest.mark.parametrize('method', ['rk45', 'exact'])
 def test_a_log_of_all_this_verifies(top, tmp_path, capsys, method):
-    """States, and resets are in the journal: the run can be computed again."""
+    """States and resets are in the journal: the run can be computed again."""
     path = str(tmp_path / 'run.mcap')
     assert top.set(
         solver__method=method, increments__enabled=True, markers__enabled=True, mag__enabled=True,
@@ -232,7 +232,7 @@ def test_a_log_of_all_this_verifies(top, tmp_path, capsys, method):
     top.done('StepSimulation', steps=11)
     top.done('ResetSimulation', scope=2)
     top.done('StepSimulation', steps=5)
-    top.pause().done('StepSimulation', steps=20)
+    top.done('StepSimulation', steps=20)
     top.done('SetEntityState', entity='spinning_top', state=state, set_pose=True)
     top.done('StepSimulation', steps=13)
     assert top.switch('record', False).success

@@ -131,7 +131,6 @@ class Shape:
 
     centre : of the cylinder along e3, signed: the centre of mass
     tip : along e3, on the side of the centre of mass, half a radius out of the cylinder
-    lower, upper : corners of the box around cylinder, pivot and tip, in the body frame
     """
 
     def __init__(self, top: Top) -> None:
@@ -142,9 +141,6 @@ class Shape:
         self.centre = top.com_distance
         reach = abs(self.centre) + 0.5 * self.height + 0.5 * self.radius
         self.tip = math.copysign(reach, self.centre or 1.0)
-        heights = 0.0, self.tip, self.centre - 0.5 * self.height, self.centre + 0.5 * self.height
-        self.lower = -self.radius, -self.radius, min(heights)
-        self.upper = self.radius, self.radius, max(heights)
 
 
 def _drawable(length: float) -> float:
