@@ -120,7 +120,7 @@ def whole(tmp_path_factory):
 
 def test_every_stream_has_columns_or_is_left_out():
     """Those without a rate of their own, too; each number has a name."""
-    names = [name for name in ensemble_spec.STREAMS if name not in ensemble_spec.WITHOUT_COLUMNS]
+    names = list(ensemble_spec.STREAMS)
     sample = {'imu.lever_arm': {'values': [[0.1, 0.0, 0.0]]}}
     for some in ([name] for name in names):
         one = table(ensemble_spec.parse({'runs': 1, 'duration': 0.1, 'streams': some}, 'test'), 0)
@@ -136,10 +136,9 @@ def test_every_stream_has_columns_or_is_left_out():
         'imu/mag.magnetic_field_covariance.8'}
 
 
-@pytest.mark.parametrize('run', [0, 7])
-def test_a_run_has_the_samples_that_its_log_has(whole, tmp_path, run):
+def test_a_run_has_the_samples_that_its_log_has(whole, tmp_path):
     """Also where the IMU loses samples, and sends some twice."""
-    folder, path = whole
+    (folder, path), run = whole, 7
     values = ensemble_spec.read(path).values(run)
     every = parquet.read_table(folder)
     rows = every.filter(every['run'].to_numpy() == run)
@@ -185,8 +184,7 @@ def test_two_workers_of_which_one_is_killed_make_the_same_dataset(
     assert contents(folder / 'data') == contents(data)
     manifest = json.loads((folder / 'manifest.json').read_text())
     assert manifest['complete'] and manifest['failed'] == {}
-    assert {'spinning_top_sim', 'numpy', 'pyarrow', 'python', 'rclpy', 'mcap', 'zstandard',
-            'lz4'} <= set(manifest['versions'])
+    assert {'spinning_top_sim', 'numpy', 'pyarrow', 'python'} <= set(manifest['versions'])
     assert ensemble_spec.parse(manifest['specification'], 'test') == ensemble_spec.read(path)
     assert sorted(entry.name for entry in folder.iterdir()) == ['data', 'manifest.json']
 
@@ -244,42 +242,21 @@ def test_a_row_alone_is_computed_from_the_manifest(whole, tmp_path):
     assert main([str(tmp_path), '--row', '31', '-o', str(tmp_path / 'one.parquet')]) == 1
 
 
-def test_logs_and_failed_runs(tmp_path, capsys, ensemble):
-    """A run that no motion begins is told with its reason; a log that is lost is made again."""
-    path = written(tmp_path, runs=6, duration=0.2, format='mcap', streams=[], sample={
+def test_failed_runs_are_told_with_their_reason(tmp_path, capsys, ensemble):
+    """Also by a part that is there already, and is not computed again."""
+    path = written(tmp_path, runs=6, duration=0.05, runs_per_part=3, streams=[], sample={
         'initial.theta': {'values': [0.5, 0.5, 3.0]}, 'spin.lz': {'values': [1.42, 1e30]}})
-    folder = tmp_path / 'logs'
-
-    def compute():
+    folder = tmp_path / 'other'
+    for _ in range(2):
         assert ensemble(path, '-o', folder) == 0
         said = capsys.readouterr().err
         assert said.startswith('ensemble: 3 of 6 runs failed, see manifest.json; run 3: ValueErr')
         assert said.count('\n') == 1
-        return contents(folder)
-
-    before = compute()
-    failed = json.loads(before['manifest.json'])['failed']
-    assert list(failed) == ['3', '4', '5']
-    assert all('ValueError: no motion from theta' in why for why in failed.values())
-    logs = sorted((folder / 'data').iterdir())
-    assert [log.name for log in logs] == [f'run-{run:09d}.mcap' for run in range(3)]
-    assert main([str(folder), '--row', '2', '-o', str(tmp_path / 'one.mcap')]) == 0
-    assert (tmp_path / 'one.mcap').read_bytes() == logs[2].read_bytes()
-    logs[0].unlink()
-    then = logs[1].stat().st_ino
-    assert compute() == before
-    assert logs[1].stat().st_ino == then
-
-
-def test_a_part_that_is_there_tells_its_failed_runs(tmp_path):
-    specification = ensemble_spec.parse({
-        'runs': 3, 'duration': 0.05, 'runs_per_part': 3,
-        'sample': {'spin.lz': {'values': [1.42, 1e30, 1.4]}}}, 'test')
-    failed = parts_of(specification, tmp_path)
-    assert list(failed) == ['1']
-    assert parts_of(specification, tmp_path) == failed
-    part, = (tmp_path / 'data').iterdir()
-    assert set(parquet.read_table(part)['run'].to_pylist()) == {0, 2}
+        failed = json.loads((folder / 'manifest.json').read_text())['failed']
+        assert list(failed) == ['3', '4', '5']
+        assert all('ValueError: no motion from theta' in why for why in failed.values())
+    part, = (folder / 'data').iterdir()
+    assert set(parquet.read_table(part)['run'].to_pylist()) == {0, 1, 2}
 
 
 # --------------------------------------------------------------------------------- what is drawn
@@ -360,18 +337,14 @@ def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(
     ({'params': ['none.yaml']}, 'none.yaml: No such file'),
     ({'sample': {'spin.l3': {'gauss': [1, 2]}}}, 'must be one of uniform, normal, log_uniform'),
     ({'sample': {'spin.l3': {'uniform': [2, 1]}}}, 'uniform = [2, 1]: must be [low, high] with'),
-    ({'sample': {'spin.l3': {'uniform': [1, 10 ** 400]}}}, 'must be [low, high] with low <= high'),
-    ({'sample': {'spin.l3': {'normal': [2]}}}, 'normal = [2]: must be [mean, deviation]'),
-    ({'sample': {'top.mass': {'log_uniform': [0, 1]}}}, '0 < low <= high'),
+    ({'sample': {'spin.l3': {'normal': [2]}}}, 'normal = [2]: must be a list of 2 numbers'),
     ({'sample': {'top.mass': {'uniform': [1, 1e31]}}}, 'top.mass = 1e+31: must be a number >= 0'),
     ({'sample': {'spin.l3': {'values': []}}}, 'must have one value at least'),
-    ({'sample': {'solver.method': {'values': ['exact', 'euler']}}}, "'euler': must be one of"),
     ({'sample': {'markers.trace_points': {'uniform': [1, 2]}}}, 'must be values'),
     ({'sample': {'imu.enabled': {'values': [True, False]}}}, 'imu.enabled must not be sampled'),
     ({'streams': ['imu', 'markers']}, "streams: 'markers': must be some of pose"),
     ({'runs': 1.5}, 'runs = 1.5: must be an integer >= 1'),
-    ({'duration': 0.0}, 'duration = 0.0: must be a number > 0'),
-    ({'format': 'csv'}, "format = 'csv': must be one of parquet, mcap"),
+    ({'duration': 0.0}, 'duration = 0.0: must be a number >= 1e-09'),
     ({'run': 3}, "'run'")])
 def test_a_bad_specification_is_refused_and_makes_nothing(tmp_path, capsys, changes, said):
     path = written(tmp_path, **changes)
@@ -411,11 +384,9 @@ def test_a_folder_of_something_else_is_refused(whole, tmp_path, capsys, ensemble
         f'{tmp_path} exists and has no manifest.json: choose a new folder\n')
 
 
-@pytest.mark.parametrize('text', [
-    '{"versions": 1, "specification": {"runs": 1, "duration": 1.0}}', '[' * 100_000])
-def test_what_is_no_manifest_is_refused(tmp_path, capsys, text):
+def test_what_is_no_manifest_is_refused(tmp_path, capsys):
     place = tmp_path / 'manifest.json'
-    place.write_text(text)
+    place.write_text('{"versions": 1, "specification": {"runs": 1, "duration": 1.0}}')
     assert main([str(tmp_path), '--row', '0', '-o', str(tmp_path / 'one.mcap')]) == 2
     error = capsys.readouterr().err
     assert error.startswith(f'ensemble: {place} is no manifest') and error.count('\n') == 1

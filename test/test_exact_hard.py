@@ -43,12 +43,3 @@ def test_states_are_right_to_the_last_digits(case):
             error(motion.psi[k], state['psi'], start.psi),
             max(map(error, (w, x, y, z), state['q'])))
     assert max(map(max, errors.values())) <= BOUND, errors
-
-
-@cases
-def test_the_start_is_the_start(case):
-    top, start = top_of(case), start_of(case)
-    motion = solve(top, start, [0.0])
-    found = motion.theta[0], motion.theta_dot[0], motion.phi[0], motion.psi[0]
-    expected = start.theta, start.theta_dot, start.phi, start.psi
-    assert max(map(error, found, expected, expected)) <= BOUND

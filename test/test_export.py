@@ -122,20 +122,6 @@ def test_kalibr_gets_the_parameters(folder):
                for name in content if name != 'rostopic')
 
 
-def test_kalibr_gets_matrices_that_are_not_the_identity(tmp_path):
-    matrix = [1.01, 0.0, 0.0, 0.002, 0.99, 0.0, 0.0, 0.003, 1.0]
-    assert simulate.main([*options(NOISY, **{'imu.accelerometer_M': matrix}), '--duration', '0.01',
-                          '-o', str(tmp_path / 'run.mcap'), '--quiet', '--namespace', 'left',
-                          *exports(tmp_path, 'kalibr')]) == 0
-    content = yaml.safe_load((tmp_path / 'imu.yaml').read_text())
-    identity = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-    assert content['rostopic'] == '/left/imu/data_raw'
-    assert content['model'] == 'scale-misalignment'
-    assert content['accelerometers'] == {'M': [matrix[:3], matrix[3:6], matrix[6:]]}
-    assert content['gyroscopes'] == {'M': identity, 'A': [[0.0, 0.0, 0.0]] * 3,
-                                     'C_gyro_i': identity}
-
-
 @pytest.mark.parametrize(('arguments', 'reason', 'code'), [
     (['--export', 'tum:DIR/a'], 'the log has no ground_truth/imu_odom', 2),
     (['--export', 'euroc_imu:DIR/a', '-p', 'imu.enabled:=false'], 'no imu/data_raw', 2),

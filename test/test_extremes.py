@@ -170,7 +170,7 @@ def short_life(rng):
 
     for _ in range(3):
         simulation.log_to(lambda entries, size: None, streams())
-        asked = iter(range(30))
+        asked = iter(range(10))
         target_ns = max(simulation.now_ns, 0) + rng.choice(
             (0, 1, *(10 ** n for n in range(3, 18))))
         try:

@@ -123,11 +123,3 @@ def test_no_reading_is_beyond_the_range_or_off_the_grid_of_the_resolution(limit,
     assert found[-1, 0] >= limit - step - 1e-15 * limit and found[0, 0] == -found[-1, 0]
     assert not np.signbit(found[-2, :3]).any(), 'no reading is -0'
     assert found[-1, 3] == limit and np.array_equal(found[2:4, 3], values[2:4])
-
-
-@pytest.mark.parametrize(('kind', 'step'), [
-    ('gyroscope', 5e-324), ('accelerometer', 1e-13), ('gyroscope', -0.1),
-    ('accelerometer', math.nan)])
-def test_a_resolution_that_doubles_cannot_divide_by_is_refused(kind, step):
-    with pytest.raises(ValueError, match=rf'imu\.{kind}_resolution = {step!r}: must be'):
-        parameters.checked({f'imu.{kind}_resolution': step})

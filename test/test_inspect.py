@@ -24,7 +24,7 @@ from spinning_top_sim import tools
 from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.tools import analysis, inspect, recover, simulate
+from spinning_top_sim.tools import inspect, recorded_run, recover, simulate
 from spinning_top_sim.tools.survey import survey
 
 NAMES = {'cusp': 'cusps', 'fast_gyroscope': 'cusps', 'free_top': 'free top', 'heavy_top': 'loops',
@@ -91,14 +91,14 @@ def chunks_of(path):
 
 
 def rewritten(source, target, change=lambda topic, number, data: data, metadata=None,
-              stamp=lambda topic, number, stamp_ns, copy=0: stamp_ns):
+              stamp=lambda topic, number, stamp_ns: stamp_ns):
     """
     Copy a log with checksums that are right.
 
     change : takes topic, number in it and data of a message; returns other data, None to drop it,
         or a list of data
     metadata : what is another in the metadata of the run
-    stamp : takes topic, number and log time [ns], and the place in the list; returns the log time
+    stamp : takes topic, number and log time [ns]; returns the log time
     """
     numbers = {}
     with open(source, 'rb') as old, open(target, 'wb') as new:
@@ -116,10 +116,10 @@ def rewritten(source, target, change=lambda topic, number, data: data, metadata=
         for _, channel, message in reader.iter_messages():
             topic = channel.topic
             number = numbers[topic] = numbers.get(topic, -1) + 1
-            data = change(topic, number, message.data)
-            for copy, one in enumerate(data if isinstance(data, list) else [data]):
+            data, at_ns = (change(topic, number, message.data),
+                           stamp(topic, number, message.log_time))
+            for one in data if isinstance(data, list) else [data]:
                 if one is not None:
-                    at_ns = stamp(topic, number, message.log_time, *filter(None, [copy]))
                     writer.add_message(channels[channel.id], at_ns, one, at_ns)
         writer.finish()
     return target
@@ -135,8 +135,7 @@ def with_flipped_bit(data, byte, bit=0):
 
 
 @pytest.mark.parametrize(('scene', 'method'), [
-    *((scene, 'exact') for scene in SCENES), ('cusp', 'rk45'), ('planar_pendulum', 'rk45'),
-    ('sleeping', 'rk45')])
+    *((scene, 'exact') for scene in SCENES), ('cusp', 'rk45')])
 def test_every_scene_is_measured_from_its_data(tmp_path, scene, method):
     duration = 20 if scene in ('near_separatrix', 'waking_sleeper') else 4
     found = surveyed(log_of(
@@ -157,9 +156,6 @@ def test_every_scene_is_measured_from_its_data(tmp_path, scene, method):
     assert measured.mean_precession_rate == pytest.approx(
         truth.mean_precession_rate, rel=1e-9, abs=1e-9 if scene == 'free_top' else 0.0)
     assert measured.mean_spin_rate == pytest.approx(truth.mean_spin_rate, rel=1e-9)
-    # Near a pole a tilt is the root of a square that doubles hold to 1e-16.
-    assert measured.theta_min == pytest.approx(truth.theta_min, abs=1e-6)
-    assert measured.theta_max == pytest.approx(truth.theta_max, abs=1e-6)
     assert not measured.missing
 
 
@@ -199,8 +195,8 @@ def test_any_topic_with_an_attitude_measures_a_motion(tmp_path, topic):
     for name in ('nutation_period', 'mean_precession_rate', 'mean_spin_rate'):
         assert getattr(motion.measured, name) == pytest.approx(
             getattr(motion.exact, name), rel=1e-9), name
-    assert max(curve.largest for curve in found.errors.values()) < 1e-14
-    drifts = [curve.largest for curves in found.drifts.values() for curve in curves.values()]
+    assert max(found.errors.values()) < 1e-14
+    drifts = [drift for drifts in found.drifts.values() for drift in drifts.values()]
     assert len(drifts) == (3 if topic.startswith('ground_truth') else 0)
     assert all(drift < 1e-14 for drift in drifts)
 
@@ -222,23 +218,9 @@ def test_errors_and_drifts_are_those_in_the_data(stepped, tmp_path, capsys):
     errors = content['orientation_error']
     assert errors['/a/b/pose']['max'] == pytest.approx(1e-6, rel=1e-3)
     assert errors['/a/b/joint_states']['max'] < 1e-9
-    assert errors['/a/b/pose']['rms'] == pytest.approx(1e-6 / np.sqrt(298), rel=1e-2)
     for drifts in content['drifts'].values():
         assert 0.0 < drifts['energy'] < 1e-11 and drifts['l3'] < 1e-13
     assert content['motions'][-1]['measured']['nutations'] >= 1
-
-
-@pytest.mark.parametrize(('count', 'accuracy'), [(10, 1e-6), (20, 1e-11)])
-def test_few_samples_in_a_nutation_are_enough(count, accuracy):
-    phase = 2.0 * np.pi * np.arange(39 * count + count // 2) / count + 2.0     # 39 rises
-    half = 0.25 + 0.05 * np.cos(phase)
-    rows = np.stack((0.0 * half, np.sin(half), 0.0 * half, np.cos(half)))
-    data = analysis.Attitudes(np.arange(len(phase)) * 10_000_000, rows)
-    measured = analysis.measure(data)
-    assert measured.nutations == 38
-    assert measured.nutation_period == pytest.approx(count / 100, rel=accuracy)
-    assert measured.theta_min == pytest.approx(0.4, rel=accuracy)
-    assert measured.theta_max == pytest.approx(0.6, rel=accuracy)
 
 
 @pytest.mark.parametrize(('kept', 'gaps'), [
@@ -292,12 +274,6 @@ def test_offline_logs_verify_and_a_changed_bit_is_found_wherever_it_is(
     assert not (verdict['missing'] or verdict['unexpected'])
     assert first['byte'] == places[first['topic']][0]
     assert first['logged'] != first['computed']
-
-
-def test_a_command_exactly_at_the_end_verifies(tmp_path, capsys):
-    verdict = verified(capsys, log_of(tmp_path / 'run.mcap', '--duration', 0.5, '--command',
-                                      '0.5:2.0:1.5'))
-    assert verdict['identical'] and verdict['compared']['/spinning_top/commands'] == 1
 
 
 def test_a_difference_names_field_stamp_and_both_values(short, tmp_path, capsys):
@@ -380,19 +356,9 @@ def test_live_logs_verify(tmp_path, capsys):
         assert verdict['identical'] and code == 0, verdict
         assert sum(verdict['compared'].values()) > 100
         assert [motion['cause'] for motion in content['motions']] == causes
-        assert all(topic['missing'] == 0 and topic['off_grid'] == 0
+        assert all(topic['missing'] == 0
                    for topic in content['topics'].values() if topic['stream'])
         assert all(error['max'] < 1e-9 for error in content['orientation_error'].values())
-
-
-def test_an_euler_form_that_stops_verifies(tmp_path, capsys):
-    """Where the equations cannot go on the log ends; so does what is computed again."""
-    path = tmp_path / 'run.mcap'
-    assert simulate.main(['-o', str(path), '--quiet', '--duration', '5',
-                          '-p', 'solver.equations:=euler', '-p', 'spin.lz:=1.6']) == 1
-    capsys.readouterr()
-    verdict = verified(capsys, path)
-    assert verdict['identical'] and sum(verdict['compared'].values()) > 100
 
 
 # ------------------------------------------------------------------------------ what is told
@@ -503,8 +469,7 @@ def test_a_reader_that_leaves_is_no_error(short, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(('key', 'text'), [
-    ('parameters', '[' * 100_000), ('parameters', '{"world_frame": "\\ud800"}'),
-    ('parameters_now', ''), ('parameters', '{"top.lambda1": 1e-320}'), ('epoch_ns', '-1'),
+    ('parameters', '[' * 100_000), ('parameters', '{"top.lambda1": 1e-320}'),
     ('begun_ns', str(10 ** 18)), ('history', '[[5, 1.0, 1.0], [4, 1.0, 1.0]]'),
     ('history', '[[1e300, 1.0, 1.0]]'), ('history', '[[0, 1, NaN]]')])
 def test_odd_metadata_end_in_words(short, tmp_path, capsys, key, text):
@@ -517,7 +482,7 @@ def test_odd_metadata_end_in_words(short, tmp_path, capsys, key, text):
 @pytest.mark.parametrize('event', [
     {'event': 'command', 'l3': math.nan, 'lz': 1.0},
     {'event': 'command', 'sent_ns': 2 ** 63, 'l3': 1.0, 'lz': 1.0},
-    {'event': 'parameters', 'x': 1}, {'event': []}, {'event': 'state', 'l3': 1.0, 'lz': 1.0},
+    {'event': []}, {'event': 'state', 'l3': 1.0, 'lz': 1.0},
     {'event': 'reset', 'parameters': {}, 'epoch_ns': 10 ** 18}])
 def test_an_odd_entry_of_the_journal_is_told(short, tmp_path, capsys, event):
     """It is left out: the run is followed to its end all the same."""
@@ -531,38 +496,46 @@ def test_an_odd_entry_of_the_journal_is_told(short, tmp_path, capsys, event):
                for note in content['notes'])
 
 
-def test_a_run_that_no_log_of_its_size_holds_is_not_computed(short, tmp_path, capsys):
-    """A stamp of the year 2100: neither 10^10 samples nor 10^10 steps."""
+def test_a_run_that_no_log_of_its_size_holds_is_not_computed(
+        short, tmp_path, capsys, monkeypatch):
+    """A stamp of the year 2096: neither 10^12 samples nor 10^12 steps."""
     path = rewritten(short, tmp_path / 'late.mcap', stamp=lambda topic, number, stamp_ns: (
         4 * 10 ** 18 if (topic, number) == ('/pose', 50) else stamp_ns))
     code, out, _ = told(capsys, path, '--verify')
     assert code == 1 and 'lacks most samples of this run' in out
-    path = rewritten(
-        short, tmp_path / 'far.mcap', lambda topic, number, data: (
-            data.replace(b'"sent_ns": 300000000', b'"sent_ns": 3999999999000000000').replace(
-                b'"t_ns": 300000000', b'"t_ns": 3999999999000000000')
-            if topic.endswith('/events') else data),
+    monkeypatch.setattr(recorded_run, 'STEPS_A_BYTE', 0)        # they would take a minute
+    t_ns = 3_999_999_998_000_000_000
+    far = journal.event('command', t_ns, t_ns, l3=1.7, lz=1.4)
+    path = rewritten(short, tmp_path / 'far.mcap', lambda topic, number, data: (
+        far if topic.endswith('/events') and number == 1 else data),
         stamp=lambda topic, number, stamp_ns: (
-            4 * 10 ** 18 if (topic.endswith('/events') and number == 1) else stamp_ns))
-    code, out, _ = told(capsys, path)
-    assert 'journal, entry at 4000000000.000000000 s' in out or 'integration steps' in out
+            4 * 10 ** 18 if topic.endswith('/events') and number == 1 else stamp_ns))
+    assert 'integration steps are too many' in told(capsys, path)[1]
+
+
+def test_topics_are_known_by_their_names_in_a_log_put_together_anew(stepped):
+    with LogReader(stepped) as reader:
+        run = recorded_run.read_run_description(reader)
+        found = recorded_run._topics(reader.topics[::-1], run.values_at_recording)
+    assert found.items() > run.topics.items()
+    assert {*found} - {*run.topics} == {'~/commands', '~/events'}
 
 
 # ---------------------------------------------------------------------------------- pictures
 
 
-def test_pictures_are_drawn(stepped, tmp_path, capsys):
+def test_pictures_are_drawn(short, tmp_path, capsys):
     pytest.importorskip('matplotlib')
     image = pytest.importorskip('PIL.Image')
     page, film = tmp_path / 'page.png', tmp_path / 'top.gif'
-    assert told(capsys, stepped, '--plot', page, '--animate', film)[0] == 0
+    assert told(capsys, short, '--plot', page, '--animate', film)[0] == 0
     pixels = np.asarray(image.open(page).convert('L'))
     assert min(pixels.shape) > 600 and 0.02 < np.mean(pixels < 250) < 0.5
     frames = image.open(film)
-    assert frames.n_frames == 19 and frames.info['duration'] == 50
+    assert frames.n_frames == 7 and frames.info['duration'] == 50
     assert film.stat().st_size < 400_000
     shown = []
-    for number in (0, 10):
+    for number in (0, 6):
         frames.seek(number)
         shown.append(np.asarray(frames.convert('RGB'), int))
     assert np.mean(np.abs(shown[1] - shown[0]).max(axis=2) > 30) > 0.01
@@ -579,10 +552,11 @@ def test_without_matplotlib_there_is_a_hint(short, tmp_path, capsys, monkeypatch
     assert 'motion 2' in out                            # the rest is told all the same
 
 
-def test_neither_ros_nor_pictures_are_imported_unasked(short):
-    code = ('import sys\nfrom spinning_top_sim.tools.inspect import main\n'
+def test_neither_ros_nor_scipy_nor_pictures_are_imported_unasked(short, tmp_path):
+    code = ('import sys\nfrom spinning_top_sim.tools import inspect, simulate\n'
+            f'simulate.main(["-o", {str(tmp_path / "run.csv")!r}, "--duration", "1"])\n'
             'early = sorted({"scipy"} & set(sys.modules))\n'
-            f'main([{str(short)!r}, "--verify"])\n'
+            f'inspect.main([{str(short)!r}, "--verify"])\n'
             'print("loaded:", early, sorted({"rclpy", "matplotlib"} & set(sys.modules)))')
     run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                          timeout=60, check=True)

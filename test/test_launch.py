@@ -249,9 +249,6 @@ def test_a_log_is_replayed_with_the_frames_that_it_was_recorded_with(installed, 
     assert ('/markers', '/a/b/markers') in run.nodes['rviz2/rviz2'].remappings
 
 
-# ------------------------------------------------------------------------------------------- rviz
-
-
 # ---------------------------------------------------------------------------------- the real thing
 
 RUN = """

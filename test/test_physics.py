@@ -115,17 +115,6 @@ def test_products_and_angles_of_rotations():
             small, abs=2e-15)
 
 
-def at_rest(theta):
-    return solve(Top(**TOP), State(theta=theta, l3=0.0, lz=0.0), [0.0])
-
-
-def test_hanging_at_rest_an_accelerometer_reads_g_upwards():
-    hanging = at_rest(math.pi).specific_force((0.1, 0.0, 0.2))
-    assert np.array(hanging)[:, 0] == pytest.approx((0.0, 0.0, -TOP['gravity']))
-    upright = at_rest(0.0).specific_force((0.0, 0.0, 0.0))
-    assert tuple(float(x[0]) for x in upright) == (0.0, 0.0, TOP['gravity'])
-
-
 NAMES = {
     'loop-c-thd+': 'loops', 'wavy-a': 'waves', 'fast-1e+08-cusp': 'cusps',
     'cross-top-a': 'through the top', 'cross-bottom-a': 'through the bottom',
@@ -184,19 +173,6 @@ def test_the_gyroscopic_ratio_by_hand():
     for distance in (0.5, -0.5):
         assert described(**top, top__com_distance=distance)[0].gyroscopic_ratio == 1.125
     assert described(**top, top__com_distance=0.0)[0].gyroscopic_ratio == math.inf
-
-
-def test_the_extremes_of_the_precession_by_hand():
-    """
-    It is least inside the swing, where L3 u^2 - 2 Lz u + L3 = 0 with u = cos(theta).
-
-    For L3 = 0.3 and Lz = 0.5 that is u = 1/3, and phi' = (0.5 - 0.1)/(lambda1 8/9).
-    """
-    description, top, _ = described(initial__theta=0.5 * math.pi, spin__l3=0.3, spin__lz=0.5,
-                                    top__com_distance=-0.15)
-    assert description.theta_max == pytest.approx(0.5 * math.pi, abs=1e-15)
-    assert description.theta_min < math.acos(1.0 / 3.0)
-    assert description.precession_min == pytest.approx(0.45 / top.lambda1, rel=1e-14)
 
 
 @pytest.mark.parametrize(('theta', 'theta_dot', 'l3', 'lz'), [

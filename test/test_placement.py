@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""States of a top from pose and twist, and the box around it."""
+"""States of a top from pose and twist."""
 
 import math
 
@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.placement import POLE, Box, state_of
-from spinning_top_sim.physics.top import Shape, State, Top
+from spinning_top_sim.physics.placement import POLE, state_of
+from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.propagator import propagate
 
 TOP = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
@@ -54,16 +54,3 @@ def test_at_a_pole_what_is_not_spin_is_nutation(tilt, inverted, rates):
     assert np.allclose(np.abs(again @ q), 1.0, rtol=0.0, atol=1e-15)
     assert np.allclose(again, q, rtol=0.0, atol=POLE)
     assert np.allclose(rates_again, rates, rtol=0.0, atol=1e-14)
-
-
-@pytest.mark.parametrize('distance', [0.15, 0.0, -0.4])
-def test_the_box_holds_the_body_the_pivot_and_the_tip(distance):
-    top = Top(lambda1=0.5, lambda3=0.15, mass=2.0, com_distance=distance, gravity=9.8)
-    box, shape = Box.of(top), Shape(top)
-    assert box.upper[:2].tolist() == (-box.lower[:2]).tolist() == 2 * [shape.radius]
-    for height in (0.0, shape.tip, shape.centre - shape.height / 2,
-                   shape.centre + shape.height / 2):
-        assert box.lower[2] <= height <= box.upper[2]
-    assert {*box.lower, *box.upper} <= {
-        -shape.radius, shape.radius, 0.0, shape.tip, shape.centre - shape.height / 2,
-        shape.centre + shape.height / 2}

@@ -2,8 +2,8 @@
 """
 The recorder: logs that others read, a bounded loss, and disks that fail.
 
-The readers are rosbags, mcap-ros2-support and mcap, none of them written here; the messages are
-serialized by rosbags.  Children are killed for good after a timeout, whatever they do.
+The readers are rosbags and mcap, none of them written here; the messages are
+serialized by rosbags.
 """
 
 import io
@@ -12,14 +12,12 @@ import os
 import random
 import re
 import shutil
-import signal
 import struct
 import subprocess
 import sys
 import textwrap
 import threading
 import time
-import tracemalloc
 import zlib
 from contextlib import closing
 from pathlib import Path
@@ -33,17 +31,16 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Channel as ChannelRecord
-from mcap.records import Chunk, Message, MessageIndex, SummaryOffset
+from mcap.records import Chunk, DataEnd, Message, MessageIndex, SummaryOffset
 from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
-from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Qos, QosHistory, QosReliability
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from spinning_top_sim.recording import mcap_writer, writer
+from spinning_top_sim.recording import writer
 from spinning_top_sim.recording.chunks import CHUNK_BYTES, PlainChunk, time_span
-from spinning_top_sim.recording.errors import DefinitionNotFoundError, RecordingError
+from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.mcap_writer import McapWriter
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import (
@@ -132,32 +129,6 @@ def eventually(condition):
         time.sleep(0.005)
 
 
-def start_child(code: str, *arguments) -> subprocess.Popen:
-    head = (
-        'import json, os, resource, signal, struct, sys, time\n'
-        'from spinning_top_sim.recording import writer\n'
-        'from spinning_top_sim.recording.rosbag2 import RecordedTopic\n'
-        'from spinning_top_sim.recording.writer import McapRecorder\n'
-        f'TOPICS = [RecordedTopic("/a", {ARRAY!r})]\n')
-    return subprocess.Popen(
-        [sys.executable, '-c', head + textwrap.dedent(code), *map(str, arguments)],
-        env=os.environ | {'PYTHONPATH': str(ROOT)}, start_new_session=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-def outcome(child: subprocess.Popen) -> tuple[str, str]:
-    try:
-        return child.communicate(timeout=60)
-    finally:
-        kill(child)
-
-
-def kill(child: subprocess.Popen) -> None:
-    if child.poll() is None:
-        os.killpg(child.pid, signal.SIGKILL)
-    child.communicate()
-
-
 # What readers find
 
 @pytest.mark.parametrize(('compression', 'default_typestore'), [
@@ -175,57 +146,27 @@ def test_rosbags_reads_every_message(tmp_path, compression, default_typestore):
             assert value == number
 
 
-def test_mcap_ros2_support_reads_every_message(tmp_path):
-    record(tmp_path / 'run.mcap', some_messages(500))
-    with open(tmp_path / 'run.mcap', 'rb') as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        read = list(reader.iter_decoded_messages())
-    assert len(read) == 500
-    for number, (_, _, stored, message) in enumerate(read):
-        assert stored.log_time == stored.publish_time == EPOCH_NS + number * 1_000_000
-        value = message.pose.position.z if number % 2 == 0 else message.data[0]
-        assert value == number
-    assert read[0][3].header.frame_id == 'world'
-
-
-def test_all_checksums_and_indexes_are_there(tmp_path):
-    record(tmp_path / 'run.mcap', some_messages(20_000))
-    with open(tmp_path / 'run.mcap', 'rb') as file:
-        summary = make_reader(file, validate_crcs=True).get_summary()
-        file.seek(0)
-        records = list(StreamReader(file, emit_chunks=True, validate_crcs=True).records)
-    end = next(item for item in records if type(item).__name__ == 'DataEnd')
-    footer = records[-1]
+def test_checksums_are_there_and_indexes_lead_to_the_messages(tmp_path):
+    """Chunk index -> message index -> message, by the offsets, as rosbag2 goes."""
+    path = tmp_path / 'run.mcap'
+    record(path, some_messages(20_000), max_loss=60.0)
+    content = path.read_bytes()
+    records = list(StreamReader(io.BytesIO(content), emit_chunks=True, validate_crcs=True).records)
+    summary = make_reader(io.BytesIO(content), validate_crcs=True).get_summary()
+    (end,) = (item for item in records if isinstance(item, DataEnd))
     assert end.data_section_crc != 0
-    content = (tmp_path / 'run.mcap').read_bytes()
-    assert footer.summary_crc == zlib.crc32(content[footer.summary_start:-12])
+    assert records[-1].summary_crc == zlib.crc32(content[records[-1].summary_start:-12])
     assert summary.statistics.message_start_time == EPOCH_NS
     assert summary.statistics.message_end_time == EPOCH_NS + 19_999 * 1_000_000
     for group in (item for item in records if isinstance(item, SummaryOffset)):
         assert content[group.group_start] == group.group_opcode
         assert content[group.group_start + group.group_length] in SUMMARY_OPCODES
-    chunks = [item for item in records if isinstance(item, Chunk)]
-    assert len(chunks) > 1
-    assert summary.statistics.chunk_count == len(chunks) == len(summary.chunk_indexes)
-    for chunk, index in zip(chunks, summary.chunk_indexes, strict=True):
-        assert chunk.uncompressed_crc != 0
-        assert chunk.uncompressed_size <= CHUNK_BYTES + 200
-        assert index.message_index_length > 0
-        breakup_chunk(chunk, validate_crc=True)
-
-
-def test_message_indexes_lead_to_the_messages(tmp_path):
-    """Chunk index -> message index -> message, by the offsets, as rosbag2 goes."""
-    path = tmp_path / 'run.mcap'
-    record(path, some_messages(20_000), max_loss=60.0)
-    with open(path, 'rb') as file:
-        summary = make_reader(file).get_summary()
-    content = path.read_bytes()
-    assert len(summary.chunk_indexes) > 1
+    assert summary.statistics.chunk_count == len(summary.chunk_indexes) > 1
     found = []
     for chunk_index in summary.chunk_indexes:
-        start = chunk_index.chunk_start_offset
-        plain = get_chunk_data_stream(record_at(content, start, Chunk))[0].read(2 * CHUNK_BYTES)
+        chunk = record_at(content, chunk_index.chunk_start_offset, Chunk)
+        assert chunk.uncompressed_crc != 0 and chunk.uncompressed_size <= CHUNK_BYTES + 200
+        plain = get_chunk_data_stream(chunk, validate_crc=True)[0].read(2 * CHUNK_BYTES)
         assert sorted(chunk_index.message_index_offsets) == [1, 2]
         for channel_id, offset in chunk_index.message_index_offsets.items():
             index = record_at(content, offset, MessageIndex)
@@ -256,8 +197,10 @@ def test_channels_carry_qos_and_type_hash(tmp_path):
     for topic in TOPICS:
         channel = channels[topic.name]
         assert channel.message_encoding == 'cdr'
-        assert yaml.safe_load(channel.metadata['offered_qos_profiles']) == [
-            dict(DEFAULT_QOS) | topic.qos]
+        profiles = channel.metadata['offered_qos_profiles']
+        assert yaml.safe_load(profiles) == [dict(DEFAULT_QOS) | topic.qos]
+        # As yaml-cpp writes it: in blocks and without anchors.
+        assert profiles.startswith('- history: 1\n  depth: ') and '&' not in profiles
         assert channel.metadata['topic_type_hash'] == JAZZY.hash_rihs01(topic.type_name)
         schema = summary.schemas[channel.schema_id]
         assert (schema.name, schema.encoding) == (topic.type_name, 'ros2msg')
@@ -266,28 +209,6 @@ def test_channels_carry_qos_and_type_hash(tmp_path):
         profile: Qos = reader.connections[1].ext.offered_qos_profiles[0]
         assert profile.reliability is QosReliability.BEST_EFFORT
         assert (profile.history, profile.depth) == (QosHistory.KEEP_LAST, 3)
-
-
-def test_offered_qos_is_written_as_yaml_cpp_writes_it(tmp_path):
-    record(tmp_path / 'run.mcap', [])
-    with open(tmp_path / 'run.mcap', 'rb') as file:
-        channel = make_reader(file).get_summary().channels[1]
-    assert channel.metadata['offered_qos_profiles'] == textwrap.dedent("""\
-        - history: 1
-          depth: 10
-          reliability: 1
-          durability: 2
-          deadline:
-            sec: 9223372036
-            nsec: 854775807
-          lifespan:
-            sec: 9223372036
-            nsec: 854775807
-          liveliness: 1
-          liveliness_lease_duration:
-            sec: 9223372036
-            nsec: 854775807
-          avoid_ros_namespace_conventions: false""")
 
 
 def parsed_qos(text):
@@ -364,26 +285,6 @@ def test_a_bag_folder_made_of_the_embedded_metadata_is_read(tmp_path):
         assert reader.ros_distro == os.environ.get('ROS_DISTRO', 'jazzy')
 
 
-def test_the_same_messages_give_the_same_bytes(tmp_path):
-    """Chunk borders fall as time has it, also between topics; each topic is the same."""
-    messages = some_messages(3000)
-    seen = []
-    for name, pause in (('a', 0.0), ('b', 0.02)):
-        with closing(McapRecorder(
-                tmp_path / name, TOPICS, METADATA, min_free_bytes=0,
-                max_loss=0.01 if pause else 60.0)) as recorder:
-            for number, message in enumerate(messages):
-                recorder.write(*message)
-                if pause and number % 1000 == 500:
-                    time.sleep(pause)           # a chunk ends here
-        topics = {}
-        for topic, _, message in complete_messages(tmp_path / name):
-            topics.setdefault(topic, []).append(message)
-        seen.append(topics)
-    assert seen[0] == seen[1]
-    assert [message.sequence for message in seen[0][TOPICS[0].name]] == list(range(1500))
-
-
 def test_chunks_with_falling_stamps_give_the_whole_span(tmp_path):
     """Statistics and bag metadata tell the earliest and the latest stamp of all chunks."""
     path = tmp_path / 'run.mcap'
@@ -422,25 +323,25 @@ def test_a_schema_is_the_text_of_rosbag2(tmp_path, monkeypatch):
         {'type_name': 'nested_msgs/msg/Zebra', 'hash_string': 'RIHS01_0'},
         {'type_name': 'nested_msgs/msg/Root', 'hash_string': 'RIHS01_1'}]}))
     monkeypatch.setenv('AMENT_PREFIX_PATH', f'{tmp_path / "nothing"}{os.pathsep}{tmp_path}')
-    definition = find_definition('nested_msgs/msg/Root')
+    text, type_hash = find_definition('nested_msgs/msg/Root')
     line = '=' * 80
-    assert definition.text == (
+    assert text == (
         '# Zebra in a comment\r\nnested_msgs/Zebra[<=3] z\nApe a\nstring<=5 s\nuint8 N=1\n'
         f'\n{line}\nMSG: nested_msgs/Ape\nZebra[2] z # no newline at the end'
         f'\n{line}\nMSG: nested_msgs/Zebra\nfloat32 c  # [°]\n')
-    assert definition.type_hash == 'RIHS01_1'
+    assert type_hash == 'RIHS01_1'
 
 
 @pytest.mark.parametrize('type_name', [
     'sensor_msgs/msg/Imu', 'nav_msgs/msg/Odometry', 'visualization_msgs/msg/MarkerArray'])
 def test_type_hashes_are_those_others_compute(type_name):
-    assert find_definition(type_name).type_hash == JAZZY.hash_rihs01(type_name)
+    assert find_definition(type_name)[1] == JAZZY.hash_rihs01(type_name)
 
 
 @pytest.mark.parametrize('type_name', [
     'geometry_msgs/msg/NoSuchType', 'no_such_msgs/msg/Type', '../msg/passwd'])
 def test_a_missing_definition_is_named(tmp_path, type_name):
-    with pytest.raises(DefinitionNotFoundError) as caught:
+    with pytest.raises(RecordingError) as caught:
         McapRecorder(
             tmp_path / 'run.mcap', [RecordedTopic('/a', type_name)], {}, min_free_bytes=0)
     assert type_name in str(caught.value)
@@ -462,15 +363,6 @@ def test_an_existing_file_is_left_alone(tmp_path):
 def test_a_missing_directory_is_named(tmp_path):
     with pytest.raises(RecordingError, match=f'no directory {tmp_path}/logs'):
         McapRecorder(tmp_path / 'logs' / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
-
-
-def test_a_file_that_may_not_be_made_is_named(tmp_path, monkeypatch):
-    def open_read_only(path, *_, **__):
-        raise PermissionError(13, os.strerror(13), str(path))
-
-    monkeypatch.setattr(mcap_writer, 'open', open_read_only, raising=False)
-    with pytest.raises(RecordingError, match=r'run\.mcap: Permission denied$'):
-        McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
 
 
 def test_too_little_space_at_the_start_leaves_no_file(tmp_path):
@@ -496,23 +388,6 @@ def test_topics_twice_are_refused(tmp_path):
 
 
 # Running and ending
-
-def test_what_is_written_reaches_the_disk_without_being_closed(tmp_path, monkeypatch):
-    synced = []
-    fsync = os.fsync
-    monkeypatch.setattr(os, 'fsync', lambda fd: (fsync(fd), synced.append(fd)))
-    recorder = McapRecorder(
-        tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02, min_free_bytes=0)
-    before = len(synced)
-    for message in some_messages(100):
-        recorder.write(*message)
-    eventually(lambda: recorder.counters.longest_flush > 0.0 and recorder.counters.queued == 0)
-    assert recorder.state == 'recording'
-    assert len(synced) > before
-    assert len(complete_messages(tmp_path / 'run.mcap')) == 100
-    assert recorder.counters.bytes == (tmp_path / 'run.mcap').stat().st_size
-    recorder.close()
-
 
 def test_a_file_and_its_name_are_on_the_disk_when_it_is_closed(tmp_path, monkeypatch):
     """First the content, then the directory: a name without content would be a broken log."""
@@ -655,32 +530,6 @@ def test_a_disk_that_fails_under_rows_is_told_and_nothing_follows(tmp_path, monk
     assert numbers_in(tmp_path / 'run.mcap') == list(range(100))
 
 
-@pytest.mark.parametrize('rows', [True, False])
-def test_chunks_are_made_in_memory_that_is_there(tmp_path, rows):
-    """What is taken beside it is a fraction of a chunk: else a heap grows and shrinks by it."""
-    file = create_file(tmp_path / 'run.mcap', TOPICS, METADATA, compression='zstd')
-    times, messages = np.arange(1000), np.zeros((1000, 870), np.uint8)
-
-    def write():
-        if rows:
-            file.append_rows([(0, times, messages)])
-        else:
-            for time_ns in range(1000):
-                file.append(0, time_ns, bytes(870))
-        file.write_chunk()
-
-    write()
-    tracemalloc.start()
-    try:
-        write()
-        _, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    file.finish()
-    assert file.chunk_count == 2
-    assert peak < 0.5 * 1000 * (870 + 31)
-
-
 @pytest.mark.parametrize(('compression', 'size'), [
     ('zstd', CHUNK_BYTES), ('lz4', 2 * CHUNK_BYTES - 31), ('none', 2 * CHUNK_BYTES)])
 def test_a_chunk_of_noise_survives_whatever_its_size(compression, size):
@@ -728,13 +577,19 @@ def test_a_full_queue_says_so_and_loses_nothing(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize('ending', ['pass', 'os.kill(os.getpid(), signal.SIGINT)'])
 def test_an_interpreter_that_ends_without_closing_leaves_a_whole_file(tmp_path, ending):
-    child = start_child(f"""
-        recorder = McapRecorder(sys.argv[1], TOPICS, {{}}, min_free_bytes=0, max_loss=60.0)
+    code = f"""
+        import os, signal, sys
+        from spinning_top_sim.recording.rosbag2 import RecordedTopic
+        from spinning_top_sim.recording.writer import McapRecorder
+        topics = [RecordedTopic('/a', {ARRAY!r})]
+        recorder = McapRecorder(sys.argv[1], topics, {{}}, min_free_bytes=0, max_loss=60.0)
         for number in range(100):
             recorder.write(0, number, bytes(8))
         {ending}
-        """, tmp_path / 'run.mcap')
-    outcome(child)
+        """
+    subprocess.run([sys.executable, '-c', textwrap.dedent(code), tmp_path / 'run.mcap'],
+                   env=os.environ | {'PYTHONPATH': str(ROOT)}, capture_output=True, timeout=60,
+                   check=False)
     with Reader(tmp_path / 'run.mcap') as reader:
         assert [stamp for _, stamp, _ in reader.messages()] == list(range(100))
 
@@ -831,164 +686,79 @@ def test_a_sync_that_hangs_does_not_hang_the_end(tmp_path, slow_disk):
     assert is_indexed(recorder.close(timeout=PATIENCE_S).path)
 
 
-@pytest.mark.parametrize(('what', 'when'), [('file', 'recording'), ('folder', 'closing')])
-def test_a_log_that_is_deleted_is_an_error(tmp_path, what, when):
-    path = tmp_path / 'logs' / 'run.mcap'
-    path.parent.mkdir()
-    recorder = McapRecorder(path, TOPICS, METADATA, min_free_bytes=0,
-                                 max_loss=0.02 if when == 'recording' else 60.0)
-    recorder.write(0, 1, pose_cdr(1))
-    path.unlink() if what == 'file' else shutil.rmtree(path.parent)
-    if when == 'recording':
-        eventually(lambda: recorder.state == 'failed')
-    assert recorder.close().error == f'recording to {path} stopped: the file was deleted'
-    assert recorder.state == 'failed'
-
-
-def test_a_kill_takes_nothing_that_was_in_the_file(tmp_path):
-    """The child notes with every message how many were in the file when it was accepted."""
-    children = []
-    try:
-        for number in range(2):
-            folder = tmp_path / str(number)
-            folder.mkdir()
-            children.append(start_child("""
-                recorder = McapRecorder(
-                    sys.argv[1] + '/run.mcap', TOPICS, {}, min_free_bytes=0, max_loss=0.2)
-                with open(sys.argv[1] + '/written', 'wb', buffering=0) as written:
-                    for number in range(1_000_000):
-                        recorder.write(0, number, struct.pack('<4sIIId', bytes(4), 0, 0, 1, 0.0))
-                        written.write(struct.pack('<Q', recorder.counters.messages))
-                        time.sleep(0.001)
-                """, folder))
-        for number, child in enumerate(children):  # each at another phase of the flushes
-            path = tmp_path / str(number) / 'written'
-            wanted = 300 + 31 * number
-            eventually(lambda p=path, w=wanted, c=child: c.poll() is not None or (
-                p.exists() and (n := numbers_written(p))[-1:] > [10] and len(n) > w))
-            kill(child)
-    finally:
-        for child in children:
-            kill(child)
-    for number in range(2):
-        written = numbers_written(tmp_path / str(number) / 'written')
-        kept = numbers_in(tmp_path / str(number) / 'run.mcap')
-        assert kept == list(range(len(kept)))
-        assert 10 < written[-1] <= len(kept) <= len(written) + 1
-
-
-def numbers_written(path: Path) -> list[int]:
-    content = path.read_bytes()
-    return [number for number, in struct.iter_unpack('<Q', content[:len(content) // 8 * 8])]
-
-
 # Disks that fail
 
-FILL = """
-    def limit(size):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+@pytest.fixture
+def disk(monkeypatch):
+    """A disk on which a file has at most `disk.size` bytes."""
+    disk, pwrite = SimpleNamespace(size=1 << 30), os.pwrite
 
-    def wait_until(condition):
-        deadline = time.monotonic() + 20.0
-        while not condition():
-            assert time.monotonic() < deadline
-            time.sleep(0.005)
+    def write(descriptor, data, offset):
+        if offset >= disk.size:
+            raise OSError(28, os.strerror(28))
+        return pwrite(descriptor, data[:disk.size - offset], offset)
 
-    def tell(recorder):
-        summary = recorder.close()
-        recorder.write(0, 0, b'after the end')
-        print(json.dumps({
-            'state': recorder.state, 'error': recorder.error, 'room': recorder.room,
-            'bytes': summary.bytes, 'counts': summary.counts, 'lost': summary.lost,
-            'written': written, 'same': summary.error}))
-
-    written = 0
-    def write(recorder, count):
-        global written
-        for _ in range(count):
-            recorder.write(0, written, os.urandom(1000))
-            written += 1
-    """
+    monkeypatch.setattr(os, 'pwrite', write)
+    return disk
 
 
-def test_a_full_disk_stops_the_recording_and_leaves_an_indexed_file(tmp_path):
-    """The torn chunk is cut off, and where it stood there is room for the summary."""
-    child = start_child(FILL + """
-    writer.QUEUE_BYTES = 4_000_000
-    recorder = McapRecorder(sys.argv[1], TOPICS, {}, min_free_bytes=0, max_loss=100.0)
-    write(recorder, 2000)       # half full, so that chunks of 1 MB are made
-    wait_until(lambda: recorder.counters.messages > 1000)
-    limit(recorder.counters.bytes + 100_000)
-    write(recorder, 3000)
-    wait_until(lambda: recorder.state == 'failed')
-    tell(recorder)
-    """, tmp_path / 'run.mcap')
-    told = report(child)
-    assert told['state'] == 'failed'
-    assert str(tmp_path / 'run.mcap') in told['error']
-    assert 'File too large' in told['error']
-    assert told['same'] == told['error']
-    assert told['room']
-    assert is_indexed(tmp_path / 'run.mcap')
-    kept = told['counts']['/a']
-    assert kept > 1000
-    assert told['lost'] == told['written'] - kept
-    with Reader(tmp_path / 'run.mcap') as reader:
-        assert [stamp for _, stamp, _ in reader.messages()] == list(range(kept))
-
-
-def test_a_disk_that_fills_at_the_very_end_costs_only_the_index(tmp_path):
-    child = start_child(FILL + """
-    recorder = McapRecorder(sys.argv[1], TOPICS, {}, min_free_bytes=0, max_loss=0.02)
-    write(recorder, 300)
-    wait_until(lambda: recorder.counters.queued == 0)
-    limit(recorder.counters.bytes + 100)
-    tell(recorder)
-    """, tmp_path / 'run.mcap')
-    told = report(child)
-    assert told['state'] == 'failed'
-    assert 'File too large' in told['error']
-    assert not is_indexed(tmp_path / 'run.mcap')
-    assert told['lost'] == 0
-    assert told['bytes'] == (tmp_path / 'run.mcap').stat().st_size
-    assert numbers_in(tmp_path / 'run.mcap') == list(range(300))
-
-
-def report(child: subprocess.Popen) -> dict:
-    out, err = outcome(child)
-    assert err == ''
-    return json.loads(out)
-
-
-def test_a_failing_disk_stops_the_recording(tmp_path, monkeypatch):
-    recorder = McapRecorder(
-        tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02, min_free_bytes=0)
-    monkeypatch.setattr(os, 'fsync', refuse_to_sync)
-    for message in some_messages(50):
-        recorder.write(*message)
-    eventually(lambda: recorder.state == 'failed')
-    assert recorder.error == (
-        f'recording to {tmp_path / "run.mcap"} stopped: Input/output error')
-    recorder.write(0, 0, b'late')
-    assert recorder.room
-    assert recorder.close().error == recorder.error
-    assert recorder.counters.lost + recorder.counters.messages == 51
-    assert len(complete_messages(tmp_path / 'run.mcap')) == recorder.counters.messages
-
-
-def test_a_disk_that_runs_short_stops_the_recording_in_good_order(tmp_path, monkeypatch):
-    recorder = McapRecorder(
-        tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02, min_free_bytes=1)
-    monkeypatch.setattr(os, 'fstatvfs', lambda fd: SimpleNamespace(f_bavail=0, f_frsize=4096))
-    recorder.write(0, 7, pose_cdr(7))
-    eventually(lambda: recorder.state == 'failed')
-    assert recorder.error == (
-        f'recording to {tmp_path / "run.mcap"} stopped: '
-        '0 bytes are free on the disk, fewer than min_free_bytes = 1')
+@pytest.mark.parametrize(('room', 'max_loss'), [(100_000, 100.0), (100, 0.02)])
+def test_a_full_disk_stops_the_recording_and_costs_what_is_not_written(
+        tmp_path, disk, monkeypatch, room, max_loss):
+    """A torn chunk is cut off, and where it stood there is room for the summary; or only that."""
+    monkeypatch.setattr(writer, 'QUEUE_BYTES', 4_000_000)
+    path, rng = tmp_path / 'run.mcap', random.Random(3)
+    at_end = max_loss < 1.0
+    recorder = McapRecorder(path, TOPICS, METADATA, min_free_bytes=0, max_loss=max_loss)
+    for number in range(2000):      # half full, so that chunks of 1 MB are made
+        recorder.write(0, number, rng.randbytes(1000))
+    eventually(lambda: recorder.counters.messages > (1999 if at_end else 1000))
+    disk.size = recorder.counters.bytes + room
+    for number in range(2000, 2000 if at_end else 5000):
+        recorder.write(0, number, rng.randbytes(1000))
     summary = recorder.close()
-    assert (is_indexed(summary.path), summary.lost) == (True, 0)
-    with Reader(tmp_path / 'run.mcap') as reader:
-        assert [stamp for _, stamp, _ in reader.messages()] == [7]
+    recorder.write(0, 0, b'after the end')
+    kept = summary.messages
+    assert recorder.error == f'recording to {path} stopped: No space left on device'
+    assert recorder.state == 'failed' and summary.error == recorder.error and recorder.room
+    assert kept == 2000 if at_end else kept > 1000
+    assert recorder.counters.lost == (2001 if at_end else 5001) - kept
+    assert is_indexed(path) != at_end
+    assert numbers_in(path) == list(range(kept)) and summary.bytes == path.stat().st_size
+
+
+FAULTS = {
+    'the file was deleted': lambda path, patch: path.unlink(),
+    'the file was deleted ': lambda path, patch: shutil.rmtree(path.parent),
+    'Input/output error': lambda path, patch: patch.setattr(os, 'fsync', refuse_to_sync),
+    '0 bytes are free on the disk, fewer than min_free_bytes = 1': lambda path, patch: (
+        patch.setattr(os, 'fstatvfs', lambda _: SimpleNamespace(f_bavail=0, f_frsize=4096))),
+}
+
+
+@pytest.mark.parametrize('reason', FAULTS)
+def test_a_fault_stops_the_recording_with_its_reason(tmp_path, monkeypatch, reason):
+    path = tmp_path / 'logs' / 'run.mcap'
+    path.parent.mkdir()
+    recorder = McapRecorder(path, TOPICS, METADATA, max_loss=0.02, min_free_bytes=1)
+    recorder.write(0, 0, pose_cdr(0))
+    FAULTS[reason](path, monkeypatch)
+    recorder.write(0, 1, pose_cdr(1))
+    eventually(lambda: recorder.state == 'failed')
+    recorder.write(0, 2, b'late')
+    summary = recorder.close()
+    assert recorder.error == summary.error == f'recording to {path} stopped: {reason.strip()}'
+    assert recorder.room and summary.messages + summary.lost == 3 and summary.lost >= 1
+    if path.exists():
+        assert is_indexed(path) and numbers_in(path) == list(range(summary.messages))
+
+
+def test_a_message_that_cannot_be_packed_is_no_exception_for_the_simulation(tmp_path):
+    recorder = McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+    recorder.write(0, -1, b'')
+    summary = recorder.close()
+    assert recorder.state == 'failed' and 'stopped: error:' in (summary.error or '')
+    assert (is_indexed(summary.path), summary.lost) == (True, 1)
 
 
 def test_an_interrupted_write_shifts_nothing(tmp_path, monkeypatch):
@@ -1018,14 +788,5 @@ def test_an_interrupted_write_shifts_nothing(tmp_path, monkeypatch):
         stream.seek(0)
         assert len(list(make_reader(stream, validate_crcs=True).iter_messages())) == 100
     assert len(complete_messages(path)) == 100
-
-
-def test_a_message_that_cannot_be_packed_is_no_exception_for_the_simulation(tmp_path):
-    recorder = McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
-    recorder.write(0, -1, b'')
-    summary = recorder.close()
-    assert recorder.state == 'failed'
-    assert 'stopped: error:' in (summary.error or '')
-    assert (is_indexed(summary.path), summary.lost) == (True, 1)
 
 

@@ -12,6 +12,7 @@ import io
 import os
 import random
 import resource
+import signal
 import struct
 import subprocess
 import sys
@@ -390,46 +391,6 @@ def test_what_can_be_decoded_is_kept_and_the_rest_is_told(tmp_path, log, case):
         check_with_all_readers(output, wanted)
 
 
-@pytest.mark.parametrize('has_summary', [True, False])
-def test_lost_chunks_are_told_in_numbers(tmp_path, log, has_summary):
-    """By the statistics, or by the message indexes that are whole."""
-    (_, start, end), (_, last_start, last_end) = log.chunks[1:]
-    broken = tmp_path / 'broken.mcap'
-    content = flipped(flipped(log.content, end - 8, 3), last_end - 8, 3)
-    bag = next(start for opcode, start, _ in log.records
-               if opcode == Opcode.METADATA and start > last_end)
-    broken.write_bytes(content if has_summary else content[:bag])
-    with LogReader(broken) as reader:
-        damage = reader.damage
-    assert (damage.lost_chunks, damage.missing_messages) == (2, 2 * MESSAGES_PER_CHUNK)
-    assert damage.missing_exactly == has_summary
-    assert [(loss.offset, loss.bytes, loss.reason) for loss in damage.losses] == [
-        (start, end - start, damage.losses[0].reason),
-        (last_start, last_end - last_start, damage.losses[1].reason)]
-    code, out, _ = run(broken)
-    assert code == SOME_LOST
-    least = '' if has_summary else 'at least '
-    assert f'lost: {damage.lost_bytes} bytes, {least}{2 * MESSAGES_PER_CHUNK} messages\n' in out
-    with LogReader(tmp_path / 'broken_recovered.mcap') as reader:
-        assert reader.whole and reader.damage.lossless
-
-
-@pytest.mark.parametrize('has_summary', [True, False])
-def test_a_wrong_number_in_a_message_is_seen_by_the_checksum_alone(tmp_path, has_summary):
-    """Uncompressed: nothing else about the chunk is wrong."""
-    path = tmp_path / 'run.mcap'
-    messages = write_log(path, compression='none')
-    content = path.read_bytes()
-    chunks = [record for record in records_of(content) if record[0] == Opcode.CHUNK]
-    data = content.index(messages[MESSAGES_PER_CHUNK + 2][2])
-    assert chunks[1][1] < data < chunks[1][2]
-    path.write_bytes(flipped(content if has_summary else content[:chunks[2][2]], data + 9, 2))
-    with LogReader(path) as reader:
-        (loss,) = reader.damage.losses
-    assert (loss.offset, loss.reason) == (chunks[1][1], 'its checksum is wrong')
-    assert seen_by_us(path) == messages[:MESSAGES_PER_CHUNK] + messages[2 * MESSAGES_PER_CHUNK:]
-
-
 def test_a_wild_length_that_seems_to_lead_to_a_record_takes_no_other_chunk(tmp_path):
     """It leads to data in the next chunk that look like the head of metadata."""
     path = tmp_path / 'run.mcap'
@@ -464,13 +425,6 @@ def test_recovering_a_whole_file_changes_nothing(tmp_path, compression):
         assert not reader.damage.lines()
 
 
-def test_a_whole_file_without_messages_is_recovered(tmp_path):
-    write_log(tmp_path / 'run.mcap', chunks=0)
-    assert run(tmp_path / 'run.mcap', '-o', tmp_path / 'whole.mcap')[0] == ALL_KEPT
-    assert seen_by_mcap(tmp_path / 'whole.mcap') == []
-    assert metadata_of(tmp_path / 'whole.mcap')['spinning_top_sim'] == METADATA
-
-
 def test_a_topic_tells_all_that_its_channel_says(log, tmp_path):
     (tmp_path / 'run.mcap').write_bytes(log.content)
     with LogReader(tmp_path / 'run.mcap') as reader:
@@ -479,7 +433,7 @@ def test_a_topic_tells_all_that_its_channel_says(log, tmp_path):
         assert reader.library.startswith('spinning_top_sim ')
         assert reader.size == len(log.content)
     assert (topic.name, topic.type_name, topic.encoding) == ('/top/number', NUMBER, 'cdr')
-    assert (topic.schema_encoding, topic.schema) == ('ros2msg', find_definition(NUMBER).text)
+    assert (topic.schema_encoding, topic.schema) == ('ros2msg', find_definition(NUMBER)[0])
     assert topic.qos == (dict(DEFAULT_QOS) | TOPICS[1].qos,)
     assert topic.metadata['topic_type_hash'] == JAZZY.hash_rihs01(NUMBER)
 
@@ -700,12 +654,10 @@ def test_a_recovery_tells_what_it_has_written(tmp_path, log):
     path, output, told = tmp_path / 'run.mcap', tmp_path / 'whole.mcap', []
     path.write_bytes(log.content)
     with LogReader(path) as reader:
-        done = recover(reader, output, lambda *progress: told.append(progress))
-    size = len(log.content)
-    assert (done.path, done.bytes, done.messages, done.chunks) == (
-        output, output.stat().st_size, len(log.messages), len(log.chunks))
-    assert told == sorted(told) and told[-1] == (size, size)
-    assert {total for _, total in told} == {size} and len(told) > len(log.chunks)
+        done = recover(reader, output, told.append)
+    assert (done.size, done.messages, done.chunk_count) == (
+        output.stat().st_size, len(log.messages), len(log.chunks))
+    assert told == sorted(told) and told[-1] == len(log.content) and len(told) > len(log.chunks)
 
 
 def test_memory_does_not_grow_with_the_file(tmp_path):
@@ -738,31 +690,11 @@ def test_nothing_is_overwritten(tmp_path, log):
     for output in (path, other, tmp_path / 'link.mcap'):
         code, out, err = run(path, '-o', output)
         assert (code, out) == (FAILED, '')
-        assert err == f'recover: {output} exists, and nothing is overwritten\n'
+        assert err == (
+            f'recover: cannot write {output}: it exists, and nothing is overwritten\n')
     assert path.read_bytes() == log.content
     assert other.read_text() == 'precious'
     assert len(list(tmp_path.iterdir())) == 3
-
-
-def test_an_output_that_appears_meanwhile_is_not_overwritten(tmp_path, log, monkeypatch):
-    path, output = tmp_path / 'run.mcap', tmp_path / 'whole.mcap'
-    path.write_bytes(log.content)
-    monkeypatch.setattr(McapWriter, 'sync', lambda self: output.write_text('precious'))
-    code, _, err = run(path, '-o', output)
-    assert (code, err) == (FAILED, f'recover: {output} exists, and nothing is overwritten\n')
-    assert output.read_text() == 'precious'
-    assert len(list(tmp_path.iterdir())) == 2
-
-
-def test_a_file_system_without_links_does_too(tmp_path, log, monkeypatch):
-    def refuse(*_):
-        raise PermissionError(1, os.strerror(1))
-
-    (tmp_path / 'run.mcap').write_bytes(log.content)
-    monkeypatch.setattr(os, 'link', refuse)
-    assert run(tmp_path / 'run.mcap', '-o', tmp_path / 'whole.mcap')[0] == ALL_KEPT
-    assert sorted(path.name for path in tmp_path.iterdir()) == ['run.mcap', 'whole.mcap']
-    assert seen_by_mcap(tmp_path / 'whole.mcap') == log.messages
 
 
 def test_a_full_disk_leaves_nothing_behind(monkeypatch, tmp_path, log):
@@ -795,7 +727,7 @@ def test_an_output_that_cannot_be_made_is_named(tmp_path, log):
 
 @pytest.mark.parametrize(('content', 'reason'), [
     (b'', 'it is empty'),
-    (MCAP0_MAGIC[:5], 'it ends after 5 bytes of an MCAP file'),
+    (MCAP0_MAGIC[:5], 'it is no MCAP file'),
     (b'SQLite format 3\x00' + bytes(100), 'it is no MCAP file'),
     (b'\n', 'it is no MCAP file'),
 ])
@@ -808,7 +740,7 @@ def test_what_is_no_log_is_refused(tmp_path, content, reason):
     assert run(path) == (FAILED, '', f'recover: cannot read {path}: {reason}\n')
 
 
-def test_what_cannot_be_opened_is_named(tmp_path, monkeypatch, log):
+def test_what_cannot_be_opened_is_named(tmp_path):
     os.mkfifo(tmp_path / 'pipe')
     for name, reason in (('missing', 'No such file or directory'),
                          ('', 'it is no regular file'), ('pipe', 'it is no regular file')):
@@ -817,14 +749,6 @@ def test_what_cannot_be_opened_is_named(tmp_path, monkeypatch, log):
             LogReader(path)
         assert str(caught.value) == f'cannot read {path}: {reason}'
         assert run(path, '-o', tmp_path / 'x') == (FAILED, '', f'recover: {caught.value}\n')
-
-    def refuse(path, *_, **__):
-        raise PermissionError(13, os.strerror(13), str(path))
-
-    (tmp_path / 'run.mcap').write_bytes(log.content)
-    monkeypatch.setattr(log_file, 'open', refuse, raising=False)
-    assert run(tmp_path / 'run.mcap') == (
-        FAILED, '', f'recover: cannot read {tmp_path / "run.mcap"}: Permission denied\n')
 
 
 def test_a_disk_that_fails_while_it_is_read_is_an_error(tmp_path, log, monkeypatch):
@@ -854,23 +778,14 @@ def test_a_disk_that_fails_while_it_is_read_is_an_error(tmp_path, log, monkeypat
     assert [path.name for path in tmp_path.iterdir()] == ['run.mcap']
 
 
-def test_ctrl_c_leaves_nothing_behind(tmp_path, log, monkeypatch):
-    def interrupt(self, **options):
-        raise KeyboardInterrupt
-
+@pytest.mark.parametrize(('number', 'code'), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_leaves_nothing_behind(tmp_path, log, monkeypatch, number, code):
     (tmp_path / 'run.mcap').write_bytes(log.content)
-    monkeypatch.setattr(McapWriter, 'finish', interrupt)
-    assert run(tmp_path / 'run.mcap')[0] == 130
+    monkeypatch.setattr(McapWriter, 'finish', lambda *_, **__: signal.raise_signal(number))
+    found = None
+    try:
+        found, _, _ = run(tmp_path / 'run.mcap')
+    except SystemExit as end:
+        found = end.code
+    assert found == code
     assert [path.name for path in tmp_path.iterdir()] == ['run.mcap']
-
-
-def test_reading_and_recovering_import_no_ros(tmp_path, log):
-    (tmp_path / 'run.mcap').write_bytes(log.content)
-    done = subprocess.run(
-        [sys.executable, '-c',
-         'import sys; from spinning_top_sim.tools.recover import main\n'
-         f'assert main([{str(tmp_path / "run.mcap")!r}]) == 0\n'
-         'print([name for name in ("rclpy", "scipy") if name in sys.modules])'],
-        env=os.environ | {'PYTHONPATH': str(ROOT)}, capture_output=True, text=True, timeout=60,
-        check=True)
-    assert done.stdout.endswith('\n[]\n')

@@ -5,8 +5,6 @@ import io
 import math
 import os
 import re
-import shlex
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -34,12 +32,12 @@ def reported():
     """A report of a paused simulation that stands at 1.25 s, and what it is about."""
     values = parameters.checked({'start_paused': True})
     simulation = LiveSimulation(values)
-    session = SimpleNamespace(error=None, warning=None, size='',
+    session = SimpleNamespace(error=None, warning=None,
                               numbers=lambda: {'recorder': 'off'}, has_room=lambda: True,
                               write_command=print, write_event=lambda *_, **__: None)
     loop = TickLoop(simulation, values, session, update_subscribers=lambda: None, tell=print)
     loop.start()
-    loop.step(1, 1.25)
+    loop.step(1_250_000_000)
     return SimpleNamespace(report=MotionReport(simulation, loop, session), loop=loop,
                            session=session, simulation=simulation)
 
@@ -59,11 +57,11 @@ def test_the_real_time_factor_is_measured_between_readings_that_are_apart(clock,
     assert factor() == 2.5              # at 1.25 s
     clock.now += 0.01                   # a report that was held up
     assert factor() == 2.5
-    reported.loop.step(1, 0.5)
+    reported.loop.step(500_000_000)
     clock.now += 0.99
     assert factor() == 0.5
     reported.loop.reset(reported.simulation.values, 0)
-    reported.loop.step(1, 0.25)
+    reported.loop.step(250_000_000)
     clock.now += 1.0
     assert factor() == 0.25
 
@@ -95,24 +93,18 @@ def test_the_worst_problem_is_the_level_and_the_message(reported):
     reported.loop.slipped_ns = 0
     reported.loop.reset(reported.simulation.values, 0)
     assert status_of(reported)[:2] == (0, 'paused')
-    reported.loop.step(1, 1.0)
+    reported.loop.step(1_000_000_000)
     level, message, _ = status_of(reported, 1e-300)
     assert level == 1 and 'more than max_error = 1e-300 rad' in message
 
 
-def test_the_status_line_and_what_is_told_of_a_new_motion(clock, reported):
-    told = reported.report.new_motion()
-    assert 'cusp' in told and max(map(len, told.splitlines())) <= 80
-    assert reported.report.new_motion() is None
+def test_the_status_line(clock, reported):
     line = reported.report.status_line()
     assert line.startswith('t      1.25 s paused | ') and ' | x' not in line
     assert 'L3 1.6 Lz 1.386' in line and 'no subscribers yet' in line
     clock.now += 1.0
     status_of(reported)
-    reported.session.size = '1.2 MB'
     reported.loop.command(2.0, 1.0)
-    assert reported.report.new_motion() is not None
-    assert ' | log 1.2 MB | ' in reported.report.status_line()
     reported.simulation.outputs[0].sent = 12
     assert ' | 12 messages | ' in reported.report.status_line()
     reported.loop.resume()
@@ -124,75 +116,29 @@ def test_the_status_line_and_what_is_told_of_a_new_motion(clock, reported):
     assert ' FAILED | ' in reported.report.status_line()
 
 
-@pytest.mark.parametrize('on_path', [False, True])
-def test_the_next_command_works_where_it_is_pasted(monkeypatch, tmp_path, on_path):
-    monkeypatch.setattr(reports.sys, 'executable', str(tmp_path / 'my bin/python'))
-    monkeypatch.setattr(reports.shutil, 'which', lambda _: '/bin/inspect' if on_path else None)
-    log = Path('/a b/run.mcap')
-    if not on_path:
-        assert reports.inspect_command(log).startswith('ros2 run spinning_top_sim inspect ')
-        (tmp_path / 'my bin').mkdir()
-        (tmp_path / 'my bin/inspect').touch()
-    program, *arguments = shlex.split(reports.inspect_command(log))
-    assert program == ('inspect' if on_path else str(tmp_path / 'my bin/inspect'))
-    assert arguments == [str(log), '--plot', 'top.png']
+def standard_output(monkeypatch, *, isatty):
+    """Return a standard output of 12 columns."""
+    out = io.StringIO()
+    out.isatty = lambda: isatty
+    monkeypatch.setattr(reports.sys, 'stdout', out)
+    monkeypatch.setattr(reports.shutil, 'get_terminal_size', lambda: os.terminal_size((12, 24)))
+    return out
 
 
-class Screen(io.StringIO):
-    """A standard output that is a terminal, or none."""
-
-    def __init__(self, columns):
-        super().__init__()
-        self.columns = columns
-
-    def isatty(self):
-        return self.columns is not None
-
-
-@pytest.fixture
-def screen(monkeypatch):
-    """Return a terminal of so many columns (None: no terminal), and what is shown."""
-    def of(columns):
-        out = Screen(columns)
-        monkeypatch.setattr(reports.sys, 'stdout', out)
-        monkeypatch.setattr(reports.os, 'get_terminal_size', lambda *_: os.terminal_size(
-            (out.columns, 24)))
-        return reports.Terminal(), out
-    return of
-
-
-def test_the_status_line_fits_the_terminal_also_when_that_becomes_narrower(screen):
-    terminal, out = screen(20)
-    terminal.show('123456 | 123456 | 123456')
-    terminal.show('123456 | 12345678901 | 1')
-    out.columns = 5
-    terminal.show('123456 | 123456 | 123456')
-    assert out.getvalue().split('\r\x1b[K') == ['', '123456 | 123456', '123456', '1234']
-
-
-def test_a_line_that_stays_stands_below_the_status_line(screen):
-    terminal, out = screen(80)
-    terminal.show('one | two')
+def test_a_line_that_stays_stands_below_the_status_line_which_fits_the_terminal(monkeypatch):
+    out, terminal = standard_output(monkeypatch, isatty=True), reports.Terminal()
+    terminal.show('one | two | three')
     terminal.end()
     terminal.end()
-    terminal.show('three')
+    terminal.show('four')
     terminal.tell('done')
-    assert out.getvalue() == '\r\x1b[Kone | two\n\r\x1b[Kthree\ndone\n'
+    assert out.getvalue() == '\r\x1b[Kone | two |\n\r\x1b[Kfour\ndone\n'
 
 
-@pytest.mark.parametrize('columns', [None, 0, OSError(5, 'Input/output error')])
-def test_without_a_terminal_under_launch_or_when_it_is_gone_lines_are_whole(
-        screen, monkeypatch, columns):
-    terminal, out = screen(columns)
-
-    def size(*_):
-        if isinstance(columns, OSError):
-            raise columns
-        return os.terminal_size((columns, 24))
-    monkeypatch.setattr(reports.os, 'get_terminal_size', size)
+def test_without_a_terminal_lines_are_whole(monkeypatch):
+    out, terminal = standard_output(monkeypatch, isatty=False), reports.Terminal()
     terminal.show('a | ' * 50 + 'z')
-    terminal.show('b')
     terminal.end()
-    assert out.getvalue() == 'a | ' * 50 + 'z\nb\n'
+    assert out.getvalue() == 'a | ' * 50 + 'z\n'
     monkeypatch.setattr(reports.sys, 'stdout', None)
     terminal.show('c')                      # a closed standard output is no terminal

@@ -65,12 +65,6 @@ def test_a_sensor_with_one_error_is_not_perfect(error):
     assert not np.array_equal(rows, np.broadcast_to((0.8, 0.9, 1.1, 0.7, 0.8, 1.2), (20, 6)))
 
 
-@pytest.mark.parametrize('band', [(2.0, 1.0), (3.0, 3.0)])
-def test_a_band_that_does_not_ascend_is_refused(band):
-    with pytest.raises(ValueError, match=r'imu\.bias_instability_band = \[\d.0, \d.0\]: the sec'):
-        parameters.checked({'imu.bias_instability_band': band})
-
-
 # ------------------------------------------------------------------------------------ the bias
 
 def test_the_bias_begins_with_the_turn_on_bias_and_walks_with_its_density():
@@ -131,14 +125,6 @@ def test_a_gauss_markov_bias_is_stationary_at_any_time(time):
     assert np.std(rows, axis=0) == pytest.approx(2.0, rel=4.0 / math.sqrt(2.0 * len(rows)))
     correlation = np.mean(rows[:, 0] * rows[:, 1]) / 4.0
     assert correlation == pytest.approx(math.exp(-1.0 / time), abs=4.0 / math.sqrt(len(rows)))
-
-
-def test_gauss_markov_has_no_seam_between_its_blocks():
-    """Steps across the seams of 512 are distributed as all others."""
-    path = noise.Path(3, noise.Purpose.GAUSS_MARKOV, (120 * (0.2,),), (120 * (1.0,),))
-    steps = np.diff(path.at(np.arange(51_200) * noise.STEP_NS), axis=1)[:, 511::512]
-    expected = math.sqrt(-2.0 * math.expm1(-0.001 / 0.2))
-    assert np.std(steps) == pytest.approx(expected, rel=4.0 / math.sqrt(2.0 * steps.size))
 
 
 def test_the_allan_deviation_of_a_flicker_bias_is_flat_over_its_band():

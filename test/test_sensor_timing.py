@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 from helpers.readings import run
-from helpers.simulations import EPOCH_NS, SECOND, output, play, publish, record, simulate
+from helpers.simulations import EPOCH_NS, SECOND
 
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
@@ -109,26 +109,6 @@ def test_stamps_stay_within_what_a_message_holds():
     later = Timing(parameters.checked({'imu.stamp_offset': 1.0}))
     assert later.stamps_ns(2 ** 31 * SECOND - 1, np.zeros(1, np.int64), PERIOD_NS) == (
         2 ** 31 * SECOND - 1)
-
-
-def test_a_run_in_which_nearly_all_is_lost_goes_on():
-    """Of 20 001 samples, a hundredth, one or two times: subscribers get what is recorded."""
-    values = {'imu.drop_rate': 0.99, 'imu.duplicate_rate': 0.5, 'solver.method': 'exact'}
-    simulation = simulate(values)
-    taken, published = record(simulation, RAW), publish(simulation, RAW)
-    assert simulation.advance(100 * SECOND)
-    assert simulation.now_ns == 100 * SECOND
-    assert 200 < len(taken) < 400
-    assert [data for *_, data in taken] == [data for _, data in published]
-    assert output(simulation, RAW).sent == len(published)
-    assert play(simulate(values), 100 * SECOND, RAW) == taken
-
-
-def test_without_faults_the_labels_say_so():
-    stamps, true, copies = labels(run({'imu.rate': 100.0}, SECOND, LABELS)[1])
-    assert np.array_equal(stamps, true)
-    assert np.array_equal(true, EPOCH_NS + 10_000_000 * np.arange(101))
-    assert copies.tolist() == 101 * [1]
 
 
 # -------------------------------------------------------------------------------------------- live

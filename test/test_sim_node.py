@@ -36,7 +36,7 @@ from helpers.node_logs import (
 )
 from visualization_msgs.msg import MarkerArray
 
-WATCHED_S = 3
+WATCHED_S = 1
 
 RUNS = {
     'plain': {},

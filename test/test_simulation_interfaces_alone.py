@@ -20,11 +20,9 @@ def test_before_the_clock_nothing_can_be_set(tmp_path):
         assert top.state == STOPPED
         for name in ('PLAYING', 'PAUSED'):
             assert top.set_state(name) == TRANSITION_ERROR
-        world = top.messages.Resource(uri='looping')
         for expected, name, request in (
                 (FAILED, 'StepSimulation', {'steps': 1}),
                 (INCORRECT_STATE, 'ResetSimulation', {'scope': 0}),
-                (INCORRECT_STATE, 'LoadWorld', {'world_resource': world}),
                 (INCORRECT_STATE, 'SetEntityState', {'entity': 'spinning_top'})):
             code, text = top.refused(name, **request)
             assert (code, text) == (expected, 'waiting for /clock (use_sim_time is set)')

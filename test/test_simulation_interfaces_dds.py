@@ -21,8 +21,6 @@ from helpers.node_logs import (
     QUIET,
     assert_clean_end,
     settled,
-    stamp_of,
-    stamps_of,
     xyzw,
 )
 from nav_msgs.msg import Odometry
@@ -32,7 +30,7 @@ from spinning_top_sim.nodes.simulation_standard import service_name
 
 UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
 STOPPED, PLAYING, PAUSED, QUITTING = range(4)
-SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
+CANCELED, ABORTED = 5, 6
 
 
 @pytest.fixture(scope='module')
@@ -91,24 +89,6 @@ def test_steps_publish_and_the_state_is_that_of_the_last_sample(peer, served):
     assert call(peer, served, 'GetEntities').entities == ['spinning_top']
 
 
-def test_simulate_steps_with_feedback(peer, served, steps):
-    count, feedback = settled(served.odom), []
-    handle = resolved(steps.send_goal_async(
-        simulation_interfaces.action.SimulateSteps.Goal(steps=50),
-        feedback_callback=lambda message: feedback.append(
-            (message.feedback.completed_steps, message.feedback.remaining_steps))))
-    assert handle.accepted
-    result = resolved(handle.get_result_async())
-    assert (result.status, result.result.result.result) == (SUCCEEDED, OK)
-    served.odom.wait(count + 50)
-    assert settled(served.odom) == count + 50
-    assert set(stamps_of(served.odom)[count:][1:] - stamps_of(served.odom)[count:][:-1]) == {
-        10_000_000}
-    # A client drops feedback that comes late or fast; what it takes is in order.
-    assert feedback == sorted(feedback)
-    assert {one + other for one, other in feedback} <= {50}
-
-
 def test_simulate_steps_can_be_canceled_and_the_node_answers_meanwhile(peer, served, steps):
     feedback = []
     handle = resolved(steps.send_goal_async(
@@ -127,19 +107,9 @@ def test_simulate_steps_can_be_canceled_and_the_node_answers_meanwhile(peer, ser
     assert call(peer, served, 'StepSimulation', steps=1).result.result == OK
 
 
-def test_play_load_a_world_and_quit(peer, served):
+def test_play_and_quit(peer, served):
     assert set_state(peer, served, PLAYING) == OK
     served.odom.wait_more(20)
-    response = call(peer, served, 'LoadWorld', world_resource=simulation_interfaces.msg.Resource(
-        uri='looping'))
-    assert response.result.result == OK, response.result.error_message
-    assert call(peer, served, 'GetSimulationState').state.state == STOPPED
-    assert call(peer, served, 'GetCurrentWorld').world.name == 'looping'
-    assert peer.get(served.node, 'spin.lz') == [1.3]
-    count = settled(served.odom)
-    assert set_state(peer, served, PLAYING) == OK
-    served.odom.wait(count + 20)
-    assert stamp_of(served.odom.raw[count]) > stamp_of(served.odom.raw[count - 1])
     assert call(peer, served, 'ResetSimulation', scope=4).result.result == UNSUPPORTED
     assert set_state(peer, served, QUITTING) == OK
     assert_clean_end(served.node, served.node.wait())

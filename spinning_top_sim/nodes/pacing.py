@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """When ticks and recorded messages are due, without ROS: a clock, a fair lock, threads."""
 
-import itertools
 import math
 import threading
 import time
@@ -19,11 +18,7 @@ BATCH_BYTES, BATCH_MESSAGES, BATCHES = 256_000, 512, 16     # read ahead
 
 
 class SimulatedClock:
-    """
-    Maps a source clock [ns] to simulated time [ns]: `scale` times as fast, with pauses.
-
-    Calls from several threads need a lock around them.
-    """
+    """Maps a source clock [ns] to simulated time [ns]: `scale` times as fast, with pauses."""
 
     def __init__(self, source: Callable[[], int], scale: float) -> None:
         self._source, self._scale = source, scale
@@ -117,17 +112,6 @@ class DeadlineThread(threading.Thread):
         self._stopped = True
         if self.is_alive():
             self.join(5.0)
-
-
-def rounds(read: Callable[[], Iterable[Message]], span_ns: int, loop: bool) -> Iterator[Message]:
-    """Yield the messages of a log that lasts `span_ns`, once or in endless repetition."""
-    for number in itertools.count():
-        shift = number * (span_ns + ROUND_GAP_NS)
-        at_ns = None
-        for at_ns, send, data in read():
-            yield at_ns + shift, send, data
-        if at_ns is None or not loop:
-            return
 
 
 def read_ahead(messages: Iterable[Message]) -> Generator[Message]:

@@ -37,7 +37,6 @@ class RecordingSession:
     def __init__(self, simulation: LiveSimulation, lock: FairLock,
                  topics: Callable[[Sequence[Stream]], list[Topic]]) -> None:
         self.error: str | None = None       # why the last recording stopped early or did not start
-        self.path = Path()                  # of the last recording
         self._simulation, self._lock, self._topics = simulation, lock, topics
         self._recorder: McapRecorder | None = None
         self._pending: list[tuple[Sequence[Entry], int]] = []   # while a log is being opened
@@ -47,10 +46,9 @@ class RecordingSession:
 
     def start(self, values: Mapping[str, Any]) -> Callable[[], str]:
         """
-        Begin to record into memory; return a function that opens the log.
+        Begin to record into memory; return a function that opens the log, before the next start.
 
-        The function returns a text with the path, or raises RecordingError and records nothing.
-        It must run before the next start.
+        It returns a text with the path, or raises RecordingError and records nothing.
         """
         if self._recorder is not None:
             path = self._recorder.path
@@ -79,7 +77,7 @@ class RecordingSession:
             with self._lock:
                 for messages in self._pending:
                     recorder.write_all(*messages)
-                self._recorder, self.path, self.error = recorder, recorder.path, None
+                self._recorder, self.error = recorder, None
                 self._feed(recorder.write_all, streams)
         return f'recording to {recorder.path}'
 
@@ -105,10 +103,10 @@ class RecordingSession:
     def check(self) -> str | None:
         """Close a recording that has failed; return the reason."""
         recorder = self._recorder
-        if recorder is None or recorder.error is None:
-            return None
-        self.stop(recorder.error)
-        return recorder.error
+        reason = recorder.error if recorder else None
+        if reason:
+            self.stop(reason)
+        return reason
 
     def write_command(self, l3: float, lz: float) -> None:
         """Record a command that is applied now, as a message and as an event."""
@@ -140,13 +138,7 @@ class RecordingSession:
     def warning(self) -> str | None:
         """A text for the user while the disk is too slow for `record.max_loss`."""
         recorder = self._recorder
-        return None if recorder is None else recorder.warning
-
-    @property
-    def size(self) -> str:
-        """Size of the log for the user, empty without a log."""
-        recorder = self._recorder
-        return '' if recorder is None else f'{recorder.counters.bytes / 1e6:.1f} MB'
+        return recorder.warning if recorder else None
 
     def numbers(self) -> dict[str, object]:
         """Return the values for /diagnostics."""

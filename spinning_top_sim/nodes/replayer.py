@@ -4,6 +4,7 @@
 import argparse
 import contextlib
 import importlib
+import itertools
 import os
 import re
 import sys
@@ -42,10 +43,10 @@ class Replayer(Node):
         self.finished: Future = Future()    # completes with the exit code when all is played
         self._reader, self._options = log, options
         self._terminal = reports.Terminal()
-        self._log_begin_ns, self._end_ns = log.span
-        self._begin_ns = self._log_begin_ns + round(options.start * NANOSECONDS)
-        self._span_ns = self._end_ns - self._begin_ns
-        self._length_s = (self._end_ns - self._log_begin_ns) / NANOSECONDS
+        log_begin_ns, end_ns = log.span
+        self._begin_ns = log_begin_ns + round(options.start * NANOSECONDS)
+        self._span_ns = end_ns - self._begin_ns
+        self._length_s = (end_ns - log_begin_ns) / NANOSECONDS
         if self._span_ns < 0:
             raise ValueError(f'--start {options.start:g}: the log lasts {self._length_s:.3f} s')
         self._outputs = self._open_publishers()     # by channel
@@ -57,9 +58,6 @@ class Replayer(Node):
             additional_constraints=f'must be {pacing.RATES}', dynamic_typing=True))
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         if options.clock:
-            if self._end_ns > LAST_STAMP_NS:
-                raise ValueError('--clock: the log has times after January 2038, which a stamp '
-                                 'cannot be')
             clock = self.create_publisher(ClockMessage, '/clock', 10)
             self._senders.add(clock)
             self.create_timer(1.0 / max(options.clock, pacing.SLOWEST), lambda: clock.publish(
@@ -96,15 +94,9 @@ class Replayer(Node):
             raise LookupError('--clock publishes another /clock')
         if topic.encoding != 'cdr':
             raise LookupError(f'its messages are encoded as {topic.encoding!r}, not as CDR')
-        kind = message_class(topic.type_name)
-        try:
-            qos = qos_profile((topic.qos or [DEFAULT_QOS])[0])
-        except ValueError as error:
-            self.get_logger().warning(f'{topic.name} is published with default QoS, not with '
-                                      f'the recorded one: {error}')
-            qos = qos_profile(DEFAULT_QOS)
         return self.create_publisher(
-            kind, topic.name, qos,
+            message_class(topic.type_name), topic.name,
+            qos_profile((topic.qos or [DEFAULT_QOS])[0]),
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
     def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
@@ -137,8 +129,7 @@ class Replayer(Node):
                     publisher.get_subscription_count() for publisher in self._senders
                     ) < self._options.wait_for_subscribers):
                 pass
-            with contextlib.closing(pacing.read_ahead(pacing.rounds(
-                    self._messages, self._span_ns, self._options.loop))) as messages:
+            with contextlib.closing(pacing.read_ahead(self._messages())) as messages:
                 self._playback.run(messages)
             # Best-effort subscribers read shared memory, which ends with its sender.
             self._stopping.wait(0.3)
@@ -157,13 +148,20 @@ class Replayer(Node):
             self.finished.set_result(code)
 
     def _messages(self) -> Iterator[pacing.Message]:
+        """Yield the messages to play, in endless repetition with --loop."""
         names = {channel.name for channel in self._reader.topics
                  if channel.channel_id in self._outputs}
         start = self._begin_ns if self._options.start else None
-        for message in self._reader.messages(names, start):
-            at_ns = message.log_time or self._begin_ns      # 0: before the first /clock
-            if message.channel_id in self._outputs:
-                yield at_ns, self._outputs[message.channel_id].publish, message.data
+        for number in itertools.count():
+            shift_ns, is_empty = number * (self._span_ns + pacing.ROUND_GAP_NS), True
+            for message in self._reader.messages(names, start):
+                at_ns = message.log_time or self._begin_ns      # 0: before the first /clock
+                if message.channel_id in self._outputs:
+                    is_empty = False
+                    yield (at_ns + shift_ns, self._outputs[message.channel_id].publish,
+                           message.data)
+            if is_empty or not self._options.loop:
+                return
 
     def _tell_damage(self) -> bool:
         """Return whether messages are missing unexpectedly; say so once."""
@@ -184,9 +182,8 @@ class Replayer(Node):
         number, within = divmod(self._playback.now() - self._begin_ns,
                                 self._span_ns + pacing.ROUND_GAP_NS)
         at = self._options.start + min(within, self._span_ns) / NANOSECONDS
-        percent = 100.0 * at / self._length_s if self._length_s else 100.0
         which = f' of round {number + 1}' if self._options.loop else ''
-        return f'{at:.2f} of {self._length_s:.2f} s, {percent:.0f} %{which}'
+        return f'{at:.2f} of {self._length_s:.2f} s{which}'
 
     def _show_status(self) -> None:
         self._tell_damage()
@@ -224,12 +221,8 @@ def message_class(type_name: str) -> type:
 
 def qos_profile(recorded: Mapping[str, Any]) -> QoSProfile:
     """Return a recorded QoS.  Raises ValueError if no publisher can offer it."""
-    policies: dict[str, Any] = {}
-    for key, value in recorded.items():
-        timed = isinstance(value, Mapping)
-        number = value['sec'] * NANOSECONDS + value['nsec'] if timed else value
-        if number < 0:
-            raise ValueError(f'{key} = {number}: must be >= 0')
-        policies[key] = Duration(nanoseconds=min(number, 2 ** 63 - 1)) if timed else number
+    policies = {
+        key: Duration(nanoseconds=min(value['sec'] * NANOSECONDS + value['nsec'], 2 ** 63 - 1))
+        if isinstance(value, Mapping) else value for key, value in recorded.items()}
     policies['depth'] = min(policies['depth'], 2 ** 31 - 1) or DEFAULT_QOS['depth']
     return QoSProfile(**policies)

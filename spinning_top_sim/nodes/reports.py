@@ -3,12 +3,10 @@
 
 import math
 import os
-import shlex
 import shutil
 import sys
 import time
 from operator import itemgetter
-from pathlib import Path
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -27,9 +25,9 @@ class MotionReport:
                  session: RecordingSession) -> None:
         self._simulation, self._loop, self._session = simulation, loop, session
         self._speed = math.nan                  # simulated time over real time
-        self._read_at, self._read_ns = time.monotonic(), 0
-        self._described: object = None          # the motion that `_regime` names
+        self._described: object = None          # the segment that `_regime` names
         self._regime = ''
+        self._read_at, self._read_ns = time.monotonic(), 0
         self.waits_for_clock = False            # whether /clock has not begun, or has stopped
 
     def diagnostics(self, stamp: Time, name: str, max_error: float) -> DiagnosticArray:
@@ -85,38 +83,22 @@ class MotionReport:
             self._read_at, self._read_ns = self._read_at + elapsed, now_ns
         return self._speed
 
-    def new_motion(self) -> str | None:
-        """Return a description of the present motion, once for each motion."""
-        simulation = self._simulation
-        if simulation.segment is self._described:
-            return None
-        self._described = simulation.segment
-        description = simulation.describe()
-        self._regime = 'beyond doubles' if description is None else description.name
-        return None if description is None else '\n  '.join(
-            ['the motion:', *str(description).split('; ')])
-
     def status_line(self) -> str:
         """Return the line for the terminal, with the angle in degrees."""
-        simulation, loop, size = self._simulation, self._loop, self._session.size
+        simulation, loop = self._simulation, self._loop
+        if simulation.segment is not self._described:
+            self._described, motion = simulation.segment, simulation.describe()
+            self._regime = motion.name if motion else ''
         theta, sent = math.degrees(float(simulation.state().theta[0])), self._total('sent')
         flag = (' FAILED' if loop.failure else ' waiting for /clock' if self.waits_for_clock
                 else ' paused' if loop.paused else '')
         is_running = loop.state is LoopState.RUNNING and not math.isnan(self._speed)
-        # The most important parts come first: a terminal shows as many as fit.
+        # The most important parts come first: a terminal shows as much as fits.
         return ' | '.join(filter(None, (
             f't {loop.now_ns / NANOSECONDS:9.2f} s{flag}', self._regime, f'theta {theta:6.2f} deg',
-            f'x{self._speed:.2f}' if is_running else '', f'log {size}' if size else '',
+            f'x{self._speed:.2f}' if is_running else '',
             f'L3 {simulation.l3:.4g} Lz {simulation.lz:.4g}', f'{sent} messages' if sent
             else 'no subscribers yet', f'dE/E {simulation.energy_drift:+.0e}')))
-
-
-def inspect_command(log: Path) -> str:
-    """Return the command that inspects a log, as this user can paste it into the terminal."""
-    beside = Path(sys.executable).with_name('inspect')
-    program = ['inspect'] if shutil.which('inspect') else [str(beside)] if beside.exists() else [
-        'ros2', 'run', 'spinning_top_sim', 'inspect']
-    return shlex.join([*program, str(log), '--plot', 'top.png'])
 
 
 class Terminal:
@@ -126,17 +108,11 @@ class Terminal:
         self._open = False              # whether the cursor is at the end of a status line
 
     def show(self, line: str) -> None:
-        """Show a status line, on a terminal as many of its parts as fit."""
-        try:
-            columns = os.get_terminal_size(1).columns if sys.stdout.isatty() else 0
-        except (AttributeError, OSError):       # standard output or the terminal is closed
-            columns = 0
-        if not columns:
+        """Show a status line, on a terminal as much as fits."""
+        if sys.stdout is None or not sys.stdout.isatty():
             self._write(f'{line}\n')
             return
-        while len(line) >= columns and ' | ' in line:
-            line = line.rpartition(' | ')[0]
-        self._write(f'\r\x1b[K{line[:max(columns - 1, 1)]}')
+        self._write(f'\r\x1b[K{line[:max(shutil.get_terminal_size().columns - 1, 1)]}')
         self._open = True
 
     def tell(self, line: str) -> None:

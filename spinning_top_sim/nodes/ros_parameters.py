@@ -16,6 +16,7 @@ from rclpy.parameter import Parameter as RosParameter
 
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.parameters import Parameter
+from spinning_top_sim.tools.scene_file import parse_yaml
 
 SPIN = ('spin.l3', 'spin.lz')
 
@@ -27,7 +28,7 @@ def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
     Unknown parameters are warned about.  The node must have been made with
     `automatically_declare_parameters_from_overrides`, the public way to learn of them.
     """
-    given, given_twice = {}, _given_twice(argv, node.get_fully_qualified_name())
+    given, last_given = {}, _last_given(argv, node.get_fully_qualified_name())
     for name in node.get_parameters_by_prefix(''):
         value = node.get_parameter(name).value
         if name == 'use_sim_time' and not isinstance(value, bool):
@@ -35,7 +36,7 @@ def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
         if name in {'use_sim_time', 'start_type_description_service'}:
             continue        # rclpy declares these itself
         if name in parameters.BY_NAME:
-            given[name] = _as_doubles(parameters.BY_NAME[name], given_twice.get(name, value))
+            given[name] = _as_doubles(parameters.BY_NAME[name], last_given.get(name, value))
         elif not name.startswith('qos_overrides.'):
             near = difflib.get_close_matches(name, parameters.BY_NAME, 1)
             hint = f'; did you mean {near[0]}?' if near else ''
@@ -51,36 +52,27 @@ def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
     return values
 
 
-def _given_twice(argv: Sequence[str], node_name: str) -> dict[str, object]:
+def _last_given(argv: Sequence[str], node_name: str) -> dict[str, object]:
     """
-    Return the last value of each parameter that the command line gives to a node more than once.
+    Return the last value that the command line gives to each parameter of a node.
 
     rcl keeps the last value of each type, and of these rclpy prefers an integer to a double.
     """
-    names = [text.partition(':=')[0].rpartition(':')[2] for flag, text in pairwise(argv)
-             if flag in {'-p', '--param'}]
-    if '--params-file' not in argv and len(set(names)) == len(names):
-        return {}
-    import yaml  # noqa: PLC0415 - it takes 10 ms
-
     last: dict[str, object] = {}
-    twice = set()
     for flag, text in pairwise(argv):
         tree: Any = {}
         if flag == '--params-file':
-            tree = yaml.safe_load(Path(text).read_bytes())
+            tree = parse_yaml(Path(text).read_bytes(), text)
         elif flag in {'-p', '--param'}:
             rule, _, shown = text.partition(':=')
             node, _, name = rule.rpartition(':')
-            tree = {node or '/**': {'ros__parameters': {name: yaml.safe_load(shown)}}}
+            tree = {node or '/**': {'ros__parameters': {name: parse_yaml(shown, text)}}}
         for path, value in _leaves(tree):
             nodes, _, name = path.partition('/ros__parameters/')
             pattern = re.escape(nodes).replace(r'/\*\*', r'(/\w+)*').replace(r'\*', r'\w+')
             if re.fullmatch(pattern, node_name):
-                name = name.replace('/', '.')
-                twice |= {name} & last.keys()
-                last[name] = value
-    return {name: last[name] for name in twice}
+                last[name.replace('/', '.')] = value
+    return last
 
 
 def _leaves(tree: object, path: str = '') -> Iterator[tuple[str, object]]:
@@ -95,15 +87,11 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     """Return what `ros2 param describe` shows.  Types are dynamic: `Parameter.check` decides."""
     result = ParameterDescriptor(
         name=parameter.name, description=parameter.describe(range_too=False), dynamic_typing=True,
-        read_only=parameter.effect is parameters.Effect.START)
+        read_only=parameter.effect is parameters.Effect.START,
+        additional_constraints=parameter.allowed)
     lowest = parameter.minimum if parameter.above is None else parameter.above
     if lowest is None or parameter.maximum is None:
-        result.additional_constraints = parameter.allowed
         return result
-    if parameter.above is not None:
-        result.additional_constraints = f'must be > {parameter.above:g}'
-    elif parameter.smallest is not None:
-        result.additional_constraints = f'must be 0 or >= {parameter.smallest:g}'
     if isinstance(parameter.default, int):
         result.integer_range = [IntegerRange(
             from_value=int(lowest), to_value=int(parameter.maximum))]
@@ -120,16 +108,12 @@ def with_doubles(given: Sequence[RosParameter]) -> list[RosParameter]:
 
 
 def _as_doubles(parameter: Parameter, value: Any) -> Any:
-    default = parameter.default
     if isinstance(value, list | array.array):
-        of_doubles = isinstance(default, tuple) and isinstance(default[0], float)
-        return [_as_double(item) if of_doubles else item for item in value]
-    return _as_double(value) if parameter.is_double else value
-
-
-def _as_double(value: object) -> object:
+        return [_as_doubles(parameter, item) for item in value]
+    first = parameter.default[0] if isinstance(parameter.default, tuple) else None
     with contextlib.suppress(ValueError):
-        return float(value) if type(value) in {int, str} else value     # type: ignore[arg-type]
+        if type(value) in {int, str} and (parameter.is_double or isinstance(first, float)):
+            return float(value)
     return value
 
 

@@ -3,8 +3,8 @@
 Offers simulation_interfaces, the standard of ROS 2 for simulators.
 
 The handler of GetEntities is `_get_entities`.  A handler takes a request, fills the response, and
-may return a text for `error_message`.  RefusedError has the result code of a refusal; ValueError,
-RuntimeError and OSError mean RESULT_OPERATION_FAILED.
+may return a text for `error_message`.  RefusedError has the result code of a refusal; other errors
+mean RESULT_OPERATION_FAILED.
 """
 
 import importlib
@@ -15,37 +15,25 @@ from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse
 
-from spinning_top_sim.nodes import entity, worlds
-from spinning_top_sim.nodes.simulation_standard import (
-    ACTION,
-    FEATURES,
-    SERVICES,
-    RefusedError,
-    UnsupportedError,
-    service_name,
-)
+from spinning_top_sim.nodes import entity
+from spinning_top_sim.nodes.simulation_standard import FEATURES, RefusedError, service_name
 from spinning_top_sim.nodes.simulator import Simulator
 from spinning_top_sim.nodes.tick_loop import LoopState
-from spinning_top_sim.nodes.worlds import World
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 
 
 def offer(node: Simulator) -> None:
-    """
-    Create the services and the action server, in the namespace of the node.
-
-    Services that the installed version of simulation_interfaces lacks are left out.
-    """
+    """Create the services that are installed, and the action server, in the node's namespace."""
     messages, services, actions = (importlib.import_module(f'simulation_interfaces.{kind}')
                                    for kind in ('msg', 'srv', 'action'))
     handlers = SimulationHandlers(node, messages, actions)
-    for name in SERVICES:
+    for name in FEATURES:
         if hasattr(services, name):
             node.create_service(getattr(services, name), service_name(name),
                                 partial(handlers.serve, name))
     # The node keeps the action server.
-    ActionServer(node, getattr(actions, ACTION), service_name(ACTION), handlers.simulate_steps,
+    ActionServer(node, actions.SimulateSteps, 'simulate_steps', handlers.simulate_steps,
                  cancel_callback=lambda _: CancelResponse.ACCEPT)
 
 
@@ -64,7 +52,6 @@ class SimulationHandlers:
         self._results, self._states = messages.Result, messages.SimulationState
         self._name = node.get_name()            # of the entity
         self._category = messages.EntityCategory.CATEGORY_ROBOT
-        self._world: World | None = None        # the world that was loaded last
         self._pause_at_start = -1               # `loop.interruptions` when PAUSED was set at t = 0
         self._quits = self._steps = False
 
@@ -80,22 +67,17 @@ class SimulationHandlers:
         return response
 
     def _outcome(self, act: Callable[[], str | None]) -> tuple[int, str]:
-        """Return the result code and the text of an action; unexpected errors stop the motion."""
-        try:
-            return self._results.RESULT_OK, act() or ''
-        except RefusedError as error:
-            return error.code, str(error)
-        except (ValueError, RuntimeError, OSError) as error:
-            return self._results.RESULT_OPERATION_FAILED, str(error)
-        except Exception as error:
-            self._node.fail(error)
-            return self._results.RESULT_OPERATION_FAILED, f'{type(error).__name__}: {error}'
+        """Return the result code and the text of an action."""
+        error, text = self._node.outcome(act)
+        if error is None:
+            return self._results.RESULT_OK, text
+        return getattr(error, 'code', self._results.RESULT_OPERATION_FAILED), text
 
     def _get_simulator_features(self, _: Any, response: Any) -> None:
-        names = dict.fromkeys(name for row in FEATURES.values() for name in row)
         known = self._messages.SimulatorFeatures
-        response.features.features = sorted(
-            getattr(known, name) for name in names if hasattr(known, name))
+        response.features.features = sorted({
+            getattr(known, name) for row in FEATURES.values() for name in row
+            if hasattr(known, name)})
 
     def _state(self) -> int:
         """Return the constant of SimulationState; the caller holds the lock."""
@@ -156,8 +138,6 @@ class SimulationHandlers:
                 self._pause_at_start = self._loop.interruptions
                 return
             self._loop.pause()
-            if self._loop.failure:
-                raise RuntimeError(self._loop.failure)
 
     def _quit(self) -> None:
         with self._lock:
@@ -186,7 +166,7 @@ class SimulationHandlers:
         step_ns = round(self._node.values['step.dt'] * NANOSECONDS)
         with self._lock:
             target_ns = loop.now_ns + count * step_ns
-            loop.step_by(count * step_ns)
+            loop.step(count * step_ns)
             if loop.now_ns < target_ns:
                 raise RuntimeError(f'{loop.time_text}: `duration` ends before the steps do')
 
@@ -239,12 +219,10 @@ class SimulationHandlers:
         """Raise RefusedError before the motion begins, and when the process ends."""
         with self._lock:
             quits = self._state() == self._states.STATE_QUITTING
-        try:
-            self._node.check_started()
-            if quits:
-                raise RuntimeError('the simulator is quitting')
-        except RuntimeError as error:
-            raise RefusedError(self._results.RESULT_INCORRECT_STATE, error) from error
+        error, reason = self._node.outcome(self._node.check_started)
+        if quits or error:
+            raise RefusedError(self._results.RESULT_INCORRECT_STATE,
+                               reason or 'the simulator is quitting')
 
     def _reset_simulation(self, request: Any, _: Any) -> None:
         time_and_state = request.SCOPE_TIME | request.SCOPE_STATE
@@ -257,10 +235,13 @@ class SimulationHandlers:
                 self._loop.set_state(lambda _: parameters.start_state(values))
             self._node.show_spin()
         else:
-            raise UnsupportedError(
+            raise self._unsupported(
                 f'scope = {request.scope}: must be {request.SCOPE_DEFAULT} or '
                 f'{request.SCOPE_ALL} (all), {request.SCOPE_STATE} (state) or {time_and_state} '
                 '(time and state): time goes back with the state only, and nothing is spawned')
+
+    def _unsupported(self, reason: str) -> RefusedError:
+        return RefusedError(self._results.RESULT_FEATURE_UNSUPPORTED, reason)
 
     def _check_entity(self, name: str) -> None:
         if name != self._name:
@@ -275,84 +256,38 @@ class SimulationHandlers:
                               self._node.values['world_frame'])
 
     def _get_entities(self, request: Any, response: Any) -> None:
-        if entity.is_chosen(request.filters, self._name, self._category):
-            response.entities = [self._name]
+        filters = request.filters
+        if (filters.filter or filters.categories or filters.tags.tags
+                or filters.bounds.type != filters.bounds.TYPE_EMPTY):
+            raise self._unsupported('filters must be empty: there is one entity')
+        response.entities = [self._name]
 
     def _get_entities_states(self, request: Any, response: Any) -> None:
         self._get_entities(request, response)
-        response.states = [self._messages.EntityState() for _ in response.entities]
-        for message in response.states:
-            self._fill_state(message)
+        response.states = [self._messages.EntityState()]
+        self._fill_state(response.states[0])
 
     def _get_entity_state(self, request: Any, response: Any) -> None:
         self._check_entity(request.entity)
         self._fill_state(response.state)
 
-    def _set_entity_state(self, request: Any, response: Any) -> str:
+    def _set_entity_state(self, request: Any, _: Any) -> None:
         self._check_entity(request.entity)
         self._check_runs()
-        try:
-            change = entity.changed_state(request, self._simulation.top,
-                                          self._node.values['world_frame'])
-        except entity.PoseError as error:
-            raise RefusedError(response.INVALID_POSE, error) from error
+        top, frame = self._simulation.top, self._node.values['world_frame']
         with self._lock:
-            self._loop.set_state(change)
+            self._loop.set_state(lambda now: entity.asked_state(request, top, frame, now))
         self._node.show_spin()
-        return ('the acceleration follows from pose and twist: that of the request is not used'
-                if getattr(request, 'set_acceleration', False) else '')
 
     def _get_entity_info(self, request: Any, response: Any) -> None:
         self._check_entity(request.entity)
         response.info.category.category = self._category
-        response.info.description = entity.describe(self._simulation.top)
+        top = self._simulation.top
+        response.info.description = (
+            f'heavy symmetric top on a fixed pivot: mass {top.mass:g} kg, centre of mass '
+            f'{top.com_distance:g} m from the pivot, moments of inertia {top.lambda1:g} and '
+            f'{top.lambda3:g} kg m^2')
         response.info.tags = list(entity.TAGS)
-
-    def _get_entity_bounds(self, request: Any, response: Any) -> None:
-        self._check_entity(request.entity)
-        entity.fill_bounds(response.bounds, self._simulation.top)
-
-    def _filled(self, message: Any, world: World) -> Any:
-        """Return a WorldResource that describes a world."""
-        message.name, message.world_resource.uri = world.name, world.uri
-        message.world_resource.resource_string = '' if world.uri else world.text
-        return message
-
-    def _get_available_worlds(self, request: Any, response: Any) -> None:
-        if request.filter.tags or request.additional_sources:
-            raise UnsupportedError('filter.tags and additional_sources must be empty: worlds have '
-                                   'no tags, and load_world takes the path of any other world')
-        for world in worlds.scenes():
-            response.worlds.append(self._filled(self._messages.WorldResource(), world))
-
-    def _load_world(self, request: Any, response: Any) -> str:
-        resource = request.world_resource
-        if not (resource.uri or resource.resource_string):
-            raise RefusedError(response.NO_RESOURCE, 'uri and resource_string are empty: one of '
-                               'them must be a world')
-        try:
-            world = (World.read(resource.uri) if resource.uri
-                     else World.parse(resource.resource_string))
-            values = world.values(self._node.values)
-        except FileNotFoundError as error:
-            raise RefusedError(self._results.RESULT_NOT_FOUND, error) from error
-        except worlds.FormatError as error:
-            raise RefusedError(response.UNSUPPORTED_FORMAT, error) from error
-        except ValueError as error:
-            raise RefusedError(response.RESOURCE_PARSE_ERROR, error) from error
-        ignored = (f'not used, as no parameters that a running node can change: '
-                   f'{", ".join(world.ignored)}' if world.ignored else '')
-        if ignored and request.fail_on_unsupported_element:
-            raise RefusedError(response.UNSUPPORTED_ELEMENTS, ignored)
-        self._check_runs()
-        self._node.start_again(values, paused=True)
-        self._world = world
-        self._filled(response.world, world)
-        return ignored
-
-    def _get_current_world(self, _: Any, response: Any) -> None:
-        self._filled(response.world,
-                         worlds.present_world(self._simulation.values, self._world))
 
 
 @types.coroutine

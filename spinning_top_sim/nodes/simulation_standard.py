@@ -12,18 +12,12 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
     'StepSimulation': ('STEP_SIMULATION_SINGLE', 'STEP_SIMULATION_MULTIPLE'),
     'SimulateSteps': ('STEP_SIMULATION_ACTION',),
     'ResetSimulation': ('SIMULATION_RESET', 'SIMULATION_RESET_STATE'),
-    'GetEntities': ('ENTITY_TAGS', 'ENTITY_CATEGORIES'),
+    'GetEntities': (),
     'GetEntitiesStates': ('ENTITY_STATE_GETTING',),
     'GetEntityState': ('ENTITY_STATE_GETTING',),
     'SetEntityState': ('ENTITY_STATE_SETTING',),
     'GetEntityInfo': ('ENTITY_INFO_GETTING',),
-    'GetEntityBounds': ('ENTITY_BOUNDS',),
-    'GetAvailableWorlds': ('AVAILABLE_WORLDS',),
-    'LoadWorld': ('WORLD_LOADING', 'WORLD_RESOURCE_STRING'),
-    'GetCurrentWorld': ('WORLD_INFO_GETTING',),
 }
-ACTION = 'SimulateSteps'
-SERVICES = tuple(name for name in FEATURES if name != ACTION)
 
 
 def service_name(type_name: str) -> str:
@@ -31,16 +25,9 @@ def service_name(type_name: str) -> str:
     return re.sub(r'(?<!^)(?=[A-Z])', '_', type_name).lower()
 
 
-class RefusedError(Exception):
+class RefusedError(RuntimeError):
     """A request is refused with a result code."""
 
     def __init__(self, code: int, reason: object) -> None:
         super().__init__(str(reason))
         self.code = code
-
-
-class UnsupportedError(RefusedError):
-    """The standard allows a request that this node does not support."""
-
-    def __init__(self, reason: object) -> None:
-        super().__init__(0, reason)     # RESULT_FEATURE_UNSUPPORTED

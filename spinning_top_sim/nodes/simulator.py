@@ -2,7 +2,6 @@
 """The node `spinning_top`: connects a `Simulation` to topics, services and parameters."""
 
 import functools
-import itertools
 import sys
 import time
 import traceback
@@ -26,18 +25,11 @@ from spinning_top_sim.nodes.pacing import DeadlineThread, FairLock
 from spinning_top_sim.nodes.publishers import StreamPublishers
 from spinning_top_sim.nodes.recording_session import RecordingSession
 from spinning_top_sim.nodes.ros_parameters import SPIN
-from spinning_top_sim.nodes.tick_loop import (
-    LAST_EPOCH_NS,
-    TOO_LATE,
-    LoopState,
-    TickLoop,
-    next_epoch,
-)
+from spinning_top_sim.nodes.tick_loop import LoopState, TickLoop, next_epoch
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.live import LiveSimulation
-from spinning_top_sim.streams.simulation import PoleError
 
 LAST_ANSWERS_S = 0.2            # time for the last answers before the node ends
 
@@ -58,7 +50,8 @@ class Simulator(Node):
         simulation = self.simulation = LiveSimulation(values)
         # A reset starts with this spin.  An unset spin.lz stays unset: it follows initial.theta.
         self._start_spin = {name: values[name] for name in SPIN}
-        self._values = {**values, 'spin.lz': simulation.lz}
+        # The parameters, with the spin as last commanded.
+        self.values = {**values, 'spin.lz': simulation.lz}
         self.add_pre_set_parameters_callback(ros_parameters.with_doubles)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._date = DateClock(self, journal.is_enabled('clock', values))
@@ -72,17 +65,16 @@ class Simulator(Node):
             source=self._date.now_ns if self._date.follows else time.monotonic_ns)
         self._pacer = DeadlineThread(self._tick, self._idle, lambda: self.loop.grid, self.fail)
         self._report = reports.MotionReport(simulation, self.loop, self._session)
-        self._outputs.open(simulation.outputs, values)
+        self._status_timer: Timer | None = None
+        self._status_period = 0.0
+        self._open_outputs(values)
         self._diagnostics = self._outputs.create(DiagnosticArray, '/diagnostics')
         self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
         for name, kind, act in (('set_pause', SetBool, self._set_pause),
                                 ('step', Trigger, self._step), ('reset', Trigger, self._reset),
                                 ('record', SetBool, self._record)):
             self.create_service(kind, f'~/{name}', functools.partial(self._serve, act))
-        self._diagnostics_count = itertools.count()
         self._steady_timer(1.0, self._publish_diagnostics)
-        self._status_timer: Timer | None = None
-        self._set_status_period(values['status_period'])
         if not simulation.top.is_realizable:
             self._log.warning(
                 f'top.lambda3 = {simulation.top.lambda3!r} kg m^2: no rigid body has more than '
@@ -98,21 +90,23 @@ class Simulator(Node):
 
     def _begin(self) -> None:
         """Start the motion once there is a date."""
-        date_ns = self._date.now_ns()
-        if date_ns == 0:
+        if self._date.now_ns() == 0:
             return
-        if self._date.follows and date_ns > LAST_EPOCH_NS:
-            self._log.warning(f'/clock: {TOO_LATE}', once=True)
-            return
-        self.destroy_timer(self._begin_timer)
-        if self._values['max_error'] > 0.0:
+        if self.values['max_error'] > 0.0:
             _ = self.simulation.segment.exact    # its modules take a while to import
         now_ns = self._date.first_ns()
-        self.simulation.epoch_ns = next_epoch(now_ns)
+        try:
+            self.simulation.epoch_ns = next_epoch(now_ns)
+        except ValueError as error:
+            if not self._date.follows:
+                raise
+            self._log.warning(f'/clock: {error}', once=True)
+            return
+        self.destroy_timer(self._begin_timer)
         if not self._date.follows:
             time.sleep((self.simulation.epoch_ns - now_ns) / NANOSECONDS)
         self.loop.start()
-        open_log = (self._session.start(self.start_values) if self._values['record.enabled']
+        open_log = (self._session.start(self.start_values) if self.values['record.enabled']
                     else None)
         self._pacer.start()
         if open_log is not None:
@@ -129,8 +123,6 @@ class Simulator(Node):
         summary = self._session.stop()
         if summary:
             self._terminal.tell(summary)
-            if self._session.path.exists():
-                self._terminal.tell(f'next: {reports.inspect_command(self._session.path)}')
 
     def finish(self) -> None:
         """End the process after the response that is being prepared."""
@@ -163,14 +155,9 @@ class Simulator(Node):
             self.loop.idle()
 
     @property
-    def values(self) -> Mapping[str, Any]:
-        """The parameters, with the spin as last commanded."""
-        return self._values
-
-    @property
     def start_values(self) -> dict[str, Any]:
         """The parameters that a reset starts with."""
-        return {**self._values, **self._start_spin}
+        return {**self.values, **self._start_spin}
 
     def _on_command(self, message: Float64MultiArray) -> None:
         """Treat a command as a change of the parameters spin.l3 and spin.lz."""
@@ -192,19 +179,19 @@ class Simulator(Node):
         changes = {p.name: p.value for p in given if p.name in parameters.BY_NAME}
         if not changes:
             return SetParametersResult(successful=True)
-        successful, reason = self._outcome(self._change, changes)
-        if ros_parameters.is_command(changes) and not successful:
+        error, reason = self.outcome(lambda: self._change(changes))
+        if error is not None and ros_parameters.is_command(changes):
             self.loop.rejected_commands += 1
-        return SetParametersResult(successful=successful, reason=reason)
+        return SetParametersResult(successful=error is None, reason=reason)
 
     def _change(self, changes: dict[str, Any]) -> None:
-        values, start_spin = ros_parameters.changed(self._values, changes, self._start_spin)
+        values, start_spin = ros_parameters.changed(self.values, changes, self._start_spin)
         self._check_surroundings(values, restarted=False)
         rest = sorted(changes.keys() - SPIN)
         with self.lock:
             if ros_parameters.is_command(changes):
                 self.check_started()
-                self._command(values['spin.l3'], values['spin.lz'])
+                self.loop.command(values['spin.l3'], values['spin.lz'])
             if rest:
                 changed = {name: values[name] for name in rest}
                 self._session.write_event('parameters', **changed)
@@ -213,10 +200,10 @@ class Simulator(Node):
                 self.loop.set_pace(values)
         for effect in (parameters.Effect.RESET, parameters.Effect.RECORDING):
             names = [name for name in rest if parameters.BY_NAME[name].effect is effect
-                     and values[name] != self._values[name]]
+                     and values[name] != self.values[name]]
             if names:
                 self._log.info(f'{", ".join(names)}: {effect.value}')
-        self._values, self._start_spin = values, start_spin
+        self.values, self._start_spin = values, start_spin
 
     def _check_surroundings(self, values: Mapping[str, Any], *, restarted: bool) -> None:
         """Raise ValueError for parameters that contradict what is in use already."""
@@ -228,34 +215,31 @@ class Simulator(Node):
             raise ValueError(f'imu.rate = {values["imu.rate"]!r}: must be >= {lowest:g} while '
                              'means or increments are taken, published or recorded')
 
-    def _command(self, l3: float, lz: float) -> None:
-        try:
-            self.loop.command(l3, lz)
-        except PoleError as error:
-            raise ValueError(
-                f'{error}, as by: ros2 topic pub --once {self.resolve_topic_name("~/commands")} '
-                "std_msgs/msg/Float64MultiArray '{data: [L3, Lz]}', or by the service "
-                f'{self.get_fully_qualified_name()}/set_parameters_atomically') from error
-
     def _open_outputs(self, values: Mapping[str, Any]) -> None:
         """Open the publishers and the status line that these parameters ask for."""
         self._outputs.open(self.simulation.outputs, values)
-        if values['status_period'] != self._values['status_period']:
-            self._set_status_period(values['status_period'])
+        period = values['status_period']
+        if period != self._status_period:
+            self._status_period = period
+            if self._status_timer is not None:
+                self.destroy_timer(self._status_timer)
+            self._status_timer = (
+                self._steady_timer(period, self._show_status) if period else None)
 
     def _serve(self, act: Callable[[Any], str], request: object, response: Any) -> object:
-        response.success, response.message = self._outcome(act, request)
+        error, response.message = self.outcome(lambda: act(request))
+        response.success = error is None
         return response
 
-    def _outcome(self, act: Callable[[Any], str | None], asked: object) -> tuple[bool, str]:
-        """Return whether `act` succeeds, and its text; unexpected errors stop the motion."""
+    def outcome(self, act: Callable[[], str | None]) -> tuple[Exception | None, str]:
+        """Return the error of an action, and its text; unexpected errors stop the motion."""
         try:
-            return True, act(asked) or ''
-        except (ValueError, RuntimeError, RecordingError) as error:
-            return False, str(error)
+            return None, act() or ''
+        except (ValueError, RuntimeError, OSError, RecordingError) as error:
+            return error, str(error)
         except Exception as error:
             self.fail(error)
-            return False, f'{type(error).__name__}: {error}'
+            return error, f'{type(error).__name__}: {error}'
 
     def check_started(self) -> None:
         """Raise RuntimeError before the motion begins."""
@@ -273,7 +257,8 @@ class Simulator(Node):
     def _step(self, _: Trigger.Request) -> str:
         with self.lock:
             self.check_started()
-            self.loop.step(self._values['step.count'], self._values['step.dt'])
+            self.loop.step(round(
+                self.values['step.count'] * self.values['step.dt'] * NANOSECONDS))
             return self.loop.time_text
 
     def _reset(self, _: Trigger.Request) -> str:
@@ -291,23 +276,20 @@ class Simulator(Node):
         Raises RuntimeError before the motion begins, and ValueError if no motion begins with these
         values; nothing changes then.
         """
+        start = self.start_values if values is None else dict(values)
         with self.lock:
             self.check_started()
-            start = self.start_values if values is None else values
             self._check_surroundings(start, restarted=True)
             self.loop.reset(start, self._date.first_ns(), paused)
-            if values is not None:
-                self._open_outputs(values)
-                self._start_spin = {name: values[name] for name in SPIN}
-        if values is not None:
-            changed = [name for name in values if values[name] != self._values[name]]
-            self._values = dict(values)
-            self._show(name for name in changed if name not in SPIN)
+            self._open_outputs(start)
+        changed = [name for name in start if start[name] != self.values[name] and name not in SPIN]
+        self.values, self._start_spin = start, {name: start[name] for name in SPIN}
+        self._show(changed)
         self.show_spin()
 
     def show_spin(self) -> None:
         """Set the parameters spin.l3 and spin.lz to the present spin."""
-        self._values |= {'spin.l3': self.simulation.l3, 'spin.lz': self.simulation.lz}
+        self.values |= {'spin.l3': self.simulation.l3, 'spin.lz': self.simulation.lz}
         self._show(SPIN)
 
     def _show(self, names: Iterable[str]) -> None:
@@ -316,7 +298,7 @@ class Simulator(Node):
         try:
             self.set_parameters([
                 Parameter(name, value=list(value) if isinstance(value, tuple) else value)
-                for name, value in ((name, self._values[name]) for name in names)])
+                for name, value in ((name, self.values[name]) for name in names)])
         finally:
             self.add_on_set_parameters_callback(self._on_set_parameters)
 
@@ -346,53 +328,38 @@ class Simulator(Node):
         return self.create_timer(period, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _publish_diagnostics(self) -> None:
-        """Check /clock, the recording and the names of other nodes; publish /diagnostics."""
+        """Check /clock and the recording; publish /diagnostics."""
         self._check_clock()
         self._check_recording()
         if self._session.warning:
             self._log.warning(f'recording: {self._session.warning}', throttle_duration_sec=10.0)
-        if next(self._diagnostics_count) % 10 == 1:
-            names = self.get_node_names_and_namespaces()
-            if names.count((self.get_name(), self.get_namespace())) > 1:
-                self._log.warning(
-                    f'there is another node {self.get_fully_qualified_name()}: give one of them a '
-                    'namespace, with --ros-args -r __ns:=/NAME', once=True)
         if self._report.overloaded:
             self._log.warning(
                 'this machine cannot keep up with these rates: live topics skip samples, or the '
                 'clock slips; a recording stays complete, and /diagnostics counts', once=True)
-        if self._values['max_error'] > 0.0:
+        if self.values['max_error'] > 0.0:
             # Without the lock, because it takes milliseconds and ticks would wait.
             _ = self.simulation.segment.exact
         with self.lock:
             message = self._report.diagnostics(
                 self.get_clock().now().to_msg(), self.get_fully_qualified_name().lstrip('/'),
-                self._values['max_error'])
+                self.values['max_error'])
         self._diagnostics.publish(message)
 
     def _check_clock(self) -> None:
         """Warn when the /clock that is followed stops; say when it goes on."""
         waits = self._date.is_missing()
-        if waits and not self._report.waits_for_clock:
-            self._log.warning('waiting for /clock (use_sim_time is set)')
-        elif self._report.waits_for_clock and not waits:
-            self._log.info('/clock goes on')
-        self._report.waits_for_clock = waits
+        if waits != self._report.waits_for_clock:
+            self._report.waits_for_clock = waits
+            self._log.warning('waiting for /clock (use_sim_time is set)' if waits else
+                              '/clock goes on')
 
     def _check_recording(self) -> None:
         reason = self._session.check()
         if reason:
             self._log.error(f'recording stopped: {reason}; the simulation goes on')
 
-    def _set_status_period(self, period: float) -> None:
-        if self._status_timer is not None:
-            self.destroy_timer(self._status_timer)
-        self._status_timer = self._steady_timer(period, self._show_status) if period else None
-
     def _show_status(self) -> None:
-        _ = self.simulation.segment.exact
         with self.lock:
-            motion, line = self._report.new_motion(), self._report.status_line()
-        if motion and self.context.ok():        # a signal may have shut it down
-            self._log.info(motion)
+            line = self._report.status_line()
         self._terminal.show(line)

@@ -13,12 +13,7 @@ TOPICS = {'ground_truth/odom': 'ground_truth/odom_throttle'}
 
 
 class Throttle:
-    """
-    Publishes at most RATE messages of a stream a second.
-
-    Sending a message to a subscriber costs more than computing it.  `flush`, called while the
-    motion stands still, publishes the last message.
-    """
+    """Publishes at most RATE messages of a stream a second, as sending one is expensive."""
 
     def __init__(self, publisher: Publisher) -> None:
         self.publisher = publisher
@@ -27,11 +22,7 @@ class Throttle:
         self._publish_all: Publish | None = None
 
     def sink(self, publish_all: Publish | None) -> Publish | None:
-        """
-        Return the function that takes the messages of the stream; None without subscribers.
-
-        publish_all : publishes every message on the stream's own topic; None without subscribers
-        """
+        """Return what takes the messages of the stream; `publish_all` takes each of them."""
         self._publish_all = publish_all
         if self.publisher.get_subscription_count():
             return self._publish

@@ -31,13 +31,12 @@ LATEST_NS = 500_000_000         # samples later than this are recorded, but not 
 LONGEST_LAG_NS = 1_000_000_000
 # No motion begins later than a day before the stamps end.
 LAST_EPOCH_NS = LAST_STAMP_NS - 86_400 * NANOSECONDS
-TOO_LATE = 'the seconds of a ROS stamp, an int32, end in January 2038'
 
 
 def next_epoch(date_ns: int) -> int:
     """Return the first stamp from this date on [ns] that t = 0 may have.  Raises ValueError."""
     if date_ns > LAST_EPOCH_NS:
-        raise ValueError(TOO_LATE)
+        raise ValueError('the seconds of a ROS stamp, an int32, end in January 2038')
     return -(-date_ns // EPOCH_GRID_NS) * EPOCH_GRID_NS
 
 
@@ -192,16 +191,8 @@ class TickLoop:
         if self.state is LoopState.PAUSED:
             self._enter(LoopState.RUNNING)
 
-    def step(self, count: int, dt: float) -> None:
-        """
-        Move a paused motion on by count x dt [s], rounded to 1 ns, or raise RuntimeError.
-
-        It goes no further than `duration`.
-        """
-        self.step_by(round(count * dt * NANOSECONDS))
-
-    def step_by(self, length_ns: int) -> None:
-        """Move a paused motion on by this time [ns], as `step` does."""
+    def step(self, length_ns: int) -> None:
+        """Move a paused motion on, at most to `duration`, or raise RuntimeError."""
         if self.failure:
             raise RuntimeError(f'the motion stands still: {self.failure}')
         if not self.paused:
@@ -229,8 +220,6 @@ class TickLoop:
     def command(self, l3: float, lz: float) -> None:
         """Send what is due, then let L3 and Lz jump [kg m^2/s], or raise ValueError."""
         self._send_before_change()
-        if self.failure:
-            raise ValueError(f'l3 = {l3!r}, lz = {lz!r}: the motion stands still: {self.failure}')
         self._simulation.command(l3, lz)
         self._recording.write_command(l3, lz)
         self.commands += 1
@@ -242,8 +231,6 @@ class TickLoop:
         change : takes the present state (n = 1), and returns the new one
         """
         self._send_before_change()
-        if self.failure:
-            raise ValueError(f'the motion stands still: {self.failure}')
         state = change(self._simulation.state())
         self._simulation.set_state(state)
         self._recording.write_event('state', **asdict(state))
@@ -253,6 +240,8 @@ class TickLoop:
         if self._simulation.now_ns < 0:         # the change sends the samples of t = 0
             self._update_subscribers()
         self._advance()
+        if self.failure:
+            raise ValueError(f'the motion stands still: {self.failure}')
 
     def reset(self, values: Mapping[str, Any], date_ns: int, paused: bool | None = None) -> None:
         """

@@ -51,7 +51,7 @@ class Increments(NamedTuple):
         (x, y, z, w), (a, b, c, d), (v1, v2, v3) = self.rotation, later.rotation, later.velocity
         return Increments(
             np.stack(attitude.product((x, y, z, w), (a, b, c, d))),
-            self.velocity + np.stack(attitude.in_body((-x, -y, -z, w), (v1, v2, v3))),
+            self.velocity + np.stack(attitude.in_world((x, y, z, w), (v1, v2, v3))),
             self.angles + later.angles, self.forces + later.forces)
 
 
@@ -125,8 +125,8 @@ def _differences(first: States, last: States, seconds: float, point: Point) -> R
     # The lengths of q and p, rounded like their components, would scale all the small angles.
     too_long, longer = _excess(now), _excess(last.rows_quaternion)
     scale = 1.0 - 0.5 * (too_long + longer)
-    v1, v2, v3 = (attitude.in_body((-x, -y, -z, w), first.velocity(point)))
-    u1, u2, u3 = (attitude.in_body((-a, -b, -c, d), last.velocity(point)))
+    v1, v2, v3 = attitude.in_world(now, first.velocity(point))
+    u1, u2, u3 = attitude.in_world(last.rows_quaternion, last.velocity(point))
     change = u1 - v1, u2 - v2, u3 - v3 + first.top.gravity * seconds
     return np.stack((*(scale * part for part in axis), 1.0 + (shrunk + 0.5 * (too_long - longer)),
                      *attitude.in_body(now, change)))

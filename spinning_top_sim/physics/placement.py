@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A top that is put somewhere: its state from pose and twist, and the space that it takes."""
+"""A top that is put somewhere: its state from pose and twist."""
 
 import math
-from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.top import Shape, State, Top
+from spinning_top_sim.physics.top import State, Top
 
 Reals = NDArray[np.float64]
 # An axis nearer to a vertical than this [rad] counts as vertical.  The rounding of Lz changes the
@@ -55,24 +53,3 @@ def state_of(top: Top, quaternion: Reals, angular_velocity: Reals) -> State:
     return State(theta=theta, theta_dot=wy * math.cos(phi) - wx * math.sin(phi), phi=phi,
                  psi=half_sum - half_difference, l3=l3,
                  lz=top.lambda1 * (w1 * z1 + w2 * z2) + l3 * z3)
-
-
-@dataclass(frozen=True)
-class Box:
-    """
-    A box along the axes of its frame.
-
-    lower, upper : (3,) its corners [m]
-    """
-
-    lower: Reals
-    upper: Reals
-
-    @classmethod
-    def of(cls, top: Top) -> Self:
-        """Return the box in the body frame around the body that is drawn, the pivot, the tip."""
-        shape = Shape(top)
-        heights = (0.0, shape.tip, shape.centre - 0.5 * shape.height,
-                   shape.centre + 0.5 * shape.height)
-        return cls(np.array([-shape.radius, -shape.radius, min(heights)]),
-                   np.array([shape.radius, shape.radius, max(heights)]))

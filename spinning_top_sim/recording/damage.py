@@ -12,11 +12,10 @@ class Loss:
     bytes: int
     what: str                       # the kind of the record at the offset
     reason: str
-    refused: bool = False           # larger than what is read; may be right
 
     def __str__(self) -> str:
-        return (f'{"refused" if self.refused else "lost"}: {self.what} at byte {self.offset} '
-                f'({count(self.bytes, "byte")}): {self.reason}')
+        return (f'lost: {self.what} at byte {self.offset} ({count(self.bytes, "byte")}): '
+                f'{self.reason}')
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ class Damage:
     def lines(self) -> list[str]:
         """Return a human-readable report: the sums if something is lost, then each loss."""
         lines = []
-        if not self.lossless and not (self.losses and all(loss.refused for loss in self.losses)):
+        if not self.lossless:
             number = count(self.missing_messages, 'message')
             lines.append(f'lost: {count(self.lost_bytes, "byte")}, ' + (
                 number if self.missing_exactly else f'at least {number}' if self.missing_messages

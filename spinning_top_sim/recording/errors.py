@@ -8,16 +8,18 @@ class RecordingError(Exception):
     """A recording cannot start; the text names the path or type and the reason."""
 
 
-class DefinitionNotFoundError(RecordingError):
-    """The definition of a message type is not installed; the text says where it was sought."""
-
-
 class LogError(Exception):
     """A log cannot be read or recovered; the text names the path and the reason."""
 
 
-def no_place_in(directory: Path) -> str:
-    """Return why a file cannot be made there, where the system says that there is no such file."""
-    # A directory such as /proc is there, and takes no files.
-    reason = 'no files can be made in' if directory.is_dir() else 'there is no directory'
-    return f'{reason} {directory}'
+def why_not_written(path: Path, error: Exception) -> str:
+    """Return why a new file cannot be made or written, without the path that OSError adds."""
+    if isinstance(error, FileExistsError):
+        return 'it exists, and nothing is overwritten'
+    if isinstance(error, FileNotFoundError):
+        # A directory such as /proc is there, and takes no files.
+        reason = 'no files can be made in' if path.parent.is_dir() else 'there is no directory'
+        return f'{reason} {path.parent}'
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    return f'{type(error).__name__}: {error}'

@@ -26,10 +26,9 @@ from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording.chunks import ENTRY_SIZE, INDEX_HEAD
 from spinning_top_sim.recording.errors import LogError
-from spinning_top_sim.recording.records import HEAD, DamagedError, check_size, parse
+from spinning_top_sim.recording.records import HEAD, MAX_DECLARED, DamagedError, check_size, parse
 
 MAGIC_SIZE = len(MCAP0_MAGIC)
-LARGEST_SUMMARY = 1 << 24   # that is parsed [bytes], which takes ten times as much memory
 
 _FOOTER_SIZE = HEAD.size + 8 + 8 + 4
 _BLOCK = 1 << 16
@@ -80,7 +79,7 @@ class LogFile:
         raise DamagedError('no record ends in the file that begins there')
 
     def raw(self, offset: int, end: int) -> bytes:
-        """Return the bytes of a record; raises TooLargeError."""
+        """Return the bytes of a record; raises DamagedError if it is too large."""
         check_size(end - offset - HEAD.size, self.max_bytes)
         return self.read(offset, end - offset)
 
@@ -126,12 +125,12 @@ class Summary:
             and len(self.metadata) == self.statistics.metadata_count
             and set(self.channels).union(
                 *(index.message_index_offsets for index in self.chunks.values()))
-            <= known_channels(self.schemas, self.channels))
+            <= known_topics(self.schemas, self.channels).keys())
 
 
-def known_channels(schemas: dict[int, Schema], channels: dict[int, Channel]) -> set[int]:
-    """Return the ids of the channels whose schema is there, or that have none."""
-    return {number for number, channel in channels.items()
+def known_topics(schemas: dict[int, Schema], channels: dict[int, Channel]) -> dict[int, str]:
+    """Return the topics, by channel id, of channels whose schema is there, or that have none."""
+    return {number: channel.topic for number, channel in channels.items()
             if channel.schema_id == 0 or channel.schema_id in schemas}
 
 
@@ -148,7 +147,7 @@ def read_summary(file: LogFile) -> Summary:
         if not MAGIC_SIZE <= start <= footer_offset:
             raise DamagedError('the footer does not lead to it')
         summary = Summary(start, closed=True)
-        if file.size - start <= min(LARGEST_SUMMARY, file.max_bytes):   # else a scan does
+        if file.size - start <= min(MAX_DECLARED, file.max_bytes):   # else a scan does
             _read_section(file.read(start, file.size - start), footer, summary)
         return summary
     except DamagedError as damage:

@@ -43,18 +43,19 @@ class McapWriter:
     compression : of the chunks, 'zstd', 'lz4' or 'none'
     """
 
-    def __init__(self, path: Path, *, header: bytes, compression: str) -> None:
+    def __init__(self, path: Path, *, header: records.Header, compression: str) -> None:
         self._path = path
-        self._compression = compression
         self._chunk = PlainChunk(compression)       # of messages that come one by one
         # Chunks of rows: one is filled while the others are compressed.
         self._spare_chunks: queue.SimpleQueue[PlainChunk] = queue.SimpleQueue()
-        self._pool: ThreadPoolExecutor | None = None
+        for _ in range(_COMPRESSING + 1):
+            self._spare_chunks.put(PlainChunk(compression))
+        self._pool = ThreadPoolExecutor(_COMPRESSING, 'chunks')     # has no threads before rows
         self._queued = _NOTHING                     # the last chunk of rows
 
         self.message_counts: dict[int, int] = {}    # messages in the file by channel id
         self.chunk_count = 0
-        self._start_ns = self._end_ns = 0           # earliest and latest stamp; 0 without messages
+        self._times_ns: list[int] = []              # earliest and latest stamp of each chunk
         self._end = 0, 0    # size and checksum of the file; one assignment, so always consistent
         self._next_sequence: dict[int, int] = {}
         self._type_names: dict[int, str] = {}       # by schema id
@@ -66,12 +67,17 @@ class McapWriter:
 
         self._file = open(path, 'xb', buffering=0)  # noqa: SIM115
         with self.discarded_on_failure():
-            self._write([MCAP0_MAGIC, header])
+            self._write([MCAP0_MAGIC, record_bytes(header)])
 
     @property
     def size(self) -> int:
         """Size of the file, all of it whole records [bytes]."""
         return self._end[0]
+
+    @property
+    def messages(self) -> int:
+        """Number of messages in the file."""
+        return sum(self.message_counts.values())
 
     @contextlib.contextmanager
     def discarded_on_failure(self) -> Iterator[None]:
@@ -99,9 +105,8 @@ class McapWriter:
         elif isinstance(record, records.Attachment):
             self._summary_records[Opcode.ATTACHMENT_INDEX].append(
                 record_bytes(records.AttachmentIndex(
-                    offset=offset, length=len(raw), log_time=record.log_time,
-                    create_time=record.create_time, data_size=len(record.data), name=record.name,
-                    media_type=record.media_type)))
+                    offset, len(raw), record.log_time, record.create_time, len(record.data),
+                    record.name, record.media_type)))
         elif isinstance(record, records.Schema):
             self._type_names[record.id] = record.name
             self._summary_records[Opcode.SCHEMA].append(raw)
@@ -132,10 +137,6 @@ class McapWriter:
         the order in which they came.  This waits while both are busy, and raises the OSError of
         an earlier chunk.
         """
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(_COMPRESSING, 'chunks')
-            for _ in range(_COMPRESSING + 1):
-                self._spare_chunks.put(PlainChunk(self._compression))
         if self._queued.done():
             self._wait()
         if self._chunk.size:
@@ -172,10 +173,7 @@ class McapWriter:
         self._summary_records[Opcode.CHUNK_INDEX].append(chunk_index)
         self.chunk_count += 1
         if indexes:
-            empty = not any(self.message_counts.values())
-            start_ns = chunk.message_start_time
-            self._start_ns = start_ns if empty else min(self._start_ns, start_ns)
-            self._end_ns = max(self._end_ns, chunk.message_end_time)
+            self._times_ns += chunk.message_start_time, chunk.message_end_time
             for channel_id in indexes:
                 self.message_counts[channel_id] += len(entries[channel_id]) // 2
 
@@ -194,23 +192,19 @@ class McapWriter:
             raise OSError(f'{free} bytes are free on the disk, fewer than min_free_bytes = '
                           f'{min_free_bytes}')
 
-    def finish(self, *, bag: bool = True, file_name: str = '') -> None:
-        """
-        Write the summary, bring all to the disk and close the file.
-
-        bag : whether to write a `rosbag2` record, which names `file_name`, default: this file
-        """
+    def finish(self, *, bag: bool = True) -> None:
+        """Write the `rosbag2` record and the summary, bring all to the disk, close the file."""
         try:
-            if self._pool is not None:
-                self._pool.shutdown()
+            self._pool.shutdown()
             if bag:
                 topics = [(channel, self._type_names.get(channel.schema_id, ''),
                            self.message_counts[channel.id])
                           for channel in self._channels.values()]
                 self.write(records.Metadata(BAG_METADATA, {
                     'serialized_metadata': bag_metadata_yaml(
-                        topics, file_name=file_name or self._path.name, start_ns=self._start_ns,
-                        end_ns=self._end_ns)}))
+                        topics, file_name=self._path.name,
+                        start_ns=min(self._times_ns, default=0),
+                        end_ns=max(self._times_ns, default=0))}))
             self._write([record_bytes(records.DataEnd(self._end[1]))])
             self._write([self._summary()])
             self.sync()
@@ -220,7 +214,6 @@ class McapWriter:
 
     def _queue(self, chunk: PlainChunk) -> None:
         """Have a chunk compressed in a thread, and written after those queued before."""
-        assert self._pool is not None
         self._queued = self._pool.submit(self._write_in_turn, chunk, self._queued)
 
     def _wait(self) -> None:
@@ -243,11 +236,12 @@ class McapWriter:
         """Return the summary section, the footer and the closing magic."""
         groups = self._summary_records
         groups[Opcode.STATISTICS] = [record_bytes(records.Statistics(
-            message_count=sum(self.message_counts.values()),
+            message_count=self.messages,
             schema_count=len(groups[Opcode.SCHEMA]), channel_count=len(groups[Opcode.CHANNEL]),
             attachment_count=len(groups[Opcode.ATTACHMENT_INDEX]),
             metadata_count=len(groups[Opcode.METADATA_INDEX]), chunk_count=self.chunk_count,
-            message_start_time=self._start_ns, message_end_time=self._end_ns,
+            message_start_time=min(self._times_ns, default=0),
+            message_end_time=max(self._times_ns, default=0),
             channel_message_counts=self.message_counts))]
         summary = bytearray()
         offsets = bytearray()

@@ -24,8 +24,8 @@ from mcap.writer import MCAP0_MAGIC
 from spinning_top_sim.recording import records
 from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.errors import LogError
-from spinning_top_sim.recording.log_file import MAGIC_SIZE, LogFile, known_channels, read_summary
-from spinning_top_sim.recording.records import HEAD, DamagedError, Messages
+from spinning_top_sim.recording.log_file import MAGIC_SIZE, LogFile, known_topics, read_summary
+from spinning_top_sim.recording.records import HEAD, DamagedError, LogMessage, Messages
 from spinning_top_sim.recording.rosbag2 import Qos, qos_profiles
 from spinning_top_sim.recording.scan import Part, Scan
 from spinning_top_sim.recording.writer import OUR_LIBRARY
@@ -64,32 +64,6 @@ class LogTopic:
     encoding: str
     qos: tuple[Qos, ...]
     metadata: Mapping[str, str]
-    channel_id: int
-
-
-class LogMessage(NamedTuple):
-    """
-    A message of a log.
-
-    Parameters
-    ----------
-    topic : str
-        Name of the topic.
-    log_time, publish_time : int
-        Times of the record [ns].
-    sequence : int
-        Number in its channel.
-    data : bytes
-        The serialized message.
-    channel_id : int
-        Number of its channel.
-    """
-
-    topic: str
-    log_time: int
-    publish_time: int
-    sequence: int
-    data: bytes
     channel_id: int
 
 
@@ -204,9 +178,9 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         """
         names = None if topics is None else frozenset(topics)
         channels = self._index.channels
-        wanted = {number: channels[number].topic
-                  for number in known_channels(self._index.schemas, channels)
-                  if names is None or channels[number].topic in names}
+        wanted = {number: topic
+                  for number, topic in known_topics(self._index.schemas, channels).items()
+                  if names is None or topic in names}
         times = range(start or 0, 1 << 64 if end is None else end)
         held: list[int] = []        # bytes of each part that is read and not yet passed
         # A part is read when its time comes.
@@ -248,12 +222,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         if sum(held) > most:
             raise LogError(f'cannot read {self.path}: the messages of several chunks overlap in '
                            f'time, and these have more than {most} bytes')
-        for channel_id in messages.entries.keys() - wanted:
-            del messages.entries[channel_id]
-        for message in messages.in_order(by_time=True):
-            yield LogMessage(
-                wanted[message.channel_id], message.log_time, message.publish_time,
-                message.sequence, message.data, message.channel_id)
+        yield from messages.in_order(wanted, by_time=True)
         held.remove(held_bytes)
 
     @functools.cached_property
@@ -290,13 +259,11 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     def _read_header(self) -> Header:
         """Return the header; raises LogError if neither magic nor header is there."""
         magic = self.file.read(0, MAGIC_SIZE)
-        problem = ('it is empty' if not magic else 'it is no MCAP file'
-                   if not MCAP0_MAGIC.startswith(magic)
-                   else f'it ends after {self.size} bytes of an MCAP file')
         with contextlib.suppress(DamagedError):
             header = self.file.record(MAGIC_SIZE, self.size)
             if isinstance(header, Header):
                 return header
         if magic != MCAP0_MAGIC:
-            raise LogError(f'cannot read {self.path}: {problem}')
+            reason = 'it is no MCAP file' if magic else 'it is empty'
+            raise LogError(f'cannot read {self.path}: {reason}')
         return Header(profile='ros2', library='')

@@ -11,17 +11,17 @@ from __future__ import annotations
 import struct
 import zlib
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from io import BytesIO
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 import zstandard
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Chunk, McapRecord, Message
+from mcap.records import Attachment, Chunk, McapRecord
 from mcap.stream_reader import StreamReader
 
 from spinning_top_sim.recording.chunks import ENTRY_SIZE, INDEX_HEAD, MESSAGE, MESSAGE_FIELDS
@@ -31,7 +31,6 @@ MAX_BYTES = 256 << 20               # of one record or one uncompressed chunk in
 MAX_DECLARED = 16 << 20             # of schemas, channels or metadata, which take ten times that
 HEAD = struct.Struct('<BQ')         # of every record: opcode, length of what follows
 
-_BLOCK = 1 << 20    # bytes decompressed at a time
 _MESSAGE_OPCODE = int(Opcode.MESSAGE)   # compares faster
 
 
@@ -39,35 +38,60 @@ class DamagedError(Exception):
     """A record cannot be decoded; the text says why."""
 
 
-class TooLargeError(DamagedError):
-    """A record is larger than what is read into memory; it may be right."""
+class LogMessage(NamedTuple):
+    """
+    A message of a log.
+
+    Parameters
+    ----------
+    topic : str
+        Name of the topic.
+    log_time, publish_time : int
+        Times of the record [ns].
+    sequence : int
+        Number in its channel.
+    data : bytes
+        The serialized message.
+    channel_id : int
+        Number of its channel.
+    """
+
+    topic: str
+    log_time: int
+    publish_time: int
+    sequence: int
+    data: bytes
+    channel_id: int
 
 
 @dataclass
 class Messages:
     """The messages of a chunk, or adjacent ones outside of chunks."""
 
-    plain: bytes | bytearray    # the uncompressed records
+    plain: bytes    # the uncompressed records
     # As in message indexes: millions of tiny messages fit into a chunk.
     entries: dict[int, array[int]] = field(default_factory=dict)
     declared: list[McapRecord] = field(default_factory=list)    # schemas and channels
 
-    def in_order(self, *, by_time: bool = False) -> Iterator[Message]:
-        """Yield the messages in file order, or by log time and equal ones in file order."""
-        if not self.entries:
+    def in_order(self, topics: Mapping[int, str], *, by_time: bool = False,
+                 ) -> Iterator[LogMessage]:
+        """
+        Yield the messages in file order, or by log time and equal ones in file order.
+
+        topics : names by channel id; messages of other channels are left out
+        """
+        entries = [np.frombuffer(numbers, np.uint64).reshape(-1, 2)
+                   for channel_id, numbers in self.entries.items() if channel_id in topics]
+        if not entries:
             return
-        plain = memoryview(self.plain)
-        times, offsets = np.concatenate([
-            np.frombuffer(numbers, np.uint64).reshape(-1, 2) for numbers in self.entries.values()
-            ]).T
+        times, offsets = np.concatenate(entries).T
         for place in np.lexsort((offsets, times) if by_time else (offsets,)):
             offset = int(offsets[place])
             _, length, channel_id, sequence, log_time, publish_time = MESSAGE.unpack_from(
-                plain, offset)
-            yield Message(
-                channel_id=channel_id, sequence=sequence, log_time=log_time,
-                publish_time=publish_time,
-                data=plain[offset + MESSAGE.size:offset + HEAD.size + length].tobytes())
+                self.plain, offset)
+            yield LogMessage(
+                topics[channel_id], log_time, publish_time, sequence,
+                self.plain[offset + MESSAGE.size:offset + HEAD.size + length], channel_id)
 
 
 class _Record(BytesIO):
@@ -81,9 +105,9 @@ class _Record(BytesIO):
 
 
 def check_size(size: int, limit: int) -> None:
-    """Raise TooLargeError for more bytes than are read into memory."""
+    """Raise DamagedError for more bytes than are read into memory."""
     if size > limit:
-        raise TooLargeError(f'its {size} bytes are more than the {limit} that are read')
+        raise DamagedError(f'its {size} bytes are more than the {limit} that are read')
 
 
 def parse(raw: bytes) -> McapRecord:
@@ -125,7 +149,7 @@ def open_chunk(chunk: Chunk, max_bytes: int) -> Messages:
     return find_messages(plain)
 
 
-def find_messages(plain: bytes | bytearray) -> Messages:
+def find_messages(plain: bytes) -> Messages:
     """Return the messages and declarations in records that follow one another; DamagedError."""
     found = Messages(plain)
     declared_bytes = offset = 0
@@ -145,13 +169,13 @@ def find_messages(plain: bytes | bytearray) -> Messages:
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             declared_bytes += length
             check_size(declared_bytes, MAX_DECLARED)
-            found.declared.append(parse(bytes(plain[offset:end])))
+            found.declared.append(parse(plain[offset:end]))
         offset = end
     return found
 
 
-def _decompress(chunk: Chunk, max_bytes: int) -> bytes | bytearray:
-    """Return the uncompressed bytes of all frames, never more than the chunk states."""
+def _decompress(chunk: Chunk, max_bytes: int) -> bytes:
+    """Return the uncompressed bytes of all frames; never takes more than the chunk states."""
     size = chunk.uncompressed_size
     check_size(size, max_bytes)
     stream: BinaryIO = BytesIO(chunk.data)
@@ -161,12 +185,10 @@ def _decompress(chunk: Chunk, max_bytes: int) -> bytes | bytearray:
         stream = lz4.frame.open(stream)
     elif chunk.compression:
         raise DamagedError(f'its compression {chunk.compression[:20]!r} is unknown')
-    plain = bytearray()
     try:
-        while len(plain) < size and (block := stream.read(min(_BLOCK, size - len(plain)))):
-            plain += block
-        if len(plain) < size or stream.read(1):
-            raise DamagedError('it has not the size that it says it has')
+        plain = stream.read(size + 1)
     except (zstandard.ZstdError, RuntimeError, EOFError, ValueError, MemoryError):
         raise DamagedError('it cannot be decompressed') from None
+    if len(plain) != size:
+        raise DamagedError('it has not the size that it says it has')
     return plain

@@ -16,14 +16,13 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
 
 import yaml
 
-from spinning_top_sim.recording.errors import DefinitionNotFoundError
+from spinning_top_sim.recording.errors import RecordingError
 
 if TYPE_CHECKING:
     from mcap.records import Channel
@@ -63,24 +62,20 @@ _POLICY_NAMES = {
 }
 
 
-@dataclass(frozen=True)
-class MessageDefinition:
-    """What a log says about one message type."""
+def find_definition(type_name: str) -> tuple[str, str]:
+    """
+    Return schema and type hash (REP-2011) of a type such as 'sensor_msgs/msg/Imu'.
 
-    text: str       # its `ros2msg` schema: the definition followed by those it depends on
-    type_hash: str  # 'RIHS01_' and 64 hexadecimal digits (REP-2011)
-
-
-def find_definition(type_name: str) -> MessageDefinition:
-    """Look up a type such as 'sensor_msgs/msg/Imu'; raises DefinitionNotFoundError."""
+    The `ros2msg` schema is the definition followed by those it depends on.  Raises RecordingError.
+    """
     if not re.fullmatch(r'[a-zA-Z0-9_]+/msg/[a-zA-Z0-9_]+', type_name, re.ASCII):
-        raise DefinitionNotFoundError(
+        raise RecordingError(
             f'{type_name!r} is not the name of a message type: expected package/msg/Type')
     text = _with_dependencies(type_name, seen=set())
     for entry in json.loads(_installed_text(type_name, '.json'))['type_hashes']:
         if entry['type_name'] == type_name:
-            return MessageDefinition(text, entry['hash_string'])
-    raise DefinitionNotFoundError(f'the description of {type_name} does not hold its type hash')
+            return text, entry['hash_string']
+    raise RecordingError(f'the description of {type_name} does not hold its type hash')
 
 
 def _with_dependencies(type_name: str, seen: set[str]) -> str:
@@ -107,8 +102,8 @@ def _installed_text(type_name: str, suffix: str) -> str:
         except (FileNotFoundError, NotADirectoryError):
             searched.append(str(path))
         except (OSError, UnicodeDecodeError) as error:
-            raise DefinitionNotFoundError(f'{type_name}: cannot read {path}: {error}') from error
-    raise DefinitionNotFoundError(
+            raise RecordingError(f'{type_name}: cannot read {path}: {error}') from error
+    raise RecordingError(
         f'no definition of {type_name} is installed; searched {", ".join(searched)}')
 
 

@@ -1,71 +1,48 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes what can be decoded of a damaged log into a new, indexed one."""
 
-import contextlib
 import os
-import secrets
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from mcap.opcode import Opcode
 from mcap.records import Chunk, Header, Metadata
 
-from spinning_top_sim.recording.damage import Damage
-from spinning_top_sim.recording.errors import LogError, no_place_in
-from spinning_top_sim.recording.mcap_writer import McapWriter, record_bytes, sync_directory
+from spinning_top_sim.recording.errors import LogError, why_not_written
+from spinning_top_sim.recording.mcap_writer import McapWriter
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA
 from spinning_top_sim.recording.scan import Part, Scan
 
 
-@dataclass(frozen=True)
-class Recovered:
-    """What a recovery wrote."""
-
-    path: Path
-    bytes: int
-    messages: int
-    chunks: int
-    damage: Damage  # of the old file
-
-
 def recover(reader: LogReader, output: str | os.PathLike[str],
-            progress: Callable[[int, int], None] = lambda done, total: None) -> Recovered:
+            progress: Callable[[float], object] = lambda done: None) -> McapWriter:
     """
-    Write everything that can be decoded of a log into a new file.
+    Write everything that can be decoded of a log into a new file; return what has written it.
 
-    output : appears when it is complete and on the disk, never before
-    progress : is called with the number of bytes that are done, and that of all
+    output : must not exist; is removed again where the recovery fails
+    progress : is called with the number of bytes that are done
 
     Chunks of messages are copied as they are, other messages are put into new chunks; message
     indexes, statistics, summary and the `rosbag2` record are made anew.
     Raises LogError, also if a file that was not closed holds no whole message.
     """
     output = Path(output)
-    draft = output.parent / f'.recover-{secrets.token_hex(8)}.tmp'
     try:
-        if os.path.lexists(output):
-            raise FileExistsError
-        return _recover(reader, output, draft, progress)
-    except FileExistsError:
-        raise LogError(f'{output} exists, and nothing is overwritten') from None
-    except FileNotFoundError as error:
-        raise LogError(f'cannot write {output}: {no_place_in(output.parent)}') from error
+        return _recover(reader, output, progress)
     except OSError as error:
-        raise LogError(f'cannot write {output}: {error.strerror or error}') from error
+        raise LogError(f'cannot write {output}: {why_not_written(output, error)}') from error
 
 
-def _recover(reader: LogReader, output: Path, draft: Path,
-             progress: Callable[[int, int], None]) -> Recovered:
-    size = reader.size
-    writer = McapWriter(draft, header=record_bytes(Header(reader.profile, reader.library)),
+def _recover(reader: LogReader, output: Path,
+             progress: Callable[[float], object]) -> McapWriter:
+    writer = McapWriter(output, header=Header(reader.profile, reader.library),
                         compression='zstd')
     with writer.discarded_on_failure():
-        scan = reader.scan(lambda offset: progress(offset // 2, size))
+        scan = reader.scan(lambda offset: progress(offset / 2))
         declared = False
         for part in scan.parts:
-            progress((size + part.offset) // 2, size)
+            progress((reader.size + part.offset) / 2)
             if part.channel_ids:
                 if not declared:        # channels stand before the messages, metadata as it stood
                     _declare(scan, writer)
@@ -76,15 +53,12 @@ def _recover(reader: LogReader, output: Path, draft: Path,
         writer.write_chunk()
         if not declared:
             _declare(scan, writer)
-        messages = sum(writer.message_counts.values())
-        if not messages and not reader.whole:
+        if not writer.messages and not reader.whole:
             raise LogError(f'nothing to save in {reader.path}: there is no whole message in it')
-        os.chmod(draft, reader.file.mode)
-        writer.finish(bag=reader.profile == 'ros2' or BAG_METADATA in scan.metadata,
-                      file_name=output.name)
-        _publish(draft, output)
-    progress(size, size)
-    return Recovered(output, writer.size, messages, writer.chunk_count, scan.damage)
+        os.chmod(output, reader.file.mode)
+        writer.finish(bag=reader.profile == 'ros2' or BAG_METADATA in scan.metadata)
+    progress(reader.size)
+    return writer
 
 
 def _declare(scan: Scan, writer: McapWriter) -> None:
@@ -92,23 +66,21 @@ def _declare(scan: Scan, writer: McapWriter) -> None:
     for schema in scan.schemas.values():
         writer.write(schema)
     for number, channel in scan.channels.items():
-        if number in scan.known_channels:
+        if number in scan.known_topics:
             writer.write(channel)
 
 
 def _copy_messages(reader: LogReader, part: Part, writer: McapWriter) -> None:
     messages = reader.open_part(part)
-    known = reader.scan().known_channels
-    if part.opcode == Opcode.CHUNK and not messages.declared and part.channel_ids <= known:
+    topics = reader.scan().known_topics
+    if part.opcode == Opcode.CHUNK and not messages.declared and part.channel_ids <= set(topics):
         chunk = reader.file.record(part.offset, part.end)
         assert isinstance(chunk, Chunk)
         chunk.message_start_time, chunk.message_end_time = part.start_ns, part.end_ns
         writer.write_chunk()            # what came before stays before
         writer.copy_chunk(chunk, messages.entries)
         return
-    for channel_id in messages.entries.keys() - known:
-        del messages.entries[channel_id]
-    for message in messages.in_order():
+    for message in messages.in_order(topics):
         writer.add_message(message.channel_id, message.sequence, message.log_time,
                            message.publish_time, message.data)
 
@@ -117,17 +89,3 @@ def _copy_record(reader: LogReader, part: Part, writer: McapWriter) -> None:
     record = reader.file.record(part.offset, part.end)
     if not (isinstance(record, Metadata) and record.name == BAG_METADATA):
         writer.write(record, reader.file.raw(part.offset, part.end))
-
-
-def _publish(draft: Path, output: Path) -> None:
-    """Give a file its name without taking that of another (FileExistsError)."""
-    try:
-        os.link(draft, output)
-    except OSError:
-        # It exists, or a file system without links: then nothing protects until the renaming.
-        if os.path.lexists(output):
-            raise FileExistsError from None
-        os.rename(draft, output)
-    with contextlib.suppress(OSError):
-        draft.unlink()
-    sync_directory(output.parent)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
@@ -19,36 +19,33 @@ from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording.chunks import time_span
 from spinning_top_sim.recording.damage import Damage, Loss, count
-from spinning_top_sim.recording.log_file import MAGIC_SIZE, LogFile, Summary, known_channels
-from spinning_top_sim.recording.mcap_writer import record_bytes
+from spinning_top_sim.recording.log_file import MAGIC_SIZE, LogFile, Summary, known_topics
 from spinning_top_sim.recording.records import (
     HEAD,
     MAX_DECLARED,
     DamagedError,
     Messages,
-    TooLargeError,
     check_size,
     find_messages,
     index_entries,
     open_chunk,
     size_of,
 )
-from spinning_top_sim.recording.rosbag2 import BAG_METADATA
 
 _DATA_END_SIZE = HEAD.size + 4
 _RUN_BYTES = 1 << 20    # of messages outside of chunks that are read at a time
 _BLOCK = 1 << 16        # bytes searched at a time
-# What may begin a chunk, a schema, a channel or metadata: opcode and a length below 2^40.
+# What may begin a record that is searched: opcode, a length below 2^40, and behind the fields of
+# fixed size a name of less than 2^16 bytes; of a chunk, a compression, or one size twice.
 # Single messages are not looked for: nothing in them tells them from chance.
-_CANDIDATE = re.compile(rb'[\x03\x04\x06\x0c](?=.{5}\x00\x00\x00)', re.DOTALL)
-# Where the length of the first text is in the content; a chunk's is followed by that of the data.
-_NAME_OFFSETS: dict[int, int] = {
-    Opcode.SCHEMA: 2, Opcode.CHANNEL: 4, Opcode.METADATA: 0, Opcode.CHUNK: 28}
-_MAX_NAME = 1 << 12
+_CANDIDATE = re.compile(
+    rb'[\x03\x04\x06\x0c](?=.{5}\0{3})(?:'
+    rb'(?<=\x03)(?=.{10}..\0\0)|(?<=\x04)(?=.{12}..\0\0)|(?<=\x0c)(?=.{8}..\0\0)|'
+    rb'(?<=\x06)(?=.{24}(?!\0{8})(.{8}).{4}\0{4}\1|.{36}(?:\x03\0{3}lz4|\x04\0{3}zstd)))',
+    re.DOTALL)
+_CANDIDATE_BYTES = HEAD.size + 28 + 4 + 8       # that the expression looks at
+_SEARCHED = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.CHUNK)
 _MAX_EFFORT = 4         # bytes of candidates read, as a multiple of the file's size
-# A recovery makes these anew, so a truncated one is no loss.
-_REPEATED = (Opcode.DATA_END, Opcode.STATISTICS, Opcode.CHUNK_INDEX,
-             Opcode.METADATA_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.SUMMARY_OFFSET, Opcode.FOOTER)
 
 
 class Part(NamedTuple):
@@ -88,14 +85,14 @@ class Scan:
         self._behind_chunk = False      # only message indexes since the last chunk
         self._is_proven = True          # all messages are in chunks with checksums
         self._small_bytes = 0           # of schemas, channels and metadata
-        # Bytes of candidates that may be read and uncompressed, so that a search ends in time.
+        # Bytes of candidates that may be read and unpacked, so that a search ends in time.
         self._effort = _MAX_EFFORT * file.size
         self._unpacking = _MAX_EFFORT * (file.size + file.max_bytes)
 
         if file.read(0, MAGIC_SIZE) != MCAP0_MAGIC:
             self._defects.append('the first eight bytes are not those of an MCAP file')
         self._walk(progress)
-        self.known_channels = known_channels(self.schemas, self.channels)
+        self.known_topics = known_topics(self.schemas, self.channels)   # by channel id
         self.damage = self._damage()
 
     def _walk(self, progress: Callable[[int], object]) -> None:
@@ -127,30 +124,31 @@ class Scan:
         if isinstance(record, Schema | Channel | Metadata):
             self._small_bytes += end - offset
             check_size(self._small_bytes, MAX_DECLARED)
-        for declared in (record, *(messages.declared if messages else ())):
+        for declared in (record, *messages.declared):
             if isinstance(declared, Schema):
                 self.schemas.setdefault(declared.id, declared)
             elif isinstance(declared, Channel):
                 self.channels.setdefault(declared.id, declared)
         if isinstance(record, Metadata):
             self.metadata[record.name] = record.metadata
-        if messages is not None and messages.entries:
+        if messages.entries:
             self._is_proven &= isinstance(record, Chunk) and record.uncompressed_crc != 0
             self._add(opcode, offset, end, messages)
         elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
             self.parts.append(Part(opcode, offset, end))
 
     def _decode(self, opcode: int, offset: int, end: int,
-                ) -> tuple[McapRecord | int | None, Messages | None]:
+                ) -> tuple[McapRecord | int | None, Messages]:
         """Return a record, of a message index the number of entries, and the messages in it."""
+        nothing = Messages(b'')
         check_size(end - offset - HEAD.size, self._file.max_bytes)
         if opcode > Opcode.DATA_END:    # of an application, or of a later version of the format
             if self._ours:
                 raise DamagedError('there is no such kind of record')
-            return None, None
+            return None, nothing
         raw = self._file.raw(offset, end)
         if opcode == Opcode.MESSAGE_INDEX:
-            return index_entries(raw), None
+            return index_entries(raw), nothing
         if opcode == Opcode.MESSAGE:
             if self._all_in_chunks:
                 raise DamagedError('all messages of the file are in chunks')
@@ -158,7 +156,7 @@ class Scan:
         record = self._file.record(offset, end)
         if isinstance(record, Chunk):
             return record, open_chunk(record, self._file.max_bytes)
-        return record, None
+        return record, nothing
 
     def _check_length(self, record: McapRecord | int | None, offset: int, end: int) -> None:
         """Raise DamagedError for a length that neither its fields nor the next record prove."""
@@ -205,62 +203,45 @@ class Scan:
         end = (stated_end if stated_end == self._limit or self._is_record(stated_end)
                else self._search(offset + 1))
         is_truncated = not stated_end and not self._summary.closed and end == self._limit
-        if what == 'message index' or (
-                is_truncated and (opcode in _REPEATED or self._is_bag(offset))):
+        # A recovery makes these anew; behind messages, we write no other metadata.
+        is_bag = opcode == Opcode.METADATA and self._ours and self._found.total() > 0
+        if what == 'message index' or (is_truncated and (opcode == Opcode.DATA_END or is_bag)):
             self._defects.append(f'{what} at byte {offset}: {damage}')
             if offset < stated_end < end:
                 self._losses.append(Loss(stated_end, end - stated_end, 'something',
                                          'no record can be decoded there'))
         else:
-            self._losses.append(Loss(offset, end - offset, what, str(damage),
-                                     isinstance(damage, TooLargeError)))
+            self._losses.append(Loss(offset, end - offset, what, str(damage)))
         self._behind_chunk &= opcode == Opcode.MESSAGE_INDEX
         return end
 
-    def _is_bag(self, offset: int) -> bool:
-        """Return whether a truncated record is bag metadata, which tell nothing of their own."""
-        bag = record_bytes(Metadata(BAG_METADATA, {}))[:-4]
-        head = self._file.read(offset, len(bag))
-        return head[:1] == bag[:1] and bag.startswith(head[HEAD.size:], HEAD.size)
-
-    def _search(self, offset: int, kinds: bytes = bytes(_NAME_OFFSETS)) -> int:
+    def _search(self, offset: int, kinds: Collection[int] = _SEARCHED) -> int:
         """Return where the next record of these kinds begins that can be decoded, or the limit."""
         while offset < self._limit:
-            block = self._file.read(offset, _BLOCK + HEAD.size)
-            for match in _CANDIDATE.finditer(block, 0, _BLOCK + HEAD.size - 1):
-                if match.group()[0] in kinds and self._is_record(offset + match.start()):
-                    return offset + match.start()
+            block = self._file.read(offset, _BLOCK + _CANDIDATE_BYTES)
+            for match in _CANDIDATE.finditer(block, 0, len(block)):
+                start = match.start()
+                if start < _BLOCK and block[start] in kinds and self._is_record(offset + start):
+                    return offset + start
             offset += _BLOCK
         return self._limit
 
     def _is_record(self, offset: int) -> bool:
-        """Return whether a record begins there that can be decoded."""
+        """Return whether a record begins there that can be decoded; False without effort left."""
         try:
             opcode, end = self._file.head(offset, self._limit)
-            if opcode in _NAME_OFFSETS:
-                self._spend(opcode, offset, end)
+            if opcode in _SEARCHED:
+                self._effort -= end - offset
+            if opcode == Opcode.CHUNK:
+                stated = int.from_bytes(self._file.read(offset + HEAD.size + 16, 8), 'little')
+                self._unpacking -= min(stated, self._file.max_bytes)
+            if self._effort < 0 or self._unpacking < 0:
+                return False
             _, messages = self._decode(opcode, offset, end)
-        except TooLargeError:
-            return opcode == Opcode.CHUNK
         except DamagedError:
             return False
         # Zeros look like an empty chunk.
-        return opcode != Opcode.CHUNK or bool(messages and messages.plain)
-
-    def _spend(self, opcode: int, offset: int, end: int) -> None:
-        """Raise DamagedError where decoding a record is not worth the effort, or none is left."""
-        start = self._file.read(offset + HEAD.size, 64)
-        name_start = _NAME_OFFSETS[opcode] + 4
-        name_size = int.from_bytes(start[name_start - 4:name_start], 'little')
-        right = 0 < name_size < _MAX_NAME
-        if opcode == Opcode.CHUNK:
-            data_start = name_start + name_size + 8
-            data_size = int.from_bytes(start[data_start - 8:data_start], 'little')
-            right = data_size <= end - offset - HEAD.size - data_start
-            self._unpacking -= right and int.from_bytes(start[16:24], 'little')
-        self._effort -= right and end - offset
-        if not right or self._effort < 0 or self._unpacking < 0:
-            raise DamagedError('it is no record')
+        return opcode != Opcode.CHUNK or bool(messages.plain)
 
     # ------------------------------------------------------------------------- end of the scan
 
@@ -281,7 +262,7 @@ class Scan:
             else:
                 self._losses.append(Loss(0, 0, 'something', reason))
         if self._summary.problem:
-            other = self._search(offset, bytes([Opcode.CHUNK]))
+            other = self._search(offset, [Opcode.CHUNK])
             if other < self._limit:
                 self._losses.append(Loss(other, self._limit - other, 'another log',
                                          'it stands behind the end of this one'))
@@ -289,13 +270,13 @@ class Scan:
     def _damage(self) -> Damage:
         if self._summary.problem:
             self._defects.append(self._summary.problem)
-        found = sum(self._found[number] for number in self.known_channels)
+        found = sum(self._found[number] for number in self.known_topics)
         unknown = self._found.total() - found
         if unknown:
             self._losses.append(Loss(0, 0, count(unknown, 'message'),
                                      'no whole record declares their channels'))
         statistics = self._summary.statistics
-        parts = [part for part in self.parts if part.channel_ids & self.known_channels]
+        parts = [part for part in self.parts if part.channel_ids & self.known_topics.keys()]
         return Damage(
             truncated=not self._summary.closed, losses=tuple(self._losses),
             defects=tuple(self._defects),

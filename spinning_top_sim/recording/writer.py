@@ -18,14 +18,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from spinning_top_sim.recording.errors import RecordingError, no_place_in
+from spinning_top_sim.recording.errors import RecordingError, why_not_written
 from spinning_top_sim.recording.provenance import version
 from spinning_top_sim.recording.rosbag2 import RecordedTopic, find_definition, offered_qos_yaml
 
 try:
     from mcap.records import Channel, Header, Metadata, Schema
 
-    from spinning_top_sim.recording.mcap_writer import McapWriter, record_bytes, sync_directory
+    from spinning_top_sim.recording.mcap_writer import McapWriter, sync_directory
 except ImportError as error:
     raise RecordingError(
         f'recording needs the Python package mcap with zstandard and lz4: {error}') from error
@@ -184,7 +184,7 @@ class McapRecorder:
             self.state = 'closed'
         except Exception as error:  # whatever it is, the simulation goes on without a log
             self._accepting = False
-            self.error = f'recording to {self.path} stopped: {_reason(error)}'
+            self.error = f'recording to {self.path} stopped: {why_not_written(self.path, error)}'
             self._queue.clear()
             self._bytes_out = self._bytes_in
             self._taken.set()
@@ -268,37 +268,24 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f'topic {name!r} is listed twice: once is allowed')
-    definitions = {
+    definitions = {     # text and type hash
         name: find_definition(name) for name in dict.fromkeys(topic.type_name for topic in topics)}
     try:
         header = Header(profile='ros2', library=OUR_LIBRARY + version('spinning_top_sim'))
-        file = McapWriter(path, header=record_bytes(header), compression=compression)
+        file = McapWriter(path, header=header, compression=compression)
         with file.discarded_on_failure():
             file.check_disk(min_free_bytes)
             file.write(Metadata(METADATA_NAME, dict(metadata)))
-            for number, (name, definition) in enumerate(definitions.items(), start=1):
-                file.write(Schema(
-                    id=number, name=name, encoding='ros2msg', data=definition.text.encode()))
+            for number, (name, (text, _)) in enumerate(definitions.items(), start=1):
+                file.write(Schema(id=number, name=name, encoding='ros2msg', data=text.encode()))
             for number, topic in enumerate(topics, start=1):
                 file.write(Channel(
                     id=number, topic=topic.name, message_encoding='cdr',
                     schema_id=1 + list(definitions).index(topic.type_name),
                     metadata={'offered_qos_profiles': offered_qos_yaml(topic),
-                              'topic_type_hash': definitions[topic.type_name].type_hash}))
+                              'topic_type_hash': definitions[topic.type_name][1]}))
             file.sync()
             sync_directory(path.parent)
-    except FileExistsError as error:
-        raise RecordingError(f'cannot record to {path}: it exists, and a recording '
-                             'overwrites nothing') from error
-    except FileNotFoundError as error:
-        raise RecordingError(f'cannot record to {path}: {no_place_in(path.parent)}') from error
     except (OSError, ValueError) as error:
-        raise RecordingError(f'cannot record to {path}: {_reason(error)}') from error
+        raise RecordingError(f'cannot record to {path}: {why_not_written(path, error)}') from error
     return file
-
-
-def _reason(error: Exception) -> str:
-    """Return what went wrong, without the path that OSError adds."""
-    if isinstance(error, OSError):
-        return error.strerror or str(error)
-    return f'{type(error).__name__}: {error}'

@@ -36,9 +36,8 @@ STAGES = tuple(map(_fractions, (
     '19372/6561 -25360/2187 64448/6561 -212/729',
     '9017/3168 -355/33 46732/5247 49/176 -5103/18656',
     '35/384 0 500/1113 125/192 -2187/6784 11/84')))
-FOURTH_ORDER = _fractions('5179/57600 0 7571/16695 393/640 -92097/339200 187/2100 1/40')
-ERROR = tuple(fifth - fourth
-              for fifth, fourth in zip((*STAGES[-1], Fraction(0)), FOURTH_ORDER, strict=True))
+# The weights of fifth order, which are the last stage, less those of fourth order.
+ERROR = _fractions('71/57600 0 -71/16695 71/1920 -17253/339200 22/525 -1/40')
 
 # Hairer et al. eq. (4.13): aim a little below the tolerance and change the step within limits.
 SAFETY = 0.9
@@ -57,16 +56,12 @@ class Equations(ABC):
     """
     Equations of motion y' = f(y), with what the step control needs.
 
-    name : as it stands in error messages
-    is_complex : whether the unknowns are complex numbers
-    start : the unknowns at t = 0
+    start : the unknowns at t = 0, all complex or all real
     tolerance, fastest_rate : relative error of a step, and a bound on |y'|/|y| [1/s]: the first
         step's length comes from these two
     derivative : f; takes the unknowns one by one
     """
 
-    name: str
-    is_complex: bool
     start: Vector
     tolerance: float
     fastest_rate: float
@@ -141,7 +136,7 @@ class Integrator:
     def __init__(self, equations: Equations) -> None:
         self.equations = equations
         start = equations.start
-        self._step = unrolled_step(len(start), equations.is_complex)
+        self._step = unrolled_step(len(start), isinstance(start[0], complex))
         derivative = equations.derivative(*start)
         self.newest = Step(0.0, start, derivative, 0.0, start, derivative)
         if not equations.fastest_rate <= FASTEST_RATE:
@@ -162,8 +157,7 @@ class Integrator:
             h = end - t                         # what the sum really made of it
             if not h > SMALLEST_STEP_ULPS * math.ulp(t):
                 raise IntegrationError(
-                    f'the step size collapsed to {self._next_step:.3g} s at t = {t:.9g} s '
-                    f'({equations.name} equations)')
+                    f'the step size collapsed to {self._next_step:.3g} s at t = {t:.9g} s')
             y_new, derivative_new, difference = self._step(equations.derivative, h, y, derivative)
             self.evaluations += 6
             errors = equations.errors(y, y_new, difference)

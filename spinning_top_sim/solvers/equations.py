@@ -58,9 +58,6 @@ class TransportEquations(Equations):
         stepped and in the body [rad/s].  They differ by chi/2.  Those of beta have the other sign.
     """
 
-    name = 'transport'
-    is_complex = True
-
     def __init__(self, top: Top, start: State, rtol: float, atol: float,
                  carried_share: float = 0.5) -> None:
         lambda1, l3, lz, torque = top.lambda1, start.l3, start.lz, top.gravity_torque
@@ -82,7 +79,7 @@ class TransportEquations(Equations):
         self.fastest_rate = (self._scale + (abs(l3) + abs(lz)) / lambda1
                              + math.sqrt(abs(torque) / lambda1))
         self._large_enough = NUTATION_SHARE * self._scale ** 2
-        self.start = self.project((alpha, beta, m))
+        self.start = self.accepted((), (alpha, beta, m))
 
     def _vector(self, start: State) -> Vector:
         """Return alpha, beta and m of a state; L_x + i L_y by eq. (6), turned by exp(i phi)."""
@@ -122,11 +119,8 @@ class TransportEquations(Equations):
         return abs(da) / tolerance, abs(db) / tolerance, abs(dm) / self._scale / tolerance
 
     def accepted(self, y: Vector, y_new: Vector) -> Vector:
-        return self.project(y_new)
-
-    def project(self, y: Vector) -> Vector:
-        """Return y moved back onto the invariants; see `project_columns`."""
-        alpha, beta, m = y
+        """Return y_new moved back onto the invariants; see `project_columns`."""
+        alpha, beta, m = y_new
         projected = self._project((alpha.real, alpha.imag, beta.real, beta.imag, m.real, m.imag),
                                   ONE_STATE, POLE_SHARE)
         return complex(*projected[:2]), complex(*projected[2:4]), complex(*projected[4:])
@@ -182,9 +176,6 @@ class EulerEquations(Equations):
     pole, and phi and psi drift off while every error estimate is small.  So these equations stop
     with an error there.
     """
-
-    name = 'euler'
-    is_complex = False
 
     def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
         self.top, self.l3, self.lz = top, start.l3, start.lz

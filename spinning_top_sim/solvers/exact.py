@@ -168,9 +168,6 @@ class ExactSolution:
     def release(self, before_ns: int) -> None:
         pass                            # nor to forget
 
-    def exact_solution(self) -> ExactSolution:
-        return self
-
     def states(self, times_ns: NDArray[np.int64] | range) -> States:
         """Return the states at integer nanoseconds (n,), in any order and of any sign."""
         return self._states(Times.from_ns(times_ns), self.ns_limit, 'ns')

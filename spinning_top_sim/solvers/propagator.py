@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-What every solver has, the choice among them, and `solve`, which reads a motion at given times.
-
-A new solver is a class with the members of `Propagator`, a name in METHODS, and a branch in
-`propagate` that makes it.
-"""
+"""What every solver has, the choice among them, and `solve`, which reads a motion at times."""
 
 from contextlib import suppress
 from typing import Protocol
@@ -69,9 +64,6 @@ class Propagator(Protocol):
 
     def states_at_seconds(self, t: Column) -> States:
         """Return the states at times (n,) [s] for `solve`; ascending, if it takes steps."""
-
-    def exact_solution(self) -> ExactSolution | None:
-        """Return the closed form of the same motion; None where doubles cannot hold it."""
 
 
 def propagate(top: Top, start: State, *, method: str, equations: str = 'transport',

@@ -23,7 +23,6 @@ from spinning_top_sim.solvers.equations import (
     TransportEquations,
     half_axis,
 )
-from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.times import NANOSECONDS, Times
 from spinning_top_sim.solvers.unwrap import PhaseUnwrapper, turns_to_follow
 
@@ -120,12 +119,6 @@ class SteppedMotion(ABC):
     def _phases_at(self, steps: NDArray[np.int64]) -> Rows:
         """Return further rows per time, of the step that it lies in: none here."""
         return np.empty((0, len(steps)))
-
-    def exact_solution(self) -> ExactSolution | None:
-        try:
-            return ExactSolution(self.top, self.start)
-        except ValueError:
-            return None
 
     @abstractmethod
     def _states_of(self, t: Column, unknowns: Rows) -> States:

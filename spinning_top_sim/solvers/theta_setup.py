@@ -153,9 +153,6 @@ class _Side(NamedTuple):
     slope: Decimal
 
 
-Sides = tuple[_Side, ...]
-
-
 def _set_up(top: Top, start: State) -> ThetaMotion:
     torque = Decimal(top.mass) * Decimal(top.gravity) * Decimal(top.com_distance)
     lambda1, lambda3 = Decimal(top.lambda1), Decimal(top.lambda3)
@@ -185,7 +182,7 @@ def _resting(side: _Side, lambda1: Decimal) -> Factor:
     return Factor(rate, side.turns, ZERO, (parts, parts), 0, ZERO)
 
 
-def _nutating(sides: Sides, lambda1: Decimal, sense: int,
+def _nutating(sides: tuple[_Side, ...], lambda1: Decimal, sense: int,
               cubic: tuple[Decimal, Decimal, Decimal, Decimal], falling: bool) -> ThetaMotion:
     """Return a motion with P >= 0; with sense -1 that of which this is the mirror image."""
     roots, f3 = cubic_roots(*cubic), cubic[3]
@@ -235,7 +232,8 @@ class _Pole(NamedTuple):
     zero: Decimal | None
 
 
-def _poles(sides: Sides, roots: Roots, scale: Decimal, imaginary: bool) -> tuple[_Pole, _Pole]:
+def _poles(sides: tuple[_Side, ...], roots: Roots, scale: Decimal,
+           imaginary: bool) -> tuple[_Pole, _Pole]:
     """
     Return the poles of alpha and beta; scale: 2 P lambda1.
 

@@ -14,7 +14,6 @@ from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
@@ -75,7 +74,8 @@ class Imu:
 
     def means(self, samples: Samples) -> tuple[Vector, Vector]:
         """Return the means of `true` over the intervals that end at these samples."""
-        increments, seconds = samples.once(self._body_increments), self.lengths(samples)
+        increments = samples.once(self._body_increments)
+        seconds = self.intervals.lengths(samples.times)
         # The mean over an empty interval is the value itself.
         divisor = np.where(seconds > 0.0, seconds, 1.0)
         states = samples.states
@@ -89,10 +89,6 @@ class Imu:
     def sampled(self, samples: Samples) -> tuple[Vector, Vector]:
         """Return the readings of a perfect sensor: values or means, as `imu.sampling` says."""
         return samples.once(self.means) if self.takes_means else self.true(samples.states)
-
-    def lengths(self, samples: Samples) -> Column:
-        """Return the lengths (n,) [s] of the intervals that end at these samples."""
-        return self.intervals.lengths(samples.times)
 
     def increments(self, samples: Samples) -> tuple[Quaternion, Vector]:
         """Return rotation and velocity increment [m/s] over the intervals that end there."""
@@ -108,8 +104,7 @@ class Imu:
 
     def motion(self, states: States) -> tuple[Vector, Vector]:
         """Return position in the world [m], and velocity in the frame of the IMU [m/s]."""
-        x, y, z, w = states.rows_quaternion
-        return (attitude.in_body((-x, -y, -z, w), self._lever_arm),
+        return (attitude.in_world(states.rows_quaternion, self._lever_arm),
                 self._from_body(states.velocity(self._lever_arm)))
 
     def _from_body(self, vector: Vector) -> Vector:
@@ -146,9 +141,13 @@ class Sensor:
         white = np.array(_six(values, 'noise_density')) / math.sqrt(period_ns * 1e-9)
         variances = (white ** 2 + np.array(resolution) ** 2 / 12.0).tolist()
         self.rate_variance, self.force_variance = variances[0], variances[3]
+        turn_on_bias = np.array(_six(values, 'turn_on_bias'))[:, np.newaxis]
+        if turn_on_bias.any():
+            turn_on_bias *= noise.white(
+                values['seed'], noise.Purpose.TURN_ON, np.zeros(1, np.int64), 6)
         self._noise = noise.SensorNoise(
-            values['seed'], noise.Purpose.WHITE, period_ns, white[:, np.newaxis],
-            _turn_on_bias(values), _bias_paths(values))
+            values['seed'], noise.Purpose.WHITE, period_ns, white[:, np.newaxis], turn_on_bias,
+            _bias_paths(values))
         deviations = values['imu.orientation_stddev']
         self.orientation_variances = tuple(deviation ** 2 for deviation in deviations)
         self._orientation_noise = noise.SensorNoise(
@@ -217,14 +216,6 @@ def _six(values: Mapping[str, Any], error: str) -> tuple[float, ...]:
     """Return a parameter for the three axes of the gyroscope and those of the accelerometer."""
     rate, force = (values[f'imu.{kind}_{error}'] for kind in KINDS)
     return 3 * (rate,) + 3 * (force,)
-
-
-def _turn_on_bias(values: Mapping[str, Any]) -> NDArray[np.float64]:
-    """Return the constant bias of the six axes, (6, 1)."""
-    deviations = np.array(_six(values, 'turn_on_bias'))[:, np.newaxis]
-    if not deviations.any():
-        return deviations
-    return deviations * noise.constant(values['seed'], noise.Purpose.TURN_ON, 6)
 
 
 def _bias_paths(values: Mapping[str, Any]) -> list[noise.Path]:

@@ -16,9 +16,9 @@ that changes samples after `now_ns` empties the queue.
 
 import contextlib
 import time
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
@@ -40,53 +40,35 @@ Entry = tuple[int, int, bytes]
 Write = Callable[[Sequence[Entry], int], object]
 
 
-@dataclass
-class Usage:
-    """How often the use of some outputs has changed."""
-
-    changes: int = 0
-
-
+@dataclass(eq=False)
 class Output:
     """
     Where the samples of a stream go.
 
+    publish : takes each message in time; None while there are no subscribers
     log_index : number of the stream in the log, None if it is not recorded
     sent, skipped : samples that were published, and those that were too late for that
     """
 
-    def __init__(self, stream: Stream, usage: Usage) -> None:
-        self.stream, self._usage = stream, usage
-        self._publish: Callable[[bytes], object] | None = None
-        self.log_index: int | None = None
-        self.sent = self.skipped = 0
-
-    @property
-    def publish(self) -> Callable[[bytes], object] | None:
-        """What takes each message in time; None while there are no subscribers."""
-        return self._publish
-
-    @publish.setter
-    def publish(self, publish: Callable[[bytes], object] | None) -> None:
-        if (publish is None) != (self._publish is None):
-            self._usage.changes += 1
-        self._publish = publish
+    stream: Stream
+    publish: Callable[[bytes], object] | None = None
+    log_index: int | None = None
+    sent: int = 0
+    skipped: int = 0
 
     @property
     def is_used(self) -> bool:
         """Whether anybody takes the samples: else they are not computed."""
-        return self._publish is not None or self.log_index is not None
+        return self.publish is not None or self.log_index is not None
 
 
+@dataclass(slots=True)
 class Instant:
     """The messages of one time: for the log, their size together [bytes], and for subscribers."""
 
-    __slots__ = ('entries', 'published', 'size')
-
-    def __init__(self) -> None:
-        self.entries: list[Entry] = []
-        self.size = 0
-        self.published: list[tuple[Output, bytes]] = []
+    entries: list[Entry] = field(default_factory=list)
+    size: int = 0
+    published: list[tuple[Output, bytes]] = field(default_factory=list)
 
 
 class LiveSimulation(Simulation):
@@ -101,13 +83,13 @@ class LiveSimulation(Simulation):
 
     def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
         super().__init__(values, epoch_ns)
-        self._usage = Usage()
-        self.outputs = [Output(stream, self._usage) for stream in self.streams]
+        self.outputs = [Output(stream) for stream in self.streams]
         self.computed_ns = -1
         self._write: Write = lambda entries, size: None
         self._queue: deque[tuple[int, Instant]] = deque()       # by time [ns]
         self._used: list[Output] = []               # those whose samples are in the queue
-        self._holds_for = -1, -1                    # `version` and `Usage.changes` of the queue
+        # `version`, `epoch_ns`, and which outputs had no subscribers, when the queue was computed.
+        self._holds_for: tuple[int, int, list[bool]] = -1, 0, []
         self._work: Iterator[Block | None] | None = None
         self._block = SMALLEST_BLOCK
 
@@ -115,10 +97,6 @@ class LiveSimulation(Simulation):
         super().restart(values)
         for output, stream in zip(self.outputs, self.streams, strict=True):
             output.stream = stream
-
-    def output(self, stream: Stream) -> Output:
-        """Return the output of a stream."""
-        return next(output for output in self.outputs if output.stream is stream)
 
     def log_to(self, write: Write | None, streams: Sequence[Stream] = ()) -> None:
         """
@@ -131,7 +109,7 @@ class LiveSimulation(Simulation):
             self._write = write
         for output in self.outputs:
             output.log_index = streams.index(output.stream) if output.stream in streams else None
-        self._usage.changes += 1
+        self.version += 1
 
     def lowest_imu_rate(self, *, restarted: bool) -> float:
         """
@@ -170,7 +148,10 @@ class LiveSimulation(Simulation):
                 self._compute(target_ns, publish_from_ns)
         finally:
             if publish_from_ns > begin_ns + 1:
-                self._count_skipped(begin_ns, min(self.now_ns, publish_from_ns - 1))
+                until_ns = min(self.now_ns, publish_from_ns - 1)
+                for output in self.outputs:
+                    if output.publish is not None:
+                        output.skipped += len(output.stream.times(begin_ns, until_ns))
 
     def prepare(self, until_ns: int, budget_ns: int | None = None) -> bool:
         """
@@ -196,7 +177,8 @@ class LiveSimulation(Simulation):
 
     def _refresh(self) -> None:
         """Empty the queue if the motion or the outputs have changed."""
-        holds_for = self.version, self._usage.changes
+        holds_for = (self.version, self.epoch_ns,
+                     [output.publish is None for output in self.outputs])
         if holds_for != self._holds_for:
             self._holds_for = holds_for
             self._used = [output for output in self.outputs if output.is_used]
@@ -213,11 +195,6 @@ class LiveSimulation(Simulation):
                 if output.publish is not None:      # it may be gone since the head of `advance`
                     output.publish(message)
                     output.sent += 1
-
-    def _count_skipped(self, after_ns: int, until_ns: int) -> None:
-        for output in self.outputs:
-            if output.publish is not None:
-                output.skipped += len(output.stream.times(after_ns, until_ns))
 
     def _compute(self, target_ns: int, publish_from_ns: int) -> None:
         """Finish the block under way, or compute one up to `target_ns` at most."""
@@ -261,17 +238,16 @@ class LiveSimulation(Simulation):
 
     def _append(self, block: Block) -> None:
         """Put a block into the queue, in the order of time."""
-        instants: dict[int, Instant] = {}
+        instants: defaultdict[int, Instant] = defaultdict(Instant)
         epoch_ns = self.epoch_ns
         for stream, times_ns, rows in block.parts:
-            output, data, size = self.output(stream), rows.tobytes(), stream.size
+            output = next(one for one in self.outputs if one.stream is stream)
+            data, size = rows.tobytes(), stream.size
             log_index, is_published = output.log_index, output.publish is not None
             begin = 0
             for t_ns in times_ns.tolist():
                 message = data[begin:begin + size]
                 begin += size
-                if t_ns not in instants:
-                    instants[t_ns] = Instant()
                 instant = instants[t_ns]
                 if log_index is not None:
                     instant.entries.append((log_index, epoch_ns + t_ns, message))

@@ -35,11 +35,6 @@ def white(seed: int, purpose: Purpose, numbers: NDArray[np.int64], columns: int,
     return _gathered(partial(_normal, seed, purpose, columns=columns), numbers)
 
 
-def constant(seed: int, purpose: Purpose, columns: int) -> NDArray[np.float64]:
-    """Return a standard normal number for each column, (columns, 1)."""
-    return _normal(seed, purpose, 0, columns, count=1).T
-
-
 @dataclass(frozen=True)
 class Path:
     """

@@ -2,6 +2,7 @@
 """The motion of a run: segments of one solution each, joined by commands."""
 
 import math
+from contextlib import suppress
 from functools import cached_property, reduce
 from itertools import pairwise
 
@@ -35,14 +36,19 @@ class Segment:
         self.solver, self.start, self.start_ns = solver, start, start_ns
         self.end_ns = start_ns + solver.ns_limit
         self.reached_ns = min(start_ns + solver.reached_ns, self.end_ns)
-        first = solver.states(range(1))
-        self.energy, self.l3, self.lz = float(first.energy[0]), start.l3, start.lz
+        self._first = solver.states(range(1))
+        self.energy, self.l3, self.lz = float(self._first.energy[0]), start.l3, start.lz
 
     @cached_property
     def exact(self) -> ExactSolution | None:
-        """The exact solution of the same motion; None where it ends before SHORTEST_RUN_NS."""
-        exact = self.solver.exact_solution()
-        return exact if exact and exact.ns_limit >= SHORTEST_RUN_NS else None
+        """The closed form; None where doubles cannot hold it, or not for SHORTEST_RUN_NS."""
+        if isinstance(self.solver, ExactSolution):
+            return self.solver
+        with suppress(ValueError):
+            exact = ExactSolution(self.solver.top, self.solver.start)
+            if exact.ns_limit >= SHORTEST_RUN_NS:
+                return exact
+        return None
 
     def reach(self, t_ns: int, max_steps: int) -> bool:
         """
@@ -84,10 +90,8 @@ class Segment:
         if self.exact is not None:
             return self.exact.states(
                 np.minimum(times_ns - self.start_ns, self.exact.ns_limit)).rows_axis
-        start, ones = self.start, np.ones(len(times_ns))
-        across = math.sin(start.theta)
-        return (across * math.cos(start.phi) * ones, across * math.sin(start.phi) * ones,
-                math.cos(start.theta) * ones)
+        x, y, z = (np.full(len(times_ns), part[0]) for part in self._first.rows_axis)
+        return x, y, z
 
 
 class Path:

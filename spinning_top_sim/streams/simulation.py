@@ -32,10 +32,6 @@ OFFLINE_BYTES, LONGEST_OFFLINE_NS, MOST_BLOCKS = 4 << 20, 100 * NANOSECONDS, 20_
 MOST_RATE = MOST_TURNS / SHORTEST_RUN_NS * NANOSECONDS
 
 
-class PoleError(ValueError):
-    """A command that is impossible with the axis at a pole, where Lz must be L3 or -L3."""
-
-
 class Simulation:
     """
     One top in motion.  Times are integer nanoseconds since the start.
@@ -47,7 +43,8 @@ class Simulation:
     now_ns : every sample up to here is done (-1: not even that of t = 0)
     history : what was applied since the start: commands as (t_ns, l3, lz), states that were set as
         t_ns and the fields of `State`, changes of `imu.rate` as (t_ns, rate)
-    version : changes with all that makes samples after `now_ns` other ones
+    epoch_ns : stamp of t = 0 [ns]
+    version : changes with all but `epoch_ns` that makes samples after `now_ns` other ones
 
     Raises ValueError where there is no motion from the start state.
     """
@@ -55,7 +52,7 @@ class Simulation:
     def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
         self.version = 0
         self._steps_before = self._evaluations_before = 0
-        self._epoch_ns = epoch_ns
+        self.epoch_ns = epoch_ns
         self._load(values)
 
     def restart(self, values: Mapping[str, Any]) -> None:
@@ -70,8 +67,7 @@ class Simulation:
 
     def _load(self, values: Mapping[str, Any]) -> None:
         # Whatever may be refused comes first, before anything changes.
-        for stamp_ns in (self._epoch_ns,
-                         self._epoch_ns + round(values['duration'] * NANOSECONDS)):
+        for stamp_ns in (self.epoch_ns, self.epoch_ns + round(values['duration'] * NANOSECONDS)):
             if not 0 <= stamp_ns <= LAST_STAMP_NS:
                 raise ValueError(f'the stamp {stamp_ns / NANOSECONDS:.12g} s: must be >= 0 and '
                                  f'< {2 ** 31} s, in January 2038')
@@ -106,16 +102,6 @@ class Simulation:
     def lz(self) -> float:
         """Lz as last commanded [kg m^2/s]."""
         return self.segment.lz
-
-    @property
-    def epoch_ns(self) -> int:
-        """Stamp of t = 0 [ns]."""
-        return self._epoch_ns
-
-    @epoch_ns.setter
-    def epoch_ns(self, epoch_ns: int) -> None:
-        self._epoch_ns = epoch_ns
-        self.version += 1
 
     @property
     def steps(self) -> int:
@@ -159,7 +145,7 @@ class Simulation:
         """
         span_ns = max(span_of(streams, OFFLINE_BYTES, LONGEST_OFFLINE_NS),
                       (until_ns - self.now_ns) // MOST_BLOCKS)
-        for block in blocks(self.path, streams, self._epoch_ns, self.now_ns, until_ns,
+        for block in blocks(self.path, streams, self.epoch_ns, self.now_ns, until_ns,
                             span_ns=span_ns, most_steps=OFFLINE_STEPS):
             if block is not None:
                 self.now_ns = block.until_ns
@@ -184,7 +170,7 @@ class Simulation:
         """
         Let L3 and Lz jump now [kg m^2/s]: an impulsive torque.  Angles and theta' stay.
 
-        Raises ValueError naming what is off, at a pole PoleError; the motion goes on unchanged.
+        Raises ValueError naming what is off; the motion goes on unchanged.
         """
         for name, value in (('l3', l3), ('lz', lz)):
             if not math.isfinite(value):
@@ -194,7 +180,7 @@ class Simulation:
         theta = float(now.theta[0])
         pole = pole_momentum(abs(theta), l3)
         if pole is not None and lz != pole:
-            raise PoleError(
+            raise ValueError(
                 f'lz = {lz!r} kg m^2/s with l3 = {l3!r}: the axis is at a pole (theta = '
                 f'{theta!r} rad), where lz must equal {pole!r}; command both together')
         self._go_on_from(ContinuedState(

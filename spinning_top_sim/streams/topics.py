@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.attitude import Quaternion, Vector
+from spinning_top_sim.physics.attitude import Vector
 from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.physics.top import Shape
 from spinning_top_sim.streams import messages, parameters, timing
@@ -189,40 +189,40 @@ class GroundTruthImu(ImuStream):
 
 
 class ImuIncrements(ImuRaw):
-    """The increments over the interval that ends at a sample (docs/sensor.md)."""
+    """
+    An increment over the interval that ends at a sample (docs/sensor.md).
+
+    place, count : which of the increments it is, and its number of components
+    """
 
     parameter, rate_parameter = 'increments', 'imu.rate'
+    place: int
+    count: int
 
-    def _measured(self, samples: Samples) -> tuple[Quaternion, Vector]:
-        exact = self.imu.increments(samples)
-        if self._sensor.is_perfect:
-            return exact
-        return self._sensor.disturb(exact, samples.once(self.imu.means), samples.times,
-                                    self.imu.lengths(samples))
+    def _template(self) -> Template:
+        return messages.stamped(self._frame_id, self.count)
+
+    def fields(self, samples: Samples) -> Sequence[Field]:
+        increments = self.imu.increments(samples)
+        if not self._sensor.is_perfect:
+            increments = self._sensor.disturb(
+                increments, samples.once(self.imu.means), samples.times,
+                self.imu.intervals.lengths(samples.times))
+        return (increments[self.place],)
 
 
 class ImuDq(ImuIncrements):
     """The rotation increment."""
 
     topic, type_name = 'imu/dq', 'geometry_msgs/msg/QuaternionStamped'
-
-    def _template(self) -> Template:
-        return messages.stamped(self._frame_id, 4)
-
-    def fields(self, samples: Samples) -> Sequence[Field]:
-        return (self._measured(samples)[0],)
+    place, count = 0, 4
 
 
 class ImuDv(ImuIncrements):
     """The velocity increment."""
 
     topic, type_name = 'imu/dv', 'geometry_msgs/msg/Vector3Stamped'
-
-    def _template(self) -> Template:
-        return messages.stamped(self._frame_id, 3)
-
-    def fields(self, samples: Samples) -> Sequence[Field]:
-        return (self._measured(samples)[1],)
+    place, count = 1, 3
 
 
 class GroundTruthImuOdometry(Stream):
@@ -268,10 +268,9 @@ class Markers(Stream):
     """
     The top and the trace of its tip for Foxglove and RViz, in the world frame.
 
-    A line along the axis and down the side of the body shows the spin.  Every message has the
-    whole trace, so that it is complete wherever a viewer starts or jumps in a log.  The points of
-    the trace are on the exact path, at multiples of a fixed time step before the sample; the last
-    point is the tip of the body.  With a coarse `solver.rtol` the body leaves the path visibly.
+    Every message has the whole trace, so that it is complete wherever a viewer starts or jumps in
+    a log.  Its points are on the exact path, at multiples of a fixed time step; the last one is
+    the tip of the body.
     """
 
     parameter, topic, type_name = 'markers', 'markers', 'visualization_msgs/msg/MarkerArray'

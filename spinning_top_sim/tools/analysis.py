@@ -60,9 +60,8 @@ class Attitudes:
         else:
             self.phi, self.psi = (np.unwrap(np.angle(tip)) for tip in (self.tip, self.body_tip))
 
-    def first(self, seconds: float) -> Attitudes:
-        """Return the samples of the first seconds, at least two."""
-        count = max(2, int(np.searchsorted(self.time, seconds, 'right')))
+    def first(self, count: int) -> Attitudes:
+        """Return the first samples."""
         return Attitudes(self.stamps_ns[:count], self.rows[:, :count])
 
     def constants(self, top: Top) -> tuple[Column, Column, Column] | None:
@@ -114,17 +113,13 @@ def longest_run(blocks: list[tuple[NDArray[np.int64], NDArray[np.float64]]]) -> 
 
 @dataclass(frozen=True)
 class Measured:
-    """The numbers of `regimes.Description`, measured from samples."""
+    """Numbers of `regimes.Description`, measured from samples."""
 
     samples: int
     nutations: int                        # whole ones
     nutation_period: float | None
-    theta_min: float
-    theta_max: float
     mean_precession_rate: float | None
     mean_spin_rate: float | None
-    precession_min: float | None
-    precession_max: float | None
     missing: tuple[str, ...]              # why numbers are None
 
 
@@ -137,9 +132,9 @@ def measure(data: Attitudes, expected: float | None = None) -> Measured:
     A nutation lasts from one rise of the tip through its middle height to the next.  The tip is
     fastest there, and far from the poles, where phi may jump.
     """
-    low, high, count = _extreme(data, 1.0), _extreme(data, -1.0), len(data.stamps_ns)
+    count = len(data.stamps_ns)
     nutations, period, begin, end, reason = 0, None, 0.0, count - 1.0, ''
-    if high - low >= RESTS:
+    if np.ptp(2.0 * np.arctan2(np.sqrt(data.sin2), np.sqrt(data.cos2))) >= RESTS:
         nutations, begin, end = _crossings(data)
         period = (end - begin) / nutations * data.period if nutations else None
         in_one = min(period or math.inf, expected or math.inf) / data.period
@@ -151,11 +146,8 @@ def measure(data: Attitudes, expected: float | None = None) -> Measured:
                         for angle, tip in ((data.phi, data.tip), (data.psi, data.body_tip)))
     if not reason and None in (precession, spin):
         reason = 'phi or psi cannot be unwrapped: a pole, or too few samples in a turn'
-    slowest = fastest = None
-    if data.phi_dot is not None and np.isfinite(data.phi_dot).all():
-        slowest, fastest = float(np.min(data.phi_dot)), float(np.max(data.phi_dot))
-    return Measured(count, nutations, None if reason else period, low, high, precession, spin,
-                    slowest, fastest, (reason,) if reason else ())
+    return Measured(count, nutations, None if reason else period, precession, spin,
+                    (reason,) if reason else ())
 
 
 def _spline(values: NDArray[np.generic], index: float) -> BSpline:
@@ -166,24 +158,6 @@ def _spline(values: NDArray[np.generic], index: float) -> BSpline:
     part = values[begin:begin + WINDOW]
     return make_interp_spline(np.arange(begin, begin + len(part)), part,
                               k=min(DEGREE, len(part) - 1))
-
-
-def _extreme(data: Attitudes, sign: float) -> float:
-    """Return the least (sign 1) or greatest (-1) tilt, also between samples [rad]."""
-    from scipy.optimize import minimize_scalar  # noqa: PLC0415
-
-    index = int(np.argmin(sign * data.sin2))
-    # The smaller of the two squares has the digits of a small angle.
-    near_top = bool(data.sin2[index] < 0.5)
-    square, sign = (data.sin2, sign) if near_top else (data.cos2, -sign)
-    extreme = float(square[index])
-    if 0 < index < len(square) - 1:
-        spline = _spline(square, index)
-        found = minimize_scalar(lambda at: sign * float(spline(at)), method='bounded',
-                                bounds=(index - 1.0, index + 1.0), options={'xatol': 1e-9})
-        extreme = sign * min(sign * extreme, float(found.fun))
-    angle = 2.0 * math.asin(math.sqrt(min(max(extreme, 0.0), 1.0)))
-    return angle if near_top else math.pi - angle
 
 
 def _crossings(data: Attitudes) -> tuple[int, float, float]:

@@ -13,25 +13,14 @@ from spinning_top_sim.streams.messages import EXACT_VARIANCE
 NO_ORIENTATION = -1.0           # first variance of a sensor_msgs/Imu without orientation
 
 
-class Layout(NamedTuple):
-    """
-    Where the attitude is in a message.
-
-    strings, skipped : numbers of strings and of doubles between the header and the quaternion
-    covariance : rows of the matrix after the quaternion, the last three for rotations; 0: none
-    """
-
-    strings: int
-    skipped: int
-    covariance: int
-
-
+# By type: how many strings and doubles are between the header and the quaternion, and the rows of
+# the covariance matrix after it, of which the last three are for rotations; 0: none.
 LAYOUTS = {
-    'sensor_msgs/msg/Imu': Layout(0, 0, 3),
-    'geometry_msgs/msg/QuaternionStamped': Layout(0, 0, 0),
-    'geometry_msgs/msg/PoseStamped': Layout(0, 3, 0),
-    'geometry_msgs/msg/PoseWithCovarianceStamped': Layout(0, 3, 6),
-    'nav_msgs/msg/Odometry': Layout(1, 3, 6)}
+    'sensor_msgs/msg/Imu': (0, 0, 3),
+    'geometry_msgs/msg/QuaternionStamped': (0, 0, 0),
+    'geometry_msgs/msg/PoseStamped': (0, 3, 0),
+    'geometry_msgs/msg/PoseWithCovarianceStamped': (0, 3, 6),
+    'nav_msgs/msg/Odometry': (1, 3, 6)}
 
 
 class Attitude(NamedTuple):
@@ -48,21 +37,20 @@ def decode(data: bytes, type_name: str) -> Attitude:
 
     Raises ValueError if the message is too short or has no orientation.
     """
-    layout = LAYOUTS[type_name]
+    strings, skipped, size = LAYOUTS[type_name]
     order = '<' if data[1:2] == b'\1' else '>'
     try:
         seconds, nanoseconds = struct.unpack_from(f'{order}iI', data, 4)
         at = 12
-        for _ in range(1 + layout.strings):         # the first one is the frame
+        for _ in range(1 + strings):         # the first one is the frame
             at += -at % 4
             at += 4 + struct.unpack_from(f'{order}I', data, at)[0]
     except struct.error as error:
         raise ValueError(str(error)) from error
-    at += (4 - at) % 8 + 8 * layout.skipped         # aligned after the encapsulation header
+    at += (4 - at) % 8 + 8 * skipped         # aligned after the encapsulation header
     quaternion = np.frombuffer(data, f'{order}f8', 4, at)
     covariance = np.full((3, 3), np.nan)
-    if layout.covariance:
-        size = layout.covariance
+    if size:
         matrix = np.frombuffer(data, f'{order}f8', size * size, at + 32).reshape(size, size)
         # The first variance of a pose is that of the position.
         if size == 3 and matrix[0, 0] == NO_ORIENTATION:

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Simulate many runs from one specification into a dataset: the samples of all
-runs in Parquet files, or a log (MCAP) a run. Dask shares the runs among the
-processes of this machine, or of a cluster.
+runs in Parquet files. Dask shares the runs among the processes of this
+machine, or of a cluster.
 
 docs/howto.md describes the specification and the dataset, and
 examples/ensemble.yaml is one. A run depends on the specification and its
 number alone. The same command again computes the files that are missing, such
 as after an interruption.
 
-  ensemble DIR --row K -o one.mcap           # computes run K again
+  ensemble DIR --row K -o one.mcap           # computes run K again, as a log
 
 exit codes:
   0    done; the manifest has the reasons of runs that failed
@@ -42,7 +42,6 @@ from spinning_top_sim.tools.ensemble_part import (
 from spinning_top_sim.tools.recorded_run import ODD, reason_of
 
 MANIFEST = 'manifest.json'
-FORMAT = 2                  # of the manifest
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -87,7 +86,7 @@ def _compute_dataset(arguments: argparse.Namespace) -> int:
     specification = ensemble_spec.read(arguments.specification)
     folder = arguments.output.absolute()
     manifest: dict[str, Any] = json.loads(json.dumps({
-        'format': FORMAT, 'complete': False, 'versions': versions(),
+        'format': 3, 'complete': False, 'versions': versions(),
         'specification': asdict(specification), 'failed': {}}))
     if (folder / MANIFEST).exists():
         difference = _difference(_read_manifest(folder), manifest)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The runs of an ensemble: the samples of one run, and the files of a part of the dataset.
+The runs of an ensemble: the samples of one run, and the file of a part of the dataset.
 
 A file is written in a temporary folder and then moved into the dataset.  A file that is there
 already is not computed again.
@@ -18,14 +18,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.provenance import version
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING
-from spinning_top_sim.tools.ensemble_spec import WITHOUT_COLUMNS, Specification
+from spinning_top_sim.tools.ensemble_spec import Specification
 from spinning_top_sim.tools.recorded_run import field_names, reason_of
 from spinning_top_sim.tools.simulate import write_log
 
@@ -53,8 +52,7 @@ class EnsembleError(Exception):
 def versions() -> dict[str, str]:
     """Return the versions on which the bytes of a dataset depend."""
     return {'python': platform.python_version(), 'machine': platform.machine(),
-            **{name: version(name) for name in (
-                'spinning_top_sim', 'numpy', 'pyarrow', 'mcap', 'rclpy', 'zstandard', 'lz4')}}
+            **{name: version(name) for name in ('spinning_top_sim', 'numpy', 'pyarrow')}}
 
 
 def samples(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Samples]:
@@ -67,29 +65,24 @@ def samples(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Samp
     Raises ValueError if no motion begins, IntegrationError if it ends early.
     """
     simulation = Simulation(values, EPOCH_NS)
-    streams = [stream for stream in simulation.streams
-               if stream.parameter in names and stream.parameter not in WITHOUT_COLUMNS]
-    parts: dict[str, list[Samples]] = {stream.topic: [] for stream in streams}
-    recorded = journal.recorded_streams(streams, values)
+    columns = {stream: _column_names(stream) for stream in simulation.streams
+               if stream.parameter in names}
+    # Empty arrays first, for a stream without samples.
+    parts = {stream: [(np.empty(0, np.int64), np.empty((len(labels), 0)))]
+             for stream, labels in columns.items()}
+    recorded = journal.recorded_streams(list(columns), values)
     for block in simulation.play(recorded, round(values['duration'] * NANOSECONDS)):
         for stream, times_ns, rows in block.parts:
             once = np.diff(times_ns, prepend=-1) > 0        # a faulty sensor sends some twice
-            numbers = np.array([column for field in stream.template.decode(rows)
-                                for column in field.T])
-            if not once.all():
-                numbers = numbers[:, once]
-            parts[stream.topic].append((times_ns[once], {
-                name: column for name, column in zip(_column_names(stream), numbers, strict=True)
-                if name}))
-    return {stream.topic: _joined(parts[stream.topic], stream) for stream in streams}
-
-
-def _joined(parts: Sequence[Samples], stream: Stream) -> Samples:
-    if len(parts) == 1:
-        return parts[0]
-    return np.concatenate([np.empty(0, np.int64), *(times_ns for times_ns, _ in parts)]), {
-        name: np.concatenate([np.empty(0), *(columns[name] for _, columns in parts)])
-        for name in _column_names(stream) if name}
+            numbers = np.vstack([field.T for field in stream.template.decode(rows)])
+            parts[stream].append((times_ns[once], numbers[:, once]))
+    found = {}
+    for stream, labels in columns.items():
+        times_ns = np.concatenate([times_ns for times_ns, _ in parts[stream]])
+        numbers = np.concatenate([numbers for _, numbers in parts[stream]], axis=1)
+        found[stream.topic] = times_ns, {
+            label: column for label, column in zip(labels, numbers, strict=True) if label}
+    return found
 
 
 def _column_names(stream: Stream) -> Sequence[str]:
@@ -114,9 +107,7 @@ def table(specification: Specification, run: int) -> 'pyarrow.Table':
     import pyarrow as pa  # noqa: PLC0415
 
     found = samples(specification.values(run), specification.kept)
-    rows_ns, *others_ns = (times_ns for times_ns, _ in found.values())
-    if not all(np.array_equal(rows_ns, times_ns) for times_ns in others_ns):
-        rows_ns = np.unique(np.concatenate((rows_ns, *others_ns)))
+    rows_ns = np.unique(np.concatenate([times_ns for times_ns, _ in found.values()]))
     columns = {'run': pa.repeat(pa.scalar(run), len(rows_ns)),
                't': pa.array(rows_ns / NANOSECONDS)}
     for name, value in specification.drawn(run).items():
@@ -124,14 +115,11 @@ def table(specification: Specification, run: int) -> 'pyarrow.Table':
         one = pa.scalar(value, pa.float64() if value is None else None)
         columns[name] = pa.repeat(one, len(rows_ns))
     for topic, (times_ns, named) in found.items():
-        if len(times_ns) < len(rows_ns):
-            present = np.isin(rows_ns, times_ns)
-            for name, numbers in named.items():
-                column = np.zeros(len(rows_ns))
-                column[present] = numbers
-                columns[f'{topic}.{name}'] = pa.array(column, mask=~present)
-        else:
-            columns |= {f'{topic}.{name}': numbers for name, numbers in named.items()}
+        present = np.isin(rows_ns, times_ns)
+        for name, numbers in named.items():
+            column = np.zeros(len(rows_ns))
+            column[present] = numbers
+            columns[f'{topic}.{name}'] = pa.array(column, mask=~present)
     return pa.table(columns)
 
 
@@ -139,60 +127,41 @@ def write_row(specification: Specification, run: int, path: Path) -> None:
     """
     Compute one run into a new file, .mcap or .parquet.
 
-    The bytes of a log are those of the log in the dataset.  Raises RecordingError for a file that
-    exists, and ValueError or IntegrationError as `samples` does.
+    Raises RecordingError or OSError if it exists, ValueError or IntegrationError as `table` does.
     """
     from pyarrow import parquet  # noqa: PLC0415
 
-    if path.exists() or not path.parent.is_dir():
-        raise RecordingError(f'{path}: must not exist, and its folder must')
     if path.suffix == '.mcap':
-        with tempfile.TemporaryDirectory(dir=path.parent) as temporary:
-            _write_log(specification, run, path, Path(temporary, _log_name(run)))
+        values = specification.values(run)
+        write_log(path, Simulation(values, EPOCH_NS),
+                  [(round(values['duration'] * NANOSECONDS), None)], lambda done: None, '/')
     else:
-        parquet.write_table(table(specification, run), path)
+        rows = table(specification, run)
+        with open(path, 'xb') as file:
+            parquet.write_table(rows, file)
 
 
 def compute_part(specification: Specification, part: int, folder: str,
                  wanted: Mapping[str, str]) -> dict[str, str]:
     """
-    Compute the files of a part that are not in `folder`; return the runs that failed, and why.
+    Compute the file of a part, unless it is in `folder`; return the runs that failed, and why.
 
-    The files depend on the specification and the versions alone.
+    The file depends on the specification and the versions alone.
 
     wanted : what `versions` must be
 
-    Raises EnsembleError for other versions; RecordingError or OSError if a file cannot be written.
+    Raises EnsembleError for other versions; OSError if the file cannot be written.
     """
-    if versions() != wanted:
-        raise EnsembleError(f'a worker has {versions()}, which gives other bytes than {wanted}')
-    data, runs, failed = Path(folder, DATA), specification.part(part), {}
-    with tempfile.TemporaryDirectory(dir=Path(folder, UNFINISHED)) as temporary:
-        if specification.format == 'parquet':
-            name = f'part-{part:06d}.parquet'
-            return _write_parquet(specification, runs, data / name, Path(temporary, name))
-        for run in runs:
-            name = _log_name(run)
-            try:
-                _write_log(specification, run, data / name, Path(temporary, name))
-            except (OSError, RecordingError):
-                raise
-            except Exception as error:
-                failed[str(run)] = reason_of(error)
-    return failed
-
-
-def _write_parquet(specification: Specification, runs: Sequence[int], path: Path,
-                   temporary: Path) -> dict[str, str]:
-    """Write the table of some runs, unless it is there; return the runs that failed, and why."""
     import pyarrow as pa  # noqa: PLC0415
     from pyarrow import parquet  # noqa: PLC0415
 
+    if versions() != wanted:
+        raise EnsembleError(f'a worker has {versions()}, which gives other bytes than {wanted}')
+    path = Path(folder, DATA, f'part-{part:06d}.parquet')
     with contextlib.suppress(OSError, ValueError, KeyError):    # it is missing, or not whole
-        failed: dict[str, str] = json.loads(parquet.read_metadata(path).metadata[FAILED])
-        return failed
+        return dict(json.loads(parquet.read_metadata(path).metadata[FAILED]))
     failed, tables = {}, []
-    for run in runs:
+    for run in specification.part(part):
         try:
             tables.append(table(specification, run))
         except Exception as error:
@@ -200,22 +169,11 @@ def _write_parquet(specification: Specification, runs: Sequence[int], path: Path
     if tables:
         rows = pa.concat_tables(tables).replace_schema_metadata({FAILED: json.dumps(failed)})
         constant = ['run', *specification.drawn(0)]
-        parquet.write_table(
-            rows, temporary, compression='zstd', row_group_size=ROWS_IN_A_GROUP,
-            use_dictionary=constant, write_statistics=constant, use_byte_stream_split=[
-                name for name in rows.column_names if name not in constant])
-        temporary.replace(path)
+        with tempfile.TemporaryDirectory(dir=Path(folder, UNFINISHED)) as temporary:
+            written = Path(temporary, path.name)
+            parquet.write_table(
+                rows, written, compression='zstd', row_group_size=ROWS_IN_A_GROUP,
+                use_dictionary=constant, write_statistics=constant, use_byte_stream_split=[
+                    name for name in rows.column_names if name not in constant])
+            written.replace(path)
     return failed
-
-
-def _write_log(specification: Specification, run: int, path: Path, temporary: Path) -> None:
-    """Write the log of a run, unless it is there; the name of `temporary` is in the log."""
-    if not path.exists():
-        values = specification.values(run)
-        write_log(temporary, Simulation(values, EPOCH_NS),
-                  [(round(values['duration'] * NANOSECONDS), None)], lambda done: None, '/')
-        temporary.replace(path)
-
-
-def _log_name(run: int) -> str:
-    return f'run-{run:09d}.mcap'

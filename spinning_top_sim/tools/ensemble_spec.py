@@ -6,7 +6,7 @@ import math
 from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +16,19 @@ from spinning_top_sim.physics.top import shown
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.tools.scene_file import parse_section, parse_yaml, read_scene
 
-FORMATS = ('parquet', 'mcap')
-# Streams that only a log can have, not a table.
-WITHOUT_COLUMNS = ('clock', 'markers')
 DEFAULTS = {parameter.name: parameter.default for parameter in parameters.TABLE}
-STREAMS = tuple(row[0] for row in parameters.STREAM_DEFAULTS)
+# Streams that a table can have; only a log has the others.
+STREAMS = tuple(row[0] for row in parameters.STREAM_DEFAULTS if row[0] not in ('clock', 'markers'))
 # By default a part has at most this many rows, or one run, and a large ensemble at least this
 # many parts.
 ROWS_IN_A_PART, LEAST_PARTS = 200_000, 50
 VALUES, PARAMS = 'values', 'params'
+_entry = partial(parameters.Parameter, text='', effect=parameters.Effect.START)
+ENTRIES = (
+    _entry('runs', 1, minimum=1, maximum=2 ** 63 - 1),
+    _entry('duration', 1.0, minimum=1e-9, maximum=parameters.LONGEST),
+    _entry('seed', 0, minimum=0, maximum=2 ** 63 - 1), _entry('streams', ('imu',)),
+    _entry('runs_per_part', 0, minimum=0, maximum=2 ** 63 - 1))
 
 
 def _log_uniform(random: np.random.Generator, low: float, high: float) -> float:
@@ -60,8 +64,7 @@ class Specification:
     params : mappings of parameters; a later one overrides those before it
     sample : name of a parameter to {distribution: [a, b]}, or to {values: [...]}
     streams : names of the streams to keep; empty: those that the parameters of a run enable
-    format : 'parquet' or 'mcap'
-    runs_per_part : runs that are computed by one task, and in Parquet share a file
+    runs_per_part : runs that are computed by one task, and share a file
     """
 
     runs: int
@@ -70,7 +73,6 @@ class Specification:
     params: Sequence[Mapping[str, Any]] = ()
     sample: Mapping[str, Mapping[str, Sequence[Any]]] | None = None
     streams: Sequence[str] = ()
-    format: str = 'parquet'
     runs_per_part: int = 0
 
     @property
@@ -125,10 +127,8 @@ class Specification:
 
         The table of each run has columns for all of them, so that the files form one table.
         """
-        return [name for name in STREAMS
-                if (self.format != 'parquet' or name not in WITHOUT_COLUMNS)
-                and any(journal.is_recorded(name, {**DEFAULTS, **values})
-                        for values in self.alternatives)]
+        return [name for name in STREAMS if any(
+            journal.is_recorded(name, {**DEFAULTS, **values}) for values in self.alternatives)]
 
 
 def read(path: Path) -> Specification:
@@ -152,22 +152,16 @@ def parse(content: object, source: str, folder: Path = Path()) -> Specification:
 
 def _checked(given: Specification, folder: Path) -> Specification:
     """Return the specification with files read, and lists and mappings of checked values."""
-    for name, least in (('runs', 1), ('seed', 0), ('runs_per_part', 0)):
-        value = getattr(given, name)
-        if type(value) is not int or not least <= value < 2 ** 63:
-            raise ValueError(f'{name} = {shown(value)}: must be an integer >= {least}')
-    duration = parameters.BY_NAME['duration'].check(given.duration)
-    if not duration > 0.0:
-        raise ValueError(f'duration = {duration!r}: must be a number > 0')
-    if given.format not in FORMATS:
-        raise ValueError(f'format = {shown(given.format)}: must be one of {", ".join(FORMATS)}')
     sample = given.sample or {}
     if not isinstance(sample, Mapping):
         raise ValueError(f'sample = {shown(sample)}: must be a mapping of parameters')
     checked = replace(
-        given, duration=duration, streams=_streams(given.streams, given.format),
+        given, **{entry.name: entry.check(getattr(given, entry.name)) for entry in ENTRIES},
         params=[_parameter_set(one, 'params', folder) for one in _list(given.params, 'params')],
         sample={name: _rule(name, rule, folder) for name, rule in sample.items()})
+    for name in checked.streams:
+        if name not in STREAMS:
+            raise ValueError(f'streams: {shown(name)}: must be some of {", ".join(STREAMS)}')
     return checked if checked.runs_per_part else replace(
         checked, runs_per_part=_runs_per_part(checked))
 
@@ -189,15 +183,6 @@ def _parameter_set(given: object, what: str, folder: Path) -> dict[str, Any]:
         raise ValueError(f'{what}: {shown(given)}: must be a parameter file, or parameters and '
                          'their values')
     return {name: parameters.BY_NAME[name].check(value) for name, value in found.items()}
-
-
-def _streams(given: object, file_format: str) -> list[str]:
-    allowed = [name for name in STREAMS if file_format != 'parquet' or name not in WITHOUT_COLUMNS]
-    names = list(_list(given, 'streams'))
-    for name in names:
-        if name not in allowed:
-            raise ValueError(f'streams: {shown(name)}: must be some of {", ".join(allowed)}')
-    return names
 
 
 def _rule(name: object, rule: object, folder: Path) -> dict[str, list[Any]]:
@@ -224,14 +209,10 @@ def _bounds(name: str, kind: str, items: Sequence[Any]) -> list[float]:
     if name == PARAMS or not parameters.BY_NAME[name].is_double:
         raise ValueError(f'sample: {name}: {kind}: must be values, because the parameter is no '
                          'double')
-    _, allowed, is_allowed = DISTRIBUTIONS[kind]
-    try:
-        bounds = [*map(float, items)]
-        fits = is_allowed(*bounds)
-    except (TypeError, ValueError, OverflowError):
-        fits = False
-    if not fits:
-        raise ValueError(f'sample: {name}: {kind} = {shown(items)}: must be {allowed}')
+    what, (_, allowed, is_allowed) = f'sample: {name}: {kind}', DISTRIBUTIONS[kind]
+    bounds = list(_entry(what, (0.0, 0.0)).check(items))
+    if not is_allowed(*bounds):
+        raise ValueError(f'{what} = {shown(items)}: must be {allowed}')
     for bound in bounds[:1] if kind == 'normal' else bounds:
         parameters.BY_NAME[name].check(bound)
     return bounds

@@ -5,12 +5,12 @@ Writes files for other tools from a log.
 TUM: "timestamp tx ty tz qx qy qz qw", in s and m (vision.in.tum.de, RGB-D dataset, file formats).
 EuRoC: state_groundtruth_estimate0/data.csv and imu0/data.csv (M. Burri et al., "The EuRoC micro
 aerial vehicle datasets", IJRR 35, 2016).  kalibr: imu.yaml (github.com/ethz-asl/kalibr, wiki "Yaml
-formats"; the matrices as its model scale-misalignment writes them).
+formats").
 """
 
 import argparse
 import itertools
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.streams.parameters import IDENTITY
 from spinning_top_sim.streams.topics import all_streams
 from spinning_top_sim.tools.recorded_run import RunDescription
 
@@ -83,10 +82,8 @@ def write(reader: LogReader, run: RunDescription,
 
 def _tum(reader: LogReader, run: RunDescription) -> Iterator[str]:
     for stamps_ns, (position, orientation, *_) in _blocks(reader, run, ODOMETRY):
-        for stamp_ns, row in zip(stamps_ns.tolist(), np.hstack((position, orientation)).tolist(),
-                                 strict=True):
-            seconds, rest_ns = divmod(stamp_ns, 10 ** 9)
-            yield f'{seconds}.{rest_ns:09d} {" ".join(map(repr, row))}\n'
+        stamps = (f'{stamp_ns // 10 ** 9}.{stamp_ns % 10 ** 9:09d}' for stamp_ns in stamps_ns)
+        yield from _rows(' ', stamps, position, orientation)
 
 
 def _euroc(reader: LogReader, run: RunDescription) -> Iterator[str]:
@@ -97,40 +94,30 @@ def _euroc(reader: LogReader, run: RunDescription) -> Iterator[str]:
     bias = np.concatenate([np.hstack(fields[1:]) for _, fields in biases])
     yield EUROC_HEAD
     for stamps_ns, (position, orientation, velocity, _) in _blocks(reader, run, ODOMETRY):
-        x, y, z, w = orientation.T
-        world = attitude.in_body((-x, -y, -z, w), tuple(velocity.T))
+        world = attitude.in_world(tuple(orientation.T), tuple(velocity.T))
         # The bias of the last reading before the sample.
         newest = np.maximum(np.searchsorted(bias_ns, stamps_ns, 'right') - 1, 0)
-        yield from _csv(stamps_ns, position, np.column_stack((w, x, y, z)),
+        yield from _rows(',', stamps_ns, position, np.roll(orientation, 1, axis=1),
                         np.column_stack(world), bias[newest])
 
 
 def _euroc_imu(reader: LogReader, run: RunDescription) -> Iterator[str]:
     yield EUROC_IMU_HEAD
     for stamps_ns, (_, rates, force) in _blocks(reader, run, RAW):
-        yield from _csv(stamps_ns, rates, force)
+        yield from _rows(',', stamps_ns, rates, force)
 
 
-def _csv(stamps_ns: NDArray[np.int64], *columns: NDArray[np.float64]) -> Iterator[str]:
-    for stamp_ns, row in zip(stamps_ns.tolist(), np.hstack(columns).tolist(), strict=True):
-        yield f'{stamp_ns},{",".join(map(repr, row))}\n'
+def _rows(separator: str, stamps: Iterable[object],
+          *columns: NDArray[np.float64]) -> Iterator[str]:
+    for stamp, row in zip(stamps, np.hstack(columns).tolist(), strict=True):
+        yield f'{stamp}{separator}{separator.join(map(repr, row))}\n'
 
 
 def _kalibr(_: LogReader, run: RunDescription) -> Iterator[str]:
     values = run.values_in_effect
     content = {'rostopic': run.topics[RAW], 'update_rate': values['imu.rate'],
                **{name.removeprefix('imu.'): values[name] for name in KALIBR_NEEDS}}
-    force, rates, sensitivity = (values[f'imu.{name}'] for name in (
-        'accelerometer_M', 'gyroscope_M', 'gyroscope_A'))
-    if force != IDENTITY or rates != IDENTITY or any(sensitivity):
-        content |= {'model': 'scale-misalignment', 'accelerometers': {'M': _matrix(force)},
-                    'gyroscopes': {'M': _matrix(rates), 'A': _matrix(sensitivity),
-                                   'C_gyro_i': _matrix(IDENTITY)}}
     yield yaml.safe_dump(content, sort_keys=True, default_flow_style=None)
-
-
-def _matrix(rows: Sequence[float]) -> list[list[float]]:
-    return [list(rows[k:k + 3]) for k in (0, 3, 6)]
 
 
 def _blocks(reader: LogReader, run: RunDescription, topic: str,

@@ -28,7 +28,7 @@ from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import cli, export
 from spinning_top_sim.tools.recorded_run import RunDescription
 from spinning_top_sim.tools.survey import MotionReport, Survey, survey
-from spinning_top_sim.tools.verify import Verdict, verify
+from spinning_top_sim.tools.verify import Comparison, Verdict
 
 DEGREES = math.degrees(1.0)
 # Rows of the table of a motion: text, field of Description and Measured, factor.
@@ -64,11 +64,12 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     with LogReader(arguments.log) as reader:
-        found = survey(reader)
-        verdict = _verified(arguments, reader, found) if arguments.verify else None
-        if arguments.export and found.run is None:
-            raise ValueError(f'--export: {found.foreign_reason}')
-        exported = list(export.write(reader, found.run, arguments.export)) if found.run else []
+        found, verdict = survey(reader), None
+        exported: list[str] = []
+        if found.run is not None:
+            if arguments.verify:
+                verdict = _verified(arguments, reader, found, found.run)
+            exported += export.write(reader, found.run, arguments.export)
     if arguments.json:
         print(json.dumps(_as_json(found, verdict), indent=2, allow_nan=False))
     else:
@@ -76,46 +77,39 @@ def _run(arguments: argparse.Namespace) -> int:
             cli.print_line(line)
     for line in exported:
         cli.print_line(line, sys.stderr if arguments.json else None)
-    drawn = _draw(arguments, found)
-    verified = not arguments.verify or (verdict is not None and verdict.identical)
-    passed = found.whole and not found.damage.defects and verified and drawn
+    for option in ('verify', 'export'):
+        if found.run is None and getattr(arguments, option):
+            raise LogError(f'--{option}: {found.foreign_reason}')
+    _draw(arguments, found)
+    passed = found.whole and not found.damage.defects and (verdict is None or verdict.identical)
     return cli.OK if passed else cli.FAILED
 
 
-def _verified(arguments: argparse.Namespace, reader: LogReader, found: Survey) -> Verdict | None:
-    """Return the result of --verify, None for a log of another program."""
-    if found.run is None:
-        cli.print_line(f'inspect: --verify: {found.foreign_reason}', sys.stderr)
-        return None
+def _verified(arguments: argparse.Namespace, reader: LogReader, found: Survey,
+              run: RunDescription) -> Verdict:
     begin_ns, end_ns = found.damage.start_ns, found.end_ns
     with cli.progress('verified', (end_ns - begin_ns) / NANOSECONDS, 's',
                       quiet=arguments.json) as show:
-        return verify(reader, found.run, end_ns,
-                      lambda stamp_ns: show((stamp_ns - begin_ns) / NANOSECONDS))
+        return Comparison(run).compare(
+            reader, end_ns, lambda stamp_ns: show((stamp_ns - begin_ns) / NANOSECONDS))
 
 
-def _draw(arguments: argparse.Namespace, found: Survey) -> bool:
-    """Draw the pictures; return whether there was no error."""
+def _draw(arguments: argparse.Namespace, found: Survey) -> None:
+    """Draw the pictures.  Raises LogError, or OSError or ValueError for the name of a file."""
     if arguments.plot is None and arguments.animate is None:
-        return True
+        return
+    if found.shown is None:
+        raise LogError('nothing to draw: no attitude of a top in this log')
     try:
-        if found.shown is None:
-            raise ValueError('nothing to draw: no attitude of a top in this log')
         from spinning_top_sim.tools import plots  # noqa: PLC0415
-
-        motion, data = found.shown
-        if arguments.plot is not None:
-            plots.draw_page(found.path.name, motion, data, arguments.plot)
-        if arguments.animate is not None:
-            plots.animate(data, arguments.animate)
-        return True
     except ImportError as error:
-        reason = ("pictures need matplotlib: pip install 'spinning_top_sim[plot]', or "
-                  f'apt install python3-matplotlib ({error})')
-    except (OSError, ValueError) as error:
-        reason = str(error)
-    cli.print_line(f'inspect: {reason}', sys.stderr)
-    return False
+        raise LogError("pictures need matplotlib: pip install 'spinning_top_sim[plot]', or "
+                       f'apt install python3-matplotlib ({error})') from error
+    motion, data = found.shown
+    if arguments.plot is not None:
+        plots.draw_page(found.path.name, motion, data, arguments.plot)
+    if arguments.animate is not None:
+        plots.animate(motion, data, arguments.animate)
 
 
 def _as_json(found: Survey, verdict: Verdict | None) -> object:
@@ -129,18 +123,15 @@ def _as_json(found: Survey, verdict: Verdict | None) -> object:
         'duration': (damage.end_ns - damage.start_ns) / NANOSECONDS,
         'topics': {name: asdict(topic) for name, topic in found.topics.items()},
         'ours': run is not None, 'why_not_ours': found.foreign_reason or None,
-        'notes': [*_broken_entries(run), *found.notes],
-        'run': None, 'events': [], 'verify': None,
+        'notes': found.notes, 'run': None, 'events': [], 'verify': None,
         'motions': [{
             **_fields_of(motion, 'cause', 'begin_ns', 'end_ns', 'source'),
             'regime': motion.exact and motion.exact.name,
             **_fields_of(motion.segment, 'l3', 'lz', 'energy'),
             'exact': motion.exact and asdict(motion.exact),
             'measured': motion.measured and asdict(motion.measured)} for motion in found.motions],
-        'drifts': {topic: {name: series.largest for name, series in drifts.items()}
-                   for topic, drifts in found.drifts.items()},
-        'orientation_error': {topic: {'max': series.largest, 'rms': series.rms}
-                              for topic, series in found.errors.items()}}
+        'drifts': found.drifts,
+        'orientation_error': {topic: {'max': error} for topic, error in found.errors.items()}}
     if run is not None:
         content['run'] = {'parameters': run.values_at_start, 'seed': run.values_at_start['seed'],
                           **_fields_of(run, 'epoch_ns', 'begun_ns'), **run.surroundings}
@@ -155,11 +146,6 @@ def _as_json(found: Survey, verdict: Verdict | None) -> object:
 
 def _fields_of(source: object, *names: str) -> dict[str, object]:
     return {name: getattr(source, name) for name in names}
-
-
-def _broken_entries(run: RunDescription | None) -> list[str]:
-    return [f'journal, entry at {seconds(stamp_ns)}: {reason}'
-            for stamp_ns, reason in (run.broken if run else ())]
 
 
 def _as_text(found: Survey, verdict: Verdict | None) -> Iterator[str]:
@@ -184,26 +170,18 @@ def _as_text(found: Survey, verdict: Verdict | None) -> Iterator[str]:
            f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
            f'{counts["parameters"]} changes of parameters'
            + (f', {counts["state"]} states set' if counts['state'] else ''))
-    yield from _broken_entries(run)
     yield from found.notes
     for number, motion in enumerate(found.motions, start=1):
         yield from _motion(number, motion, damage.start_ns)
-    yield from _accuracy(found)
+    if found.errors or found.drifts:
+        yield from cli.table(
+            'largest relative drifts in a motion, orientation error against the exact solution '
+            '[rad]', ('from', 'E', 'L3', 'Lz', 'error'),
+            [(topic, *(_number(found.drifts.get(topic, {}).get(name), 2)
+                       for name in ('energy', 'l3', 'lz')), _number(found.errors.get(topic), 3))
+             for topic in found.topics if topic in {**found.drifts, **found.errors}])
     if verdict is not None:
         yield from _verdict(verdict)
-
-
-def _accuracy(found: Survey) -> Iterator[str]:
-    if found.drifts:
-        yield from cli.table(
-            'largest drifts since the start of each motion, relative', ('from', 'E', 'L3', 'Lz'),
-            [(topic, *(f'{series.largest:.2g}' for series in drifts.values()))
-             for topic, drifts in found.drifts.items()])
-    if found.errors:
-        yield from cli.table('orientation error against the exact solution [rad]',
-                             ('from', 'max', 'rms'),
-                             [(topic, f'{series.largest:.3g}', f'{series.rms:.3g}')
-                              for topic, series in found.errors.items()])
 
 
 def _topics(found: Survey) -> Iterator[str]:
@@ -214,10 +192,6 @@ def _topics(found: Survey) -> Iterator[str]:
     for name, topic in found.topics.items():
         for begin, end in topic.gaps_ns:
             yield f'gap: {name} from {seconds(begin)} to {seconds(end)}'
-        if topic.off_grid:
-            yield f'{name}: {topic.off_grid} stamps are not on the grid'
-        if topic.odd_size:
-            yield f'{name}: {topic.odd_size} messages do not have the size of this stream'
 
 
 def _motion(number: int, motion: MotionReport, begin_ns: int) -> Iterator[str]:

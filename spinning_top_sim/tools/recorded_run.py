@@ -4,12 +4,9 @@
 import contextlib
 import json
 import operator
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.recording.reader import LogReader, LogTopic
@@ -56,16 +53,8 @@ def field_names(stream: Stream) -> Sequence[str] | None:
     return FIELDS.get(stream.topic) or FIELDS.get(stream.type_name)
 
 
-# Takes messages of a stream: stamps (n,) [ns], and rows (n, size), valid until it returns.
-TakeRows = Callable[[Stream, NDArray[np.int64], NDArray[np.uint8]], object]
-
-
 class ForeignLogError(Exception):
     """A log lacks what is needed to compute its run again; the text says what."""
-
-
-class DepartureError(Exception):
-    """The computation cannot follow the journal; the text says where."""
 
 
 @dataclass(frozen=True)
@@ -177,14 +166,8 @@ def _topics(topics: Sequence[LogTopic], values: Mapping[str, Any]) -> dict[str, 
     if [topic.type_name for topic in topics] == [type_name for _, type_name in recorded]:
         return {name: topic.name for topic, (name, _) in zip(topics, recorded, strict=True)}
     known = [*((stream.topic, stream.type_name) for stream in every), *journal.TOPICS]
-    found: dict[str, str] = {}
-    for topic in topics:
-        names = [name for name, type_name in known
-                 if type_name == topic.type_name and name not in found
-                 and topic.name.endswith('/' + name.lstrip('~/'))]
-        if names:
-            found[max(names, key=len)] = topic.name
-    return found
+    return {name: topic.name for topic in reversed(topics) for name, type_name in known
+            if type_name == topic.type_name and topic.name.endswith('/' + name.lstrip('~/'))}
 
 
 def _event(stamp_ns: int, data: bytes) -> Event:
@@ -208,40 +191,37 @@ def _event(stamp_ns: int, data: bytes) -> Event:
     return Event(name, stamp_ns, t_ns, sent_ns, details)
 
 
-def rerun(run: RunDescription, end_ns: int,
-          send: TakeRows | None = None) -> Iterator[tuple[Simulation, Event | None]]:
+def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
+          ) -> Iterator[tuple[Simulation, Event | Block]]:
     """
-    Compute the run of a log again; yield it at the start, after each event and each block (None).
+    Compute the run of a log again; yield it at the start, after each event and after each block.
 
     end_ns : log time of the end [ns]
-    send : takes the messages of the log's streams in blocks; without it only motions are computed
+    samples : yield the messages of the log's streams in blocks; else only motions are computed
 
-    Raises DepartureError where there is no motion with these parameters and commands, or where it
+    Raises one of ODD where there is no motion with these parameters and commands, or where it
     takes far more work than a run that fits into the log.
     """
-    try:
-        yield from _Rerun(run, send).events(end_ns)
-    except ODD as error:
-        raise DepartureError(reason_of(error)) from error
+    return _Rerun(run, samples).events(end_ns)
 
 
 class _Rerun:
     """The computation of a run, within limits that the size of its log sets."""
 
-    def __init__(self, run: RunDescription, send: TakeRows | None) -> None:
-        self._run, self._send = run, send
+    def __init__(self, run: RunDescription, samples: bool) -> None:
+        self._run, self._samples = run, samples
         self._most_steps = LEAST_STEPS + STEPS_A_BYTE * run.log_bytes
         self._samples_left = LEAST_SAMPLES + SAMPLES_A_BYTE * run.log_bytes
         self._simulation = Simulation(run.values_at_start, run.epoch_ns)
 
-    def events(self, end_ns: int) -> Iterator[tuple[Simulation, Event | None]]:
+    def events(self, end_ns: int) -> Iterator[tuple[Simulation, Event | Block]]:
         simulation, run = self._simulation, self._run
         # Before the recording: the motion and its commands, no samples.
         for event in run.history:
-            self._move_to(event.t_ns)
+            yield from self._play(event.t_ns, ())
             _apply(simulation, event)
-        if self._send is not None:
-            self._move_to(run.begun_ns)
+        if self._samples:
+            yield from self._play(run.begun_ns, ())
         simulation.skip_to(run.begun_ns)
         at_once = {name for stream in simulation.streams for name in stream.at_once}
         simulation.apply({name: run.values_at_recording[name] for name in at_once})
@@ -250,41 +230,31 @@ class _Rerun:
         # The journal: samples up to each event that acts on them, and up to the end.
         for event in run.events:
             if event.name in ('reset', *FIELDS_OF) or not at_once.isdisjoint(event.details):
-                yield from self._samples_up_to(event.sent_ns, event.name in FIELDS_OF)
+                yield from self._up_to(event.sent_ns, event.name in FIELDS_OF)
                 _apply(simulation, event)
                 yield simulation, event
-        yield from self._samples_up_to(end_ns - simulation.epoch_ns, False)
+        yield from self._up_to(end_ns - simulation.epoch_ns, False)
 
-    def _move_to(self, t_ns: int) -> None:
-        for _ in self._blocks(t_ns, ()):
-            pass
+    def _up_to(self, t_ns: int, moves: bool) -> Iterator[tuple[Simulation, Block]]:
+        """Compute the samples up to a time; `moves`: let the motion reach it in any case."""
+        streams = [stream for stream in self._simulation.streams
+                   if self._samples and stream.topic in self._run.topics]
+        if streams or moves:
+            yield from self._play(t_ns, streams)
+        self._simulation.skip_to(t_ns)
 
-    def _samples_up_to(self, t_ns: int, moves: bool) -> Iterator[tuple[Simulation, None]]:
-        """Send the samples up to a time; `moves`: let the motion reach it in any case."""
-        simulation = self._simulation
-        if self._send is not None:
-            streams = [one for one in simulation.streams if one.topic in self._run.topics]
-            self._samples_left -= sum(len(one.times(simulation.now_ns, t_ns)) for one in streams)
-            if self._samples_left < 0:
-                raise DepartureError(f'a log of {self._run.log_bytes} bytes lacks most samples of '
-                                     'this run')
-            for block in self._blocks(t_ns, streams):
-                for stream, sent_ns, rows in block.parts:
-                    self._send(stream, simulation.epoch_ns + sent_ns, rows)
-                yield simulation, None
-        elif moves:
-            self._move_to(t_ns)
-        simulation.skip_to(t_ns)
-
-    def _blocks(self, t_ns: int, streams: Sequence[Stream]) -> Iterator[Block]:
-        """Yield the blocks up to a time, as far as the equations and the limit of steps go."""
+    def _play(self, t_ns: int, streams: Sequence[Stream]) -> Iterator[tuple[Simulation, Block]]:
+        """Yield the blocks up to a time, as far as the equations and the limits go."""
+        simulation, log_bytes = self._simulation, self._run.log_bytes
+        self._samples_left -= sum(len(one.times(simulation.now_ns, t_ns)) for one in streams)
+        if self._samples_left < 0:
+            raise ValueError(f'a log of {log_bytes} bytes lacks most samples of this run')
         with contextlib.suppress(IntegrationError):
-            for block in self._simulation.play(streams, t_ns):
-                yield block
-                if self._simulation.steps > self._most_steps:
-                    raise DepartureError(
-                        f'over {self._most_steps} integration steps are too many for a log of '
-                        f'{self._run.log_bytes} bytes')
+            for block in simulation.play(streams, t_ns):
+                yield simulation, block
+                if simulation.steps > self._most_steps:
+                    raise ValueError(f'over {self._most_steps} integration steps are too many for '
+                                     f'a log of {log_bytes} bytes')
 
 
 def _apply(simulation: Simulation, event: Event) -> None:

@@ -26,7 +26,6 @@ from spinning_top_sim.recording.salvage import recover
 from spinning_top_sim.tools import cli
 
 SOME_LOST, TERMINATED = 3, 143
-PROGRESS_BYTES = 50_000_000     # smaller files are done before one could read the progress
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -49,16 +48,15 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     log: Path = arguments.log
     output: Path = arguments.output or log.parent / f'{log.stem}_recovered.mcap'
-    with LogReader(log) as reader, cli.progress(
-            'recovered', reader.size, 'bytes', quiet=reader.size < PROGRESS_BYTES) as show:
-        recovered = recover(reader, output, lambda done, total: show(done))
-    lossless = recovered.damage.lossless
-    for line in recovered.damage.lines():
+    with LogReader(log) as reader, cli.progress('recovered', reader.size, 'bytes') as show:
+        recovered = recover(reader, output, show)
+    damage = reader.damage
+    for line in damage.lines():
         cli.print_line(line)
-    cli.print_line(f'kept{" all" * lossless}: {count(recovered.messages, "message")} in '
-               f'{count(recovered.chunks, "chunk")}, {count(recovered.bytes, "byte")} in '
-               f'{recovered.path}')
-    return cli.OK if lossless else SOME_LOST
+    cli.print_line(f'kept{" all" * damage.lossless}: {count(recovered.messages, "message")} in '
+                   f'{count(recovered.chunk_count, "chunk")}, {count(recovered.size, "byte")} in '
+                   f'{output}')
+    return cli.OK if damage.lossless else SOME_LOST
 
 
 if __name__ == '__main__':

@@ -26,6 +26,7 @@ from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
+from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Encoded, Samples, Stream, period_ns
@@ -96,9 +97,10 @@ def _run(arguments: argparse.Namespace) -> int:
         else:
             table = Table(period_ns(values['pose.rate']))
             write = _write_csv if file_format == 'csv' else _write_parquet
-            write(output, _rows(simulation, table, stops, show))
-            rows = len(table.times(-1, stops[-1][0]))
-            summary = f'{rows} rows of {", ".join(UNITS)}'
+            # A command changes the rows after its time.
+            write(output, (rows for done in _play(simulation, [table], stops, show)
+                           if isinstance(done, Block) for _, _, rows in done.parts))
+            summary = ', '.join(UNITS)
     lines = [f'{output}: {summary}']
     if arguments.export:
         with LogReader(output) as reader:
@@ -141,14 +143,25 @@ def _parse_stops(commands: Sequence[str], duration_ns: int) -> list[Stop]:
     return [*sorted(stops, key=lambda stop: stop[0]), (duration_ns, None)]
 
 
-def _command(simulation: Simulation, l3: float, lz: float) -> None:
-    """Apply a command.  Raises IntegrationError where the state then cannot take it."""
-    try:
-        simulation.command(l3, lz)
-    except ValueError as error:
-        t = simulation.now_ns / NANOSECONDS
-        raise IntegrationError(f'--command {t!r}:{l3!r}:{lz!r}: {error}; the file holds the run '
-                               f'up to t = {t!r} s') from error
+def _play(simulation: Simulation, streams: Sequence[Stream], stops: Sequence[Stop],
+          show: Callable[[float], object]) -> Iterator[Block | tuple[float, float]]:
+    """
+    Yield the blocks up to each stop, then L3 and Lz of its command, which has been applied.
+
+    Raises IntegrationError where the state cannot take a command.
+    """
+    for stop_ns, momenta in stops:
+        for block in simulation.play(streams, stop_ns):
+            yield block
+            show(simulation.now_ns / NANOSECONDS)
+        if momenta is not None:
+            try:
+                simulation.command(*momenta)
+            except ValueError as error:
+                t, (l3, lz) = simulation.now_ns / NANOSECONDS, momenta
+                raise IntegrationError(f'--command {t!r}:{l3!r}:{lz!r}: {error}; the file holds '
+                                       f'the run up to t = {t!r} s') from error
+            yield momenta
 
 
 def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
@@ -168,14 +181,12 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
         provenance(values, epoch_ns, -1, (), values), compression=values['record.compression'])
     try:
         file.append(events_topic, epoch_ns, journal.event('start', 0, -1))
-        for stop_ns, momenta in stops:
-            for block in simulation.play(streams, stop_ns):
+        for done in _play(simulation, streams, stops, show):
+            if isinstance(done, Block):
                 file.append_rows([(streams.index(stream), epoch_ns + t_ns, rows)
-                                  for stream, t_ns, rows in block.parts])
-                show(simulation.now_ns / NANOSECONDS)
-            if momenta is not None:
-                _command(simulation, *momenta)
-                t_ns, (l3, lz) = simulation.now_ns, momenta
+                                  for stream, t_ns, rows in done.parts])
+            else:
+                t_ns, (l3, lz) = simulation.now_ns, done
                 file.append(events_topic, epoch_ns + t_ns, journal.event(
                     'command', t_ns, t_ns, l3=l3, lz=lz))
                 file.append(commands_topic, epoch_ns + t_ns, journal.command(l3, lz))
@@ -184,7 +195,7 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
             file.write_chunk()
         finally:
             file.finish()
-    return f'{sum(file.message_counts.values())} messages, {file.size / 1e6:.1f} MB'
+    return f'{file.messages} messages, {file.size / 1e6:.1f} MB'
 
 
 class Table(Stream):
@@ -202,17 +213,6 @@ class Table(Stream):
             states.psi, states.psi_dot, *states.quaternion.T, *states.angular_velocity.T,
             states.energy, states.l3, states.lz)
         return samples.t_ns, np.stack(columns, axis=-1)
-
-
-def _rows(simulation: Simulation, table: Table, stops: Sequence[Stop],
-          show: Callable[[float], object]) -> Iterator[NDArray[np.float64]]:
-    """Yield blocks (n, columns) of the table.  A command changes the rows after its time."""
-    for stop_ns, momenta in stops:
-        for block in simulation.play([table], stop_ns):
-            yield from (rows for _, _, rows in block.parts)
-            show(simulation.now_ns / NANOSECONDS)
-        if momenta is not None:
-            _command(simulation, *momenta)
 
 
 def _write_csv(path: Path, blocks: Iterable[NDArray[np.float64]]) -> None:

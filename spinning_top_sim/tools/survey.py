@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.attitude import angle_between
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import relative_drift
-from spinning_top_sim.recording.damage import Damage
+from spinning_top_sim.recording.damage import Damage, seconds
 from spinning_top_sim.recording.reader import LogMessage, LogReader
+from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.path import Segment
@@ -50,32 +51,8 @@ class TopicReport:
     rate: float | None = None             # mean [Hz]
     grid_rate: float | None = None        # by the parameters [Hz]
     missing: int | None = None            # samples of the grid that are not in the log
-    off_grid: int = 0                     # stamps beside the grid
     # The first gaps: log times of the first and the last missing sample [ns]
     gaps_ns: list[tuple[int, int]] = field(default_factory=list)
-    odd_size: int = 0                     # messages that do not have the size of the stream
-    longest_step_ns: int = 0              # between two messages
-
-
-@dataclass
-class Series:
-    """The largest value and the root mean square of a long series."""
-
-    largest: float = 0.0
-    square_sum: float = 0.0
-    count: int = 0
-
-    def add(self, values: Rows) -> None:
-        """Append the values that are finite."""
-        sizes = np.abs(values[np.isfinite(values)])
-        self.largest = max(self.largest, float(np.max(sizes, initial=0.0)))
-        self.square_sum += float(sizes @ sizes)
-        self.count += len(sizes)
-
-    @property
-    def rms(self) -> float:
-        """Root mean square; NaN without values."""
-        return math.sqrt(self.square_sum / self.count) if self.count else math.nan
 
 
 @dataclass
@@ -125,9 +102,10 @@ class Survey:
     run: RunDescription | None = None     # None for a log that this package did not record
     foreign_reason: str = ''              # why it is None
     motions: list[MotionReport] = field(default_factory=list)
-    # Drifts of energy, l3 and lz since the begin of the motion by topic, relative if not from 0
-    drifts: dict[str, dict[str, Series]] = field(default_factory=dict)
-    errors: dict[str, Series] = field(default_factory=dict)     # of attitudes by topic [rad]
+    # By topic, the largest drifts of energy, l3 and lz since the begin of the motion, relative if
+    # not from 0, and the largest error of an attitude [rad]
+    drifts: dict[str, dict[str, float]] = field(default_factory=dict)
+    errors: dict[str, float] = field(default_factory=dict)
     # For pictures: the first motion with samples, and the first of these
     shown: tuple[MotionReport, Attitudes] | None = None
     notes: list[str] = field(default_factory=list)
@@ -159,13 +137,15 @@ def survey(reader: LogReader) -> Survey:
 
 
 def _follow_run(found: Survey, run: RunDescription) -> None:
-    """Compute the motions of a run; add a note if it cannot be followed to its end."""
+    """Compute the motions of a run; add notes about what cannot be followed."""
+    found.notes += [f'journal, entry at {seconds(stamp_ns)}: {reason}'
+                    for stamp_ns, reason in run.broken]
     for name, topic in run.topics.items():
         found.topics[topic].stream = name
     motions = found.motions
     try:
         for simulation, event in recorded_run.rerun(run, found.damage.end_ns):
-            if event is None:
+            if isinstance(event, Block):
                 continue
             if motions:
                 last = motions[-1].sections[-1]
@@ -181,7 +161,7 @@ def _follow_run(found: Survey, run: RunDescription) -> None:
                     Imu(simulation.values)))
             motions[-1].sections.append(Section(begin_ns, begin_ns, simulation.epoch_ns, {
                 topic: stream.period_ns for topic, stream in streams.items()}))
-    except (recorded_run.DepartureError, *ODD) as error:
+    except ODD as error:
         found.notes.append(f'the run cannot be followed beyond here: {reason_of(error)}')
     if len(motions) > MOST_EXACT:
         found.notes.append(f'only the first {MOST_EXACT} motions are compared with the exact one')
@@ -219,7 +199,6 @@ def _analyse(found: Survey, motion: MotionReport, topic: str, samples: list[LogM
     """Compare samples of a stream with their motion."""
     stream, segment = motion.streams[topic], motion.segment
     fitting = [sample for sample in samples if len(sample.data) == len(stream.template)]
-    found.topics[topic].odd_size += len(samples) - len(fitting)
     stamps_ns = _stamps(fitting)
     fields = stream.template.decode(b''.join(sample.data for sample in fitting))
     data = analysis.attitudes_of(stream.topic, motion.imu, stamps_ns, fields)
@@ -229,21 +208,26 @@ def _analyse(found: Survey, motion: MotionReport, topic: str, samples: list[LogM
         motion.samples.append((data.stamps_ns, data.rows))
     values = data.constants(segment.solver.top)
     if values is not None and stream.topic != 'imu/data':       # which is noisy
-        drifts = found.drifts.setdefault(topic, {key: Series() for key in ('energy', 'l3', 'lz')})
-        for series, value, start in zip(
-                drifts.values(), values, (segment.energy, segment.l3, segment.lz), strict=True):
-            series.add(relative_drift(value, start))
+        drifts = found.drifts.setdefault(topic, {'energy': 0.0, 'l3': 0.0, 'lz': 0.0})
+        for (name, largest), value in zip(drifts.items(), values, strict=True):
+            drift = relative_drift(value, getattr(segment, name))
+            drifts[name] = max(largest, _largest(drift))
     if motion.exact is not None and (exact := segment.exact) is not None:
         times_ns = np.clip(data.stamps_ns - motion.origin_ns, -exact.ns_limit, exact.ns_limit)
         truth = exact.states(times_ns).rows_quaternion
-        found.errors.setdefault(topic, Series()).add(angle_between(data.quaternion, truth))
+        error = _largest(angle_between(data.quaternion, truth))
+        found.errors[topic] = max(found.errors.get(topic, 0.0), error)
+
+
+def _largest(values: Rows) -> float:
+    """Return the largest absolute value of those that are finite, 0 without any."""
+    return float(np.max(np.abs(values), where=np.isfinite(values), initial=0.0))
 
 
 def _count(report: TopicReport, stamps_ns: Stamps, sections: list[Section], topic: str) -> None:
     """Count the messages of a topic; compare those of a stream with the grid of each section."""
     report.count = len(stamps_ns)
     if report.count > 1:
-        report.longest_step_ns = int(np.max(np.diff(stamps_ns)))
         duration_ns = int(stamps_ns[-1] - stamps_ns[0])
         report.rate = (report.count - 1) / duration_ns * 1e9 if duration_ns else None
     for section in sections:
@@ -254,7 +238,6 @@ def _count(report: TopicReport, stamps_ns: Stamps, sections: list[Section], topi
                        for at_ns in (section.begin_ns, section.end_ns))
         is_on_grid = (here - epoch_ns) % period_ns == 0
         report.grid_rate = NANOSECONDS / period_ns
-        report.off_grid += int(np.count_nonzero(~is_on_grid))
         # A sample that is there twice does not replace a missing one.
         report.missing = (report.missing or 0) + last - first - len(np.unique(here[is_on_grid]))
         edges_ns = np.array([first * period_ns + epoch_ns, *here,

@@ -25,11 +25,10 @@ def arguments(values: Mapping[str, Any]) -> dict[str, str]:
     world, body, imu = (values[name] for name in FRAMES)
     prefix = body[:body.rfind('/') + 1]         # a/base_link, a/nutation_link
     between = [f'{prefix}precession_link', f'{prefix}nutation_link']
-    for name, value, others in (('world_frame', world, [body, imu, *between]),
-                                ('body_frame', body, between), ('imu.frame_id', imu, between)):
-        if value in others:
-            raise ValueError(f'{name} = {value!r}: must be another name than those of the '
-                             f'other frames of the robot description, {", ".join(others)}')
+    others = [world, *between]
+    if body in others or imu in others or world in between:
+        raise ValueError(f'{", ".join(FRAMES)} = {world!r}, {body!r}, {imu!r}: must be different '
+                         f'from each other and from {", ".join(between)}')
     if imu == body and any((*values['imu.lever_arm'], *values['imu.rpy'])):
         raise ValueError(f'imu.frame_id = {imu!r}: must not be the body_frame where '
                          'imu.lever_arm or imu.rpy is not zero')

@@ -3,26 +3,18 @@
 
 import math
 import operator
-import re
 import struct
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import journal
+from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.stream import Stream
-from spinning_top_sim.tools.recorded_run import (
-    DepartureError,
-    RunDescription,
-    field_names,
-    rerun,
-)
+from spinning_top_sim.tools.recorded_run import ODD, RunDescription, field_names, reason_of, rerun
 
 
 class Difference(NamedTuple):
@@ -58,13 +50,7 @@ class Verdict:
         self.first = min(self.first or this, this, key=operator.attrgetter('stamp_ns'))
 
 
-def verify(reader: LogReader, run: RunDescription, end_ns: int,
-           show: Callable[[int], None]) -> Verdict:
-    """Compute a run again up to a log time, and compare; `show` takes the one reached [ns]."""
-    return _Comparison(run).compare(reader, end_ns, show)
-
-
-class _Comparison:
+class Comparison:
     """Computes the run of a log while the log is read in the order of time."""
 
     def __init__(self, run: RunDescription) -> None:
@@ -76,6 +62,7 @@ class _Comparison:
             tuple[int, str], deque[tuple[Stream | None, bytes]]] = defaultdict(deque)
 
     def compare(self, reader: LogReader, end_ns: int, show: Callable[[int], None]) -> Verdict:
+        """Return the result up to a log time; `show` takes the one reached [ns]."""
         run, verdict = self._run, self._verdict
         for stamp_ns, reason in run.broken:
             verdict.different += 1
@@ -93,25 +80,24 @@ class _Comparison:
 
     def _compute(self, end_ns: int, show: Callable[[int], None]) -> Iterator[float]:
         """Compute the run; yield the log times before which all is computed, at last infinity."""
-        commands = self._run.commands_topic
+        topics, commands, computed = self._run.topics, self._run.commands_topic, self._computed
         try:
-            for simulation, event in rerun(self._run, end_ns, self._take):
-                if commands is not None and event is not None and event.name == 'command':
-                    self._computed[event.stamp_ns, commands].append(
+            for simulation, event in rerun(self._run, end_ns, samples=True):
+                if isinstance(event, Block):
+                    for stream, times_ns, rows in event.parts:
+                        for t_ns, row in zip(times_ns.tolist(), rows, strict=True):
+                            computed[simulation.epoch_ns + t_ns, topics[stream.topic]].append(
+                                (stream, row.tobytes()))
+                elif commands is not None and event.name == 'command':
+                    computed[event.stamp_ns, commands].append(
                         (None, journal.command(event.details['l3'], event.details['lz'])))
                 reached_ns = simulation.epoch_ns + simulation.now_ns
                 show(reached_ns)
                 # Not up to it: another command at this very time may follow.
                 yield reached_ns
-        except DepartureError as error:
-            self._verdict.stopped = str(error)
+        except ODD as error:
+            self._verdict.stopped = reason_of(error)
         yield math.inf
-
-    def _take(self, stream: Stream, stamps_ns: NDArray[np.int64],
-              rows: NDArray[np.uint8]) -> None:
-        for stamp_ns, row in zip(stamps_ns.tolist(), rows, strict=True):
-            self._computed[stamp_ns, self._run.topics[stream.topic]].append(
-                (stream, row.tobytes()))
 
     def _meet(self, key: tuple[int, str], data: bytes) -> None:
         """Compare a message of the log with the computed one of its stamp and topic."""
@@ -158,11 +144,5 @@ def _difference(key: tuple[int, str], stream: Stream | None, logged: bytes,
 
 def _warnings(run: RunDescription) -> list[str]:
     """Return the differences of this machine from that of the recording."""
-    now, found = provenance.surroundings(), []
-    for what, key, pattern in (('the version of spinning_top_sim', 'version', '.*'),
-                               ('the platform', 'platform', '.*'),
-                               ('numpy', 'libraries', '"numpy": "[^"]*"')):     # only it computes
-        then, here = (''.join(re.findall(pattern, one[key])) for one in (run.surroundings, now))
-        if then != here:
-            found.append(f'{what} was {then}, is {here}')
-    return found
+    return [f'{what} was {run.surroundings[what]}, is {here}'
+            for what, here in provenance.surroundings().items() if run.surroundings[what] != here]

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import recorded_run
 from spinning_top_sim.view.page import CATCH_UP_S, RATE, Page, set_value
@@ -38,7 +39,7 @@ def _read_log(path: Path, name: str) -> Track:
         _read_samples(reader, track, run.topics)
         try:
             _follow_run(track, run, reader.span[1])
-        except (recorded_run.DepartureError, *recorded_run.ODD) as error:
+        except recorded_run.ODD as error:
             notes.append(f'the run cannot be followed: {recorded_run.reason_of(error)}')
     if not len(track.attitudes.rows):
         raise LogError(f'{path}: no attitude of a top in it')
@@ -64,7 +65,7 @@ def _read_samples(reader: LogReader, track: Track, topics: Mapping[str, str]) ->
 def _follow_run(track: Track, run: recorded_run.RunDescription, end_ns: int) -> None:
     """Compute the run again to find its motions and commands."""
     for simulation, event in recorded_run.rerun(run, end_ns):
-        if event is None or event.name == 'parameters':
+        if isinstance(event, Block) or event.name == 'parameters':
             continue
         begin_ns = simulation.epoch_ns + max(simulation.now_ns, 0)
         track.motions.append(DescribedMotion.of(

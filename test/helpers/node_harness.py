@@ -8,7 +8,6 @@ speed of the machine decides nothing.
 
 from __future__ import annotations
 
-import array
 import contextlib
 import functools
 import itertools
@@ -23,11 +22,9 @@ import time
 from pathlib import Path
 
 import rclpy
-import yaml
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import (
     GetParameters,
-    ListParameters,
     SetParameters,
     SetParametersAtomically,
 )
@@ -294,19 +291,6 @@ class Peer:
         answer = self.call(GetParameters, node.topic('~/get_parameters'),
                            GetParameters.Request(names=list(names)), again=True)
         return [parameter_value_to_python(value) for value in answer.values]
-
-    def dump(self, node):
-        """Return all parameters as `ros2 param dump` writes them, nested at the dots."""
-        listed = self.call(ListParameters, node.topic('~/list_parameters'),
-                           ListParameters.Request()).result.names
-        tree = {}
-        for name, value in zip(listed, self.get(node, *listed), strict=True):
-            *path, leaf = name.split('.')
-            branch = tree
-            for part in path:
-                branch = branch.setdefault(part, {})
-            branch[leaf] = list(value) if isinstance(value, array.array) else value
-        return yaml.dump({node.name: {'ros__parameters': tree}}, default_flow_style=False)
 
     def send_command(self, node, *data):
         """Publish on ~/commands, where `introduce` was called before."""

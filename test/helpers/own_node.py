@@ -17,7 +17,20 @@ from helpers.node_harness import as_yaml, numbers, wait_for
 from spinning_top_sim.nodes.simulator import Simulator
 
 
-class OwnNode:
+class InThisProcess:
+    """What is made with `node` runs within the `with`."""
+
+    def __enter__(self):
+        self.node.start()
+        return self
+
+    def __exit__(self, *_):
+        self.node.stop()
+        self.node.destroy_node()
+        rclpy.try_shutdown()
+
+
+class OwnNode(InThisProcess):
     """
     The node; it runs within the `with`.  In keywords `__` stands for a dot.
 
@@ -35,15 +48,6 @@ class OwnNode:
         self.loop, self.simulation = self.node.loop, self.node.simulation
         self.heard, self._diagnosed = {}, []
         self.node._diagnostics = SimpleNamespace(publish=self._diagnosed.append)
-
-    def __enter__(self):
-        self.node.start()
-        return self
-
-    def __exit__(self, *_):
-        self.node.stop()
-        self.node.destroy_node()
-        rclpy.try_shutdown()
 
     def listen(self, *topics):
         """Let these streams, and no others, have a subscriber."""

@@ -8,7 +8,7 @@ support: they cannot be sent.  Where the package is installed, a test compares t
 
 from types import MappingProxyType, ModuleType, SimpleNamespace
 
-from geometry_msgs.msg import Accel, Pose, Twist, Vector3
+from geometry_msgs.msg import Accel, Pose, Twist
 from std_msgs.msg import Header
 
 
@@ -67,8 +67,7 @@ SimulatorFeatures = message(
 EntityCategory = message('EntityCategory', {'category': int}, CATEGORY_DYNAMIC_OBJECT=4,
                          CATEGORY_STATIC_OBJECT=5,
                          **numbered('CATEGORY_OBJECT CATEGORY_ROBOT CATEGORY_HUMAN'))
-Bounds = message('Bounds', {'type': int, 'points': [Vector3]}, **numbered(
-    'TYPE_EMPTY TYPE_BOX TYPE_CONVEX_HULL TYPE_SPHERE'))
+Bounds = message('Bounds', {'type': int}, TYPE_EMPTY=0)
 TagsFilter = message('TagsFilter', {'tags': [str], 'filter_mode': int}, **numbered(
     'FILTER_MODE_ANY FILTER_MODE_ALL'))
 EntityFilters = message('EntityFilters', {
@@ -77,12 +76,9 @@ EntityInfo = message('EntityInfo', {
     'category': EntityCategory, 'description': str, 'tags': [str]})
 EntityState = message('EntityState', {
     'header': Header, 'pose': Pose, 'twist': Twist, 'acceleration': Accel})
-Resource = message('Resource', {'uri': str, 'resource_string': str})
-WorldResource = message('WorldResource', {
-    'name': str, 'world_resource': Resource, 'description': str, 'tags': [str]})
 
 MESSAGES = (Result, SimulationState, SimulatorFeatures, EntityCategory, Bounds, TagsFilter,
-            EntityFilters, EntityInfo, EntityState, Resource, WorldResource)
+            EntityFilters, EntityInfo, EntityState)
 FILTERED, NAMED = {'filters': EntityFilters}, {'entity': str}
 SERVICES = {
     'GetSimulatorFeatures': service(response={'features': SimulatorFeatures}, result=False),
@@ -99,17 +95,6 @@ SERVICES = {
     'SetEntityState': service({**NAMED, 'state': EntityState, 'set_pose': bool, 'set_twist': bool,
                                'set_acceleration': bool}, codes={'INVALID_POSE': 101}),
     'GetEntityInfo': service(NAMED, {'info': EntityInfo}),
-    'GetEntityBounds': service(NAMED, {'bounds': Bounds}),
-    'GetAvailableWorlds': service(
-        {'additional_sources': [str], 'filter': TagsFilter, 'offline_only': bool,
-         'continue_on_error': bool}, {'worlds': [WorldResource]},
-        codes={'DEFAULT_SOURCES_FAILED': 101}),
-    'LoadWorld': service(
-        {'world_resource': Resource, 'fail_on_unsupported_element': bool,
-         'ignore_missing_or_unsupported_assets': bool}, {'world': WorldResource},
-        codes=numbered('UNSUPPORTED_FORMAT NO_RESOURCE RESOURCE_PARSE_ERROR MISSING_ASSETS '
-                       'UNSUPPORTED_ASSETS UNSUPPORTED_ELEMENTS', 101)),
-    'GetCurrentWorld': service(response={'world': WorldResource}, codes={'NO_WORLD_LOADED': 101}),
 }
 ACTIONS = {'SimulateSteps': SimpleNamespace(
     Goal=message('Goal', {'steps': int}), Result=message('Result', {'result': Result}),
