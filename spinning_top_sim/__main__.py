@@ -11,7 +11,9 @@ from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from types import ModuleType
 
-# Name: the module that has it, and what it does.
+from spinning_top_sim.installation import version
+
+# Name: the module with its `main` and `add_arguments`, and what it does.
 COMMANDS = {
     'node': ('nodes.sim_node', 'simulate a top in real time as a ROS 2 node'),
     'replay': ('nodes.replay_node', 'publish the messages of a log as a ROS 2 node'),
@@ -44,18 +46,11 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         'spinning-top', description='Simulate the heavy symmetric top, with exact truth.',
         epilog='spinning-top COMMAND --help tells the options of a command.')
-    parser.add_argument('--version', action=_Version, nargs=0, help='print the version, then end')
+    parser.add_argument('--version', action='version', version=f'%(prog)s {version()}')
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
     for name, (_, what) in COMMANDS.items():
         commands.add_parser(name, help=what, add_help=False)
     return parser
-
-
-class _Version(argparse.Action):
-    def __call__(self, *_: object) -> None:
-        from spinning_top_sim.recording.provenance import version  # noqa: PLC0415
-        print('spinning-top', version('spinning_top_sim'))
-        sys.exit()
 
 
 def _complete() -> None:

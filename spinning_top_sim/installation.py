@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is installed: the version, the shared files, and how to install what is missing."""
 
+import contextlib
 import re
 import sys
+from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 
@@ -29,7 +31,24 @@ def share() -> Path:
         for candidate in (folder / 'share' / NAME, folder):
             if (candidate / 'package.xml').is_file() and (candidate / 'config').is_dir():
                 return candidate
-    raise FileNotFoundError(f'{NAME} is not completely installed: no share/{NAME} beside {package}')
+    raise FileNotFoundError(f'{NAME} is installed without its files: there is no share/{NAME} '
+                            f'above {package}')
+
+
+@contextlib.contextmanager
+def needed(what: str, wanted: str = '') -> Iterator[None]:
+    """
+    Import what not every user has: an ImportError then says how to install it.
+
+    what : what needs it
+    wanted : as in `remedy`; by default the library that is missing
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise ImportError(f'{what} needs {error.name}, which is not installed: '
+                          f'{remedy(wanted or str(error.name))}'
+                          ) from error
 
 
 def remedy(wanted: str) -> str:
@@ -38,31 +57,17 @@ def remedy(wanted: str) -> str:
 
     wanted : an extra of the package, or the name of one library that it requires
     """
-    lines = [requirement.strip() for requirement, _, condition in
-             (line.partition(';') for line in metadata.requires(NAME) or ())
-             if re.findall(r'[\w.-]+', condition)[1:] == [wanted]
-             or re.match(r'[\w.-]+', requirement)[0] == wanted]
-    return f'{sys.executable} -m pip install ' + ' '.join(f"'{line}'" for line in lines or [wanted])
-
-
-def parameter_file(kind: str, name: str) -> Path:
-    """
-    Return a parameter file of the package by its name, or the file itself if it is a path.
-
-    kind : 'scene' or 'imu'
-
-    Raises ValueError for a name that is not there.
-    """
-    if '/' in name or name.endswith('.yaml'):
-        return Path(name)
-    files = parameter_files(kind)
-    if name not in files:
-        raise ValueError(f'--{kind} {name}: must be the path of a file, or one of '
-                         f'{", ".join(files)}')
-    return files[name]
+    lines = []
+    for line in metadata.requires(NAME) or ():
+        requirement, _, condition = (part.strip() for part in line.partition(';'))
+        library, *_ = re.split('[^\\w.-]', requirement)
+        if library == wanted or re.findall(r'[\w.-]+', condition)[1:] == [wanted]:
+            lines.append(requirement)
+    quoted = (f"'{line}'" for line in lines or [wanted])
+    return f'{sys.executable} -m pip install {" ".join(quoted)}'
 
 
 def parameter_files(kind: str) -> dict[str, Path]:
-    """Return the scenes or IMUs that are installed, by name."""
+    """Return the parameter files that are installed, by name: kind 'scene' or 'imu'."""
     folder = share() / 'config' / {'scene': '', 'imu': 'imu'}[kind]
     return {path.stem: path for path in sorted(folder.glob('*.yaml'))}

@@ -199,7 +199,7 @@ def test_the_same_command_goes_on_after_an_interruption(whole, tmp_path, ensembl
         os.killpg(running.pid, signal.SIGINT)           # as a terminal does
         _, said = running.communicate(timeout=PATIENCE)
     assert running.returncode == 130
-    assert said == 'ensemble: interrupted\n'
+    assert said == 'spinning-top ensemble: interrupted\n'
     assert not json.loads((folder / 'manifest.json').read_text())['complete']
     torn, *kept = sorted((folder / 'data').iterdir())
     assert 2 <= len(kept) < RUNS // 2
@@ -226,7 +226,8 @@ def test_a_cluster_whose_scheduler_is_killed(whole, tmp_path, capsys):
 
         with meanwhile(kill):
             assert main([str(whole[1]), '-o', str(folder), '--scheduler', address]) == 1
-    assert capsys.readouterr().err.splitlines()[-1] == 'ensemble: the scheduler is lost'
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        'spinning-top ensemble: the scheduler is lost')
 
 
 def test_a_row_alone_is_computed_from_the_manifest(whole, tmp_path):
@@ -250,7 +251,8 @@ def test_failed_runs_are_told_with_their_reason(tmp_path, capsys, ensemble):
     for _ in range(2):
         assert ensemble(path, '-o', folder) == 0
         said = capsys.readouterr().err
-        assert said.startswith('ensemble: 3 of 6 runs failed, see manifest.json; run 3: ValueErr')
+        assert said.startswith('spinning-top ensemble: '
+                               '3 of 6 runs failed, see manifest.json; run 3: ValueErr')
         assert said.count('\n') == 1
         failed = json.loads((folder / 'manifest.json').read_text())['failed']
         assert list(failed) == ['3', '4', '5']
@@ -351,7 +353,7 @@ def test_a_bad_specification_is_refused_and_makes_nothing(tmp_path, capsys, chan
     code = main([str(path), '-o', str(tmp_path / 'out')])
     error = capsys.readouterr().err
     assert said in error
-    assert error.startswith('ensemble: ') and error.count('\n') == 1
+    assert error.startswith('spinning-top ensemble: ') and error.count('\n') == 1
     assert code == (1 if 'No such file' in said else 2)
     assert not (tmp_path / 'out').exists()
 
@@ -389,7 +391,8 @@ def test_what_is_no_manifest_is_refused(tmp_path, capsys):
     place.write_text('{"versions": 1, "specification": {"runs": 1, "duration": 1.0}}')
     assert main([str(tmp_path), '--row', '0', '-o', str(tmp_path / 'one.mcap')]) == 2
     error = capsys.readouterr().err
-    assert error.startswith(f'ensemble: {place} is no manifest') and error.count('\n') == 1
+    assert error.startswith('spinning-top ensemble: '
+                            f'{place} is no manifest') and error.count('\n') == 1
 
 
 @pytest.mark.parametrize(('arguments', 'said'), [

@@ -72,7 +72,7 @@ def test_a_node_that_runs_gets_one_run_after_the_other(run, running, monkeypatch
 def test_an_interrupt_ends_the_exam(monkeypatch, capfd):
     monkeypatch.setattr(live.NodeExam, 'is_there', lambda _: signal.raise_signal(signal.SIGINT))
     assert main(['--topic', '/imu/data']) == 130
-    assert 'examine: interrupted' in capfd.readouterr().err
+    assert 'spinning-top examine: interrupted' in capfd.readouterr().err
 
 
 def test_a_node_that_does_not_run_is_told(monkeypatch, capfd):

@@ -445,7 +445,7 @@ def test_a_strangers_log_is_listed_and_its_names_do_not_act_on_the_terminal(tmp_
     assert out.replace('\n', '').isprintable()
     assert '/\\x1b[2J\\u202e\\x9b\\nline' in out and 'a/\\x1b]0;b\\x07' in out
     code, _, err = told(capsys, path, '--verify')
-    assert code == 1 and err.startswith('inspect: --verify: it was not recorded by')
+    assert code == 1 and err.startswith('spinning-top inspect: --verify: it was not recorded by')
     code, _, err = told(capsys, path, '--plot', tmp_path / 'no.png')
     assert code == 1 and 'nothing to draw' in err and not (tmp_path / 'no.png').exists()
 
@@ -547,7 +547,7 @@ def test_without_matplotlib_there_is_a_hint(short, tmp_path, capsys, monkeypatch
     monkeypatch.delitem(sys.modules, 'spinning_top_sim.tools.plots', raising=False)
     monkeypatch.delattr(tools, 'plots', raising=False)
     code, out, err = told(capsys, short, '--plot', tmp_path / 'page.png')
-    assert code == 1 and "pip install 'spinning_top_sim[plot]'" in err
+    assert code == 1 and "pip install 'matplotlib" in err
     assert len(err.splitlines()) == 1
     assert 'motion 2' in out                            # the rest is told all the same
 

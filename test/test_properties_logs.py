@@ -72,7 +72,7 @@ def check_reading_and_recovery(path, output):
         assert isinstance(reader.metadata, dict) and isinstance(reader.topics, tuple)
     code, _, err = run(path, '-o', output)
     assert code in (ALL_KEPT, FAILED, SOME_LOST)
-    assert (code == FAILED) == err.startswith('recover: ') and err.count('\n') <= 1
+    assert (code == FAILED) == err.startswith('spinning-top recover: ') and err.count('\n') <= 1
     if code != FAILED:
         assert Counter(seen_by_us(output)) == Counter(read) == Counter(seen_by_mcap(output))
         with LogReader(output) as reader:

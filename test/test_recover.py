@@ -36,10 +36,11 @@ from rosbags.typesys import Stores, get_typestore
 from test_recording import METADATA
 
 from spinning_top_sim.recording import log_file
+from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.mcap_writer import McapWriter, record_bytes
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic, find_definition
+from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic
 from spinning_top_sim.recording.salvage import recover
 from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.tools.recover import main
@@ -645,7 +646,8 @@ def test_exit_codes(tmp_path, log):
     assert f'lost: {end - 1 - start} bytes, an unknown number of messages\n' in out
     assert f'lost: chunk at byte {start} (' in out and 'kept: 24 messages in 2 chunks' in out
     assert run(head) == (
-        FAILED, '', f'recover: nothing to save in {head}: there is no whole message in it\n')
+        FAILED, '', 'spinning-top recover: '
+                    f'nothing to save in {head}: there is no whole message in it\n')
     with pytest.raises(SystemExit, match='2'):
         run()
 
@@ -691,7 +693,8 @@ def test_nothing_is_overwritten(tmp_path, log):
         code, out, err = run(path, '-o', output)
         assert (code, out) == (FAILED, '')
         assert err == (
-            f'recover: cannot write {output}: it exists, and nothing is overwritten\n')
+            'spinning-top recover: '
+            f'cannot write {output}: it exists, and nothing is overwritten\n')
     assert path.read_bytes() == log.content
     assert other.read_text() == 'precious'
     assert len(list(tmp_path.iterdir())) == 3
@@ -707,7 +710,7 @@ def test_a_full_disk_leaves_nothing_behind(monkeypatch, tmp_path, log):
         resource.RLIMIT_FSIZE, (limit, limit)))
     assert done.returncode == FAILED
     assert done.stderr == (
-        f'recover: cannot write {tmp_path / "run_recovered.mcap"}: File too large\n')
+        f'spinning-top recover: cannot write {tmp_path / "run_recovered.mcap"}: File too large\n')
     assert [item.name for item in tmp_path.iterdir()] == ['run.mcap']
 
 
@@ -716,13 +719,14 @@ def test_an_output_that_cannot_be_made_is_named(tmp_path, log):
     path.write_bytes(log.content)
     code, _, err = run(path, '-o', tmp_path / 'none' / 'whole.mcap')
     assert code == FAILED
-    assert err == (f'recover: cannot write {tmp_path}/none/whole.mcap: there is no directory '
+    assert err == ('spinning-top recover: '
+                   f'cannot write {tmp_path}/none/whole.mcap: there is no directory '
                    f'{tmp_path}/none\n')
     code, _, err = run(path, '-o', path / 'whole.mcap')
     assert code == FAILED
     assert 'Not a directory' in err
     assert run(path, '-o', '/proc/whole.mcap')[2] == (
-        'recover: cannot write /proc/whole.mcap: no files can be made in /proc\n')
+        'spinning-top recover: cannot write /proc/whole.mcap: no files can be made in /proc\n')
 
 
 @pytest.mark.parametrize(('content', 'reason'), [
@@ -737,7 +741,7 @@ def test_what_is_no_log_is_refused(tmp_path, content, reason):
     with pytest.raises(LogError) as caught:
         LogReader(path)
     assert str(caught.value) == f'cannot read {path}: {reason}'
-    assert run(path) == (FAILED, '', f'recover: cannot read {path}: {reason}\n')
+    assert run(path) == (FAILED, '', f'spinning-top recover: cannot read {path}: {reason}\n')
 
 
 def test_what_cannot_be_opened_is_named(tmp_path):
@@ -748,7 +752,8 @@ def test_what_cannot_be_opened_is_named(tmp_path):
         with pytest.raises(LogError) as caught:
             LogReader(path)
         assert str(caught.value) == f'cannot read {path}: {reason}'
-        assert run(path, '-o', tmp_path / 'x') == (FAILED, '', f'recover: {caught.value}\n')
+        assert run(path, '-o', tmp_path / 'x') == (FAILED, '', 'spinning-top recover: '
+                                                               f'{caught.value}\n')
 
 
 def test_a_disk_that_fails_while_it_is_read_is_an_error(tmp_path, log, monkeypatch):
@@ -774,7 +779,8 @@ def test_a_disk_that_fails_while_it_is_read_is_an_error(tmp_path, log, monkeypat
     monkeypatch.setattr(log_file, 'open', open_bad, raising=False)
     code, _, err = run(tmp_path / 'run.mcap')
     assert code == FAILED
-    assert err == f'recover: cannot read {tmp_path / "run.mcap"}: Input/output error\n'
+    assert err == ('spinning-top recover: '
+                   f'cannot read {tmp_path / "run.mcap"}: Input/output error\n')
     assert [path.name for path in tmp_path.iterdir()] == ['run.mcap']
 
 

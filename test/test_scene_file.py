@@ -100,7 +100,8 @@ def test_a_tag_that_rcl_ignores_is_refused_in_one_line(tmp_path, capsys, text):
     path = scene(tmp_path / 'p.yaml', **{'spin.l3': text})
     assert main(['-o', str(tmp_path / 'run.mcap'), '--duration', '1', '--params', str(path)]) == 2
     error = capsys.readouterr().err
-    assert error.startswith(f'simulate: {path} is not YAML: the tag ') and error.count('\n') == 1
+    assert error.startswith('spinning-top simulate: '
+                            f'{path} is not YAML: the tag ') and error.count('\n') == 1
     assert error.endswith(': must be !!str, as rcl ignores all others\n')
 
 
@@ -118,5 +119,6 @@ def test_an_unknown_name_is_refused_with_a_likely_one(tmp_path, capsys):
                               (['-p', 'spin.l33:=1.0'], 'spin.l33:=1.0')):
         assert main(['-o', str(output), '--duration', '1', *arguments]) == 2
         assert capsys.readouterr().err == (
-            f'simulate: {source}: there is no parameter spin.l33; did you mean spin.l3?\n')
+            'spinning-top simulate: '
+            f'{source}: there is no parameter spin.l33; did you mean spin.l3?\n')
     assert not output.exists()

@@ -213,9 +213,9 @@ def test_the_server_is_on_loopback_and_takes_the_next_free_port(page):
     (['LOG', 'LOG', 'LOG'], '3 logs: must be one or two'),
     (['LOG', '--port', '99999'], '--port 99999: must be from 0 to 65535')])
 def test_wrong_arguments_are_told_in_one_line(log, capsys, arguments, told):
-    assert command.main(['view', *(str(log) if word == 'LOG' else word
+    assert command.main([*(str(log) if word == 'LOG' else word
                                    for word in arguments)]) == 2
-    assert capsys.readouterr().err == f'view: {told}\n'
+    assert capsys.readouterr().err == f'spinning-top view: {told}\n'
 
 
 @pytest.fixture

@@ -131,7 +131,7 @@ def test_log(browser, log, tmp_path):
 
 def test_file_without_a_network(browser, log, tmp_path):
     page = tmp_path / 'page.html'
-    assert command.main(['view', str(log), '--html', str(page)]) == 0
+    assert command.main([str(log), '--html', str(page)]) == 0
     assert page.stat().st_size < 2e6        # for 6 s
     poses = poses_of(log)
     with Visit(browser, str(page), offline=True) as visit:

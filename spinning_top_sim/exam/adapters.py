@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Adapters of published attitude filters; `pip install 'spinning_top_sim[exam]'` installs most.
+Adapters of published attitude filters; the extra `exam` installs most.
 
 Each filter has the default settings of its package, and starts from the attitude of its first
 readings.  With `magnetic=False` it does not use the magnetometer.

@@ -29,6 +29,7 @@ from spinning_top_sim.exam.examiner import SEEDS, examine
 from spinning_top_sim.exam.log import NORTHS, examine_log
 from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.trial import INTERRUPTED, NodeError
+from spinning_top_sim.installation import needed
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.tools import cli
 
@@ -39,11 +40,11 @@ OPTIONS = {'a log': ('topic', 'truth', 'heading'), 'a node': ('topic', 'level', 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('examine', __doc__, argv, _add_arguments, _run,
-                   (ValueError, LogError, OSError, ImportError, NodeError))
+    return cli.run('examine', __doc__, argv, add_arguments, _run, (LogError, NodeError))
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
     add = parser.add_argument
     add('log', type=Path, nargs='?', help='an MCAP file with the attitudes and the truth')
     add('--topic', help='topic of the attitudes; without a log and --node, of a running node that '
@@ -102,7 +103,8 @@ def _report(arguments: argparse.Namespace) -> Report:
         return examine_log(arguments.log, **options)
     if arguments.filter is not None:
         make_filter = FILTERS[arguments.filter]
-        make_filter()           # imports its package once, before the runs fork
+        with needed(f'the filter {arguments.filter}'):
+            make_filter()       # imports its package once, before the runs fork
         return examine(make_filter, subject=arguments.filter, **options)
     before = signal.signal(signal.SIGINT, lambda *_: INTERRUPTED.set())
     try:

@@ -9,10 +9,12 @@ import re
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from importlib.util import find_spec
 from os import _exit
 from typing import TYPE_CHECKING, Protocol, cast
 
+from spinning_top_sim.installation import remedy
 from spinning_top_sim.recording.errors import LogError
 
 if TYPE_CHECKING:
@@ -32,24 +34,23 @@ class RunnableNode(Protocol):
     def destroy_node(self) -> None: ...
 
 
-def run(name: str, argv: list[str],
-        prepare: Callable[[list[str]], Callable[[], RunnableNode] | None]) -> int:
+def run(name: str, argv: Sequence[str] | None,
+        prepare: Callable[[list[str]], Callable[[], RunnableNode]]) -> int:
     """
-    Run a node; return 0 after an ordinary end, or 2 with one line that says why it cannot start.
+    Run the node of `spinning-top NAME`; return its exit code.
 
-    prepare : takes the arguments; returns what makes the node, or None if there is nothing to run
+    It is 0 after an ordinary end, or 2 with one line that says why the node cannot start.
+
+    argv : arguments, None for those of the program
+    prepare : takes the arguments, to which it may add some of ROS; returns what makes the node
     """
+    argv = list(sys.argv[1:] if argv is None else argv)
+    name = f'spinning-top {name}'
     # Nothing is open yet, and a KeyboardInterrupt is easily lost during imports.
     _handle(signal.SIGINT, lambda *_: _exit(130))
     _open_standard_streams()
     try:
-        if '--version' in argv[1:]:
-            from spinning_top_sim.recording.provenance import version  # noqa: PLC0415
-            print(f'{name} {version("spinning_top_sim")}')
-            return 0
         make_node = prepare(argv)
-        if make_node is None:
-            return 0
         import rclpy  # noqa: PLC0415
         # From `init` on, rclpy shuts the context down at SIGINT and SIGTERM.  A launched node gets
         # SIGINT twice, from the terminal and from launch.
@@ -57,7 +58,7 @@ def run(name: str, argv: list[str],
         _handle(signal.SIGINT, lambda number, _: interrupts.append(number))
         for number in (signal.SIGHUP, signal.SIGQUIT):
             _handle(number, lambda *_: signal.raise_signal(signal.SIGTERM))
-        rclpy.init(args=argv)
+        rclpy.init(args=[name, *argv])
     except Exception as error:
         return _cannot_start(name, error)
     node, started = None, False
@@ -104,9 +105,25 @@ def _ignore_signals() -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
+def without_ros_arguments(argv: Iterable[str]) -> list[str]:
+    """Return the arguments that are not between `--ros-args` and `--` or the end."""
+    words, are_of_ros = [], False
+    for word in argv:
+        if word == '--ros-args':
+            are_of_ros = True
+        elif not are_of_ros:
+            words.append(word)
+        elif word == '--':
+            are_of_ros = False
+    return words
+
+
 def _cannot_start(name: str, error: Exception) -> int:
     kind = type(error).__name__
-    expected = (isinstance(error, ValueError | RuntimeError | OSError | LogError)
+    if isinstance(error, ModuleNotFoundError) and not find_spec('rclpy'):
+        error = RuntimeError('it needs ROS 2: source the setup.bash of an installation, or '
+                             f'{remedy("ros")}')
+    expected = (isinstance(error, ValueError | RuntimeError | OSError | LogError | ImportError)
                 or kind.startswith('Invalid'))
     print(f'{name}: cannot start: {"" if expected else f"{kind}: "}{one_line(error)}',
           file=sys.stderr)

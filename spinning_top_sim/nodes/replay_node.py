@@ -1,21 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The executable `replay_node`."""
+"""The command `spinning-top replay`, the executable `replay_node`."""
 
 import argparse
 import contextlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from spinning_top_sim.nodes.executable import RunnableNode, run
+from spinning_top_sim.nodes.executable import RunnableNode, run, without_ros_arguments
 from spinning_top_sim.nodes.pacing import FASTEST, RATES, SLOWEST
+from spinning_top_sim.tools import cli
 
 DESCRIPTION = """\
 Publish the messages of a ROS 2 log (.mcap) with their recorded spacing.
 
-  ros2 run spinning_top_sim replay_node run.mcap
-  ros2 run spinning_top_sim replay_node run.mcap --rate 0.5 --loop --clock
-  ros2 run spinning_top_sim replay_node run.mcap --ros-args -r /pose:=/old/pose
+  spinning-top replay run.mcap
+  spinning-top replay run.mcap --rate 0.5 --loop --clock
+  spinning-top replay run.mcap --ros-args -r /pose:=/old/pose
 """
 
 EPILOG = """\
@@ -36,26 +37,25 @@ exit code: 0 played (also in part: topics left out, ended by a signal),
 """
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the node; return its exit code."""
-    return run('replay_node', sys.argv if argv is None else argv, _prepare)
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the node with these arguments, by default the program's; return its exit code."""
+    return run('replay', argv, _prepare)
 
 
 def _prepare(argv: list[str]) -> Callable[[], RunnableNode]:
-    from rclpy.utilities import remove_ros_args  # noqa: PLC0415
-    options = _parser().parse_args(remove_ros_args(argv)[1:])
+    parser = cli.Parser('replay', DESCRIPTION, EPILOG)
+    add_arguments(parser)
+    options = parser.parse_args(without_ros_arguments(argv))
     from spinning_top_sim.nodes.replayer import Replayer, open_log  # noqa: PLC0415
     log = open_log(options.file, options.partial)
     return lambda: Replayer(log, options)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser('replay_node', description=DESCRIPTION, epilog=EPILOG,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
     add = parser.add_argument
     not_negative = _number(0.0, sys.float_info.max, 'a finite number >= 0')
     add('file', type=Path, metavar='FILE', help='the log')
-    add('--version', action='store_true', help='print the version, then end')
     add('-r', '--rate', metavar='R',
         type=_number(SLOWEST, FASTEST, f'{RATES}; --start-paused begins with a pause'),
         help='recorded over real time (default: the parameter `rate`, 1)')
@@ -73,7 +73,6 @@ def _parser() -> argparse.ArgumentParser:
         help='wait S seconds before the first message')
     add('--wait-for-subscribers', type=int, default=0, metavar='COUNT',
         help='wait until there are so many, over all topics')
-    return parser
 
 
 def _number(lowest: float, highest: float, allowed: str) -> Callable[[str], float]:

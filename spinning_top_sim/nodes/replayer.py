@@ -200,7 +200,7 @@ def open_log(path: Path, partial: bool) -> LogReader:
         raise ValueError(f'{path} is torn: `recover` makes a whole log of it, --partial plays '
                          'what is whole')
     if torn:
-        print(f'replay_node: {path} is torn, playing what is whole', file=sys.stderr)
+        print(f'spinning-top replay: {path} is torn, playing what is whole', file=sys.stderr)
     return log
 
 

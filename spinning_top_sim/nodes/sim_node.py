@@ -1,25 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The executable `sim_node`."""
+"""The command `spinning-top node`, the executable `sim_node`."""
 
+import argparse
 import sys
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 
-from spinning_top_sim.nodes.executable import RunnableNode, run
+from spinning_top_sim.nodes.executable import RunnableNode, run, without_ros_arguments
 
-USAGE = """usage: sim_node [--help] [--version]
-                [--ros-args -p NAME:=VALUE --params-file FILE ...]
+DESCRIPTION = """\
+Simulate the heavy symmetric top in real time as a ROS 2 node.
 
-Simulate the heavy symmetric top in real time.  Of several values for a
-parameter, in files or not, the last one on the command line holds.
+  spinning-top node --scene looping --imu bmi088
+  spinning-top node --ros-args -p spin.l3:=2.0 --params-file mine.yaml
 
-  ros2 run spinning_top_sim sim_node
-  ros2 run spinning_top_sim sim_node --ros-args --params-file looping.yaml
-  ros2 run spinning_top_sim sim_node --ros-args -p spin.l3:=2.0
+Of several values for a parameter, the last one on the command line holds; those
+of --scene and --imu come first.
 
 exit code: 0 ended, also by a signal; 2 cannot start; 130 interrupted before
-
+"""
+INTERFACE = """\
 ~ is /spinning_top.  Subscribes to:
   ~/commands (std_msgs/Float64MultiArray: [L3, Lz] in kg m^2/s)
 Services:
@@ -29,29 +30,43 @@ Publishes, where enabled:
   /diagnostics (diagnostic_msgs/DiagnosticArray), always"""
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the node; return its exit code."""
-    return run('sim_node', sys.argv if argv is None else argv, _prepare)
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the node with these arguments, by default the program's; return its exit code."""
+    return run('node', argv, _prepare)
 
 
-def _prepare(argv: list[str]) -> Callable[[], RunnableNode] | None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    from spinning_top_sim.tools import scene_file  # noqa: PLC0415 - YAML takes 10 ms
+    scene_file.add_arguments(parser)
+    parser.add_argument('--ros-args', metavar='...', nargs='*',
+                        help='arguments of ROS 2, such as -p NAME:=VALUE and --params-file FILE')
+
+
+def _interface() -> Iterator[str]:
+    """Yield the lines about topics, services and parameters."""
     from spinning_top_sim.streams import parameters  # noqa: PLC0415
-    if {'--help', '-h'}.intersection(argv[1:]):
-        print(USAGE)
-        for *_, text in parameters.STREAM_DEFAULTS:
-            print(textwrap.fill(text, 78, initial_indent='  ', subsequent_indent=6 * ' '))
-        print('Parameters:')
-        for parameter in parameters.TABLE:
-            default = parameter.default
-            shown = list(default) if isinstance(default, tuple) else default
-            print(f'  {parameter.name}  (default {"unset" if shown is None else shown})')
-            print(textwrap.indent(textwrap.fill(parameter.describe(), 74), 6 * ' '))
-        return None
-    from rclpy.utilities import remove_ros_args  # noqa: PLC0415
-    stray = ' '.join(remove_ros_args(argv)[1:])
-    if stray:
-        raise ValueError(f'{stray!r} is not expected here; the form is: sim_node --ros-args '
-                         '-p NAME:=VALUE --params-file FILE')
+    yield INTERFACE
+    for *_, text in parameters.STREAM_DEFAULTS:
+        yield textwrap.fill(text, 78, initial_indent='  ', subsequent_indent=6 * ' ')
+    yield 'Parameters:'
+    for parameter in parameters.TABLE:
+        default = parameter.default
+        shown = list(default) if isinstance(default, tuple) else default
+        yield f'  {parameter.name}  (default {"unset" if shown is None else shown})'
+        yield textwrap.indent(textwrap.fill(parameter.describe(), 74), 6 * ' ')
+
+
+def _prepare(argv: list[str]) -> Callable[[], RunnableNode]:
+    words = without_ros_arguments(argv)
+    if words:
+        from spinning_top_sim.tools import cli  # noqa: PLC0415
+        from spinning_top_sim.tools.scene_file import chosen_files  # noqa: PLC0415
+        parser = cli.Parser('node', DESCRIPTION, '\n'.join(_interface()))
+        add_arguments(parser)
+        files = chosen_files(parser.parse_args(words))
+        given = [word for path in files for word in ('--params-file', str(path))]
+        argv[:] = ['--ros-args', *given, '--', *argv[len(words):]]
     from spinning_top_sim.nodes.simulator import Simulator  # noqa: PLC0415
 
     def make_node() -> RunnableNode:

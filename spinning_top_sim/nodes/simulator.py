@@ -75,11 +75,8 @@ class Simulator(Node):
                                 ('record', SetBool, self._record)):
             self.create_service(kind, f'~/{name}', functools.partial(self._serve, act))
         self._steady_timer(1.0, self._publish_diagnostics)
-        if not simulation.top.is_realizable:
-            self._log.warning(
-                f'top.lambda3 = {simulation.top.lambda3!r} kg m^2: no rigid body has more than '
-                f'2 (lambda1 - M R^2) = {2.0 * simulation.top.lambda1_at_com:g}; simulated all '
-                'the same')
+        if simulation.top.objection:
+            self._log.warning(simulation.top.objection)
 
     def start(self) -> None:
         """Let time run: simulated t = 0 is the next point on the grid of the stamps."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.installation import needed
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.top import State, Top
@@ -267,8 +268,5 @@ class States:
 
 def _pictures() -> ModuleType:
     """Import matplotlib only where something is drawn: it takes long to start."""
-    try:
+    with needed('a picture', 'plot'):
         return import_module('spinning_top_sim.physics.pictures')
-    except ImportError as error:
-        raise ImportError('pictures need matplotlib: '
-                          f"pip install 'spinning_top_sim[plot]' ({error})") from error

@@ -66,6 +66,13 @@ class Top:
         return self.lambda3 <= 2.0 * self.lambda1_at_com * (1.0 + 1e-12)
 
     @property
+    def objection(self) -> str:
+        """Why no rigid body has this inertia, '' if one has."""
+        return '' if self.is_realizable else (
+            f'top.lambda3 = {self.lambda3!r} kg m^2: no rigid body has more than '
+            f'2 (lambda1 - M R^2) = {2.0 * self.lambda1_at_com:g}; simulated all the same')
+
+    @property
     def lambda1_at_com(self) -> float:
         """Moment of inertia across the axis about the centre of mass [kg m^2], by Steiner."""
         return self.lambda1 - self.mass * self.com_distance * self.com_distance

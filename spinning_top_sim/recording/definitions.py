@@ -7,16 +7,15 @@ import contextlib
 import importlib.util
 import json
 import os
-import re
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spinning_top_sim.installation import remedy
-from spinning_top_sim.recording.errors import DefinitionNotFoundError
+from spinning_top_sim.recording.errors import RecordingError
+
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
@@ -25,48 +24,35 @@ _PRIMITIVES = frozenset((
     'uint32', 'int64', 'uint64', 'string', 'wstring'))
 
 
-@dataclass(frozen=True)
-class MessageDefinition:
-    """What a log says about one message type."""
-
-    text: str       # its `ros2msg` schema: the definition followed by those it depends on
-    type_hash: str  # 'RIHS01_' and 64 hexadecimal digits (REP-2011)
-
-
 @cache
-def find_definition(type_name: str) -> MessageDefinition:
+def find_definition(type_name: str) -> tuple[str, str]:
     """
-    Return the definition of a type such as 'sensor_msgs/msg/Imu'.
+    Return schema and type hash (REP-2011) of a type such as 'sensor_msgs/msg/Imu'.
 
-    It is that of the installed ROS, or else that of rosbags for Jazzy.  The text is the same from
-    both: constants, then fields, without comments and default values, which no reader needs.
-
-    Raises DefinitionNotFoundError.
+    The `ros2msg` schema is the definition followed by those it depends on.  It comes from the
+    installed ROS, or else from rosbags (Jazzy), with the same text: constants, then fields,
+    without comments and default values, which no reader needs.  Raises RecordingError.
     """
-    if not re.fullmatch(r'[a-zA-Z0-9_]+/msg/[a-zA-Z0-9_]+', type_name, re.ASCII):
-        raise DefinitionNotFoundError(
-            f'{type_name!r} is not the name of a message type: expected package/msg/Type')
     if _installed_file(type_name, '.json') is None:
         return _of_rosbags(type_name)
     for entry in json.loads(_installed_text(type_name, '.json'))['type_hashes']:
         if entry['type_name'] == type_name:
             text = f'{"=" * 80}\nMSG: '.join(_definitions(type_name, set()))
-            return MessageDefinition(text, entry['hash_string'])
-    raise DefinitionNotFoundError(f'the description of {type_name} does not hold its type hash')
+            return text, entry['hash_string']
+    raise RecordingError(f'the description of {type_name} does not hold its type hash')
 
 
-def _of_rosbags(type_name: str) -> MessageDefinition:
+def _of_rosbags(type_name: str) -> tuple[str, str]:
     try:
         store = _jazzy()
     except ImportError as error:
-        raise DefinitionNotFoundError(
+        raise RecordingError(
             f'no definition of {type_name} is installed: source the setup.bash of ROS 2, or '
             f'{remedy("rosbags")}') from error
     if type_name not in store.fielddefs:
-        raise DefinitionNotFoundError(
-            f'no definition of {type_name} is installed, and rosbags has none')
+        raise RecordingError(f'no definition of {type_name} is installed, and rosbags has none')
     text, _ = store.generate_msgdef(type_name, ros_version=2)
-    return MessageDefinition(text, store.hash_rihs01(type_name))
+    return text, store.hash_rihs01(type_name)
 
 
 @cache
@@ -101,10 +87,12 @@ def _definitions(type_name: str, seen: set[str]) -> Iterator[str]:
 
 def _installed_text(type_name: str, suffix: str) -> str:
     path = _installed_file(type_name, suffix)
+    if path is None:
+        raise RecordingError(f'no definition of {type_name} is installed')
     try:
         return path.read_text(encoding='utf-8')
     except (OSError, UnicodeDecodeError) as error:
-        raise DefinitionNotFoundError(f'{type_name}: cannot read {path}: {error}') from error
+        raise RecordingError(f'{type_name}: cannot read {path}: {error}') from error
 
 
 def _installed_file(type_name: str, suffix: str) -> Path | None:

@@ -5,8 +5,9 @@ import json
 import platform
 import sys
 from collections.abc import Iterable, Mapping
-from importlib import metadata
 from typing import Any
+
+from spinning_top_sim.installation import version
 
 
 def provenance(values_at_start: Mapping[str, Any], epoch_ns: int, begun_ns: int,
@@ -36,17 +37,9 @@ def provenance(values_at_start: Mapping[str, Any], epoch_ns: int, begun_ns: int,
 def surroundings() -> dict[str, str]:
     """Return what else decides the last bits: this package's version, machine, libraries."""
     return {
-        'version': version('spinning_top_sim'),
+        'version': version(),
         'platform': f'{platform.machine()} {platform.system()} '
                     f'{platform.python_implementation()} {platform.python_version()} '
                     f'{sys.byteorder}',
-        'libraries': json.dumps({name: version(name) for name in ('numpy', 'mcap', 'rclpy')}),
+        'libraries': json.dumps({name: version(name) for name in ('numpy', 'mcap')}),
     }
-
-
-def version(distribution: str) -> str:
-    """Return the version of an installed distribution, or 'unknown'."""
-    try:
-        return metadata.version(distribution)
-    except metadata.PackageNotFoundError:
-        return 'unknown'

@@ -1,37 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The texts that rosbag2 (jazzy) writes into a log: message definitions, offered QoS, bag metadata.
+The texts that rosbag2 (jazzy) writes into a log: offered QoS, bag metadata.
 
-With the definitions, which are rosbag2's byte for byte, a log can be read where the packages of
-its messages are missing.  Sources: rosbag2_cpp, LocalMessageDefinitionSource; rosbag2_storage,
-qos.cpp and yaml.hpp; rosbag2_storage_mcap, mcap_storage.cpp.
+Sources: rosbag2_storage, qos.cpp and yaml.hpp; rosbag2_storage_mcap, mcap_storage.cpp.
 """
 
 from __future__ import annotations
 
-import contextlib
-import importlib.util
-import json
 import os
-import re
-import sys
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
 
 import yaml
 
-from spinning_top_sim.recording.errors import RecordingError
-
 if TYPE_CHECKING:
     from mcap.records import Channel
-
-# rosbag2's own expression: it takes the word before white space at the start of a line.
-_FIELD_TYPE = re.compile(r'(?:^|\n)\s*([a-zA-Z0-9_/]+)(?:\[[^\]]*\])?\s+', re.ASCII)
-_PRIMITIVES = frozenset({
-    'bool', 'byte', 'char', 'float32', 'float64', 'int8', 'uint8', 'int16', 'uint16', 'int32',
-    'uint32', 'int64', 'uint64', 'string'})
 
 # A profile: the keys of DEFAULT_QOS, integer policies as in rmw, durations as {'sec', 'nsec'}.
 Qos = Mapping[str, Any]
@@ -60,62 +44,6 @@ _POLICY_NAMES = {
     'liveliness': ('system_default', 'automatic', 'manual_by_node', 'manual_by_topic', 'unknown',
                    'best_available'),
 }
-
-
-def find_definition(type_name: str) -> tuple[str, str]:
-    """
-    Return schema and type hash (REP-2011) of a type such as 'sensor_msgs/msg/Imu'.
-
-    The `ros2msg` schema is the definition followed by those it depends on.  Raises RecordingError.
-    """
-    if not re.fullmatch(r'[a-zA-Z0-9_]+/msg/[a-zA-Z0-9_]+', type_name, re.ASCII):
-        raise RecordingError(
-            f'{type_name!r} is not the name of a message type: expected package/msg/Type')
-    text = _with_dependencies(type_name, seen=set())
-    for entry in json.loads(_installed_text(type_name, '.json'))['type_hashes']:
-        if entry['type_name'] == type_name:
-            return text, entry['hash_string']
-    raise RecordingError(f'the description of {type_name} does not hold its type hash')
-
-
-def _with_dependencies(type_name: str, seen: set[str]) -> str:
-    """Return a definition followed by those it needs: depth first, sorted, each only once."""
-    package = type_name.partition('/')[0]
-    text = whole = _installed_text(type_name, '.msg')
-    names = set(_FIELD_TYPE.findall(text)) - _PRIMITIVES
-    for name in sorted(name if '/' in name else f'{package}/{name}' for name in names):
-        if name not in seen:
-            seen.add(name)
-            whole += f'\n{"=" * 80}\nMSG: {name}\n{_with_dependencies(name, seen)}'
-    return whole
-
-
-def _installed_text(type_name: str, suffix: str) -> str:
-    """Return the text of share/<package>/msg/<Type><suffix>, from the first place that has it."""
-    package, _, name = type_name.replace('/msg/', '/').partition('/')
-    searched = []
-    for prefix in _prefixes(package):
-        path = prefix / 'share' / package / 'msg' / f'{name}{suffix}'
-        try:
-            # Bytes, because a text file's newlines would be translated.
-            return path.read_bytes().decode()
-        except (FileNotFoundError, NotADirectoryError):
-            searched.append(str(path))
-        except (OSError, UnicodeDecodeError) as error:
-            raise RecordingError(f'{type_name}: cannot read {path}: {error}') from error
-    raise RecordingError(
-        f'no definition of {type_name} is installed; searched {", ".join(searched)}')
-
-
-def _prefixes(package: str) -> Iterator[Path]:
-    """Yield the installation prefixes that may hold a package, as ROS overlays them."""
-    yield from map(Path, filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)))
-    yield Path(sys.prefix)
-    with contextlib.suppress(ValueError):   # of a module that tells no origin, such as __main__
-        spec = importlib.util.find_spec(package)
-        for location in (spec.submodule_search_locations or ()) if spec else ():
-            # <prefix>/lib/python3.x/site-packages/<package>, or below <prefix>/local on Debian
-            yield from Path(location).parents[3:5]
 
 
 class RecordedTopic(NamedTuple):

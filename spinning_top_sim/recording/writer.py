@@ -18,9 +18,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from spinning_top_sim.installation import version
+from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import RecordingError, why_not_written
-from spinning_top_sim.recording.provenance import version
-from spinning_top_sim.recording.rosbag2 import RecordedTopic, find_definition, offered_qos_yaml
+from spinning_top_sim.recording.rosbag2 import RecordedTopic, offered_qos_yaml
 
 try:
     from mcap.records import Channel, Header, Metadata, Schema
@@ -271,7 +272,7 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
     definitions = {     # text and type hash
         name: find_definition(name) for name in dict.fromkeys(topic.type_name for topic in topics)}
     try:
-        header = Header(profile='ros2', library=OUR_LIBRARY + version('spinning_top_sim'))
+        header = Header(profile='ros2', library=OUR_LIBRARY + version())
         file = McapWriter(path, header=header, compression=compression)
         with file.discarded_on_failure():
             file.check_disk(min_free_bytes)

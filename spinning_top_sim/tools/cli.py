@@ -3,53 +3,44 @@
 
 import argparse
 import contextlib
-import importlib
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
-from typing import TextIO
+from typing import NoReturn, TextIO
+
+from spinning_top_sim.installation import version
 
 OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130         # argparse uses 2, too
 
 
-def _start(module: str) -> int:
-    """Import and run a tool; return its exit code, also if Ctrl-C interrupts the imports."""
-    try:
-        return importlib.import_module(f'spinning_top_sim.{module}').main()
-    except KeyboardInterrupt:
-        return INTERRUPTED
+class Parser(argparse.ArgumentParser):
+    """The arguments of `spinning-top NAME`; wrong ones are refused in one line."""
 
+    def __init__(self, name: str, description: str | None, epilog: str | None = None) -> None:
+        super().__init__(f'spinning-top {name}', description=description, epilog=epilog,
+                         formatter_class=argparse.RawDescriptionHelpFormatter)
+        self.add_argument('--version', action='version', version=f'%(prog)s {version()}')
 
-# The executables.
-simulate, inspect, recover, ensemble, examine = (partial(_start, module) for module in (
-    'tools.simulate', 'tools.inspect', 'tools.recover', 'tools.ensemble', 'exam.command'))
-
-
-def add_version(parser: argparse.ArgumentParser) -> None:
-    """Add the option `--version`."""
-    from spinning_top_sim.recording.provenance import version  # noqa: PLC0415 - for a fast --help
-
-    parser.add_argument('--version', action='version',
-                        version=f'%(prog)s {version("spinning_top_sim")}')
+    def error(self, message: str) -> NoReturn:
+        """Exit with one line."""
+        self.exit(WRONG_USAGE, printable(f'{self.prog}: {message}; see --help') + '\n')
 
 
 def run(name: str, help_text: str | None, argv: Sequence[str] | None,
         add_arguments: Callable[[argparse.ArgumentParser], object],
-        command: Callable[[argparse.Namespace], int], errors: tuple[type[Exception], ...]) -> int:
+        command: Callable[[argparse.Namespace], int],
+        errors: tuple[type[Exception], ...] = ()) -> int:
     """
-    Run a command; return its exit code.
+    Run the command `spinning-top NAME`; return its exit code.
 
-    errors : exceptions that are printed as one line; the exit code is then FAILED, or WRONG_USAGE
-        for a ValueError
+    errors : exceptions that are printed as one line, besides ValueError, ArithmeticError, OSError
+        and ImportError; the exit code is then FAILED, or WRONG_USAGE for a ValueError
     """
     # If a stream is closed, the next file that is opened would take its descriptor.
     sys.stdout = sys.stdout or open(os.devnull, 'w')    # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, 'w')    # noqa: SIM115
-    parser = argparse.ArgumentParser(prog=name, description=help_text,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(name, help_text)
     add_arguments(parser)
-    add_version(parser)
     arguments = parser.parse_args(argv)
     try:
         code = command(arguments)
@@ -59,14 +50,14 @@ def run(name: str, help_text: str | None, argv: Sequence[str] | None,
         # The reader of the output, such as a pager, has ended.  Python flushes the output again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
-    except errors as error:
+    except (ValueError, ArithmeticError, OSError, ImportError, *errors) as error:
         what = str(error)
         if isinstance(error, OSError) and error.filename is not None:
             what = f'{error.filename}: {error.strerror}'
-        print_line(f'{name}: {what}', sys.stderr)
+        print_line(f'{parser.prog}: {what}', sys.stderr)
         return WRONG_USAGE if isinstance(error, ValueError) else FAILED
     except KeyboardInterrupt:
-        print_line(f'{name}: interrupted', sys.stderr)
+        print_line(f'{parser.prog}: interrupted', sys.stderr)
         return INTERRUPTED
 
 

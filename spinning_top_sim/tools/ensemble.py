@@ -28,6 +28,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from spinning_top_sim.installation import needed
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.tools import cli, ensemble_spec
@@ -46,12 +47,12 @@ MANIFEST = 'manifest.json'
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('ensemble', __doc__, argv, _add_arguments, _run,
-                   (ValueError, ArithmeticError, RecordingError, IntegrationError, EnsembleError,
-                    OSError))
+    return cli.run('ensemble', __doc__, argv, add_arguments, _run,
+                   (RecordingError, IntegrationError, EnsembleError))
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
     add = parser.add_argument
     add('specification', metavar='SPEC', type=Path,
         help='the specification, or with --row the folder of a dataset')
@@ -71,11 +72,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.workers is not None and arguments.workers < 1:
         raise ValueError(f'--workers {arguments.workers}: must be >= 1')
-    try:
+    with needed('an ensemble', 'exam'):
         return (_compute_dataset if arguments.row is None else _compute_row)(arguments)
-    except ImportError as error:
-        raise EnsembleError("ensembles need Dask and pyarrow: pip install 'spinning_top_sim[exam]'"
-                            f' ({error})') from error
 
 
 def _compute_dataset(arguments: argparse.Namespace) -> int:
@@ -114,7 +112,8 @@ def _compute_dataset(arguments: argparse.Namespace) -> int:
     shutil.rmtree(folder / UNFINISHED, ignore_errors=True)  # a killed command's worker may write
     if failed:
         run, reason = next(iter(failed.items()))
-        cli.print_line(f'ensemble: {len(failed)} of {specification.runs} runs failed, see '
+        cli.print_line(f'spinning-top ensemble: '
+                       f'{len(failed)} of {specification.runs} runs failed, see '
                        f'{MANIFEST}; run {run}: {reason}', sys.stderr)
     if not arguments.quiet:
         cli.print_line(f'{arguments.output}: {specification.runs - len(failed)} runs')
@@ -127,7 +126,8 @@ def _compute_row(arguments: argparse.Namespace) -> int:
         manifest = _read_manifest(path)
         specification = ensemble_spec.parse(manifest['specification'], str(path))
         if manifest['versions'] != versions():
-            cli.print_line('ensemble: the last bits may differ: the dataset is of other versions, '
+            cli.print_line('spinning-top ensemble: '
+                           'the last bits may differ: the dataset is of other versions, '
                            f'{manifest["versions"]}', sys.stderr)
     else:
         specification = ensemble_spec.read(path)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.recording.provenance import version
+from spinning_top_sim.installation import version
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.simulation import Simulation

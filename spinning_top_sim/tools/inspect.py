@@ -21,6 +21,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from spinning_top_sim.installation import needed
 from spinning_top_sim.recording.damage import count, seconds
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
@@ -45,11 +46,11 @@ ROWS = (('nutation period [s]', 'nutation_period', 1.0),
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('inspect', __doc__, argv, _add_arguments, _run,
-                   (LogError, OSError, ValueError))
+    return cli.run('inspect', __doc__, argv, add_arguments, _run, (LogError,))
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
     add = parser.add_argument
     add('log', type=Path, help='an MCAP file, of this package or any other')
     add('--plot', type=Path, metavar='FILE',
@@ -100,11 +101,8 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> None:
         return
     if found.shown is None:
         raise LogError('nothing to draw: no attitude of a top in this log')
-    try:
+    with needed('a picture', 'plot'):
         from spinning_top_sim.tools import plots  # noqa: PLC0415
-    except ImportError as error:
-        raise LogError("pictures need matplotlib: pip install 'spinning_top_sim[plot]', or "
-                       f'apt install python3-matplotlib ({error})') from error
     motion, data = found.shown
     if arguments.plot is not None:
         plots.draw_page(found.path.name, motion, data, arguments.plot)

@@ -33,12 +33,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     # An exception, so that the unfinished output is removed.
     previous = signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     try:
-        return cli.run('recover', __doc__, argv, _add_arguments, _run, (LogError, OSError))
+        return cli.run('recover', __doc__, argv, add_arguments, _run, (LogError,))
     finally:
         signal.signal(signal.SIGTERM, previous)
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
     parser.add_argument('log', type=Path, help='the MCAP file, of this package or any other')
     parser.add_argument(
         '-o', '--output', type=Path, metavar='FILE',

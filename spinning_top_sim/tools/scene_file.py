@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reads ROS 2 parameter files and assignments (NAME:=VALUE) without ROS."""
 
+import argparse
 import difflib
 import re
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import yaml
 
+from spinning_top_sim.installation import parameter_files
 from spinning_top_sim.physics.top import shown
 from spinning_top_sim.streams import parameters
 
@@ -40,6 +43,40 @@ for _type, _pattern in (
         ('float', r'[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|'
                   r'[-+]?\.?(inf|Inf|INF)|\.?(nan|NaN|NAN)')):
     _Loader.add_implicit_resolver(f'tag:yaml.org,2002:{_type}', re.compile(f'({_pattern})$'), None)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options --scene and --imu."""
+    for kind, what in (('scene', 'top and start of a scene'), ('imu', 'errors of an IMU')):
+        parser.add_argument(
+            f'--{kind}', metavar='NAME', help=f'{what}: the name of one that is installed, or the '
+            'path of a parameter file; "help" lists the names')
+
+
+def chosen_files(arguments: argparse.Namespace) -> list[Path]:
+    """
+    Return the parameter files of --scene and --imu; exit after the list that "help" asks for.
+
+    Raises ValueError for a name that is not there.
+    """
+    paths = []
+    for kind in ('scene', 'imu'):
+        name = getattr(arguments, kind)
+        if name is None:
+            continue
+        files = parameter_files(kind)
+        if name == 'help':
+            for stem, path in files.items():
+                # The first sentence of the comment at the head, behind the licence.
+                text = ' '.join(line[2:] for line in path.read_text('utf-8').splitlines()[1:5]
+                                if line.startswith('# '))
+                print(f'{stem:20} {text.partition(". ")[0].rstrip(".")}')
+            sys.exit()
+        if name not in files and '/' not in name and not name.endswith('.yaml'):
+            raise ValueError(f'--{kind} {name}: must be the path of a file, or one of '
+                             f'{", ".join(files)}')
+        paths.append(files.get(name, Path(name)))
+    return paths
 
 
 def read_scene(path: str | Path) -> dict[str, object]:

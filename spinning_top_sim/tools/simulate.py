@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.installation import needed
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.provenance import provenance
 from spinning_top_sim.recording.reader import LogReader
@@ -30,9 +31,8 @@ from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Encoded, Samples, Stream, period_ns
-from spinning_top_sim.tools import cli, export
+from spinning_top_sim.tools import cli, export, scene_file
 from spinning_top_sim.tools.recorded_run import read_run_description
-from spinning_top_sim.tools.scene_file import is_of_ros, parse_assignment, read_scene
 
 FORMATS = ('mcap', 'csv', 'parquet')
 # Names and units of the columns of a table.
@@ -48,12 +48,14 @@ Stop = tuple[int, tuple[float, float] | None]
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('simulate', __doc__, argv, _add_arguments, _run,
-                   (ValueError, ArithmeticError, RecordingError, IntegrationError, OSError))
+    return cli.run('simulate', __doc__, argv, add_arguments, _run,
+                   (RecordingError, IntegrationError))
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
     add = parser.add_argument
+    scene_file.add_arguments(parser)
     add('--params', metavar='FILE', action='append', default=[],
         help='parameter file as for the node; may be repeated')
     add('-p', '--param', metavar='NAME:=VALUE', action='append', default=[],
@@ -88,6 +90,8 @@ def _run(arguments: argparse.Namespace) -> int:
         raise ValueError(f'--export: needs a log, and {output} is {file_format}')
     values = _parameters(arguments)
     simulation = Simulation(values, round(epoch_ns))
+    if simulation.top.objection:
+        cli.print_line(f'spinning-top simulate: warning: {simulation.top.objection}', sys.stderr)
     export.check(arguments.export, [stream.topic for stream in journal.recorded_streams(
         simulation.streams, values)], values)
     stops = _parse_stops(arguments.command, round(values['duration'] * NANOSECONDS))
@@ -114,15 +118,15 @@ def _run(arguments: argparse.Namespace) -> int:
 def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the checked parameters of the command line.  Raises ValueError or OSError."""
     given: dict[str, object] = {}
-    for path in arguments.params:
-        given.update(read_scene(path))
-    given.update((name, value) for name, value in map(parse_assignment, arguments.param)
-                 if not is_of_ros(name))
+    for path in (*scene_file.chosen_files(arguments), *arguments.params):
+        given.update(scene_file.read_scene(path))
+    given.update((name, value) for name, value in map(scene_file.parse_assignment, arguments.param)
+                 if not scene_file.is_of_ros(name))
     given.update((name, value) for name, value in vars(arguments).items()
                  if name in ('seed', 'duration') and value is not None)
     values = parameters.checked(given)
     if not values['duration'] > 0.0:
-        raise ValueError(f'duration = {values["duration"]!r} s: must be > 0 (--duration)')
+        raise ValueError('--duration S, or the parameter duration, must be given')
     return values
 
 
@@ -224,13 +228,10 @@ def _write_csv(path: Path, blocks: Iterable[NDArray[np.float64]]) -> None:
 
 
 def _write_parquet(path: Path, blocks: Iterable[NDArray[np.float64]]) -> None:
-    """Write a Parquet file.  Raises RecordingError, and makes no file, without pyarrow."""
-    try:
+    """Write a Parquet file.  Raises ImportError, and makes no file, without pyarrow."""
+    with needed('a Parquet file', 'parquet'):
         import pyarrow as pa  # noqa: PLC0415
         from pyarrow import parquet  # noqa: PLC0415
-    except ImportError as error:
-        raise RecordingError("parquet needs pyarrow: pip install 'spinning_top_sim[parquet]' "
-                             f'({error})') from error
     schema = pa.schema([(name, pa.float64()) for name in UNITS])
     with open(path, 'xb') as file, parquet.ParquetWriter(file, schema) as writer:
         for rows in blocks:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The executable `view`."""
+"""The command `spinning-top view`."""
 
 from __future__ import annotations
 
@@ -7,26 +7,29 @@ import argparse
 import contextlib
 import os
 import signal
+import subprocess
 import sys
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spinning_top_sim.nodes.executable import RunnableNode, run
+from spinning_top_sim.installation import needed
+from spinning_top_sim.nodes.executable import RunnableNode, run, without_ros_arguments
 from spinning_top_sim.recording.errors import LogError
-from spinning_top_sim.tools import cli
+from spinning_top_sim.tools import cli, scene_file
 
 if TYPE_CHECKING:
     from spinning_top_sim.view.page import Page
 
 DESCRIPTION = """\
-Show a top in the browser: the one that a sim_node simulates, or those of logs.
+Show a top in the browser: the one that a node simulates, or those of logs.
 
-  view                                  with a running sim_node of this namespace
-  view run.mcap                         without ROS
-  view rk45.mcap exact.mcap             side by side, or one over the other
-  view run.mcap --html page.html        a file that opens without this program
+  spinning-top view --scene wavy             starts a node, and shows it
+  spinning-top view                          a running node of this namespace
+  spinning-top view run.mcap                 a log; needs no ROS
+  spinning-top view rk45.mcap exact.mcap     side by side, or one over the other
+  spinning-top view run.mcap --html a.html   a file that opens without this program
 
 exit code: 0 ended, also by a signal; 1 a log cannot be read, or a file written;
 2 cannot be started, or wrong arguments; 130 interrupted before
@@ -35,27 +38,49 @@ LOOPBACK = '127.0.0.1'
 LAST_PORT = 65535
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    argv = sys.argv if argv is None else argv
-    words = argv[1:argv.index('--ros-args')] if '--ros-args' in argv else argv[1:]
-    if _parser().parse_args(words).log:
-        return cli.run('view', DESCRIPTION, words, _add_arguments, _show_logs,
-                       (ValueError, LogError, OSError, ImportError))
-    return run('view', argv, _prepare)
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command with these arguments, by default the program's; return its exit code."""
+    argv = sys.argv[1:] if argv is None else argv
+    words = without_ros_arguments(argv)
+    arguments = _parser().parse_args(words)
+    if arguments.log:
+        return cli.run('view', DESCRIPTION, words, add_arguments, _show_logs, (LogError,))
+    with _node(arguments, argv[len(words):]):
+        return run('view', argv, _prepare)
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser('view', description=DESCRIPTION,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    _add_arguments(parser)
-    cli.add_version(parser)
+    parser = cli.Parser('view', DESCRIPTION)
+    add_arguments(parser)
     return parser
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+@contextlib.contextmanager
+def _node(arguments: argparse.Namespace, ros_arguments: Sequence[str]) -> Iterator[None]:
+    """Run a node of the scene or IMU that is asked for, if one is, while the page is shown."""
+    options = [word for kind in ('scene', 'imu') if getattr(arguments, kind)
+               for word in (f'--{kind}', getattr(arguments, kind))]
+    if not options:
+        yield
+        return
+    node = subprocess.Popen([
+        sys.executable, '-m', 'spinning_top_sim', 'node', *options,
+        *(ros_arguments or ['--ros-args']), '-p', 'status_period:=0.0'])
+    try:
+        yield
+    finally:
+        node.terminate()
+        try:
+            node.wait(10.0)
+        except subprocess.TimeoutExpired:
+            node.kill()
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
     add = parser.add_argument
-    add('log', nargs='*', type=Path, help='one or two MCAP files; without: a running sim_node')
+    add('log', nargs='*', type=Path, help='one or two MCAP files; without: a running node')
+    scene_file.add_arguments(parser)
     add('--port', type=int, help='of the page (default: the first free one from 8080 on)')
     add('--host', default=LOOPBACK,
         help=f'address to serve at (default: {LOOPBACK}, which only this machine reaches)')
@@ -67,7 +92,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def _show_logs(arguments: argparse.Namespace) -> int:
     if len(arguments.log) > 2:
         raise ValueError(f'{len(arguments.log)} logs: must be one or two')
-    from spinning_top_sim.view.log import Player, read_logs  # noqa: PLC0415
+    with needed('the page', 'view'):
+        from spinning_top_sim.view.log import Player, read_logs  # noqa: PLC0415
     logs = read_logs(arguments.log)
     page = _open_page(arguments, ' and '.join(log.name for log in arguments.log))
     try:
@@ -91,11 +117,8 @@ def _open_page(arguments: argparse.Namespace, title: str) -> Page:
     """
     if arguments.port is not None and not 0 <= arguments.port <= LAST_PORT:
         raise ValueError(f'--port {arguments.port}: must be from 0 to {LAST_PORT}')
-    try:
+    with needed('the page', 'view'):
         from spinning_top_sim.view.page import Page  # noqa: PLC0415
-    except ImportError as error:
-        raise ImportError("the page needs viser: pip install 'spinning_top_sim[view]' "
-                          f'({error})') from error
     if arguments.html is not None:
         return Page(title, LOOPBACK, 0)
     page = Page(title, arguments.host, arguments.port)
@@ -110,8 +133,7 @@ def _open_page(arguments: argparse.Namespace, title: str) -> Page:
 
 
 def _prepare(argv: list[str]) -> Callable[[], RunnableNode]:
-    from rclpy.utilities import remove_ros_args  # noqa: PLC0415
-    arguments = _parser().parse_args(remove_ros_args(argv)[1:])
+    arguments = _parser().parse_args(without_ros_arguments(argv))
     if arguments.html is not None:
         raise ValueError(f'--html {arguments.html}: must have a log')
     from spinning_top_sim.view.live import LiveView  # noqa: PLC0415

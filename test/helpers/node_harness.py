@@ -79,7 +79,7 @@ class SimNode:
                    for item in ('-p', f'{name}:={as_yaml(value)}')]
         self.command = [
             *DIE_WITH_PARENT, sys.executable,
-            *(program or ('-m', 'spinning_top_sim.nodes.sim_node')),
+            *(program or ('-m', 'spinning_top_sim', 'node')),
             '--ros-args', '-r', f'__ns:={namespace}', *options, *arguments]
 
     def __enter__(self):

@@ -42,7 +42,7 @@ class OwnNode(InThisProcess):
                  'record.min_free_bytes': 0, **dotted(values)}
         options = [item for name, value in given.items()
                    for item in ('-p', f'{name}:={as_yaml(value)}')]
-        argv = ['sim_node', '--ros-args', *options, *arguments]
+        argv = ['--ros-args', *options, *arguments]
         rclpy.init(args=argv)
         self.node = Simulator(argv)
         self.loop, self.simulation = self.node.loop, self.node.simulation
@@ -119,7 +119,7 @@ def run_main(main, capfd, *arguments):
     capfd.readouterr()
     with as_a_process():
         try:
-            code = main(['program', *map(str, arguments)])
+            code = main([*map(str, arguments)])
         except SystemExit as error:         # of argparse
             code = error.code
     printed = capfd.readouterr()

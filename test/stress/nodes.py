@@ -22,7 +22,7 @@ from spinning_top_sim.recording.reader import LogReader
 PATIENCE_S = 5.0 * PATIENCE_S
 MEMORY_MB = 4000            # of the worker; DDS maps memory that it does not use
 NODE_MB = 500               # of the node
-LINES = 'sim_node: cannot start:'
+LINES = 'spinning-top node: cannot start:'
 
 
 @functools.cache
