@@ -16,8 +16,8 @@ OPTIONS = ('--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader',
            '--enable-unsafe-swiftshader')
 # Shaders are made and the scene is moved, but no pixel is computed: the processor would need ten
 # seconds for the first picture.
-NOT_DRAWN = '''for (const name of ['drawArrays', 'drawElements', 'drawElementsInstanced'])
-    WebGL2RenderingContext.prototype[name] = () => {};'''
+NOT_DRAWN = """for (const name of ['drawArrays', 'drawElements', 'drawElementsInstanced'])
+    WebGL2RenderingContext.prototype[name] = () => {};"""
 
 
 def launch():
