@@ -106,7 +106,7 @@ def test_lost_samples_are_bridged(example):
 
 
 def test_a_wrong_settling_time_or_namespace_is_told(example, logs, capsys):
-    assert example.main(['it', str(logs['pivot']), '--settle', '40']) == 1
+    assert example.main(['it', str(logs['lever arm']), '--settle', '40']) == 1
     assert '--settle 40' in capsys.readouterr().err
     assert example.main(['it', str(logs['pivot']), '--namespace', 'other']) == 1
     assert 'no topic /other/imu/data_raw; it has /pose' in capsys.readouterr().err
