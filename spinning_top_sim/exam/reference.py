@@ -55,23 +55,7 @@ class ReferenceFilter:
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
-        """
-        Take the readings of a step; return the attitude at its end.
-
-        Parameters
-        ----------
-        gyroscope, accelerometer : (3,) array
-            Mean rate over the step [rad/s], and specific force at its end [m/s^2].
-        magnetometer : (3,) array or None
-            Field at the end of the step [T].
-        dt : float
-            Length of the step [s].
-
-        Returns
-        -------
-        (4,) array
-            q(world <- sensor) as x, y, z, w.
-        """
+        """Take the readings of a step; return the attitude at its end; see `trial.Filter`."""
         if not len(self._quaternion):
             self._quaternion = from_two_vectors(accelerometer, magnetometer)
         else:
