@@ -29,7 +29,7 @@ from spinning_top_sim.exam import examine
 from spinning_top_sim.exam.adapters import FILTERS, Vqf
 from spinning_top_sim.exam.reference import ReferenceFilter
 
-PACKAGES = ('numpy', 'scipy', 'vqf', 'ahrs', 'imufusion', 'gtsam')
+PACKAGES = ('numpy', 'scipy', 'vqf', 'ahrs', 'imufusion')
 SEEDS = 3                       # of an exam
 UNHARMED = {'reference': ReferenceFilter, 'vqf': Vqf}
 COLUMNS = (('tilt [deg]', 'tilt_rms_deg'), ('heading [deg]', 'heading_rms_deg'),

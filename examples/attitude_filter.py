@@ -183,8 +183,8 @@ class Comparison:
         self._period_ns = 0
         self._step: Step
         self._last: tuple[int, np.ndarray, np.ndarray]
-        self._estimates: dict[int, Rotation] = {}
-        self._truths: dict[int, Rotation] = {}
+        self._estimates: dict[int, Sequence[float]] = {}        # w, x, y, z
+        self._truths: dict[int, Sequence[float]] = {}
         self._missing = [IMU_TOPIC, *([MAG_TOPIC] if self.has_mag else []), POSE_TOPIC]
 
     def imu(self, stamp_ns: int, rates: Sequence[float], force: Sequence[float]) -> None:
@@ -223,7 +223,7 @@ class Comparison:
     def pose(self, stamp_ns: int, attitude: Sequence[float]) -> None:
         """Take the body's true attitude, x, y, z, w."""
         self._came(POSE_TOPIC)
-        self._truths[stamp_ns] = Rotation.from_quat(attitude) * self._mounting
+        self._truths[stamp_ns] = attitude
         self._match(stamp_ns)
 
     def _came(self, topic: str) -> None:
@@ -256,14 +256,15 @@ class Comparison:
                                   last_force + (k + 1) / steps * (force - last_force))
         self._last = sample
         self._take_field()
-        w, x, y, z = estimate
-        self._estimates[stamp_ns] = self._north * Rotation.from_quat((x, y, z, w))
+        self._estimates[stamp_ns] = estimate
         self._match(stamp_ns)
 
     def _match(self, stamp_ns: int) -> None:
         if stamp_ns in self._estimates and stamp_ns in self._truths:
-            self.errors.append(Error(stamp_ns, *error_of(self._estimates.pop(stamp_ns),
-                                                         self._truths.pop(stamp_ns))))
+            w, x, y, z = self._estimates.pop(stamp_ns)
+            self.errors.append(Error(stamp_ns, *error_of(
+                self._north * Rotation.from_quat((x, y, z, w)),
+                Rotation.from_quat(self._truths.pop(stamp_ns)) * self._mounting)))
         for waiting in (self._estimates, self._truths):
             while waiting and (oldest := next(iter(waiting))) < stamp_ns - KEPT_NS:
                 del waiting[oldest]

@@ -50,17 +50,18 @@ def running():
 def test_a_node_that_runs_gets_one_run_after_the_other(run, running, monkeypatch, capfd):
     twice = run.after(run)
     direct = follow(partial(Vqf, magnetic=False), twice.part(slice(1, None)))
-    with live.NodeExam('imu/data') as node:
+    with monkeypatch.context() as alone, live.NodeExam('imu/data') as node:
+        alone.setattr(live, 'DISCOVERY_S', 0.0)
         outcome = follow(node.start, twice)
         assert np.max(np.abs(outcome.estimates[1:] - direct.estimates)) < 1e-9
-        # Another source of samples is told.
-        assert main(['--topic', 'imu/data']) == 1
-        assert '/clock has 2 publishers: end the others' in capfd.readouterr().err
-    with live.NodeExam('imu/data') as node:          # later than the first one, for the node
-        filter_ = node.start()
+        filter_ = node.start()          # later than the first run, for the node
         readings = run.gyroscope[0], run.accelerometer[0], run.magnetometer[0], 0.01
         for _ in range(10):
             filter_.update(*readings)
+        # Another source of samples is told.
+        alone.undo()
+        assert main(['--topic', 'imu/data']) == 1
+        assert '/clock has 2 publishers: end the others' in capfd.readouterr().err
         running.send_signal(signal.SIGINT)
         running.wait()
         wait_for('the node to leave the graph', lambda: not node.is_there())

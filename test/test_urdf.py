@@ -42,9 +42,6 @@ def matrix(q):
     return Rotation.from_quat(q).as_matrix()
 
 
-# ---------------------------------------------------------------------------------- kinematics
-
-
 @pytest.mark.parametrize('scene', ['cusp', 'fast_gyroscope'])
 def test_the_joint_states_put_base_link_where_the_pose_is(tmp_path, scene):
     values = {**scene_parameters(scene), **MOUNTED}
@@ -76,13 +73,6 @@ def test_the_joint_states_put_base_link_where_the_pose_is(tmp_path, scene):
     assert np.abs(model.get_transform('imu_link', 'world')[:3, :3] - imu).max() < limit
 
 
-# ------------------------------------------------------------------------------------- frames
-
-
-def links(values):
-    return [link.get('name') for link in element(values).iter('link')]
-
-
 @pytest.mark.parametrize(('values', 'named'), [
     ({'world_frame': ''}, "world_frame = ''"), ({'body_frame': '/base'}, "body_frame = '/base'"),
     ({'imu.frame_id': '${1}'}, r'imu\.frame_id'), ({'world_frame': 'base_link'}, 'world_frame'),
@@ -90,9 +80,6 @@ def links(values):
 def test_frames_that_no_tree_has_are_refused(values, named):
     with pytest.raises(ValueError, match=f'{named}.*must be'):
         described(values)
-
-
-# ------------------------------------------------------------------------- inertia, appearance
 
 
 @pytest.mark.parametrize('scene', ['cusp', 'heavy_top'])
@@ -118,9 +105,6 @@ def test_an_inertia_that_no_body_has_is_left_out_with_a_warning(name):
     for parameter, value in values.items():
         assert f'{parameter} = {value!r}' in warning
     assert 'lambda3 <= 2' in warning
-
-
-# -------------------------------------------------------------------------------------- files
 
 
 def test_the_plain_file_is_written_from_the_xacro_file():

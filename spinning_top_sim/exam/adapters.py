@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Adapters of published attitude filters; the extra `exam` installs most.
+Adapters of published attitude filters; the extra `exam` installs them.
 
 Each filter has the default settings of its package, and starts from the attitude of its first
 readings.  With `magnetic=False` it does not use the magnetometer.
@@ -115,27 +115,6 @@ class Imufusion:
         return said / np.linalg.norm(said)
 
 
-class Gtsam:
-    """Preintegration of the rates by the package gtsam (Forster et al. 2017)."""
-
-    def __init__(self) -> None:
-        import gtsam  # noqa: PLC0415
-
-        self._integrated: Any = gtsam.PreintegratedRotation(gtsam.PreintegratedRotationParams())
-        self._start: Rotation | None = None
-
-    def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
-               dt: float) -> Reals:
-        """See `trial.Filter`."""
-        if self._start is None:
-            self._start = Rotation.from_quat(from_two_vectors(accelerometer, magnetometer))
-        else:
-            self._integrated.integrateGyroMeasurement(gyroscope, np.zeros(3), dt)
-        turned = Rotation.from_matrix(self._integrated.deltaRij().matrix())
-        said: Reals = (self._start * turned).as_quat()
-        return said
-
-
 # By name; '-6d' is without magnetometer.
 FILTERS: dict[str, Callable[[], Filter]] = {
     'reference': ReferenceFilter,
@@ -144,5 +123,4 @@ FILTERS: dict[str, Callable[[], Filter]] = {
     'mahony': partial(Ahrs, 'Mahony'), 'mahony-6d': partial(Ahrs, 'Mahony', False),
     'ekf': partial(Ahrs, 'EKF'), 'ekf-6d': partial(Ahrs, 'EKF', False),
     'imufusion': Imufusion, 'imufusion-6d': partial(Imufusion, False),
-    'gtsam': Gtsam,
 }

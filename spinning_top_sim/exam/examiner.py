@@ -85,12 +85,6 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     ------
     ValueError
         If the level, a parameter or a seed is not allowed.
-
-    Notes
-    -----
-    The same arguments give the same report, unless the filter itself is random.  A filter that
-    raises, never returns or returns something other than an attitude has the fault
-    `invalid_output`; the other runs go on.
     """
     if level not in SEEDS:
         raise ValueError(f'level = {level!r}: must be one of {", ".join(SEEDS)}')

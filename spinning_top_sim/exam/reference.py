@@ -35,8 +35,6 @@ class ReferenceFilter:
         Initial standard deviation of the gyroscope bias [rad/s].
     """
 
-    is_gravity_trusted = False      # True: every specific force counts as gravity
-
     def __init__(self, gyroscope_density: float = CALIBRATED['imu.gyroscope_noise_density'],
                  accelerometer_density: float = CALIBRATED['imu.accelerometer_noise_density'],
                  field: tuple[float, float, float] = FIELD,
@@ -57,23 +55,7 @@ class ReferenceFilter:
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
-        """
-        Take the readings of a step; return the attitude at its end.
-
-        Parameters
-        ----------
-        gyroscope, accelerometer : (3,) array
-            Mean rate over the step [rad/s], and specific force at its end [m/s^2].
-        magnetometer : (3,) array or None
-            Field at the end of the step [T].
-        dt : float
-            Length of the step [s].
-
-        Returns
-        -------
-        (4,) array
-            q(world <- sensor) as x, y, z, w.
-        """
+        """Take the readings of a step; return the attitude at its end; see `trial.Filter`."""
         if not len(self._quaternion):
             self._quaternion = from_two_vectors(accelerometer, magnetometer)
         else:
@@ -82,7 +64,7 @@ class ReferenceFilter:
         variance = accelerometer_density ** 2 / dt
         deviation = abs(math.sqrt(accelerometer @ accelerometer) - GRAVITY)
         self._disturbed_s -= dt
-        if deviation > LARGEST_DEVIATION * math.sqrt(variance) and not self.is_gravity_trusted:
+        if deviation > LARGEST_DEVIATION * math.sqrt(variance):
             self._disturbed_s = DISTURBED_S
         if self._disturbed_s > 0.0:
             variance = DISTURBED ** 2
@@ -95,16 +77,12 @@ class ReferenceFilter:
     def predict(self, rates: Reals, dt: float) -> None:
         """Advance by a rotation with constant rates [rad/s] for dt [s]."""
         turn = rates * dt
-        self._quaternion = self.integrate(self._quaternion, turn)
+        self._quaternion = product(self._quaternion, exponential(turn))
         transition = np.eye(6)
         transition[:3, :3] = matrix_of(exponential(-turn))
         transition[:3, 3:] = -dt * np.eye(3)
         self._p = transition @ self._p @ transition.T
         self._p[:3, :3] += self._densities[0] ** 2 * dt * np.eye(3)
-
-    def integrate(self, quaternion: Reals, turn: Reals) -> Reals:
-        """Return the quaternion after a rotation by a rotation vector in the sensor frame."""
-        return product(quaternion, exponential(turn))
 
     def _correct(self, pairs: Sequence[tuple[Reals, Reals, float]]) -> None:
         """Correct by pairs of a reading and its vector in the world, each with its variance."""

@@ -55,14 +55,7 @@ class Report:
                 if not math.isnan(value)]
 
     def as_json(self) -> str:
-        """
-        Return the report as JSON.
-
-        Returns
-        -------
-        str
-            An object of subject, passed, faults, evidence and measures, null for NaN.
-        """
+        """Return JSON with subject, passed, faults, evidence and measures, null for NaN."""
         return json.dumps({
             'subject': self.subject, 'passed': self.passed, 'faults': self.faults,
             'evidence': dict(self.found),
@@ -70,14 +63,7 @@ class Report:
                          for name, value in self.measures.items()}}, indent=2)
 
     def as_junit(self) -> str:
-        """
-        Return the report as JUnit XML.
-
-        Returns
-        -------
-        str
-            A test suite with a test case for each fault of FAULTS.
-        """
+        """Return a test suite in JUnit XML with a test case for each fault of FAULTS."""
         suite = ElementTree.Element('testsuite', name=f'examine {self.subject}',
                                     tests=str(len(FAULTS)), failures=str(len(self.found)),
                                     errors='0', skipped='0')

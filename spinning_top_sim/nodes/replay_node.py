@@ -43,12 +43,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _prepare(argv: list[str]) -> Callable[[], RunnableNode]:
-    parser = cli.Parser('replay', DESCRIPTION, EPILOG)
-    add_arguments(parser)
-    options = parser.parse_args(without_ros_arguments(argv))
+    options = _parser().parse_args(without_ros_arguments(argv))
     from spinning_top_sim.nodes.replayer import Replayer, open_log  # noqa: PLC0415
     log = open_log(options.file, options.partial)
     return lambda: Replayer(log, options)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = cli.Parser('replay', DESCRIPTION, EPILOG)
+    add_arguments(parser)
+    return parser
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

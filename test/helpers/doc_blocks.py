@@ -87,6 +87,7 @@ class Runner:
         # Executables, and the package where it is not installed.
         paths = (str(Path(sys.executable).parent), str(ROOT / 'scripts'), os.environ['PATH'])
         self._environment = {**os.environ, 'PATH': os.pathsep.join(paths), 'COLUMNS': '118',
+                             'PYTEST_DISABLE_PLUGIN_AUTOLOAD': '1',
                              'PYTHONPATH': os.pathsep.join(filter(None, (
                                  os.environ.get('PYTHONPATH'), str(ROOT))))}
 

@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 
+from spinning_top_sim.exam.adapters import Vqf
 from spinning_top_sim.exam.reference import ReferenceFilter, product
 
 HALF = 0.5 ** 0.5
@@ -50,18 +51,21 @@ MISREADINGS = {
     'invalid_output': partial(Misreading, said=lambda q: q * np.nan)}
 
 
-class FirstOrder(ReferenceFilter):
-    def integrate(self, quaternion, turn):
-        return product(quaternion, np.array((*(0.5 * turn), 1.0)))
+class FirstOrder(Vqf):
+    """Its steps turn by 2 arctan(|w| dt / 2), as those of q + q w dt / 2 do."""
+
+    def update(self, gyroscope, accelerometer, magnetometer, dt):
+        half = 0.5 * dt * np.linalg.norm(gyroscope)
+        return super().update(gyroscope * (np.arctan(half) / half if half else 1.0),
+                              accelerometer, magnetometer, dt)
 
 
-class TakesForceForGravity(ReferenceFilter):
-    is_gravity_trusted = True
+class Tuned(Vqf):
+    """VQF with other settings."""
 
-
-class WithoutBias(ReferenceFilter):
-    def __init__(self):
-        super().__init__(bias_stddev=1e-9)
+    def __init__(self, **settings):
+        super().__init__()
+        self._make = partial(self._make, **settings)
 
 
 class HalfCovariance(ReferenceFilter):
@@ -72,9 +76,10 @@ class TwiceCovariance(ReferenceFilter):
     covariance = property(lambda self: 2.0 * self._p[:3, :3])
 
 
-# The reference filter with each fault.
+# A filter with each fault.
 FAULTY = {
-    'first_order_integration': FirstOrder, 'lever_arm': TakesForceForGravity,
-    'no_bias_estimate': WithoutBias, 'covariance_small': HalfCovariance,
-    'covariance_large': TwiceCovariance,
-    **{name: partial(misread, ReferenceFilter) for name, misread in MISREADINGS.items()}}
+    'first_order_integration': FirstOrder,
+    'covariance_small': HalfCovariance, 'covariance_large': TwiceCovariance,
+    'lever_arm': partial(Tuned, tauAcc=0.1),
+    'no_bias_estimate': partial(Tuned, motionBiasEstEnabled=False, restBiasEstEnabled=False),
+    **{name: partial(misread, Vqf) for name, misread in MISREADINGS.items()}}
