@@ -3,8 +3,8 @@
 """
 A ROS node with an attitude filter, for the exam of nodes:
 
-  examine --node "python examples/attitude_node.py" --topic imu/data
-  examine --topic imu/data                      # while it runs
+  spinning-top examine --node "python examples/attitude_node.py" --topic imu/data
+  spinning-top examine --topic imu/data                      # while it runs
 """
 
 import contextlib

@@ -73,4 +73,4 @@ def test_without_matplotlib_the_error_names_the_extra():
                '    except ImportError as error:\n        print(error)\n')
     said = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True,
                           timeout=60, check=True, cwd=ROOT).stdout
-    assert said.count("pip install 'spinning_top_sim[plot]'") == 2
+    assert said.count("-m pip install 'matplotlib") == 2

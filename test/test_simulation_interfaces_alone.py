@@ -45,7 +45,7 @@ def test_it_is_offered_where_it_is_installed_and_not_switched_off(
     offered = []
     monkeypatch.setattr(sim_node, 'find_spec', lambda name: installed or None)
     monkeypatch.setattr(simulation_handlers, 'offer', offered.append)
-    argv = ['sim_node', '--ros-args', '-p', f'simulation_interfaces:={str(wanted).lower()}']
+    argv = ['--ros-args', '-p', f'simulation_interfaces:={str(wanted).lower()}']
     with as_a_process():
         import rclpy
         rclpy.init(args=argv)

@@ -3,10 +3,10 @@
 Examine an attitude filter: its attitudes in a log beside the truth, a ROS node,
 or a published filter by name.
 
-  examine run.mcap --topic /imu/data
-  examine --node "python examples/attitude_node.py" --topic imu/data
-  examine --topic imu/data                      # of a node that runs already
-  examine --filter vqf --level full --page vqf.png
+  spinning-top examine run.mcap --topic /imu/data
+  spinning-top examine --node "python examples/attitude_node.py" --topic imu/data
+  spinning-top examine --topic imu/data                      # of a node that runs already
+  spinning-top examine --filter vqf --level full --page vqf.png
 
 exit codes:
   0    no fault was found

@@ -12,6 +12,8 @@ from spinning_top_sim.installation import version
 
 OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130         # argparse uses 2, too
 
+ERRORS: tuple[type[Exception], ...] = (ValueError, ArithmeticError, OSError, ImportError)
+
 
 class Parser(argparse.ArgumentParser):
     """The arguments of `spinning-top NAME`; wrong ones are refused in one line."""
@@ -50,7 +52,7 @@ def run(name: str, help_text: str | None, argv: Sequence[str] | None,
         # The reader of the output, such as a pager, has ended.  Python flushes the output again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
-    except (ValueError, ArithmeticError, OSError, ImportError, *errors) as error:
+    except (*ERRORS, *errors) as error:
         what = str(error)
         if isinstance(error, OSError) and error.filename is not None:
             what = f'{error.filename}: {error.strerror}'
