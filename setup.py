@@ -20,4 +20,10 @@ DATA_FILES = {
     f'lib/{NAME}': glob('scripts/*'),
 }
 
-setup(data_files=[(folder, sorted(files)) for folder, files in DATA_FILES.items() if files])
+setup(
+    # Not in pyproject.toml: old and new setuptools want different forms of the one, and colcon
+    # cannot read the other.
+    license='Apache-2.0',
+    python_requires='>=3.11',
+    data_files=[(folder, sorted(files)) for folder, files in DATA_FILES.items() if files],
+)
