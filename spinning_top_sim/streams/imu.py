@@ -47,6 +47,11 @@ class Imu:
         self.takes_means = values['imu.sampling'] == 'mean'
         self.intervals = Intervals(period_ns(values['imu.rate']))
 
+    @property
+    def present_sensor(self) -> 'Sensor':
+        """The sensor at the present rate."""
+        return self.sensor(self.intervals.length_ns)
+
     def set_rate(self, rate: float, now_ns: int) -> bool:
         """Take samples at this rate [Hz] after `now_ns`; return whether the period changes."""
         length_ns = period_ns(rate)

@@ -2,6 +2,7 @@
 """What every stream has: a topic, a message type, a grid of times, and how states become bytes."""
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
 from spinning_top_sim.streams.path import Path
+from spinning_top_sim.streams.timing import Timing
 
 Result = TypeVar('Result')
 # Messages as rows (n, size): bytes or, of a table, numbers.
@@ -54,20 +56,19 @@ class Stream:
     One topic, with samples at t = k * period_ns for k = 0, 1, 2, ...
 
     parameter : prefix of its parameters
+    fields : returns the numbers that go into the fields of `template`
+    timing : the timing faults of its messages
     rate_parameter : name of the parameter that is its rate
     """
 
-    parameter: str
-    topic: str
-    type_name: str
-
-    def __init__(self, values: Mapping[str, Any], template: Template) -> None:
-        self.template = template
+    def __init__(self, values: Mapping[str, Any], parameter: str, topic: str, type_name: str,
+                 template: Template, fields: Callable[[Samples], Sequence[Field]] = lambda _: (),
+                 timing: Timing | None = None, rate_parameter: str = '') -> None:
+        self.parameter, self.topic, self.type_name = parameter, topic, type_name
+        # A copy, with rows of its own: equal streams share the template.
+        self.template, self.fields, self._timing = copy(template), fields, timing
+        self.rate_parameter = rate_parameter or f'{parameter}.rate'
         self.period_ns = period_ns(values[self.rate_parameter])
-
-    @property
-    def rate_parameter(self) -> str:
-        return f'{self.parameter}.rate'
 
     @property
     def size(self) -> int:
@@ -102,12 +103,13 @@ class Stream:
         rows : (n, size)
             The messages, valid until the next call.
         """
-        rows = self.template.encode(epoch_ns + samples.t_ns, *self.fields(samples))
-        return samples.t_ns, rows
-
-    def fields(self, samples: Samples) -> Sequence[Field]:
-        """Return the numbers that go into the fields of `template`."""
-        raise NotImplementedError
+        t_ns = samples.t_ns
+        if self._timing is None:
+            return t_ns, self.template.encode(epoch_ns + t_ns, *self.fields(samples))
+        rows = self.template.encode(self._timing.stamps_ns(epoch_ns, t_ns, self.period_ns),
+                                    *self.fields(samples))
+        copies = self._timing.copies(t_ns, self.period_ns)
+        return np.repeat(t_ns, copies), np.repeat(rows, copies, axis=0)
 
 
 def period_ns(rate: float) -> int:
