@@ -40,7 +40,7 @@ class Simulation:
     top : the top that they describe
     streams : every stream, whether it is switched on or not
     path : the motion
-    now_ns : every sample up to here is done (-1: not even that of t = 0)
+    now_ns : every sample up to here is done (-1: not even that of t = 0); may be set
     history : what was applied since the start: commands as (t_ns, l3, lz), states that were set as
         t_ns and the fields of `State`, changes of `imu.rate` as (t_ns, rate)
     epoch_ns : stamp of t = 0 [ns]
@@ -151,10 +151,6 @@ class Simulation:
                 self.now_ns = block.until_ns
                 yield block
                 self.path.release(self.now_ns)
-
-    def skip_to(self, t_ns: int) -> None:
-        """Take the samples up to this time as done, and those after it as not done."""
-        self.now_ns = t_ns
 
     def apply(self, changes: Mapping[str, Any]) -> None:
         """Take over new values of the parameters in `Stream.at_once`, after `now_ns`."""
