@@ -27,10 +27,11 @@ class Samples:
 
     path : the motion
     times : of the samples, within the present segment [ns]
+    epoch_ns : stamp of t = 0 [ns]
     """
 
-    def __init__(self, path: Path, times: range) -> None:
-        self.path, self.times = path, times
+    def __init__(self, path: Path, times: range, epoch_ns: int) -> None:
+        self.path, self.times, self.epoch_ns = path, times, epoch_ns
         self._results: dict[Callable[..., Any], Any] = {}
 
     @cached_property
@@ -75,13 +76,8 @@ class Stream:
         """Size of a message [bytes]."""
         return len(self.template)
 
-    @property
-    def at_once(self) -> tuple[str, ...]:
-        """Names of the parameters whose changes `apply` takes over."""
-        return (self.rate_parameter,)
-
     def apply(self, changes: Mapping[str, Any]) -> None:
-        """Take over new values of parameters."""
+        """Take over a new rate, if it is among these parameters."""
         if self.rate_parameter in changes:
             self.period_ns = period_ns(changes[self.rate_parameter])
 
@@ -90,11 +86,9 @@ class Stream:
         return range((after_ns // self.period_ns + 1) * self.period_ns, until_ns + 1,
                      self.period_ns)
 
-    def encode(self, samples: Samples, epoch_ns: int) -> Encoded:
+    def encode(self, samples: Samples) -> Encoded:
         """
         Return the messages of samples.
-
-        epoch_ns : stamp of t = 0 [ns]
 
         Returns
         -------
@@ -103,7 +97,7 @@ class Stream:
         rows : (n, size)
             The messages, valid until the next call.
         """
-        t_ns = samples.t_ns
+        t_ns, epoch_ns = samples.t_ns, samples.epoch_ns
         if self._timing is None:
             return t_ns, self.template.encode(epoch_ns + t_ns, *self.fields(samples))
         rows = self.template.encode(self._timing.stamps_ns(epoch_ns, t_ns, self.period_ns),

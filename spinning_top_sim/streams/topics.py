@@ -4,7 +4,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.attitude import Vector
 from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.physics.top import Shape
-from spinning_top_sim.streams import messages, parameters, timing
+from spinning_top_sim.streams import messages, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.magnetometer import Magnetometer
-from spinning_top_sim.streams.stream import Encoded, Samples, Stream
+from spinning_top_sim.streams.stream import Samples, Stream
+from spinning_top_sim.streams.timing import Timing, faults_of
 
 JOINTS = ('precession_joint', 'nutation_joint', 'spin_joint')
 INVARIANTS = ('energy', 'l3', 'lz', 'energy_drift', 'l3_drift', 'lz_drift',
@@ -55,6 +56,16 @@ def _increment(imu: Imu, place: int, samples: Samples) -> Sequence[Field]:
     return (increments[place],)
 
 
+def _timing(timing: Timing, imu: Imu, samples: Samples) -> Sequence[Field]:
+    """Return stamp and true time of each sample of the IMU, and how often it was sent."""
+    t_ns, period_ns = samples.t_ns, imu.intervals.length_ns
+    stamps_ns = timing.stamps_ns(samples.epoch_ns, t_ns, period_ns)
+    true_ns = samples.epoch_ns + t_ns
+    columns = (*np.divmod(stamps_ns, NANOSECONDS), *np.divmod(true_ns, NANOSECONDS),
+               timing.copies(t_ns, period_ns))
+    return ([column.astype(np.float64) for column in columns],)
+
+
 def _imu_odometry(imu: Imu, samples: Samples) -> Sequence[Field]:
     states = samples.states
     position, velocity = imu.motion(states)
@@ -79,7 +90,7 @@ class ImuStream(Stream):
         self.imu, self._frame_id = imu, values['imu.frame_id']
         self._has_orientation, self._is_noisy = has_orientation, is_noisy
         super().__init__(values, parameter, topic, 'sensor_msgs/msg/Imu', self._template(),
-                         fields, timing.faults(values) if is_noisy else None)
+                         fields, faults_of(values) if is_noisy else None)
 
     def apply(self, changes: Mapping[str, Any]) -> None:
         super().apply(changes)
@@ -97,24 +108,6 @@ class ImuStream(Stream):
         return messages.imu(self._frame_id, *covariances)
 
 
-class ImuTiming(Stream):
-    """The stamp and the true time of each sample of the IMU, and how often it was sent."""
-
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values, 'imu_timing', 'ground_truth/imu_timing', ARRAY,
-                         messages.float64_multi_array(TIMING), rate_parameter='imu.rate')
-        self._times = timing.Timing(values)
-
-    def encode(self, samples: Samples, epoch_ns: int) -> Encoded:
-        t_ns = samples.t_ns
-        true_ns = epoch_ns + t_ns
-        stamps_ns = self._times.stamps_ns(epoch_ns, t_ns, self.period_ns)
-        columns = (*np.divmod(stamps_ns, NANOSECONDS), *np.divmod(true_ns, NANOSECONDS),
-                   self._times.copies(t_ns, self.period_ns))
-        return t_ns, self.template.encode(
-            true_ns, [column.astype(np.float64) for column in columns])
-
-
 class Mag(Stream):
     """The magnetic field: as a magnetometer reads it (REP-145), or exact."""
 
@@ -123,12 +116,11 @@ class Mag(Stream):
         super().__init__(values, 'mag', topic, 'sensor_msgs/msg/MagneticField',
                          messages.magnetic_field(values['imu.frame_id']),
                          self._truth if is_exact else self._readings)
-        self._values, self._imu = values, imu
-        self._sensor = Magnetometer(values, self.period_ns)
+        self._imu, self._sensor_of = imu, lru_cache(4)(partial(Magnetometer, values))
 
-    def apply(self, changes: Mapping[str, Any]) -> None:
-        super().apply(changes)
-        self._sensor = Magnetometer(self._values, self.period_ns)
+    @property
+    def _sensor(self) -> Magnetometer:
+        return self._sensor_of(self.period_ns)
 
     def _exact(self, samples: Samples) -> Vector:
         return self._sensor.true(self._imu.orientation(samples.states))
@@ -191,7 +183,7 @@ class Markers(Stream):
 def all_streams(values: Mapping[str, Any]) -> list[Stream]:
     """Return every stream, in the order in which the samples of one time are sent."""
     imu, world, body = Imu(values), values['world_frame'], values['body_frame']
-    frame, faults = values['imu.frame_id'], timing.faults(values)
+    frame, faults = values['imu.frame_id'], faults_of(values)
     stream, of_imu = partial(Stream, values), partial(ImuStream, values, imu)
     increment = partial(stream, 'increments', timing=faults, rate_parameter='imu.rate')
     return [
@@ -207,7 +199,9 @@ def all_streams(values: Mapping[str, Any]) -> list[Stream]:
                fields=lambda samples: (NO_ROTATION, *imu.present_sensor.bias(samples.times))),
         of_imu('ground_truth_imu', 'ground_truth/imu',
                lambda samples: (imu.orientation(samples.states), *imu.sampled(samples))),
-        ImuTiming(values),
+        stream('imu_timing', 'ground_truth/imu_timing', ARRAY,
+               messages.float64_multi_array(TIMING), partial(_timing, Timing(values), imu),
+               rate_parameter='imu.rate'),
         Mag(values, imu, 'imu/mag'),
         Mag(values, imu, 'ground_truth/mag', is_exact=True),
         increment('imu/dq', 'geometry_msgs/msg/QuaternionStamped', messages.stamped(frame, 4),

@@ -223,7 +223,7 @@ class _Rerun:
         if self._samples:
             yield from self._play(run.begun_ns, ())
         simulation.now_ns = run.begun_ns
-        at_once = {name for stream in simulation.streams for name in stream.at_once}
+        at_once = {stream.rate_parameter for stream in simulation.streams}
         simulation.apply({name: run.values_at_recording[name] for name in at_once})
         yield simulation, Event('start', run.epoch_ns, 0, simulation.now_ns, {})
 
