@@ -368,9 +368,9 @@ def test_a_change_of_rate_goes_on_on_the_new_grid(before, after):
 
 
 def test_a_change_of_rates_reaches_every_stream():
-    """A run is computed again by the parameters that `Stream.at_once` names."""
+    """A run is computed again by the rates of its streams."""
     simulation = simulate()
-    at_once = {name for stream in simulation.streams for name in stream.at_once}
+    at_once = {stream.rate_parameter for stream in simulation.streams}
     assert at_once == {name for name in parameters.BY_NAME if name.endswith('.rate')}
     assert all(parameters.BY_NAME[name].effect is parameters.Effect.NOW for name in at_once)
     simulation.advance(SECOND)

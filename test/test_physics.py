@@ -198,7 +198,7 @@ RESTING = {
     'sleeping': ({}, 'sleeping: theta = 0 deg'),
     'cusp': ({'initial.theta': math.pi, 'spin.l3': 1.6, 'spin.lz': -1.6},
              'hanging: theta = 180 deg'),
-    'looping': ({'initial.theta': 1e-170, 'spin.l3': 2.0, 'spin.lz': 2.0}, 'sleeping: theta')}
+    'looping': ({'initial.theta': 1e-140, 'spin.l3': 2.0, 'spin.lz': 2.0}, 'sleeping: theta')}
 
 
 @pytest.mark.parametrize(('scene', 'changed', 'begin'), [(k, *v) for k, v in RESTING.items()])

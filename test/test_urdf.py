@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.live import LiveSimulation
-from spinning_top_sim.streams.topics import JOINTS, JointStates, Pose
+from spinning_top_sim.streams.topics import JOINTS
 from spinning_top_sim.tools import urdf
 
 pytest.importorskip('xacro')
@@ -47,8 +47,8 @@ def test_the_joint_states_put_base_link_where_the_pose_is(tmp_path, scene):
     values = {**scene_parameters(scene), **MOUNTED}
     model = robot(tmp_path, values)
     simulation = LiveSimulation(parameters.checked(values))
-    pose = next(s for s in simulation.streams if isinstance(s, Pose))
-    joints = next(s for s in simulation.streams if isinstance(s, JointStates))
+    pose = next(s for s in simulation.streams if s.topic == 'pose')
+    joints = next(s for s in simulation.streams if s.topic == 'joint_states')
     taken = record(simulation, pose.topic, joints.topic)
     simulation.advance(SECOND)
     poses, positions = ([stream.template.decode(data)[0][0] for topic, _, data in taken

@@ -185,7 +185,7 @@ def record(scenario: Scenario, imu: Mapping[str, Any], seed: int) -> Run:
         halves = simulation.segment.states(range(begin_ns, stop_ns + 1, period_ns // 2))
         parts.append(_readings(device, magnetometer, halves, steps))
         if stop_ns < end_ns:
-            simulation.skip_to(stop_ns)
+            simulation.now_ns = stop_ns
             simulation.command(-simulation.l3, -simulation.lz)
         begin_ns = stop_ns
     gyroscope, accelerometer, field, truth, rates = np.split(

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures of a motion by matplotlib: the tip's path on the sphere, its curves, an animation."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,13 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.regimes import swing
 
 Reals = NDArray[np.float64]
-Complexes = NDArray[np.complex128]
 
 # From the world to the viewer: towards, right, up.  60 deg about z, then 45 deg about y.
 _TURN, _TILT = np.radians(60.0), np.radians(45.0)
 VIEW = np.array([[np.cos(_TILT), 0.0, np.sin(_TILT)], [0.0, 1.0, 0.0],
                  [-np.sin(_TILT), 0.0, np.cos(_TILT)]]) @ np.array(
     [[np.cos(_TURN), -np.sin(_TURN), 0.0], [np.sin(_TURN), np.cos(_TURN), 0.0], [0.0, 0.0, 1.0]])
+FULL_TURN = 2.0 * np.pi
 INK, FAINT, PATH = '#1b1b1b', '#c9c9c9', '#0b6fa4'
 # Okabe and Ito's colours: distinct also for the colour-blind, and as greys.
 COLOURS = ('#0072b2', '#d55e00', '#009e73')
@@ -46,34 +47,28 @@ def draw(axes: Axes, points: Reals, color: str, width: float) -> None:
                   alpha=alpha, color=color, linewidth=width)
 
 
-def on_sphere(tip: Complexes, height: Reals | float) -> Reals:
-    """Return points (n, 3) from x + iy and z."""
-    return np.stack(np.broadcast_arrays(tip.real, tip.imag, height), axis=1)
+def arc(begin: float, end: float, radius: float, height: float) -> Reals:
+    """Return points (n, 3) of a horizontal arc between two angles [rad]."""
+    angle = np.linspace(begin, end, 201)
+    return np.stack((radius * np.cos(angle), radius * np.sin(angle), np.full(201, height)), axis=1)
 
 
-def draw_sphere(axes: Axes, tilts: tuple[float, ...], lowest: float = -0.9) -> None:
-    """Draw the unit sphere with circles of these tilts; below `lowest` it is open."""
-    circle = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 400))
-    axes.plot(np.where(circle.imag > lowest + 0.2, circle.real, np.nan), circle.imag,
-              color=FAINT, linewidth=1.0)
+def draw_sphere(axes: Axes, tilts: Sequence[float]) -> None:
+    """Draw the unit sphere with circles of these tilts."""
+    axes.plot(*arc(0.0, FULL_TURN, 1.0, 0.0).T[:2], color=FAINT, linewidth=1.0)
     for theta in tilts:
-        draw(axes, on_sphere(np.sin(theta) * circle, np.cos(theta)), FAINT, 0.8)
+        draw(axes, arc(0.0, FULL_TURN, np.sin(theta), np.cos(theta)), FAINT, 0.8)
     axes.set_aspect('equal')
-    axes.set(xlim=(-1.1, 1.1), ylim=(lowest, 1.25))
+    axes.set(xlim=(-1.1, 1.1), ylim=(-1.1, 1.25))
     axes.axis('off')
 
 
-def draw_tip(axes: Axes, tip: Complexes, height: Reals) -> None:
-    """Draw the tip's path, x + iy and z, and the axis at its end."""
-    path = on_sphere(tip, height)
+def draw_tip(axes: Axes, path: Reals) -> None:
+    """Draw the tip's path (n, 3), and the axis at its end."""
     draw(axes, path, PATH, 1.8)
     across, up, _ = project(path[-1:])
     axes.plot([0.0, *across], [0.0, *up], color=INK, linewidth=2.2, solid_capstyle='round')
     axes.plot(across, up, 'o', color=INK, markersize=5)
-
-
-def _lowest(height: Reals) -> float:
-    return -0.9 if np.min(height) > -0.2 else -1.25
 
 
 def _check(motion: Any) -> None:
@@ -87,7 +82,7 @@ def _check(motion: Any) -> None:
 def plot(motion: Any) -> Figure:
     """Return a figure of `States`; see `States.plot`."""
     _check(motion)
-    x, y, z = motion.rows_axis
+    path = np.stack(motion.rows_axis, axis=1)
     bounds = sorted(float(np.arccos(u)) for u in swing(motion.top, motion.start))
     energy = motion.energy
     with rc_context(STYLE):
@@ -95,15 +90,13 @@ def plot(motion: Any) -> Figure:
         panels = figure.subplot_mosaic(
             [['sphere', 'above'], ['theta', 'rate'], ['drift', 'drift']],
             height_ratios=(2.2, 1.0, 0.8))
-        draw_sphere(panels['sphere'], (*bounds, np.pi / 2), _lowest(z))
-        draw_tip(panels['sphere'], x + 1j * y, z)
+        draw_sphere(panels['sphere'], (*bounds, np.pi / 2))
+        draw_tip(panels['sphere'], path)
         panels['sphere'].set_title('path of the axis')
         above = panels['above']
-        circle = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 200))
         for theta in bounds:
-            above.plot(np.sin(theta) * circle.real, np.sin(theta) * circle.imag, color=FAINT,
-                       linewidth=0.8)
-        above.plot(x, y, color=PATH)
+            above.plot(*arc(0.0, FULL_TURN, np.sin(theta), 0.0).T[:2], color=FAINT, linewidth=0.8)
+        above.plot(path[:, 0], path[:, 1], color=PATH)
         above.set(title='from above', aspect='equal')
         above.axis('off')
         panels['theta'].plot(motion.t, np.degrees(motion.theta_folded), color=COLOURS[0])
@@ -130,24 +123,22 @@ def animate(motion: Any, fps: float, speed: float) -> FuncAnimation:
     # Each frame shows a sample: the newest one, but for rounding.
     count = int((times[-1] - times[0]) * fps / speed + 1e-6) + 1
     shown = np.searchsorted(times, times[0] + (np.arange(count) + 1e-6) * speed / fps, 'right') - 1
-    x, y, z = motion.rows_axis
-    tip, lowest = x + 1j * y, _lowest(z)
+    path = np.stack(motion.rows_axis, axis=1)
     bounds = tuple(float(np.arccos(u)) for u in swing(motion.top, motion.start))
-    rim, mark = (on_sphere(DISC * np.exp(1j * np.linspace(begin, end, points)), DISC_HEIGHT)
-                 for begin, end, points in ((0.0, 2.0 * np.pi, 60), (-0.25, 0.25, 9)))
-    mark = np.vstack(((0.0, 0.0, DISC_HEIGHT), mark))
+    rim = arc(0.0, FULL_TURN, DISC, DISC_HEIGHT)
+    mark = np.vstack(((0.0, 0.0, DISC_HEIGHT), arc(-0.25, 0.25, DISC, DISC_HEIGHT)))
     figure = Figure(figsize=(4.0, 4.0), dpi=80)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
 
     def frame(number: int) -> list[Artist]:
         axes.clear()
-        draw_sphere(axes, bounds, lowest)
+        draw_sphere(axes, bounds)
         now = shown[number]
         for points, style in ((rim, {'facecolor': '#f2e3c9', 'edgecolor': INK, 'alpha': 0.9}),
                               (mark, {'color': COLOURS[1]})):
             turned = attitude.in_world(tuple(motion.quaternion[now]), tuple(points.T))
             axes.fill(*project(np.stack(turned, axis=1))[:2], **style)
-        draw_tip(axes, tip[:now + 1], z[:now + 1])
+        draw_tip(axes, path[:now + 1])
         axes.text(-1.05, 1.15, f't = {times[now]:.2f} s', color=INK, fontsize=9)
         return []
 

@@ -25,8 +25,6 @@ from spinning_top_sim.solvers.times import LARGEST_NS, Times
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
 MOST_TURNS = 2.0 ** 52
-# Closer to the separatrix hyperbolic functions overflow.
-LEAST_M1 = Decimal('1e-290')
 # Times that are evaluated together: the temporaries of more do not fit into the cache.
 BLOCK = 8192
 
@@ -85,9 +83,6 @@ class ExactSolution:
 
     def _take_constants(self, motion: ThetaMotion) -> None:
         top, start = self.top, self.start
-        if motion.m1 < LEAST_M1:
-            raise ValueError(f'm1 = {motion.m1:.3e} for {top} from {start}: the motion is closer '
-                             f'to the separatrix than {LEAST_M1}')
         self.m, self.m1 = float(motion.m), float(motion.m1)
         # 2 K/w, two quarter periods
         self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
@@ -142,14 +137,7 @@ class ExactSolution:
         return across
 
     def describe(self) -> Description:
-        """
-        Return the motion in the numbers that a physicist asks for.
-
-        Returns
-        -------
-        Description
-            Name, bounds, period and mean rates.
-        """
+        """Return the motion in the numbers that a physicist asks for."""
         top, start = self.top, self.start
         rests = axis_rests(top, start)
         low, high = 2 * (start.theta,) if rests else (self.theta_min, self.theta_max)

@@ -1,69 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every solver has, the choice among them, and `solve`, which reads a motion at times."""
+"""The choice among the solvers, and `solve`, which reads a motion at times."""
 
 from contextlib import suppress
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.regimes import axis_rests
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.solvers.rk45 import EulerMotion, TransportMotion
+from spinning_top_sim.solvers.rk45 import EulerMotion, SteppedMotion, TransportMotion
 from spinning_top_sim.solvers.theta_values import MOST
 
 METHODS = ('rk45', 'exact')
 EQUATIONS = ('transport', 'euler')
-
-
-class Propagator(Protocol):
-    """
-    A motion from its start at t = 0; every time counts from there.
-
-    top, start : what moves, and from where
-    """
-
-    top: Top
-    start: State
-
-    @property
-    def steps(self) -> int:
-        """Integration steps taken so far."""
-
-    @property
-    def evaluations(self) -> int:
-        """Evaluations of the right-hand side so far."""
-
-    @property
-    def reached_ns(self) -> int:
-        """The last time that `states` can give without further steps [ns]."""
-
-    @property
-    def ns_limit(self) -> int:
-        """The last time that the solver can give at all [ns]."""
-
-    def reach(self, ns: int, max_steps: int | None = None) -> bool:
-        """
-        Take steps up to a time [ns]; return False if `max_steps` were too few.
-
-        Raises IntegrationError if the equations cannot go on.
-        """
-
-    def release(self, before_ns: int) -> None:
-        """Forget the steps that only states before this time [ns] need, or more to save memory."""
-
-    def states(self, times_ns: NDArray[np.int64] | range) -> States:
-        """
-        Return the states at ascending times (n,) [ns] that are reached.
-
-        Raises IntegrationError if the steps at one of them are forgotten.
-        """
-
-    def states_at_seconds(self, t: Column) -> States:
-        """Return the states at times (n,) [s] for `solve`; ascending, if it takes steps."""
+# A motion from its start at t = 0; `SteppedMotion` says what its members do.
+Propagator = ExactSolution | SteppedMotion
 
 
 def propagate(top: Top, start: State, *, method: str, equations: str = 'transport',

@@ -35,7 +35,12 @@ MOST_KEPT = 50_000
 
 
 class SteppedMotion(ABC):
-    """A motion by the steps of some equations, read in blocks of times; see `Propagator`."""
+    """
+    A motion by the steps of some equations, from its start at t = 0; every time counts from there.
+
+    top, start : what moves, and from where
+    ns_limit : the last time that it can give at all [ns]
+    """
 
     ns_limit = 2 ** 63 - 1              # steps go on for ever
 
@@ -47,19 +52,27 @@ class SteppedMotion(ABC):
 
     @property
     def steps(self) -> int:
+        """Integration steps taken so far."""
         return self._integrator.steps
 
     @property
     def evaluations(self) -> int:
+        """Evaluations of the right-hand side so far."""
         return self._integrator.evaluations
 
     @property
     def reached_ns(self) -> int:
+        """The last time that `states` can give without further steps [ns]."""
         end = self._kept[-1].t1
         ns = math.floor(end * NANOSECONDS)
         return ns if ns / NANOSECONDS <= end else ns - 1
 
     def reach(self, ns: int, max_steps: int | None = None) -> bool:
+        """
+        Take steps up to a time [ns]; return False if `max_steps` were too few.
+
+        Raises IntegrationError if the equations cannot go on.
+        """
         taken = 0
         while self.reached_ns < ns:
             if taken == max_steps:
@@ -69,6 +82,7 @@ class SteppedMotion(ABC):
         return True
 
     def release(self, before_ns: int) -> None:
+        """Forget the steps that only states before this time [ns] need, or more to save memory."""
         count = bisect_left(self._kept, before_ns / NANOSECONDS, hi=len(self._kept) - 1,
                             key=attrgetter('t1'))
         self._forget(max(count, len(self._kept) - MOST_KEPT))
@@ -77,6 +91,7 @@ class SteppedMotion(ABC):
         del self._kept[:count]
 
     def states(self, times_ns: NDArray[np.int64] | range) -> States:
+        """Return the states at ascending times (n,) [ns]; see `states_at_seconds`."""
         return self.states_at_seconds(Times.from_ns(times_ns).seconds)
 
     def states_at_seconds(self, t: Column) -> States:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.solvers.decimal_math import double_double, pi
 from spinning_top_sim.solvers.theta_series import SIN_ODD, Series
-from spinning_top_sim.solvers.theta_setup import Factor, ThetaMotion
+from spinning_top_sim.solvers.theta_setup import ThetaMotion
 from spinning_top_sim.solvers.times import Rates, Times
 
 # glibc gives freed memory back at once, and clears the pages again at the next use, until it has
@@ -32,8 +32,8 @@ Matrix = NDArray[np.float64]
 QUARTER = 0.5 * math.pi         # the angle of a quarter period [rad]
 SIGNS = np.array((1.0, -1.0))   # of an even and of an odd number of half turns
 HALF_ANGLES = 0.5 * math.pi * np.array([[0.5], [1.0], [1.0]])       # of the three phases' units
-# Smaller amplitudes leave no room for their products in doubles, larger numbers none for halves.
-LEAST_AMPLITUDE, MOST = Decimal('1e-290'), Decimal('1e290')
+# Smaller amplitudes leave no room for their squares in doubles, larger numbers none for halves.
+LEAST_AMPLITUDE, MOST = Decimal('1e-145'), Decimal('1e290')
 
 
 class ThetaFunctions:
@@ -49,7 +49,7 @@ class ThetaFunctions:
     coefficients : of the polynomials, highest power first, by row, at even and at odd N, (k, 4, 2)
     real : the numbers, 0 and 1, of those of alpha and beta that have s = 0
     zeros : of the ones that pass a pole: 0 or 1, whether R = 0 at even or at odd N and y = 0
-    u_dot, u_dot_coefficients : of u', times `magnifier`, a power of 2 for small amplitudes
+    u_dot, u_dot_coefficients : of u'
     bounds : the least and the greatest theta in [0, pi] [rad]
     planar_rotation : (i, j) if both poles are passed: theta/2 is then within a quarter turn of
         (pi/2) (i + j N)
@@ -70,10 +70,8 @@ class ThetaFunctions:
         self.real = [k for k, factor in enumerate(factors) if not factor.sense]
         self.zeros = {k: pair.index(SIN_ODD) for k, pair in enumerate(self.prefactors[:2])
                       if SIN_ODD in pair}
-        smallest = min(map(_amplitude, ('alpha', 'beta'), factors))
-        self.magnifier = 2.0 ** -math.frexp(smallest)[1] if smallest else 1.0
-        self.u_dot = np.array([in_range("cos(theta)'", x * Decimal(self.magnifier))
-                               for x in motion.u_dot])
+        _check_amplitudes(motion)
+        self.u_dot = np.array([in_range("cos(theta)'", x) for x in motion.u_dot])
         self.u_dot_coefficients = _coefficients([[motion.u_dot_series]])[:, 0]
         # The rows where y = 0, at N = 0 and N = 1.
         alpha, beta, alpha_imag, beta_imag = np.where(
@@ -222,7 +220,7 @@ class ThetaValues:
         series = prefactor * _horner(constants.u_dot_coefficients, 4.0 * xi * (1.0 - xi))
         # In this order nothing overflows on the separatrix, where all grow like cosh x.
         theta_dot: Column = -constants.u_dot.take(self._parity) * (series / size) / (
-            constants.magnifier * without[0] * without[1])
+            without[0] * without[1])
         return theta_dot
 
     @cached_property
@@ -247,14 +245,14 @@ def in_range(name: str, value: Decimal) -> float:
     return float(value)
 
 
-def _amplitude(name: str, factor: Factor) -> float:
-    """Return the lesser of the largest coefficients at even and at odd N."""
-    sizes = [[max(map(abs, part.polynomial)) for part in parts] for parts in factor.parts]
-    for real, *_ in sizes:
-        if 0 < real < LEAST_AMPLITUDE:
-            raise ValueError(f'the amplitude of {name} is {real:.3e}: the start is too close to a '
-                             f'pole or to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
-    return float(min(map(max, sizes)))
+def _check_amplitudes(motion: ThetaMotion) -> None:
+    for name, factor in (('alpha', motion.alpha), ('beta', motion.beta)):
+        for real, _ in factor.parts:
+            size = max(map(abs, real.polynomial))
+            if 0 < size < LEAST_AMPLITUDE:
+                raise ValueError(
+                    f'the amplitude of {name} is {size:.3e}: the start is too close to a pole or '
+                    f'to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
 
 
 def _coefficients(rows: Sequence[Sequence[Series]]) -> NDArray[np.float64]:

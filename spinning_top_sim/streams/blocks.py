@@ -59,12 +59,13 @@ def blocks(path: Path, streams: Sequence[Stream], epoch_ns: int, after_ns: int, 
             failure = error
         block_end_ns = min(block_end_ns, path.present.reached_ns)
         if block_end_ns > after_ns:
-            samples = cache(partial(Samples, path))     # once for all streams of one rate
+            # Once for all streams of one rate.
+            samples = cache(partial(Samples, path, epoch_ns=epoch_ns))
             parts = []
             for stream in streams:
                 times = stream.times(after_ns, block_end_ns)
                 if times:
-                    parts.append((stream, *stream.encode(samples(times), epoch_ns)))
+                    parts.append((stream, *stream.encode(samples(times))))
                     yield None
             yield Block(block_end_ns, parts)
             after_ns = block_end_ns

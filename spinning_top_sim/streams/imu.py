@@ -47,6 +47,11 @@ class Imu:
         self.takes_means = values['imu.sampling'] == 'mean'
         self.intervals = Intervals(period_ns(values['imu.rate']))
 
+    @property
+    def present_sensor(self) -> 'Sensor':
+        """The sensor at the present rate."""
+        return self.sensor(self.intervals.length_ns)
+
     def set_rate(self, rate: float, now_ns: int) -> bool:
         """Take samples at this rate [Hz] after `now_ns`; return whether the period changes."""
         length_ns = period_ns(rate)
@@ -136,10 +141,9 @@ class Sensor:
         self.is_perfect = not any(self._g_sensitivity) and all(
             values[name] == BY_NAME[name].default
             for name in (f'imu.{kind}_{error}' for kind in KINDS for error in ERRORS))
-        resolution = _six(values, 'resolution')
-        self._converters = list(map(Converter, resolution, _six(values, 'range')))
+        self._resolutions, self._ranges = _six(values, 'resolution'), _six(values, 'range')
         white = np.array(_six(values, 'noise_density')) / math.sqrt(period_ns * 1e-9)
-        variances = (white ** 2 + np.array(resolution) ** 2 / 12.0).tolist()
+        variances = (white ** 2 + np.array(self._resolutions) ** 2 / 12.0).tolist()
         self.rate_variance, self.force_variance = variances[0], variances[3]
         turn_on_bias = np.array(_six(values, 'turn_on_bias'))[:, np.newaxis]
         if turn_on_bias.any():
@@ -161,10 +165,10 @@ class Sensor:
         white, bias = self._noise.at(times)
         # The chain of docs/sensor.md: matrices, g-sensitivity, bias, noise, rounding, range.
         w1, w2, w3, f1, f2, f3 = (
-            converter.convert(value + one_bias + one_white)
-            for value, one_bias, one_white, converter in zip(
-                itertools.chain(*self._distorted(*exact)), bias, white, self._converters,
-                strict=True))
+            converted(value + one_bias + one_white, resolution, largest)
+            for value, one_bias, one_white, resolution, largest in zip(
+                itertools.chain(*self._distorted(*exact)), bias, white, self._resolutions,
+                self._ranges, strict=True))
         return (w1, w2, w3), (f1, f2, f3)
 
     def orientation(self, exact: Quaternion, times: range) -> Quaternion:
@@ -233,26 +237,21 @@ def _bias_paths(values: Mapping[str, Any]) -> list[noise.Path]:
     return paths
 
 
-class Converter:
+def converted(value: Column, resolution: float, largest: float) -> Column:
     """
-    An analog-to-digital converter: it rounds to a resolution, then clips to a range.
+    Return readings (n,) of an analog-to-digital converter: rounded, then clipped to a range.
 
     The limits are the largest multiples of the resolution within the range.  A resolution or a
     range of 0 means none.
     """
-
-    def __init__(self, resolution: float, largest: float) -> None:
-        self._step, self._limit = resolution, largest or math.inf
-        if resolution and largest:
+    limit = largest or math.inf
+    if resolution:
+        if largest:
             steps = math.floor(largest / resolution)
-            self._limit = (steps if steps * resolution <= largest else steps - 1) * resolution
-
-    def convert(self, value: Column) -> Column:
-        """Return the readings (n,) of these values (n,)."""
-        if self._step:
-            # Adding 0.0 turns -0.0 into 0.0.
-            value = (np.rint(value / self._step) + 0.0) * self._step
-        return np.clip(value, -self._limit, self._limit)
+            limit = (steps if steps * resolution <= largest else steps - 1) * resolution
+        # Adding 0.0 turns -0.0 into 0.0.
+        value = (np.rint(value / resolution) + 0.0) * resolution
+    return np.clip(value, -limit, limit)
 
 
 def transformed(matrix: Sequence[float], vector: Vector) -> Vector:

@@ -26,7 +26,6 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.blocks import NEVER_NS, Block, blocks, span_of
 from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Stream
-from spinning_top_sim.streams.topics import ImuIncrements
 
 # Samples of the fastest stream in a block.  A command makes what is computed useless, and the next
 # one may come soon: after it, blocks begin small and double.
@@ -118,7 +117,7 @@ class LiveSimulation(Simulation):
         restarted : after `restart`, which may end the means
         """
         uses = (self.imu.takes_means and not restarted) or any(
-            isinstance(output.stream, ImuIncrements) and output.is_used for output in self.outputs)
+            output.stream.parameter == 'increments' and output.is_used for output in self.outputs)
         return parameters.LOWEST_RATE_OF_INTERVALS if uses else 0.0
 
     def advance(self, target_ns: int, publish_from_ns: int = 0,

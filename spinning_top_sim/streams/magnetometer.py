@@ -10,7 +10,7 @@ import numpy as np
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Quaternion, Vector
 from spinning_top_sim.streams import noise
-from spinning_top_sim.streams.imu import Converter, transformed
+from spinning_top_sim.streams.imu import converted, transformed
 
 
 class Magnetometer:
@@ -25,10 +25,10 @@ class Magnetometer:
 
     def __init__(self, values: Mapping[str, Any], period_ns: int) -> None:
         self._field, self._soft_iron = values['mag.field'], values['mag.soft_iron']
-        self._converter = Converter(values['mag.resolution'], values['mag.range'])
+        self._resolution, self._range = values['mag.resolution'], values['mag.range']
         deviation = values['mag.noise_density'] / math.sqrt(period_ns * 1e-9)
         walk, seed = values['mag.random_walk'], values['seed']
-        self.variance = deviation ** 2 + values['mag.resolution'] ** 2 / 12.0
+        self.variance = deviation ** 2 + self._resolution ** 2 / 12.0
         self._noise = noise.SensorNoise(
             seed, noise.Purpose.MAG_WHITE, period_ns, np.full((3, 1), deviation),
             np.array(values['mag.hard_iron'])[:, np.newaxis],
@@ -42,7 +42,7 @@ class Magnetometer:
     def read(self, exact: Vector, times: range) -> Vector:
         """Return the readings [T] of the field `exact` at these times [ns]."""
         white, bias = self._noise.at(times)
-        x, y, z = (self._converter.convert(value + one_bias + one_white)
+        x, y, z = (converted(value + one_bias + one_white, self._resolution, self._range)
                    for value, one_bias, one_white in zip(
                        transformed(self._soft_iron, exact), bias, white, strict=True))
         return x, y, z

@@ -6,14 +6,9 @@ Their parts are in the order of the .msg definitions (ROS 2 Jazzy, common_interf
 compares every template with the serializer of rclpy.
 """
 
-import copy
-from collections.abc import Callable
-from functools import lru_cache, wraps
-from typing import ParamSpec
+from functools import lru_cache
 
 from spinning_top_sim.streams.cdr import CdrWriter, Template
-
-Arguments = ParamSpec('Arguments')
 
 UNKNOWN_ORIENTATION = (-1.0,) + 8 * (0.0,)      # REP-145: no orientation in this message
 # A covariance of zeros means unknown (sensor_msgs/Imu), so that exact values have this variance.
@@ -35,23 +30,13 @@ def diagonal(*variances: float) -> tuple[float, ...]:
 EXACT = diagonal(0.0, 0.0, 0.0)
 
 
-def template(build: Callable[Arguments, Template]) -> Callable[Arguments, Template]:
-    """Serialize a message once for the same arguments: ensembles make it in every run."""
-    serialized = lru_cache(64)(build)
-
-    @wraps(build)
-    def copied(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Template:
-        return copy.copy(serialized(*args, **kwargs))  # type: ignore[arg-type]
-    return copied
-
-
-@template
+@lru_cache(64)      # ensembles make it in every run
 def pose_stamped(frame_id: str) -> Template:
     """geometry_msgs/PoseStamped at the origin; fields: orientation x, y, z, w."""
     return Template(CdrWriter().header(frame_id).append('d', *ORIGIN).field(4))
 
 
-@template
+@lru_cache(64)
 def joint_state(names: tuple[str, ...]) -> Template:
     """sensor_msgs/JointState without effort; fields: positions, velocities."""
     count = len(names)
@@ -61,7 +46,7 @@ def joint_state(names: tuple[str, ...]) -> Template:
     return Template(writer.append('I', 0))
 
 
-@template
+@lru_cache(64)
 def imu(frame_id: str, *covariances: tuple[float, ...]) -> Template:
     """sensor_msgs/Imu; fields: orientation x, y, z, w, angular velocity, linear acceleration."""
     writer = CdrWriter().header(frame_id)
@@ -70,13 +55,13 @@ def imu(frame_id: str, *covariances: tuple[float, ...]) -> Template:
     return Template(writer)
 
 
-@template
+@lru_cache(64)
 def magnetic_field(frame_id: str) -> Template:
     """sensor_msgs/MagneticField; fields: the magnetic field, its covariance."""
     return Template(CdrWriter().header(frame_id).field(3).field(9))
 
 
-@template
+@lru_cache(64)
 def odometry(frame_id: str, child_frame_id: str, *, moves: bool = False) -> Template:
     """
     nav_msgs/Odometry with exact values.
@@ -94,13 +79,13 @@ def odometry(frame_id: str, child_frame_id: str, *, moves: bool = False) -> Temp
     return Template(writer)
 
 
-@template
+@lru_cache(64)
 def stamped(frame_id: str, count: int) -> Template:
     """geometry_msgs/Vector3Stamped (count 3) or QuaternionStamped (4); fields: x, y, z(, w)."""
     return Template(CdrWriter().header(frame_id).field(count))
 
 
-@template
+@lru_cache(64)
 def float64_multi_array(labels: tuple[str, ...]) -> Template:
     """std_msgs/Float64MultiArray, one dimension labelled with its columns; fields: the data."""
     count = len(labels)
@@ -109,13 +94,13 @@ def float64_multi_array(labels: tuple[str, ...]) -> Template:
                     .append('I', count, count, 0, count).field(count))
 
 
-@template
+@lru_cache(64)
 def clock() -> Template:
     """rosgraph_msgs/Clock; no fields."""
     return Template(CdrWriter().stamp())
 
 
-@template
+@lru_cache(64)
 def markers(frame_id: str, size: tuple[float, ...], lines: tuple[float, ...], line_width: float,
             trace_points: int) -> Template:
     """

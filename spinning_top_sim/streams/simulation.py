@@ -18,7 +18,7 @@ from spinning_top_sim.streams.blocks import Block, blocks, span_of
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.intervals import LONGEST_NS
-from spinning_top_sim.streams.path import SHORTEST_RUN_NS, Path, Segment
+from spinning_top_sim.streams.path import Path, Segment
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import ImuStream, all_streams
 
@@ -28,8 +28,8 @@ FIRST_STEPS, OFFLINE_STEPS = 500, 2000
 # Offline, a block has so many bytes, but covers no more time than this, for the sake of progress;
 # nor are there more blocks than this.
 OFFLINE_BYTES, LONGEST_OFFLINE_NS, MOST_BLOCKS = 4 << 20, 100 * NANOSECONDS, 20_000
-# Turns a second whose phases doubles hold for the shortest run.
-MOST_RATE = MOST_TURNS / SHORTEST_RUN_NS * NANOSECONDS
+# Turns a second whose phases doubles hold up to the last stamp.
+MOST_RATE = MOST_TURNS / LAST_STAMP_NS * NANOSECONDS
 
 
 class Simulation:
@@ -40,7 +40,7 @@ class Simulation:
     top : the top that they describe
     streams : every stream, whether it is switched on or not
     path : the motion
-    now_ns : every sample up to here is done (-1: not even that of t = 0)
+    now_ns : every sample up to here is done (-1: not even that of t = 0); may be set
     history : what was applied since the start: commands as (t_ns, l3, lz), states that were set as
         t_ns and the fields of `State`, changes of `imu.rate` as (t_ns, rate)
     epoch_ns : stamp of t = 0 [ns]
@@ -152,12 +152,8 @@ class Simulation:
                 yield block
                 self.path.release(self.now_ns)
 
-    def skip_to(self, t_ns: int) -> None:
-        """Take the samples up to this time as done, and those after it as not done."""
-        self.now_ns = t_ns
-
     def apply(self, changes: Mapping[str, Any]) -> None:
-        """Take over new values of the parameters in `Stream.at_once`, after `now_ns`."""
+        """Take over new rates of streams after `now_ns`."""
         imu, rate = self.imu, changes.get('imu.rate')
         if rate is not None and imu.set_rate(rate, max(self.now_ns, 0)):
             self.path.keep_steps_ns = imu.intervals.keep_ns
@@ -227,10 +223,10 @@ def _segment(top: Top, start: State, start_ns: int, values: Mapping[str, Any]) -
         if spin > MOST_RATE:
             raise ValueError(f'it turns too fast: {spin:.3g} times a second, must be at most '
                              f'{MOST_RATE:.2g}')
-        if solver.ns_limit < SHORTEST_RUN_NS:
+        if solver.ns_limit < LAST_STAMP_NS:
             raise ValueError(f'it turns too fast: its phases are known for '
                              f'{solver.ns_limit / NANOSECONDS:.3g} s, must be for '
-                             f'{SHORTEST_RUN_NS / NANOSECONDS:g} s')
+                             f'{LAST_STAMP_NS / NANOSECONDS:g} s')
     except (ArithmeticError, RuntimeError, ValueError) as error:
         raise ValueError(f'no motion from theta = {start.theta!r} rad, theta_dot = '
                          f'{start.theta_dot!r} rad/s with l3 = {start.l3!r}, lz = {start.lz!r} '

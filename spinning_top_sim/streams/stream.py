@@ -2,6 +2,7 @@
 """What every stream has: a topic, a message type, a grid of times, and how states become bytes."""
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
 from spinning_top_sim.streams.path import Path
+from spinning_top_sim.streams.timing import Timing
 
 Result = TypeVar('Result')
 # Messages as rows (n, size): bytes or, of a table, numbers.
@@ -25,10 +27,11 @@ class Samples:
 
     path : the motion
     times : of the samples, within the present segment [ns]
+    epoch_ns : stamp of t = 0 [ns]
     """
 
-    def __init__(self, path: Path, times: range) -> None:
-        self.path, self.times = path, times
+    def __init__(self, path: Path, times: range, epoch_ns: int) -> None:
+        self.path, self.times, self.epoch_ns = path, times, epoch_ns
         self._results: dict[Callable[..., Any], Any] = {}
 
     @cached_property
@@ -54,33 +57,27 @@ class Stream:
     One topic, with samples at t = k * period_ns for k = 0, 1, 2, ...
 
     parameter : prefix of its parameters
+    fields : returns the numbers that go into the fields of `template`
+    timing : the timing faults of its messages
     rate_parameter : name of the parameter that is its rate
     """
 
-    parameter: str
-    topic: str
-    type_name: str
-
-    def __init__(self, values: Mapping[str, Any], template: Template) -> None:
-        self.template = template
+    def __init__(self, values: Mapping[str, Any], parameter: str, topic: str, type_name: str,
+                 template: Template, fields: Callable[[Samples], Sequence[Field]] = lambda _: (),
+                 timing: Timing | None = None, rate_parameter: str = '') -> None:
+        self.parameter, self.topic, self.type_name = parameter, topic, type_name
+        # A copy, with rows of its own: equal streams share the template.
+        self.template, self.fields, self._timing = copy(template), fields, timing
+        self.rate_parameter = rate_parameter or f'{parameter}.rate'
         self.period_ns = period_ns(values[self.rate_parameter])
-
-    @property
-    def rate_parameter(self) -> str:
-        return f'{self.parameter}.rate'
 
     @property
     def size(self) -> int:
         """Size of a message [bytes]."""
         return len(self.template)
 
-    @property
-    def at_once(self) -> tuple[str, ...]:
-        """Names of the parameters whose changes `apply` takes over."""
-        return (self.rate_parameter,)
-
     def apply(self, changes: Mapping[str, Any]) -> None:
-        """Take over new values of parameters."""
+        """Take over a new rate, if it is among these parameters."""
         if self.rate_parameter in changes:
             self.period_ns = period_ns(changes[self.rate_parameter])
 
@@ -89,11 +86,9 @@ class Stream:
         return range((after_ns // self.period_ns + 1) * self.period_ns, until_ns + 1,
                      self.period_ns)
 
-    def encode(self, samples: Samples, epoch_ns: int) -> Encoded:
+    def encode(self, samples: Samples) -> Encoded:
         """
         Return the messages of samples.
-
-        epoch_ns : stamp of t = 0 [ns]
 
         Returns
         -------
@@ -102,12 +97,13 @@ class Stream:
         rows : (n, size)
             The messages, valid until the next call.
         """
-        rows = self.template.encode(epoch_ns + samples.t_ns, *self.fields(samples))
-        return samples.t_ns, rows
-
-    def fields(self, samples: Samples) -> Sequence[Field]:
-        """Return the numbers that go into the fields of `template`."""
-        raise NotImplementedError
+        t_ns, epoch_ns = samples.t_ns, samples.epoch_ns
+        if self._timing is None:
+            return t_ns, self.template.encode(epoch_ns + t_ns, *self.fields(samples))
+        rows = self.template.encode(self._timing.stamps_ns(epoch_ns, t_ns, self.period_ns),
+                                    *self.fields(samples))
+        copies = self._timing.copies(t_ns, self.period_ns)
+        return np.repeat(t_ns, copies), np.repeat(rows, copies, axis=0)
 
 
 def period_ns(rate: float) -> int:

@@ -222,8 +222,8 @@ class _Rerun:
             _apply(simulation, event)
         if self._samples:
             yield from self._play(run.begun_ns, ())
-        simulation.skip_to(run.begun_ns)
-        at_once = {name for stream in simulation.streams for name in stream.at_once}
+        simulation.now_ns = run.begun_ns
+        at_once = {stream.rate_parameter for stream in simulation.streams}
         simulation.apply({name: run.values_at_recording[name] for name in at_once})
         yield simulation, Event('start', run.epoch_ns, 0, simulation.now_ns, {})
 
@@ -241,7 +241,7 @@ class _Rerun:
                    if self._samples and stream.topic in self._run.topics]
         if streams or moves:
             yield from self._play(t_ns, streams)
-        self._simulation.skip_to(t_ns)
+        self._simulation.now_ns = t_ns
 
     def _play(self, t_ns: int, streams: Sequence[Stream]) -> Iterator[tuple[Simulation, Block]]:
         """Yield the blocks up to a time, as far as the equations and the limits go."""

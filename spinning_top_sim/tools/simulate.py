@@ -210,7 +210,7 @@ class Table(Stream):
     def __init__(self, period_ns: int) -> None:
         self.period_ns = period_ns
 
-    def encode(self, samples: Samples, epoch_ns: int) -> Encoded:
+    def encode(self, samples: Samples) -> Encoded:
         states = samples.states
         columns = np.broadcast_arrays(
             samples.t_ns / NANOSECONDS, states.theta, states.theta_dot, states.phi, states.phi_dot,

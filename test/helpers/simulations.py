@@ -87,5 +87,5 @@ def states_of(simulation):
 
 def messages_of(simulation):
     """Count the samples that are encoded of each topic."""
-    return {one.topic: Counting(one, 'encode', lambda samples, epoch_ns: len(samples.times))
+    return {one.topic: Counting(one, 'encode', lambda samples: len(samples.times))
             for one in simulation.streams}
