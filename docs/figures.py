@@ -47,8 +47,7 @@ def motions(path):
         facts = solution.describe()
         t = np.linspace(0.0, nutations * facts.nutation_period, 4000)
         draw_sphere(axes, (facts.theta_min, facts.theta_max, np.pi / 2))
-        x, y, z = solution.states_at_seconds(t).rows_axis
-        draw_tip(axes, x + 1j * y, z)
+        draw_tip(axes, np.column_stack(solution.states_at_seconds(t).rows_axis))
         axes.text(0.0, 1.1, caption, ha='center', color=INK, fontsize=12)
         axes.text(0.0, -0.82, f'θ from {np.degrees(facts.theta_min):.1f}° to '
                   f'{np.degrees(facts.theta_max):.1f}° every {facts.nutation_period:.2f} s',

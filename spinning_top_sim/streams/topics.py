@@ -88,7 +88,7 @@ class ImuStream(Stream):
                  fields: Callable[[Samples], Sequence[Field]], *, has_orientation: bool = True,
                  is_noisy: bool = False) -> None:
         self.imu, self._frame_id = imu, values['imu.frame_id']
-        self._has_orientation, self._is_noisy = has_orientation, is_noisy
+        self.has_orientation, self._is_noisy = has_orientation, is_noisy
         super().__init__(values, parameter, topic, 'sensor_msgs/msg/Imu', self._template(),
                          fields, faults_of(values) if is_noisy else None)
 
@@ -103,7 +103,7 @@ class ImuStream(Stream):
             covariances = [messages.diagonal(*variances) for variances in (
                 sensor.orientation_variances, 3 * (sensor.rate_variance,),
                 3 * (sensor.force_variance,))]
-        if not self._has_orientation:
+        if not self.has_orientation:
             covariances[0] = messages.UNKNOWN_ORIENTATION
         return messages.imu(self._frame_id, *covariances)
 
