@@ -19,21 +19,20 @@ class Throttle:
         self.publisher = publisher
         self._due = 0.0                         # time on the monotonic clock of the next message
         self._withheld: bytes | None = None     # the newest message, until it is published
-        self._publish_all: Publish | None = None
 
     def sink(self, publish_all: Publish | None) -> Publish | None:
         """Return what takes the messages of the stream; `publish_all` takes each of them."""
-        self._publish_all = publish_all
-        if self.publisher.get_subscription_count():
-            return self._publish
-        self._withheld = None
-        return publish_all
+        if not self.publisher.get_subscription_count():
+            self._withheld = None
+            return publish_all
 
-    def _publish(self, message: bytes) -> None:
-        if self._publish_all is not None:
-            self._publish_all(message)
-        self._withheld = message
-        self.flush()
+        def publish(message: bytes) -> None:
+            if publish_all is not None:
+                publish_all(message)
+            self._withheld = message
+            self.flush()
+
+        return publish
 
     def flush(self, at_once: bool = False) -> None:
         """Publish the newest message if it is due, or in any case with `at_once`."""
