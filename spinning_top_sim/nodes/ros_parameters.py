@@ -4,7 +4,8 @@
 import array
 import contextlib
 import difflib
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from rclpy.parameter import Parameter as RosParameter
 
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.parameters import Parameter
-from spinning_top_sim.tools.scene_file import parse_scene, parse_yaml
+from spinning_top_sim.tools.scene_file import parse_yaml
 
 SPIN = ('spin.l3', 'spin.lz')
 
@@ -27,7 +28,7 @@ def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
     Unknown parameters are warned about.  The node must have been made with
     `automatically_declare_parameters_from_overrides`, the public way to learn of them.
     """
-    given, last_given = {}, _last_given(argv)
+    given, last_given = {}, _last_given(argv, node.get_fully_qualified_name())
     for name in node.get_parameters_by_prefix(''):
         value = node.get_parameter(name).value
         if name == 'use_sim_time' and not isinstance(value, bool):
@@ -35,9 +36,7 @@ def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
         if name in {'use_sim_time', 'start_type_description_service'}:
             continue        # rclpy declares these itself
         if name in parameters.BY_NAME:
-            if type(value) is int:
-                value = last_given.get(name, value)
-            given[name] = _as_doubles(parameters.BY_NAME[name], value)
+            given[name] = _as_doubles(parameters.BY_NAME[name], last_given.get(name, value))
         elif not name.startswith('qos_overrides.'):
             near = difflib.get_close_matches(name, parameters.BY_NAME, 1)
             hint = f'; did you mean {near[0]}?' if near else ''
@@ -53,21 +52,35 @@ def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
     return values
 
 
-def _last_given(argv: Sequence[str]) -> dict[str, object]:
+def _last_given(argv: Sequence[str], node_name: str) -> dict[str, object]:
     """
-    Return the last value that the command line gives to each parameter.
+    Return the last value that the command line gives to each parameter of a node.
 
     rcl keeps the last value of each type, and of these rclpy prefers an integer to a double.
     """
     last: dict[str, object] = {}
     for flag, text in pairwise(argv):
+        tree: Any = {}
         if flag == '--params-file':
-            with contextlib.suppress(ValueError):       # the file is for other nodes
-                last.update(parse_scene(Path(text).read_bytes(), text))
+            tree = parse_yaml(Path(text).read_bytes(), text)
         elif flag in {'-p', '--param'}:
             rule, _, shown = text.partition(':=')
-            last[rule.rpartition(':')[2]] = parse_yaml(shown, text)
+            node, _, name = rule.rpartition(':')
+            tree = {node or '/**': {'ros__parameters': {name: parse_yaml(shown, text)}}}
+        for path, value in _leaves(tree):
+            nodes, _, name = path.partition('/ros__parameters/')
+            pattern = re.escape(nodes).replace(r'/\*\*', r'(/\w+)*').replace(r'\*', r'\w+')
+            if re.fullmatch(pattern, node_name):
+                last[name.replace('/', '.')] = value
     return last
+
+
+def _leaves(tree: object, path: str = '') -> Iterator[tuple[str, object]]:
+    if isinstance(tree, Mapping):
+        for key, below in tree.items():
+            yield from _leaves(below, f'{path}/{str(key).strip("/")}')
+    else:
+        yield path, tree
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
