@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import tarfile
+import tempfile
 import zipfile
 from importlib import metadata
 from pathlib import Path
@@ -24,7 +25,7 @@ def run(*command, cwd=ROOT, **variables):
     """Run a command in an environment that knows nothing of this one."""
     done = subprocess.run(
         [*map(str, command)], cwd=cwd, capture_output=True, text=True, timeout=120, check=False,
-        env={'PATH': '/usr/bin:/bin', 'HOME': str(cwd), **variables})
+        env={'PATH': '/usr/bin:/bin', 'HOME': tempfile.gettempdir(), **variables})
     return done.returncode, done.stdout, done.stderr
 
 
