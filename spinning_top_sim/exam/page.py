@@ -14,7 +14,16 @@ LEAST_DEG = 1e-4                # lower limit of the logarithmic axis
 
 
 def draw_page(report: Report, path: Path) -> None:
-    """Draw a page about a report; the suffix of the path decides the format."""
+    """
+    Draw a page about a report.
+
+    Parameters
+    ----------
+    report : Report
+        What `examine` has returned.
+    path : pathlib.Path
+        Of the file; its suffix decides the format.
+    """
     with rc_context({'axes.spines.right': False, 'axes.spines.top': False, 'font.size': 9,
                      'text.parse_math': False}):        # texts of a filter may contain '$'
         figure = Figure(figsize=(11.0, 7.0), layout='constrained')
