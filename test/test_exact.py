@@ -7,6 +7,7 @@ data/reference_cases.json holds 32 motions at four times each, computed with 70 
 promises: 5e-15, relative for what is larger than 1.
 """
 
+import doctest
 import math
 import pickle
 import random
@@ -21,6 +22,7 @@ from helpers.reference import CASES, start_of, top_of
 from stress import tops
 
 from spinning_top_sim import State, Top, solve
+from spinning_top_sim.solvers import propagator
 from spinning_top_sim.solvers.cubic import cubic_roots
 from spinning_top_sim.solvers.decimal_math import precision
 from spinning_top_sim.solvers.exact import BLOCK, ExactSolution
@@ -338,3 +340,9 @@ def test_the_roots_of_the_cubic_are_right_relative_to_themselves(seed):
         with precision(60):
             found = cubic_roots(*(+f for f in (f0, f1, f2, f3)))
             assert max(abs(a / b - 1) for a, b in zip(found, true, strict=True)) < Decimal('1e-36')
+
+
+def test_the_example_of_solve_is_right_and_swapped_arguments_are_told():
+    assert doctest.testmod(propagator) == (0, 4)
+    with pytest.raises(TypeError, match=r'^solve\(State, Top, ...\): must be solve\(top'):
+        solve(State(theta=0.5, l3=1.6, lz=1.3), top_of(next(iter(CASES.values()))), [0.0])

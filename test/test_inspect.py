@@ -561,3 +561,22 @@ def test_neither_ros_nor_scipy_nor_pictures_are_imported_unasked(short, tmp_path
     run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                          timeout=60, check=True)
     assert run.stdout.strip().endswith('loaded: [] []')
+
+
+def test_a_folder_with_one_log_is_that_log_and_pictures_overwrite_nothing(
+        short, tmp_path, capsys):
+    (tmp_path / 'bag').mkdir()
+    assert inspect.main([str(tmp_path / 'bag')]) == 1
+    assert capsys.readouterr().err == (
+        f'spinning-top inspect: cannot read {tmp_path}/bag: a folder must hold one .mcap file; '
+        'in it: none\n')
+    (tmp_path / 'bag/bag_0.mcap').symlink_to(short)
+    assert inspect.main([str(tmp_path / 'bag')]) == 0
+    assert capsys.readouterr().out.startswith(f'{tmp_path}/bag/bag_0.mcap: whole')
+    (tmp_path / 'keep.png').write_text('precious')
+    for option in ('--plot', '--animate'):
+        assert inspect.main([str(short), option, str(tmp_path / 'keep.png')]) == 1
+        assert capsys.readouterr().err == (
+            f'spinning-top inspect: cannot write {tmp_path}/keep.png: it exists, and nothing is '
+            'overwritten\n')
+    assert (tmp_path / 'keep.png').read_text() == 'precious'

@@ -120,6 +120,9 @@ class Simulator(Node):
         summary = self._session.stop()
         if summary:
             self._terminal.tell(summary)
+            log = summary.partition(': ')[0]
+            self._terminal.tell(f'next: spinning-top inspect {log}\n'
+                                f'      spinning-top view {log}')
 
     def finish(self) -> None:
         """End the process after the response that is being prepared."""

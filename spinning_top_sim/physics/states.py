@@ -74,6 +74,10 @@ class States:
         self.top, self.start, self._n = top, start, n
         self._l3, self._lz = start.l3, start.lz
 
+    def __repr__(self) -> str:
+        span = f', {self.t[0]:g} to {self.t[-1]:g} s' if len(self) else ''
+        return f'<States of {len(self)} times{span}>'
+
     def __len__(self) -> int:
         return self._n
 

@@ -67,6 +67,17 @@ class LogTopic:
     channel_id: int
 
 
+def _file_of(path: Path) -> Path:
+    """Return a file, or the one in a folder; raises LogError."""
+    if not path.is_dir():
+        return path
+    files = sorted(file.name for file in path.glob('*.mcap'))
+    if len(files) != 1:
+        raise LogError(f'cannot read {path}: a folder must hold one .mcap file; in it: '
+                       f'{", ".join(files) or "none"}')
+    return path / files[0]
+
+
 class _Index(NamedTuple):
     """What a summary tells, as in `Scan`."""
 
@@ -86,7 +97,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     Parameters
     ----------
     path : str or path
-        The file.
+        The file, or a folder as `ros2 bag` makes it, which must hold exactly one.
     max_bytes : int
         Largest record, and largest uncompressed chunk, that is read into memory.
 
@@ -97,7 +108,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     """
 
     def __init__(self, path: str | os.PathLike[str], max_bytes: int = records.MAX_BYTES) -> None:
-        self.path = Path(path)
+        self.path = _file_of(Path(path))
         self.left_out = 0       # damaged chunks that `messages` has skipped
         self.file = LogFile(self.path, max_bytes)
         self.size = self.file.size

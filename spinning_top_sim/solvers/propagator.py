@@ -72,7 +72,7 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
     Parameters
     ----------
     top : Top
-        What moves.
+        The top to simulate.
     start : State
         The state at t = 0.
     t : (n,) array_like
@@ -83,7 +83,8 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
     rtol, atol : float
         Tolerated error of a step; atol is rtol/10 by default.
     equations : {'transport', 'euler'}
-        Of the steps: regular everywhere, or to the letter of the paper, for study.
+        Equations of motion used by 'rk45': regular everywhere, or those of the source in Euler
+        angles, for study.
 
     Returns
     -------
@@ -92,12 +93,26 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
 
     Raises
     ------
+    TypeError
+        If `top` is no Top or `start` no State.
     ValueError
         Naming the argument, its value and what is allowed.
     IntegrationError
         Where the 'euler' equations cannot go on, a step collapses, or the last time is more than
         1e7 steps of the present size away.
+
+    Examples
+    --------
+    >>> top = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
+    >>> motion = solve(top, State(theta=0.5, l3=1.6, lz=1.3), [0.0, 0.5, 1.0])
+    >>> motion
+    <States of 3 times, 0 to 1 s>
+    >>> motion.theta.round(6)
+    array([0.5     , 0.630905, 0.86732 ])
     """
+    if not (isinstance(top, Top) and isinstance(start, State)):
+        raise TypeError(f'solve({type(top).__name__}, {type(start).__name__}, ...): must be '
+                        'solve(top, start, t) with a Top and a State')
     try:
         times = np.asarray(t).astype(np.float64, casting='same_kind')
     except (TypeError, ValueError) as error:

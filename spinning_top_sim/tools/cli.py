@@ -58,8 +58,9 @@ def run(name: str, help_text: str | None, argv: Sequence[str] | None,
             what = f'{error.filename}: {error.strerror}'
         print_line(f'{parser.prog}: {what}', sys.stderr)
         return WRONG_USAGE if isinstance(error, ValueError) else FAILED
-    except KeyboardInterrupt:
-        print_line(f'{parser.prog}: interrupted', sys.stderr)
+    except KeyboardInterrupt as interrupt:
+        what = f'; {interrupt}' if interrupt.args else ''
+        print_line(f'{parser.prog}: interrupted{what}', sys.stderr)
         return INTERRUPTED
 
 

@@ -64,6 +64,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    for picture in filter(None, (arguments.plot, arguments.animate)):
+        if picture.exists():
+            raise LogError(f'cannot write {picture}: it exists, and nothing is overwritten')
     with LogReader(arguments.log) as reader:
         found, verdict = survey(reader), None
         exported: list[str] = []

@@ -25,9 +25,13 @@ def draw_page(name: str, motion: MotionReport, data: Attitudes, path: Path) -> N
 
 
 def animate(motion: MotionReport, data: Attitudes, path: Path) -> None:
-    """Draw the turning top as a GIF."""
-    pictures.animate(_columns(motion, data, LONGEST_S), FRAMES_PER_S, 1.0).save(
-        path, writer=PillowWriter(fps=FRAMES_PER_S))
+    """Draw the turning top as a GIF; an interrupted one leaves no file."""
+    try:
+        pictures.animate(_columns(motion, data, LONGEST_S), FRAMES_PER_S, 1.0).save(
+            path, writer=PillowWriter(fps=FRAMES_PER_S))
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
 
 
 def _columns(motion: MotionReport, data: Attitudes, seconds: float) -> SimpleNamespace:

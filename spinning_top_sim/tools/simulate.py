@@ -194,6 +194,9 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
                 file.append(events_topic, epoch_ns + t_ns, journal.event(
                     'command', t_ns, t_ns, l3=l3, lz=lz))
                 file.append(commands_topic, epoch_ns + t_ns, journal.command(l3, lz))
+    except KeyboardInterrupt as interrupt:
+        raise KeyboardInterrupt(f'{path} holds the run up to t = '
+                                f'{simulation.now_ns / NANOSECONDS:g} s') from interrupt
     finally:
         try:
             file.write_chunk()
