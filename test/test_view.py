@@ -364,6 +364,8 @@ def test_a_part_that_is_switched_on_at_one_stamp_is_drawn_for_it(page, shown):
     assert top._arrows[0].points[0, 1] == pytest.approx(
         model.arrow(shown, model.ARROWS[0], stamp_ns), abs=1e-6)
     page._bounds.value = True
+    assert 'trace' not in page.legend() and 'angular momentum' in page.legend()
+    assert top._stand.wxyz == pytest.approx([1, 0, 0, 0])
     page.draw(stamp_ns, shown.origin_ns)
     for bound, theta in zip(top._bounds, top._limits, strict=True):
         assert bound.visible

@@ -62,7 +62,7 @@ def draw(plot: Plot) -> str:
         ((at, _),) = place(np.array([x]), np.array([0.0]))
         drawn.append(f'<path class="grid" d="M{at} {TOP}V{HEIGHT - BOTTOM}"/>'
                      f'<text x="{at}" y="{HEIGHT - 19}" text-anchor="middle">{text}</text>')
-    for y, text in _ticks(bottom, top, 4):
+    for y, text in _ticks(bottom, top, 5):
         ((_, at),) = place(np.array([0.0]), np.array([y]))
         drawn.append(f'<path class="grid" d="M{LEFT} {at}H{WIDTH - RIGHT}"/>'
                      f'<text x="{LEFT - 5}" y="{at + 3}" text-anchor="end">{text}</text>')

@@ -51,9 +51,10 @@ def wheel(shape: Shape, length: float) -> list[Part]:
 
 
 def disc(shape: Shape, length: float) -> list[Part]:
-    """Return a grey disc, for a body that is not known."""
-    mesh = creation.cylinder(0.5 * abs(length), 0.02 * abs(length), sections=SMOOTH)
-    return [Part('disc', mesh.apply_translation((0.0, 0.0, shape.centre)), GREY, 0.45)]
+    """Return a grey disc with a hole, for a body that is not known."""
+    radius = abs(length)
+    mesh = creation.annulus(0.25 * radius, 0.5 * radius, 0.03 * radius, sections=SMOOTH)
+    return [Part('disc', mesh.apply_translation((0.0, 0.0, shape.centre)), GREY)]
 
 
 def stand(radius: float) -> trimesh.Trimesh:

@@ -56,7 +56,8 @@ class DrawnTop:
         radius = abs(far)
         self.root = scene.add_frame(name, show_axes=False)
         self._sphere = scene.add_icosphere(f'{name}/sphere', radius, SPHERE, subdivisions=5,
-                                           opacity=0.1, cast_shadow=False, receive_shadow=False)
+                                           opacity=0.12, side='back', cast_shadow=False,
+                                           receive_shadow=False)
         self._body = scene.add_frame(f'{name}/body', show_axes=not track.known,
                                      axes_length=0.7 * radius, axes_radius=0.015 * radius)
         for part in (body.wheel if track.known else body.disc)(track.shape, far):
@@ -76,7 +77,7 @@ class DrawnTop:
             f'{name}/{arrow.replace(" ", "_")}', NO_LINES, colour,
             shaft_radius=0.014 * radius, head_radius=0.04 * radius, head_length=0.12 * radius,
             visible=False) for arrow, colour in zip(model.ARROWS, ARROW_COLOURS, strict=True)]
-        self._fade = np.array(TRACES[number])
+        self._colour = np.array(TRACES[number])
         self._limits: tuple[float, float] | None = None         # that are drawn [rad]
         self.drawn: tuple[int, model.Vectors] | None = None
         self._shown: object = None                      # stamp and switches of the picture
@@ -109,12 +110,12 @@ class DrawnTop:
         self._draw_bounds(self.motion(page_ns), bounds)
 
     def _draw_trace(self, lines: model.Lines) -> None:
-        """Draw a trace that fades with its age."""
+        """Draw a trace that fades with its age; the colours of a line's points are linear."""
         lines = lines if len(lines) else NO_LINES
         if len(lines) != len(self._trace.points):
-            share = np.linspace(0.45, 1.0, len(lines))[:, np.newaxis, np.newaxis]
-            self._trace.colors = np.broadcast_to(
-                255 + share * (self._fade - 255), lines.shape).astype(np.uint8)
+            share = np.linspace(0.35, 1.0, len(lines))[:, np.newaxis, np.newaxis]
+            self._trace.colors = np.broadcast_to(255 * (
+                1.0 + share * (self._colour / 255 - 1.0)) ** 2.2, lines.shape).astype(np.uint8)
         self._trace.points = lines
 
     def _draw_bounds(self, motion: DescribedMotion | None, on: bool) -> None:
@@ -159,7 +160,8 @@ class Page:
             self._bounds = gui.add_checkbox('bounds of θ', True)
             self.arrows = [gui.add_checkbox(name, False) for name in model.ARROWS]
             self._over = gui.add_checkbox('one over the other', False, visible=False)
-        with gui.add_folder('Accuracy', expand_by_default=False):
+        self._accuracy_folder = gui.add_folder('Accuracy', expand_by_default=False)
+        with self._accuracy_folder:
             self._accuracy = gui.add_html('')
         panel = gui.add_panel()
         with panel.add_tab('Plots'):
@@ -185,12 +187,16 @@ class Page:
                       in enumerate(zip(tracks, shifts_ns, strict=True))]
         size = self._reach = max(abs(model.reach(track)) for track in tracks)
         self._over.visible = len(tracks) > 1
+        self._bounds.visible = self._accuracy_folder.visible = any(
+            track.known for track in tracks)
+        for arrow in self.arrows:
+            arrow.visible = self._bounds.visible
         scene.add_grid('/ground', infinite_grid=True, cell_size=0.5 * size, section_size=size,
                        cell_color=(238, 240, 244), section_color=(228, 231, 236),
                        fade_distance=9 * size, fade_from='origin', shadow_opacity=0.1,
                        position=(0.0, 0.0, -FOOT * size))
         camera = self.server.initial_camera
-        away = size * (5.2 if len(tracks) == 1 else 9.5)
+        away = size * (5.2 if len(tracks) == 1 else 10.5)
         camera.fov = VIEW_ANGLE
         camera.position = (0.0, -0.92 * away, 0.39 * away)
         camera.look_at = (0.0, 0.0, 0.1 * size)
@@ -234,8 +240,8 @@ class Page:
         """Return HTML about the colours of what is switched on."""
         entries = []
         if self._trace.value:
-            entries += [(TRACES[k], f'trace of the axis {top.track.name}'.rstrip())
-                        for k, top in enumerate(self._tops)]
+            entries += [(TRACES[k], f'trace of the axis {top.track.name}'.rstrip()
+                         + k * ' (plots: dashed)') for k, top in enumerate(self._tops)]
         if self._bounds.value and any(top.track.motions for top in self._tops):
             entries.append((BOUNDS, 'bounds of θ'))
         entries += [(colour, name) for name, colour, switch in zip(

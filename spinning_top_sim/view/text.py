@@ -59,7 +59,7 @@ def _rows(top: Top, motion: DescribedMotion) -> Iterable[tuple[str, str, str]]:
             yield 'Spin ψ′', f'{number(moves.mean_spin_rate)} rad/s', 'mean' if period else ''
     yield 'Angular mo&shy;mentum', (f'L₃ = {number(motion.l3)}, L<sub>z</sub> = '
                                     f'{number(motion.lz)}'), (
-        'kg m²/s, about axis and vertical')
+        'kg m²/s; axis, vertical')
     least = 2.0 * math.sqrt(top.lambda1 * abs(top.gravity_torque))
     if least:
         yield 'Stable upright', f'if |L₃| &gt; {number(least)} kg m²/s', ''
