@@ -11,10 +11,11 @@ from playwright.sync_api import sync_playwright
 
 from spinning_top_sim.tools import simulate
 from spinning_top_sim.view.log import Player, read_logs
+from spinning_top_sim.view.model import ARROWS
 from spinning_top_sim.view.page import Page
 
 HERE = Path(__file__).parent
-SHOWN_S = 12.0
+SHOWN_S = 12.3
 
 
 def take(address, path):
@@ -23,7 +24,7 @@ def take(address, path):
         browser = driver.chromium.launch(executable_path=shutil.which('chromium'), args=[
             '--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader',
             '--enable-unsafe-swiftshader'])
-        page = browser.new_page(viewport={'width': 1100, 'height': 800})
+        page = browser.new_page(viewport={'width': 1280, 'height': 800})
         page.goto(address)
         page.wait_for_function("window.__viserMutable?.nodePoseData['/top0/body']")
         page.wait_for_timeout(12_000)          # the scene fades in
@@ -40,6 +41,7 @@ def main():
         log = Path(folder) / 'cusp.mcap'
         simulate.main(['-o', str(log), '--duration', '30', '--quiet'])
         page = Page('cusp.mcap', '127.0.0.1', 0)
+        page.arrows[ARROWS.index('angular momentum')].value = True
         player = Player(page, read_logs([log]))
         stopped = threading.Event()
 

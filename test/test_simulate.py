@@ -114,7 +114,7 @@ def test_a_table_of_the_truth(tmp_path):
 
 
 def test_parquet(tmp_path):
-    parquet = pytest.importorskip('pyarrow.parquet', exc_type=ImportError)
+    parquet = pytest.importorskip('pyarrow.parquet')
     path = simulate(tmp_path / 'truth.parquet', '--duration', 1)
     table = parquet.read_table(path)
     assert table.num_rows == 101 and table.column_names[:2] == ['t', 'theta']

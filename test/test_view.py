@@ -5,6 +5,7 @@ import importlib
 import math
 import socket
 import urllib.request
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -12,20 +13,24 @@ from helpers.reference import ROOT
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, solve
+from spinning_top_sim.installation import parameter_files
+from spinning_top_sim.physics.regimes import SENTENCES
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.topics import all_streams
-from spinning_top_sim.tools import simulate
-from spinning_top_sim.view import command, model
+from spinning_top_sim.tools import simulate, svg
+from spinning_top_sim.tools.scene_file import read_scene
+from spinning_top_sim.view import command, model, plots, text
 from spinning_top_sim.view.track import Samples, Track, state_of
 
 viser = pytest.importorskip('viser')
-logs, pages, server, controls_of = (
+body, logs, pages, server, controls_of = (
     importlib.import_module(f'spinning_top_sim.view.{name}')
-    for name in ('log', 'page', 'server', 'controls'))
+    for name in ('body', 'log', 'page', 'server', 'controls'))
 COMMAND_S = 3.0
 
 
@@ -63,27 +68,34 @@ def test_a_log_shows_the_published_attitude_at_every_stamp(log, shown):
 
 def test_motions_of_a_log_begin_with_its_commands(shown):
     first, second = shown.motions
-    assert (first.words[0], second.words[0]) == ('cusps', 'loops')
+    assert (first.description.name, second.description.name) == ('cusps', 'loops')
     assert (second.l3, second.lz) == (2.0, 1.5)
     assert shown.commands_ns == [second.begin_ns]
     assert second.begin_ns - shown.origin_ns == COMMAND_S * 1e9
     assert shown.motion_at(second.begin_ns - 1) is first
-    assert first.theta_range[0] == pytest.approx(math.radians(30.0))
+    assert first.description.theta_min == pytest.approx(math.radians(30.0))
 
 
 @pytest.mark.parametrize('name', model.ARROWS)
 def test_arrows_are_the_vectors_in_the_world(shown, name):
     stamp_ns = shown.origin_ns + 1_230_000_000
     exact, top = truth(shown, stamp_ns), shown.top
-    omega = exact.angular_velocity[0]
+    omega, turn = exact.angular_velocity[0], Rotation.from_quat(exact.quaternion[0])
+    up = turn.inv().apply([0.0, 0.0, 1.0])
     body = {'angular velocity': omega,
             'angular momentum': omega * [top.lambda1, top.lambda1, top.lambda3],
+            'torque': np.cross([0.0, 0.0, top.com_distance], -top.mass * top.gravity * up),
             'specific force': np.ravel(exact.specific_force(shown.values['imu.lever_arm'])),
             }[name]
     drawn = model.arrow(shown, name, stamp_ns)
-    expected = Rotation.from_quat(exact.quaternion[0]).apply(body)
+    expected = turn.apply(body)
     assert drawn / np.linalg.norm(drawn) == pytest.approx(expected / np.linalg.norm(expected),
                                                           abs=1e-8)
+    if name == 'torque':                # P sin(theta), about the line of nodes
+        assert np.linalg.norm(drawn) / model.reach(shown) == pytest.approx(
+            math.sin(exact.theta[0]), abs=1e-8)
+        assert drawn @ [math.sin(exact.phi[0]), -math.cos(exact.phi[0]), 0.0] == pytest.approx(
+            -np.linalg.norm(drawn))
     if name == 'angular momentum':      # Lz is conserved, and L3 the usual length
         assert drawn[2] / model.reach(shown) == pytest.approx(
             exact.lz[0] / exact.l3[0], abs=1e-8)
@@ -110,25 +122,88 @@ def test_the_trace_between_distant_samples_is_that_of_their_velocities(shown):
         (moved.quaternion, moved.angular_velocity, moved.phi_dot))))
     stamps_ns, axis, joined = model.path(track, 0, NANOSECONDS)
     track.follow()
-    assert track.motions[0].words == shown.motions[0].words     # those of the start
+    assert track.motions[0].description.name == 'cusps'     # as at the start
     assert len(stamps_ns) == 4 * 19 + 1 and joined.all()
     exact = solve(shown.top, parameters.start_state(shown.values), stamps_ns * 1e-9)
     assert axis == pytest.approx(np.column_stack(exact.rows_axis), abs=1e-4)
 
 
-def test_curves_are_the_published_numbers(shown):
-    end_ns = shown.origin_ns + 2_500_000_000
-    for name, expected, tolerance in zip(model.CURVES[:2], (
-            lambda exact: math.degrees(exact.theta[0]), lambda exact: exact.phi_dot[0]),
-            (1e-8, 1e-7), strict=True):
-        stamps_ns, values = model.curve(shown, name, shown.origin_ns, end_ns)
+def plotted(shown, stamp_ns):
+    """Return the lines of the plots of 2.5 s, by plot and name."""
+    top = plots.Shown(shown, stamp_ns, shown.origin_ns, stamp_ns, shown.origin_ns)
+    return {(plot.title, line.name): (plot, line) for plot in (
+        *plots.motion_plots([top]), *plots.accuracy_plots([top])) for line in plot.lines}
+
+
+def test_plots_are_the_published_numbers(shown):
+    stamp_ns = shown.origin_ns + 2_500_000_000
+    found = plotted(shown, stamp_ns)
+    for key, expected, tolerance in (
+            (('Tilt', 'θ'), lambda exact: math.degrees(exact.theta[0]), 1e-8),
+            (('Precession rate', 'φ′'), lambda exact: exact.phi_dot[0], 1e-7),
+            (('Energy', 'potential'), lambda exact: shown.top.gravity_torque
+             * math.cos(exact.theta[0]), 1e-9),
+            (('Energy', 'sum'), lambda exact: exact.energy[0], 1e-9)):
+        plot, line = found[key]
+        assert plot.now == 2.5 and len(line.x) > 200
         for at in (0, 100, -1):
-            assert values[at] == pytest.approx(expected(truth(shown, int(stamps_ns[at]))),
-                                               abs=tolerance)
-    for name in model.CURVES[2:]:
-        _, values = model.curve(shown, name, shown.origin_ns, end_ns)
-        assert len(values) == 26
-        assert (values < -9.0).all()
+            exact = truth(shown, shown.origin_ns + round(line.x[at] * 1e9))
+            assert line.y[at] == pytest.approx(expected(exact), abs=tolerance)
+    total, parts = (sum(found['Energy', name][1].y for name in names)
+                    for names in (('sum',), ('kinetic', 'potential')))
+    assert total == pytest.approx(parts)
+    for title in ('Energy drift, relative', 'Orientation error'):
+        _, line = found[title, '']
+        assert len(line.y) == 26 and (line.y < -9.0).all()
+
+
+def test_the_effective_potential_meets_the_energy_at_the_turning_points(shown):
+    stamp_ns = shown.origin_ns + 2_500_000_000
+    exact, found = truth(shown, stamp_ns), plotted(shown, stamp_ns)
+    plot, turning = found['Effective potential V(θ)', 'turning points']
+    assert turning.dots and turning.x == pytest.approx([30.0, math.degrees(
+        shown.motions[0].description.theta_max)])
+    assert plot.now == pytest.approx(math.degrees(exact.theta[0]))
+    energy = exact.energy[0] - exact.l3[0] ** 2 / (2.0 * shown.top.lambda3)
+    assert turning.y == pytest.approx(energy)
+    _, line = found['Effective potential V(θ)', 'V']
+    at = 70
+    theta, l3, lz = math.radians(line.x[at]), exact.l3[0], exact.lz[0]
+    assert line.y[at] == pytest.approx(
+        (lz - l3 * math.cos(theta)) ** 2 / (2 * shown.top.lambda1 * math.sin(theta) ** 2)
+        + shown.top.gravity_torque * math.cos(theta))
+    assert np.interp(turning.x, line.x, line.y) == pytest.approx(energy, abs=1e-3)
+
+
+def test_a_plot_is_svg_with_title_units_and_its_points():
+    x = np.array([0.0, 1.0, 2.0])
+    drawn = ElementTree.fromstring(svg.draw(svg.Plot('Tilt', 't [s]', 'θ [deg]', [
+        svg.Line('θ', '#123456', x, 10.0 * x)], 1.0)))
+    texts = [text for text in drawn.itertext() if text]
+    assert {'Tilt', 't [s]', 'θ [deg]', '0.0', '2.0', '10', '20'} <= set(texts)
+    (line,) = drawn.iter('polyline')
+    (first, middle, last) = ([float(number) for number in point.split(',')]
+                             for point in line.get('points').split())
+    assert first[0] < middle[0] < last[0] and first[1] > middle[1] > last[1]
+    (mark,) = (group for group in drawn.iter('g') if group.get('class') == 'now')
+    assert mark.get('transform') == f'translate({middle[0]} 0)'
+    assert svg.draw(svg.Plot('', '', '', [], 0.0)) == ''
+
+
+@pytest.mark.parametrize('scene', parameter_files('scene'))
+def test_every_scene_has_words_and_plots(scene):
+    values = parameters.checked(read_scene(parameter_files('scene')[scene]))
+    track, start = Track('', values), parameters.start_state(values)
+    moved = solve(track.top, start, np.arange(300) * 0.01)
+    track.add('joint_states', Samples(np.arange(300) * 10_000_000, np.column_stack(
+        (moved.quaternion, moved.angular_velocity, moved.phi_dot))))
+    track.follow()
+    (motion,) = track.motions
+    words = text.words(track, motion, 0, 0)
+    assert SENTENCES[motion.description.name] in words and 'nan' not in words
+    for plot in plots.motion_plots([plots.Shown(track, 0, 0, NANOSECONDS, 0)]):
+        ElementTree.fromstring(svg.draw(plot))
+        assert 'nan' not in svg.draw(plot)
 
 
 @pytest.mark.parametrize(('start', 'words'), [
@@ -145,7 +220,7 @@ def test_a_live_track_names_the_motion_from_its_samples(start, words):
         track.add('joint_states', Samples(np.array([k]), row[np.newaxis]))
         track.follow()
     (motion,) = track.motions           # one: rounding begins no other
-    assert motion.words[0] == words
+    assert motion.description.name == words
     (energy, l3, lz), _ = state_of(track.top, rows[50])
     assert (energy, l3, lz) == pytest.approx((moved.energy[50], start.l3, start.lz), abs=1e-9)
 
@@ -158,8 +233,9 @@ def test_each_of_two_logs_has_its_own_time(page, tmp_path):
     player = logs.Player(page, logs.read_logs(paths))
     player.draw_next(0.5)
     assert player.length == 2.0
-    assert page._words.content.count('- t = 0.500 s, stamp ') == 2
-    assert all(np.isfinite(values).any() for values in page._plots[0].data)
+    assert page._words.content.count('t = 0.500 s, stamp ') == 2
+    assert page._plots.content.count('aria-label="Tilt"') == 1
+    assert page._plots.content.count('stroke-dasharray="5 3"') >= 4       # of the second log
 
 
 def test_a_truncated_log_is_shown_as_far_as_it_goes(log, shown, tmp_path):
@@ -170,11 +246,63 @@ def test_a_truncated_log_is_shown_as_far_as_it_goes(log, shown, tmp_path):
     assert shown.span[0] == part.span[0] < part.span[1] <= shown.span[1]
 
 
-def test_the_log_of_another_program_is_refused(tmp_path):
-    path = tmp_path / 'run.mcap'
-    create_file(path, [], {}, compression='none').finish()
-    with pytest.raises(LogError, match='its metadata'):
+def foreign(log, path, topics):
+    """Write a log as another program would: topics of `log`, and their new names."""
+    with LogReader(log) as reader:
+        types = {topic.name: topic.type_name for topic in reader.topics}
+        file = create_file(path, [RecordedTopic(name, types[topic])
+                                  for topic, name in topics.items()], {}, compression='none')
+        for message in reader.messages(topics=topics):
+            file.append(list(topics).index(message.topic), message.log_time, message.data)
+    file.write_chunk()
+    file.finish()
+    return path
+
+
+@pytest.mark.parametrize('topic', ['/pose', '/ground_truth/imu', '/ground_truth/odom'])
+def test_the_log_of_another_program_shows_its_attitudes(log, shown, page, tmp_path, topic):
+    # The first topic has no orientation.
+    path = foreign(log, tmp_path / 'run.mcap', {'/imu/data_raw': '/raw', topic: '/robot/state'})
+    track, = logs.read_logs([path])
+    assert not track.known and track.origin_ns == track.span[0]
+    if topic == '/pose':
+        assert track.attitudes.rows == pytest.approx(shown.samples['pose'].rows, abs=1e-15)
+    player = logs.Player(page, [track])
+    player.draw_next(0.5)
+    assert 'The body is not in this log' in page._words.content
+    assert page._plots.content.count('<svg') == 1       # the tilt
+    names = set(page.server.scene._handle_from_node_name)
+    assert '/top0/body/disc' in names and '/top0/body/rim' not in names
+
+
+def test_a_log_without_attitudes_is_refused(log, tmp_path):
+    path = foreign(log, tmp_path / 'raw.mcap', {'/imu/data_raw': '/raw'})
+    with pytest.raises(LogError, match=r'raw.mcap: no attitude in it \(sensor_msgs/msg/Imu, '):
         logs.read_logs([path])
+
+
+def test_a_page_as_a_file_is_never_overwritten(log, tmp_path, capsys):
+    path = tmp_path / 'a.html'
+    path.write_text('mine')
+    assert command.main([str(log), '--html', str(path)]) == 1
+    assert capsys.readouterr().err == (
+        f'spinning-top view: {path} exists, and nothing is overwritten\n')
+    assert path.read_text() == 'mine'
+
+
+def test_the_body_stands_on_its_pivot_and_has_marks(shown):
+    shape, length = shown.shape, model.reach(shown)
+    parts = {part.name: part.mesh for part in body.wheel(shape, length)}
+    rim, axle = parts['rim'], parts['axle']
+    assert np.hypot(*rim.vertices.T[:2]).max() == pytest.approx(shape.radius)
+    assert np.hypot(*rim.vertices.T[:2]).min() > 0.8 * shape.radius        # it hides nothing
+    assert rim.vertices[:, 2].mean() == pytest.approx(shape.centre)
+    assert sorted(axle.bounds[:, 2]) == pytest.approx([0.0, length])
+    turned = parts['mark'].vertices @ Rotation.from_euler('z', 45.0, degrees=True).as_matrix()
+    assert abs(np.sort(turned[:, 0]) - np.sort(parts['mark'].vertices[:, 0])).max() > 0.01
+    peg = body.stand(1.0)
+    assert peg.bounds[:, 2] == pytest.approx([-1.0, 0.0])
+    assert np.hypot(*peg.vertices[peg.vertices[:, 2] > -0.5].T[:2]).max() < 0.05
 
 
 def test_a_player_follows_its_buttons_and_the_slider(shown, page):
@@ -236,8 +364,10 @@ def test_a_part_that_is_switched_on_at_one_stamp_is_drawn_for_it(page, shown):
     assert top._arrows[0].points[0, 1] == pytest.approx(
         model.arrow(shown, model.ARROWS[0], stamp_ns), abs=1e-6)
     page._bounds.value = True
+    assert 'trace' not in page.legend() and 'angular momentum' in page.legend()
+    assert top._stand.wxyz == pytest.approx([1, 0, 0, 0])
     page.draw(stamp_ns, shown.origin_ns)
-    for bound, theta in zip(top._bounds, shown.motions[0].theta_range, strict=True):
+    for bound, theta in zip(top._bounds, top._limits, strict=True):
         assert bound.visible
         assert (bound.points == model.circle(model.reach(shown), theta)).all()
 

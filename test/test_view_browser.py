@@ -58,7 +58,7 @@ def test_live(browser, peer, tmp_path):
         view = SimNode(tmp_path / 'view', namespace=node.namespace, program=VIEW)
         poses = peer.listen(node.topic('pose'), PoseStamped)
         with view, Visit(browser, address_of(view)) as visit:
-            visit.read('cusps')
+            visit.read('[Cc]usps')
 
             # What is drawn was published, also while it runs.
             shown = visit.attitude()
@@ -88,12 +88,30 @@ def test_live(browser, peer, tmp_path):
             wait_for('a step', lambda: visit.read(STAMP) > before)
             visit.press('Resume')
             visit.read('pause: running')
+            # The plots have data, and a switched-on arrow is in the scene.
+            titles = visit.wait("(found => found.length === 6 && found)([...document"
+                                ".querySelectorAll('.plot .title')].map(e => e.textContent))")
+            assert {'Effective potential V(θ)', 'Energy', 'Tilt', 'Precession rate'} < set(titles)
+            assert visit.page.locator('.plot polyline').count() >= 7
+            visit.tick('torque')
+            visit.wait("[...document.querySelectorAll('.top-legend')].some("
+                       "e => e.textContent.includes('torque'))")
+
+            # A chosen scene is another top, from its start.
+            visit.choose('scene', 'fast_gyroscope')
+            visit.read('fast_gyroscope, reset: at t = 0')
+            visit.read(r'nutation period 0\.0126 s')
+            visit.choose('scene', 'wavy')
+            visit.read('wavy, reset: at t = 0')
+            visit.read('[Ww]aves')
+            visit.choose('scene', 'cusp')
+            visit.read('cusp, reset: at t = 0')
             visit.tick('record')
             visit.read('record: ')
             wait_for('a log', lambda: list(tmp_path.glob('*.mcap')))
             visit.press('Reset')
             visit.read('reset: at t = 0')
-            visit.read('cusps')
+            visit.read('[Cc]usps')
             assert visit.errors == []
             assert visit.hosts <= {'127.0.0.1', None}
 
@@ -120,12 +138,12 @@ def test_log(browser, log, tmp_path):
         visit.page.get_by_role('button', name='Play').wait_for()
         visit.put('time [s]', 1.25)
         visit.read(r't = 1\.250')
-        visit.read('cusps')
+        visit.read('[Cc]usps')
         seconds, nanoseconds = map(int, visit.read(STAMP))
         assert apart(visit.attitude(), poses[seconds * 10 ** 9 + nanoseconds]) < 1e-6
         visit.press('Next command')
         visit.read(r't = 2\.500')
-        visit.read('loops')
+        visit.read('[Ll]oops')
         assert visit.errors == []
         assert visit.hosts <= {'127.0.0.1', None}
 
@@ -133,14 +151,27 @@ def test_log(browser, log, tmp_path):
 def test_file_without_a_network(browser, log, tmp_path):
     page = tmp_path / 'page.html'
     assert command.main([str(log), '--html', str(page)]) == 0
-    assert page.stat().st_size < 2e6        # for 6 s
+    assert page.stat().st_size < 2.5e6      # for 6 s
     poses = poses_of(log)
-    with Visit(browser, str(page), offline=True) as visit:
+    with Visit(browser, str(page), offline=True, framed=True) as visit:
         # Before the first picture, and where it begins again, viser turns nothing.
         shown = wait_for('a picture', lambda: turned(visit.attitude()))
         assert min(apart(shown, pose) for pose in poses.values()) < 1e-6
+        visit.wait("String(window.__viserMutable.nodePoseData['/top0/body'].wxyz) != "
+                   f"'{','.join(map(str, [shown[3], *shown[:3]]))}'")
+
+        # Beside it: the log, what one sees before and after the command, legend and plots.
+        for words in ('cusp.mcap', '[Cc]usps', 'Released without a push', '[Ll]oops',
+                      'trace of the axis', 'Effective potential', 'Energy', 'Tilt',
+                      'Precession rate'):
+            visit.read(words)
+        ends = visit.page.evaluate("[...document.querySelectorAll('.plot')].slice(1).map("
+                                   "plot => plot.dataset.x)")
+        assert ends == ['0 6'] * 5
+        # The marks follow the scene.
         visit.page.wait_for_function(
-            "then => String(window.__viserMutable.nodePoseData['/top0/body'].wxyz) != then",
-            arg=','.join(map(str, [shown[3], *shown[:3]])))
+            "document.querySelectorAll('.plot .now')[1].getAttribute('transform') > ''"
+            " && document.querySelectorAll('.plot .now')[1].getAttribute('transform')"
+            " !== 'translate(46 0)'")
         assert visit.errors == []
         assert visit.hosts <= {'', None}

@@ -13,12 +13,38 @@ from dataclasses import dataclass
 from decimal import Decimal
 from typing import TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.top import State, Top
 
 Real = TypeVar('Real', float, Decimal)
+Reals = NDArray[np.float64]
 # Relative distance below which two roots, or a root and Lz/L3, are said to coincide.
 COINCIDE = 1e-12
+# What one sees of each motion, by its name.
+SENTENCES = {
+    'at rest': 'Nothing turns: the axis stays where it is.',
+    'cusps': 'Released without a push: the axis falls, is turned aside, and rises to stand still '
+             'for an instant.',
+    'free top': 'No torque acts: the axis goes round a fixed direction, that of the angular '
+                'momentum.',
+    'hanging': 'The axis hangs straight down, and the body only spins.',
+    'loops': 'Pushed backwards at the start: where the axis is highest it moves backwards, and '
+             'draws loops.',
+    'planar pendulum, rotating': 'Without spin: the axis goes over the top in one vertical plane.',
+    'planar pendulum, swinging': 'Without spin: the axis swings in one vertical plane.',
+    'sleeping': 'The axis stands upright and the spin is fast enough to hold it there.',
+    'sleeping, unstable': 'The axis stands upright, but the spin is too slow: a touch makes it '
+                          'fall.',
+    'spherical pendulum': 'Without spin: the axis swings round the vertical like a weight on a '
+                          'string.',
+    'steady precession': 'The axis goes round the vertical at one tilt and one speed.',
+    'through the bottom': 'The axis passes through the straight-down position in each nutation.',
+    'through the top': 'The axis passes through the upright position in each nutation.',
+    'waves': 'The axis nods up and down while it always goes round the same way.',
+}
 
 
 @dataclass(frozen=True)
@@ -169,6 +195,18 @@ def _precessing_regime(state: State, low: float, high: float, coincide: float) -
     if min(abs(reversal - low), abs(reversal - high)) <= coincide * max(1.0, abs(reversal)):
         return 'cusps'
     return 'loops' if low < reversal < high else 'waves'
+
+
+def effective_potential(top: Top, l3: float, lz: float, theta: Reals) -> Reals:
+    """
+    Return V(theta) [J] of lambda1 theta'^2/2 + V(theta) = E - L3^2/(2 lambda3).
+
+    It is (Lz - L3 cos theta)^2/(2 lambda1 sin^2 theta) + P cos(theta); theta: (n,) [rad].
+    """
+    phi_dot = attitude.precession_rate(top, l3, lz, np.cos(0.5 * theta) ** 2,
+                                       np.sin(0.5 * theta) ** 2)
+    return (0.5 * top.lambda1 * (phi_dot * np.sin(theta)) ** 2
+            + top.gravity_torque * np.cos(theta))
 
 
 def precession_extremes(top: Top, state: State, theta_min: float,

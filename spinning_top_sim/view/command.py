@@ -27,7 +27,7 @@ Show a top in the browser: the one that a node simulates, or those of logs.
 
   spinning-top view --scene wavy             starts a node, and shows it
   spinning-top view                          a running node of this namespace
-  spinning-top view run.mcap                 a log; needs no ROS
+  spinning-top view run.mcap                 a log; needs no ROS, and may be of another program
   spinning-top view rk45.mcap exact.mcap     side by side, or one over the other
   spinning-top view run.mcap --html a.html   a file that opens without this program
 
@@ -92,6 +92,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _show_logs(arguments: argparse.Namespace) -> int:
     if len(arguments.log) > 2:
         raise ValueError(f'{len(arguments.log)} logs: must be one or two')
+    if arguments.html is not None and arguments.html.exists():
+        raise FileExistsError(f'{arguments.html} exists, and nothing is overwritten')
     with needed('the page', 'view'):
         from spinning_top_sim.view.log import Player, read_logs  # noqa: PLC0415
     logs = read_logs(arguments.log)

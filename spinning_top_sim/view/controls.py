@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import viser
 
+from spinning_top_sim.installation import parameter_files
 from spinning_top_sim.physics.top import Top
 from spinning_top_sim.view.page import Page, set_value
 
@@ -21,6 +22,7 @@ class Commands(Protocol):
 
     def call(self, name: str, *on: bool) -> str: ...
     def command(self, l3: float, lz: float) -> str: ...
+    def choose(self, scene: str) -> str: ...
 
 
 class Controls:
@@ -36,8 +38,12 @@ class Controls:
         gui = page.gui
         with page.controls:
             self._status = gui.add_markdown('*waiting for sim_node*')
-            self._sliders = [gui.add_slider(label, -1.0, 1.0, 2.0 / STEPS, 0.0) for label in (
-                'L3 [kg m²/s]', 'Lz [kg m²/s]')]
+            self._scene = gui.add_dropdown('scene', ('', *parameter_files('scene')), hint=(
+                'set the top and the start of an installed scene, and reset'))
+            self._sliders = [gui.add_slider(label, -1.0, 1.0, 2.0 / STEPS, 0.0, hint=hint)
+                             for label, hint in (
+                ('L3 [kg m²/s]', 'angular momentum about the axis of the top'),
+                ('Lz [kg m²/s]', 'angular momentum about the vertical'))]
             self._pause = gui.add_button('Pause')
             step, reset = gui.add_button('Step'), gui.add_button('Reset')
             self._record = gui.add_checkbox('record', False)
@@ -47,6 +53,7 @@ class Controls:
         step.on_click(lambda _: self._act(lambda: node.call('step')))
         reset.on_click(lambda _: self._act(lambda: node.call('reset')))
         self._record.on_update(self._on_record)
+        self._scene.on_update(self._on_scene)
 
     def _act(self, action: Callable[[], str]) -> None:
         """Act, and show the message or the reason of the refusal."""
@@ -59,6 +66,10 @@ class Controls:
     def _on_record(self, event: viser.GuiEvent[Any]) -> None:
         if event.client is not None:        # somebody in a browser
             self._act(lambda: self._node.call('record', self._record.value))
+
+    def _on_scene(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client is not None and self._scene.value:
+            self._act(lambda: self._node.choose(self._scene.value))
 
     def _on_slider(self, event: viser.GuiEvent[Any]) -> None:
         if event.client is not None:

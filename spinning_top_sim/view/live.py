@@ -7,6 +7,7 @@ import threading
 import time
 import traceback
 from collections import defaultdict, deque
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -23,11 +24,13 @@ from rclpy.task import Future
 from sensor_msgs.msg import Imu, JointState
 from std_srvs.srv import SetBool, Trigger
 
+from spinning_top_sim.installation import parameter_files
 from spinning_top_sim.nodes import throttle
 from spinning_top_sim.nodes.ros_parameters import SPIN
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.journal import NODE_NAME
+from spinning_top_sim.tools.scene_file import read_scene
 from spinning_top_sim.view import model
 from spinning_top_sim.view.controls import Controls
 from spinning_top_sim.view.page import CATCH_UP_S, RATE, WINDOW_NS, Page
@@ -164,7 +167,7 @@ class LiveView(Node):
             row[0, [ENERGY_DRIFT, ORIENTATION_ERROR]] = self._errors
             track.add('~/invariants', Samples(np.array([newest_ns]), row))
             self._errors = None
-        track.forget(newest_ns - KEPT_NS)
+        track.forget(max(newest_ns - KEPT_NS, min(self._origin_ns or 0, newest_ns)))
         track.follow()
         if track.motions:
             self._controls.show_spin(track.motions[-1].l3, track.motions[-1].lz)
@@ -236,12 +239,26 @@ class LiveView(Node):
 
     def command(self, l3: float, lz: float) -> str:
         """Set L3 and Lz [kg m^2/s]; return them.  Raises RefusedError."""
+        self._set(dict(zip(SPIN, (l3, lz), strict=True)))
+        return f'spin.l3 = {l3:.4g}, spin.lz = {lz:.4g}'
+
+    def choose(self, scene: str) -> str:
+        """Set the top and the start of an installed scene, and reset.  Raises RefusedError."""
+        values = parameters.checked(read_scene(parameter_files('scene')[scene]))
+        values['spin.lz'] = parameters.start_state(values).lz
+        self._set({name: value for name, value in values.items()
+                   if name.startswith(('top.', 'initial.', 'spin.'))})
+        said = self.call('reset')
+        self._stale = True
+        return f'{scene}, {said}'
+
+    def _set(self, values: Mapping[str, object]) -> None:
+        """Set parameters of the sim_node.  Raises RefusedError."""
         result = self._ask('set_parameters_atomically', SetParametersAtomically.Request(
             parameters=[Parameter(name, value=value).to_parameter_msg()
-                        for name, value in zip(SPIN, (l3, lz), strict=True)])).result
+                        for name, value in values.items()])).result
         if not result.successful:
             raise RefusedError(result.reason)
-        return f'spin.l3 = {l3:.6g}, spin.lz = {lz:.6g}'
 
 
 def _stamp_ns(data: bytes) -> int:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of one log or two: reads their tracks, and plays them."""
 
+import contextlib
 import itertools
 import time
 from bisect import bisect_right
@@ -9,13 +10,19 @@ from collections.abc import Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.tools import recorded_run
+from spinning_top_sim.tools import recorded_run, svg
+from spinning_top_sim.tools.attitudes import LAYOUTS, decode
+from spinning_top_sim.view import plots, text
 from spinning_top_sim.view.page import CATCH_UP_S, RATE, Page, set_value
-from spinning_top_sim.view.track import WIDTHS, DescribedMotion, Track, joined
+from spinning_top_sim.view.track import WIDTHS, DescribedMotion, Samples, Track, joined
 
 BLOCK = 16384               # messages that are decoded together
 SPEEDS = ('0.1', '0.25', '0.5', '1', '2', '4', '8')
@@ -33,16 +40,18 @@ def _read_log(path: Path, name: str) -> Track:
         try:
             run = recorded_run.read_run_description(reader)
         except recorded_run.ForeignLogError as error:
-            raise LogError(f'{path}: {error}') from error
-        track = Track(name, run.values_in_effect)
-        track.origin_ns = run.epoch_ns
-        _read_samples(reader, track, run.topics)
-        try:
-            _follow_run(track, run, reader.span[1])
-        except recorded_run.ODD as error:
-            notes.append(f'the run cannot be followed: {recorded_run.reason_of(error)}')
+            track = _read_foreign(reader, name)
+            notes.append(str(error))
+        else:
+            track = Track(name, run.values_in_effect)
+            track.origin_ns = run.epoch_ns
+            _read_samples(reader, track, run.topics)
+            try:
+                _follow_run(track, run, reader.span[1])
+            except recorded_run.ODD as error:
+                notes.append(f'the run cannot be followed: {recorded_run.reason_of(error)}')
     if not len(track.attitudes.rows):
-        raise LogError(f'{path}: no attitude of a top in it')
+        raise LogError(f'{path}: no attitude in it ({", ".join(LAYOUTS)})')
     if notes:
         track.note = f'{path.name}: {"; ".join(notes)}'
     return track
@@ -62,6 +71,25 @@ def _read_samples(reader: LogReader, track: Track, topics: Mapping[str, str]) ->
         track.samples[name] = joined(samples)
 
 
+def _read_foreign(reader: LogReader, name: str) -> Track:
+    """Read the attitudes in a log of another program, from its first topic that has some."""
+    track = Track(name, parameters.checked({}), known=False)
+    for topic in reader.topics:
+        found: dict[int, NDArray[np.float64]] = {}
+        for message in reader.messages([topic.name]) if topic.type_name in LAYOUTS else ():
+            with contextlib.suppress(ValueError):       # without an orientation
+                stamp_ns, quaternion, _ = decode(message.data, topic.type_name)
+                norm = float(np.linalg.norm(quaternion))
+                if 0.5 < norm < 2.0:
+                    found[stamp_ns] = quaternion / norm
+        if found:
+            rows = Samples(np.array(list(found), np.int64), np.array(list(found.values())))
+            track.add('pose', rows)
+            track.origin_ns = track.span[0]
+            break
+    return track
+
+
 def _follow_run(track: Track, run: recorded_run.RunDescription, end_ns: int) -> None:
     """Compute the run again to find its motions and commands."""
     for simulation, event in recorded_run.rerun(run, end_ns):
@@ -69,7 +97,7 @@ def _follow_run(track: Track, run: recorded_run.RunDescription, end_ns: int) -> 
             continue
         begin_ns = simulation.epoch_ns + max(simulation.now_ns, 0)
         track.motions.append(DescribedMotion.of(
-            begin_ns, simulation.segment.start, simulation.describe()))
+            begin_ns, track.top, simulation.segment.start, simulation.describe()))
         if event.name == 'command':
             track.commands_ns.append(begin_ns)
 
@@ -147,12 +175,23 @@ class Player:
 
     def write_html(self, path: Path) -> str:
         """Write a file that plays the first minute by itself; return its length and size."""
+        page, begin_ns = self._page, self._begin_ns
+        clock = page.server.scene.add_frame('/clock', show_axes=False)
+        start = (begin_ns - self._origin_ns) / NANOSECONDS
+        clock.position = (start, 0.0, 0.0)          # read by the script of the file
         self.draw(0.0)
-        serializer = self._page.server.get_scene_serializer()
         seconds = min(self.length, LONGEST_HTML_S)
+        words = ''.join(page.words(begin_ns + round(second * NANOSECONDS), self._origin_ns)
+                        for second in [0.0, *self._commands] if second <= seconds)
+        tops = page.shown(begin_ns, self._origin_ns, begin_ns,
+                          begin_ns + round(seconds * NANOSECONDS))
+        serializer = page.server.get_scene_serializer()
         for picture in range(1, int(seconds * RATE) + 1):
             serializer.insert_sleep(1.0 / RATE)
+            clock.position = (start + picture / RATE, 0.0, 0.0)
             self.draw(picture / RATE)
-        text = serializer.as_html()
-        path.write_text(text, encoding='utf-8')
-        return f'{seconds:g} of {self.length:g} s, {len(text.encode()) / 1e6:.1f} MB'
+        document = text.document(page.title, serializer.as_html(), page.legend(), words, [
+            svg.draw(plot) for plot in (*plots.motion_plots(tops), *plots.accuracy_plots(tops))])
+        with open(path, 'x', encoding='utf-8') as file:
+            file.write(document)
+        return f'{seconds:g} of {self.length:g} s, {len(document.encode()) / 1e6:.1f} MB'

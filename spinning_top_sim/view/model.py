@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The shapes, lines, arrows and curves that show a top, as numbers in metres and seconds."""
+"""The lines and arrows that show a top, and its tilt and energies, as numbers."""
 
 import math
 
@@ -7,25 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.top import Top
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.view.track import (
-    ENERGY_DRIFT,
-    ORIENTATION_ERROR,
-    PRECESSION,
-    Samples,
-    Track,
-)
+from spinning_top_sim.view.track import Track
 
 TRACE_NS = 10 * NANOSECONDS     # length of the trace of the tip
 TRACE_POINTS = 1500             # samples in the trace at most
 REACH = 1.6                     # radius of the sphere of the trace / distance of the tip
 LONGEST_CHORD = 0.5             # of a step of the trace / its radius; a longer step is a jump
 TRACE_STEP_NS, MOST_STEPS = 10_000_000, 4       # interpolation of the trace between two samples
-CURVE_POINTS = 400              # points in a curve at most
 STEPS = 48                      # of a full circle
-ARROWS = ('angular momentum', 'angular velocity', 'specific force')
-CURVES = ('θ [deg]', "φ' [rad/s]", 'log10 |energy drift|', 'log10 orientation error [rad]')
-LEAST = 1e-17                   # is drawn for 0 on a logarithmic axis
+ARROWS = ('angular momentum', 'angular velocity', 'torque', 'specific force')
 Stamps = NDArray[np.int64]
 Vectors = NDArray[np.float64]
 Lines = NDArray[np.float32]     # (n, 2, 3), as viser takes them
@@ -63,8 +55,7 @@ def path(track: Track, begin_ns: int, end_ns: int) -> tuple[Stamps, Vectors, NDA
     apart, points between them are those of the cubic Hermite spline.
     """
     stamps_ns, rows = track.attitudes.part(begin_ns, end_ns).thinned(TRACE_POINTS)
-    x, y, z, w = rows[:, :4].T
-    axis = np.column_stack(attitude.axis_in_world((x, y, z, w)))
+    axis = axis_of(rows)
     steps = np.diff(axis, axis=0)
     longest_ns = int(np.max(np.diff(stamps_ns), initial=0))
     count = min(-(-longest_ns // TRACE_STEP_NS), MOST_STEPS)
@@ -83,6 +74,23 @@ def path(track: Track, begin_ns: int, end_ns: int) -> tuple[Stamps, Vectors, NDA
             np.repeat(joined, count))
 
 
+def axis_of(rows: Vectors) -> Vectors:
+    """Return the axis in the world (n, 3) of rows that begin with quaternions, or of one."""
+    x, y, z, w = np.atleast_2d(rows)[:, :4].T
+    return np.column_stack(attitude.axis_in_world((x, y, z, w)))
+
+
+def tilt(axis: Vectors) -> Vectors:
+    """Return theta (n,) [deg] of an axis (n, 3)."""
+    return np.degrees(np.arctan2(np.hypot(axis[:, 0], axis[:, 1]), axis[:, 2]))
+
+
+def energies(top: Top, rows: Vectors) -> tuple[Vectors, Vectors]:
+    """Return kinetic and potential energy (n,) [J] of rows with attitude and angular velocity."""
+    moments = np.array((top.lambda1, top.lambda1, top.lambda3))
+    return 0.5 * rows[:, 4:7] ** 2 @ moments, top.gravity_torque * axis_of(rows)[:, 2]
+
+
 def in_world(quaternion: Vectors, vector: Vectors) -> Vectors:
     """Return the components in the world of a vector in the body."""
     return np.array(attitude.in_world(tuple(quaternion), tuple(vector)))
@@ -92,15 +100,20 @@ def arrow(track: Track, name: str, stamp_ns: int) -> Vectors | None:
     """
     Return a vector of ARROWS (3,) in the world, scaled for drawing; None if no sample has it.
 
-    The length of the axis stands for the usual angular momentum or velocity, and for 1 g.
+    The length of the axis stands for the usual angular momentum or velocity, for 1 g, and for the
+    torque of gravity when the axis is horizontal.
     """
-    samples = track.samples['ground_truth/imu'] if name == 'specific force' else track.rates
+    samples = {'specific force': track.samples['ground_truth/imu'],
+               'torque': track.attitudes}.get(name, track.rates)
     sample = samples.at(stamp_ns)
-    if sample is None:
+    if sample is None or not track.known:
         return None
     top, row, length = track.top, sample[1], abs(reach(track))
     if name == 'specific force':
         return length / (abs(top.gravity) or 1.0) * in_world(row[:4], row[7:10])
+    if name == 'torque':        # r x m g: along the line of nodes
+        ((x, y, _),) = axis_of(row)
+        return length * np.sign(top.gravity_torque) * np.array((-y, x, 0.0))
     omega = row[4:7]
     momentum = np.array([top.lambda1, top.lambda1, top.lambda3]) * omega
     motion = track.motion_at(stamp_ns)
@@ -109,17 +122,3 @@ def arrow(track: Track, name: str, stamp_ns: int) -> Vectors | None:
     if name == 'angular velocity':
         return length * min(top.lambda1, top.lambda3) / usual * in_world(row[:4], omega)
     return length / usual * in_world(row[:4], momentum)
-
-
-def curve(track: Track, name: str, begin_ns: int, end_ns: int) -> tuple[Stamps, Vectors]:
-    """Return stamps (n,) [ns] and values (n,) of one of CURVES between two stamps."""
-    if name == CURVES[0]:
-        stamps_ns, axis, _ = path(track, begin_ns, end_ns)
-        stamps_ns, axis = Samples(stamps_ns, axis).thinned(CURVE_POINTS)
-        return stamps_ns, np.degrees(np.arctan2(np.hypot(axis[:, 0], axis[:, 1]), axis[:, 2]))
-    if name == CURVES[1]:
-        stamps_ns, rows = track.rates.part(begin_ns, end_ns).thinned(CURVE_POINTS)
-        return stamps_ns, rows[:, PRECESSION]
-    stamps_ns, rows = track.samples['~/invariants'].part(begin_ns, end_ns).thinned(CURVE_POINTS)
-    values = rows[:, ENERGY_DRIFT if name == CURVES[2] else ORIENTATION_ERROR]
-    return stamps_ns, np.log10(np.maximum(np.abs(values), LEAST))

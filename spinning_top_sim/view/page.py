@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page: scene, texts and plots, made with viser; the same for logs and for a running node."""
+"""The page: scene, words and plots, made with viser; the same for logs and for a running node."""
 
+import math
 import time
 from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
-import trimesh.creation
 import viser
-from viser import uplot
 
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.view import model
+from spinning_top_sim.tools import svg
+from spinning_top_sim.view import body, model, plots, text
 from spinning_top_sim.view.server import Server
 from spinning_top_sim.view.track import DescribedMotion, Track
 
@@ -20,10 +20,12 @@ CATCH_UP_S = 0.2                # delay up to which late pictures follow each ot
 LAST_WORDS_S = 0.2              # time to send the last texts
 PLOT_EVERY = 6                  # pictures
 WINDOW_NS = 10 * NANOSECONDS    # of the plots
-BODY, MARK, ROD = (51, 102, 178), (242, 191, 51), (90, 90, 90)
-TRACES = ((229, 77, 51), (40, 140, 70))
-BOUNDS, SPHERE = (120, 90, 170), (205, 205, 210)
-ARROW_COLOURS = ((20, 120, 60), (190, 60, 160), (230, 130, 20))
+PANEL_WIDTH = 330               # [px]
+VIEW_ANGLE = math.radians(35.0)
+STANDS_TO = math.radians(100.0)     # tilt up to which the pivot stands on a peg; else it hangs
+TRACES = ((217, 72, 43), (30, 138, 76))
+BOUNDS, SPHERE, STAND, FOOT = (122, 82, 179), (190, 200, 215), (120, 126, 136), 0.8
+ARROW_COLOURS = ((20, 120, 70), (196, 50, 150), (20, 150, 180), (230, 130, 20))
 NO_LINES = np.zeros((1, 2, 3), np.float32)
 NO_SAMPLES = 'no samples yet'
 Value = TypeVar('Value')
@@ -32,6 +34,12 @@ Value = TypeVar('Value')
 def set_value(handle: viser.GuiInputHandle[Value], value: Value) -> None:
     """Show a value in an input; viser declares `value` without its setter."""
     handle.value = value        # type: ignore[misc]
+
+
+def set_content(handle: viser.GuiHtmlHandle | viser.GuiMarkdownHandle, content: str) -> None:
+    """Show a text; it is sent only if it is another one."""
+    if handle.content != content:
+        handle.content = content
 
 
 class DrawnTop:
@@ -44,33 +52,33 @@ class DrawnTop:
 
     def __init__(self, scene: viser.SceneApi, number: int, track: Track, shift_ns: int) -> None:
         self.track, self.shift_ns = track, shift_ns
-        name, shape, far = f'/top{number}', track.shape, model.reach(track)
+        name, far = f'/top{number}', model.reach(track)
         radius = abs(far)
         self.root = scene.add_frame(name, show_axes=False)
-        self._sphere = scene.add_icosphere(f'{name}/sphere', radius, SPHERE, wireframe=True,
-                                           opacity=0.2, cast_shadow=False)
-        self._body = scene.add_frame(f'{name}/body', show_axes=False)
-        for part, colour, mesh, position in (
-                ('mark', MARK, trimesh.creation.box((
-                    0.3 * shape.radius, 0.5 * shape.radius, 1.02 * shape.height)),
-                 (0.86 * shape.radius, 0.0, shape.centre)),
-                ('disc', BODY, trimesh.creation.cylinder(shape.radius, shape.height, 48),
-                 (0.0, 0.0, shape.centre)),
-                ('rod', ROD, trimesh.creation.cylinder(0.015 * radius, radius),
-                 (0.0, 0.0, 0.5 * far))):
-            scene.add_mesh_simple(f'{name}/body/{part}', mesh.vertices, mesh.faces, color=colour,
-                                  position=position, opacity=0.35 if number else None,
-                                  flat_shading=part != 'rod')
+        self._sphere = scene.add_icosphere(f'{name}/sphere', radius, SPHERE, subdivisions=5,
+                                           opacity=0.12, side='back', cast_shadow=False,
+                                           receive_shadow=False)
+        self._body = scene.add_frame(f'{name}/body', show_axes=not track.known,
+                                     axes_length=0.7 * radius, axes_radius=0.015 * radius)
+        for part in (body.wheel if track.known else body.disc)(track.shape, far):
+            scene.add_mesh_simple(
+                f'{name}/body/{part.name}', part.mesh.vertices, part.mesh.faces,
+                color=part.colour, opacity=0.4 if number else part.opacity,
+                flat_shading=part.name != 'axle', side='double')
+        peg = body.stand(FOOT * radius)
+        self._stand = scene.add_mesh_simple(f'{name}/stand', peg.vertices, peg.faces, color=STAND,
+                                            side='double')
         self._trace = scene.add_line_segments(
-            f'{name}/trace', NO_LINES, TRACES[number], thickness=0.012 * radius)
+            f'{name}/trace', NO_LINES, TRACES[number], thickness=0.018 * radius)
         self._bounds = [scene.add_line_segments(
-            f'{name}/bound{k}', NO_LINES, BOUNDS, thickness=0.005 * radius, visible=False)
+            f'{name}/bound{k}', NO_LINES, BOUNDS, thickness=0.007 * radius, visible=False)
             for k in range(2)]
         self._arrows = [scene.add_arrows(
             f'{name}/{arrow.replace(" ", "_")}', NO_LINES, colour,
-            shaft_radius=0.012 * radius, head_radius=0.035 * radius, head_length=0.1 * radius,
+            shaft_radius=0.014 * radius, head_radius=0.04 * radius, head_length=0.12 * radius,
             visible=False) for arrow, colour in zip(model.ARROWS, ARROW_COLOURS, strict=True)]
-        self._theta_range: tuple[float, float] | None = None
+        self._colour = np.array(TRACES[number])
+        self._limits: tuple[float, float] | None = None         # that are drawn [rad]
         self.drawn: tuple[int, model.Vectors] | None = None
         self._shown: object = None                      # stamp and switches of the picture
 
@@ -93,8 +101,7 @@ class DrawnTop:
         self._body.wxyz = (w, x, y, z)
         self._trace.visible = self._sphere.visible = trace
         if trace:
-            lines = model.trace(self.track, stamp_ns)
-            self._trace.points = lines if len(lines) else NO_LINES
+            self._draw_trace(model.trace(self.track, stamp_ns))
         for name, arrow, on in zip(model.ARROWS, self._arrows, arrows, strict=True):
             arrow.visible = on
             vector = model.arrow(self.track, name, stamp_ns) if on else None
@@ -102,20 +109,33 @@ class DrawnTop:
                 np.vstack((np.zeros(3), vector)))
         self._draw_bounds(self.motion(page_ns), bounds)
 
+    def _draw_trace(self, lines: model.Lines) -> None:
+        """Draw a trace that fades with its age; the colours of a line's points are linear."""
+        lines = lines if len(lines) else NO_LINES
+        if len(lines) != len(self._trace.points):
+            share = np.linspace(0.35, 1.0, len(lines))[:, np.newaxis, np.newaxis]
+            self._trace.colors = np.broadcast_to(255 * (
+                1.0 + share * (self._colour / 255 - 1.0)) ** 2.2, lines.shape).astype(np.uint8)
+        self._trace.points = lines
+
     def _draw_bounds(self, motion: DescribedMotion | None, on: bool) -> None:
-        limits = motion.theta_range if motion else None
+        moves = motion.description if motion else None
         for bound in self._bounds:
-            bound.visible = on and limits is not None
-        if limits is not None and limits != self._theta_range:
-            self._theta_range = limits
-            for bound, theta in zip(self._bounds, limits, strict=True):
-                bound.points = model.circle(model.reach(self.track), theta)
+            bound.visible = on and moves is not None
+        if moves is None or self._limits == (moves.theta_min, moves.theta_max):
+            return
+        self._limits = moves.theta_min, moves.theta_max
+        for bound, theta in zip(self._bounds, self._limits, strict=True):
+            bound.points = model.circle(model.reach(self.track), theta)
+        # A top that comes low hangs from above.
+        self._stand.wxyz = (1, 0, 0, 0) if moves.theta_max < STANDS_TO else (0, 1, 0, 0)
 
 
 class Page:
     """
     The page, with its own server.  One thread calls `set_tracks` and `draw`.
 
+    title : such as the name of the log
     controls : the folder for the controls of the source of the samples
     message : what was done, or the reason why not
     arrows : the switches of model.ARROWS
@@ -126,17 +146,29 @@ class Page:
         shown_host = f'[{host}]' if ':' in host else host
         self.address = f'http://{shown_host}:{self.server.get_port()}'
         gui = self.gui = self.server.gui
-        gui.configure_theme(show_logo=False, show_share_button=False, control_width='large')
+        self.title = title
+        gui.configure_theme(show_logo=False, show_share_button=False, control_width='medium')
         gui.set_panel_label(title)
-        self._words, self.message = gui.add_markdown(f'*{NO_SAMPLES}*'), gui.add_markdown('')
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(PANEL_WIDTH)
+        gui.add_html(f'<style>{text.STYLE}{text.LIVE_STYLE}</style>')
+        self._words, self._legend = gui.add_html(f'<p>{NO_SAMPLES}</p>'), gui.add_html('')
+        self.message = gui.add_markdown('')
         self.controls = gui.add_folder('Control')
         with gui.add_folder('Show'):
-            self._trace = gui.add_checkbox('trace on its sphere', True)
+            self._trace = gui.add_checkbox('trace of the axis', True)
             self._bounds = gui.add_checkbox('bounds of θ', True)
             self.arrows = [gui.add_checkbox(name, False) for name in model.ARROWS]
             self._over = gui.add_checkbox('one over the other', False, visible=False)
-        self._plots_folder = gui.add_folder(f'Last {WINDOW_NS // NANOSECONDS} s')
-        self._plots: list[viser.GuiUplotHandle] = []
+        self._accuracy_folder = gui.add_folder('Accuracy', expand_by_default=False)
+        with self._accuracy_folder:
+            self._accuracy = gui.add_html('')
+        panel = gui.add_panel()
+        with panel.add_tab('Plots'):
+            self._plots = gui.add_html('')
+        panel.dock_left()
+        panel.set_width(PANEL_WIDTH)
+        panel.expand()              # also on a phone, where it is below
         self._tops: list[DrawnTop] = []
         self._number = 0            # of the picture
 
@@ -150,33 +182,25 @@ class Page:
         """Show these tops; a shift is added to a stamp of the page to get the track's."""
         for top in self._tops:
             top.root.remove()
-        for plot in self._plots:
-            plot.remove()
         scene = self.server.scene
         self._tops = [DrawnTop(scene, number, track, shift_ns) for number, (track, shift_ns)
                       in enumerate(zip(tracks, shifts_ns, strict=True))]
-        self._reach = max(abs(model.reach(track)) for track in tracks)
+        size = self._reach = max(abs(model.reach(track)) for track in tracks)
         self._over.visible = len(tracks) > 1
-        scene.add_line_segments('/vertical', self._reach * np.array(
-            [[(0, 0, -1.2), (0, 0, 1.2)]]), (150, 150, 150), thickness=0.004 * self._reach)
-        scene.add_icosphere('/pivot', 0.04 * self._reach, (60, 60, 60))
-        scene.add_grid('/ground', 4 * self._reach, 4 * self._reach, cell_size=0.5 * self._reach,
-                       section_size=self._reach, section_color=(200, 200, 200),
-                       position=(0.0, 0.0, -1.2 * self._reach))
+        self._bounds.visible = self._accuracy_folder.visible = any(
+            track.known for track in tracks)
+        for arrow in self.arrows:
+            arrow.visible = self._bounds.visible
+        scene.add_grid('/ground', infinite_grid=True, cell_size=0.5 * size, section_size=size,
+                       cell_color=(238, 240, 244), section_color=(228, 231, 236),
+                       fade_distance=9 * size, fade_from='origin', shadow_opacity=0.1,
+                       position=(0.0, 0.0, -FOOT * size))
         camera = self.server.initial_camera
-        camera.position = (0.0, -2.5 * self._reach, 1.45 * self._reach)
-        camera.look_at = (0.0, 0.0, 0.0)
-        camera.near, camera.far = 0.01 * self._reach, 100.0 * self._reach
-        empty = np.zeros(1)
-        with self._plots_folder:
-            self._plots = [self.gui.add_uplot(
-                (empty, *(empty for _ in tracks)),
-                (uplot.Series(label='s'), *(
-                    uplot.Series(label=f'{name} {track.name}'.rstrip(), width=1.5,
-                                 stroke=f'rgb{colour}')
-                    for track, colour in zip(tracks, TRACES, strict=False))),
-                scales={'x': uplot.Scale(time=False), 'y': uplot.Scale(auto=True)},
-                height=150) for name in model.CURVES]
+        away = size * (5.2 if len(tracks) == 1 else 10.5)
+        camera.fov = VIEW_ANGLE
+        camera.position = (0.0, -0.92 * away, 0.39 * away)
+        camera.look_at = (0.0, 0.0, 0.1 * size)
+        camera.near, camera.far = 0.01 * size, 100.0 * size
 
     def draw(self, page_ns: int, origin_ns: int) -> None:
         """
@@ -192,47 +216,34 @@ class Page:
                 top.draw(page_ns, trace=self._trace.value, bounds=self._bounds.value,
                          arrows=arrows)
         if self._number % PLOT_EVERY == 0:
-            self._plot(page_ns, origin_ns)
-            self._tell(page_ns, origin_ns)
+            tops = self.shown(page_ns, origin_ns, page_ns - WINDOW_NS, page_ns)
+            set_content(self._plots, ''.join(map(svg.draw, plots.motion_plots(tops))))
+            set_content(self._accuracy, ''.join(map(svg.draw, plots.accuracy_plots(tops))))
+            set_content(self._words, self.words(page_ns, origin_ns))
+            set_content(self._legend, self.legend())
         self._number += 1
 
-    def _plot(self, page_ns: int, origin_ns: int) -> None:
-        """Draw the curves over common times; NaN where a top has no sample."""
-        for name, plot in zip(model.CURVES, self._plots, strict=True):
-            curves = []
-            for top in self._tops:
-                end_ns = page_ns + top.shift_ns
-                stamps_ns, values = model.curve(top.track, name, end_ns - WINDOW_NS, end_ns)
-                curves.append((stamps_ns - top.shift_ns, values))
-            times_ns = np.unique(np.concatenate([times for times, _ in curves]))
-            if not len(times_ns):
-                continue
-            columns = np.full((len(curves), len(times_ns)), np.nan)
-            for column, (times, values) in zip(columns, curves, strict=True):
-                column[np.searchsorted(times_ns, times)] = values
-            plot.data = ((times_ns - origin_ns) / NANOSECONDS, *columns)
+    def shown(self, page_ns: int, origin_ns: int, begin_ns: int,
+              end_ns: int) -> list[plots.Shown]:
+        """Return what is plotted of the tops at a stamp, for a span of stamps of the page."""
+        return [plots.Shown(top.track, *(stamp_ns + top.shift_ns for stamp_ns in (
+            page_ns, begin_ns, end_ns, origin_ns))) for top in self._tops]
 
-    def _tell(self, page_ns: int, origin_ns: int) -> None:
-        """Describe the motions and the samples that are drawn."""
-        lines = [line for top in self._tops for line in _words_of(top, page_ns, origin_ns)]
-        text = '\n'.join(lines)
-        if text != self._words.content:
-            self._words.content = text
+    def words(self, page_ns: int, origin_ns: int) -> str:
+        """Return HTML about the motions and the samples that are drawn."""
+        drawn = [(top, top.track.attitudes.at(page_ns + top.shift_ns)) for top in self._tops]
+        return ''.join(text.words(top.track, top.motion(page_ns), sample[0],
+                                  sample[0] - top.shift_ns - origin_ns) if sample else
+                       f'<p>{top.track.name} {NO_SAMPLES}</p>' for top, sample in drawn)
 
-
-def _words_of(top: DrawnTop, page_ns: int, origin_ns: int) -> list[str]:
-    """Return lines of Markdown about a top."""
-    if top.drawn is None:
-        return [f'{top.track.name} *{NO_SAMPLES}*']
-    stamp_ns, row = top.drawn
-    motion = top.motion(page_ns)
-    regime, *numbers = motion.words if motion else ('',)
-    if motion:
-        numbers.append(f'L3 = {motion.l3:.6g}, Lz = {motion.lz:.6g} kg m²/s')
-    x, y, z, w = row[:4].tolist()
-    seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
-    title = ' '.join(filter(None, (top.track.name, regime)))
-    return [f'**{title}**' if title else '', *(f'- {number}' for number in numbers),
-            f'- t = {(stamp_ns - top.shift_ns - origin_ns) / NANOSECONDS:.3f} s, stamp '
-            f'{seconds}.{nanoseconds:09d}',
-            f'- q = {x:.6f}, {y:.6f}, {z:.6f}, {w:.6f}', '']
+    def legend(self) -> str:
+        """Return HTML about the colours of what is switched on."""
+        entries = []
+        if self._trace.value:
+            entries += [(TRACES[k], f'trace of the axis {top.track.name}'.rstrip()
+                         + k * ' (plots: dashed)') for k, top in enumerate(self._tops)]
+        if self._bounds.value and any(top.track.motions for top in self._tops):
+            entries.append((BOUNDS, 'bounds of θ'))
+        entries += [(colour, name) for name, colour, switch in zip(
+            model.ARROWS, ARROW_COLOURS, self.arrows, strict=True) if switch.value]
+        return text.legend(entries)

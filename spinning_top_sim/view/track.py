@@ -4,7 +4,6 @@
 import contextlib
 import dataclasses
 import math
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude, placement
-from spinning_top_sim.physics.regimes import Description, regime
+from spinning_top_sim.physics.regimes import Description, effective_potential, regime
 from spinning_top_sim.physics.top import Shape, State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
@@ -71,22 +70,26 @@ def empty(topic: str) -> Samples:
 
 @dataclasses.dataclass(frozen=True)
 class DescribedMotion:
-    """A motion from a stamp [ns] on: its constants, its description and its range of theta."""
+    """
+    A motion from a stamp [ns] on.
+
+    l3, lz, energy : constants [kg m^2/s], and the energy lambda1 theta'^2/2 + V(theta) [J]
+    description : None if it has no closed form
+    """
 
     begin_ns: int
     l3: float
     lz: float
-    words: tuple[str, ...]
-    theta_range: tuple[float, float] | None = None      # [rad]
+    energy: float
+    description: Description | None
 
     @classmethod
-    def of(cls, begin_ns: int, state: State,
+    def of(cls, begin_ns: int, top: Top, state: State,
            description: Description | None) -> 'DescribedMotion':
-        """Return the motion with this description, None if it has no closed form."""
-        if description is None:
-            return cls(begin_ns, state.l3, state.lz, ('beyond the closed form',))
-        return cls(begin_ns, state.l3, state.lz, tuple(re.split('[;:] ', str(description))),
-                   (description.theta_min, description.theta_max))
+        """Return the motion that begins in a state."""
+        height = effective_potential(top, state.l3, state.lz, np.array([state.theta]))
+        return cls(begin_ns, state.l3, state.lz,
+                   0.5 * top.lambda1 * state.theta_dot ** 2 + float(height[0]), description)
 
 
 class Track:
@@ -95,14 +98,15 @@ class Track:
 
     name : shown if there are several tracks
     values : checked parameters of the run
+    known : whether they are those of the body; in the logs of other programs they are not
     samples : by topic
     motions : in the order of their begin
     origin_ns, commands_ns : of a log, stamps of t = 0 and of its commands [ns]
     note : what is missing in a log, '' if nothing is
     """
 
-    def __init__(self, name: str, values: Mapping[str, Any]) -> None:
-        self.name, self.values = name, values
+    def __init__(self, name: str, values: Mapping[str, Any], known: bool = True) -> None:
+        self.name, self.values, self.known = name, values, known
         self.top = parameters.top_of(values)
         self.shape = Shape(self.top)
         self.samples = {topic: empty(topic) for topic in WIDTHS}
@@ -181,7 +185,7 @@ class Track:
             description = dataclasses.replace(ExactSolution(self.top, state).describe(),
                                               name=regime(self.top, state, SNAP))
         self.motions = [*self.motions[-MOST_MOTIONS:],
-                        DescribedMotion.of(int(stamps_ns[-1]), state, description)]
+                        DescribedMotion.of(int(stamps_ns[-1]), self.top, state, description)]
 
 
 def state_of(top: Top, row: NDArray[np.float64]) -> tuple[tuple[float, float, float], State]:

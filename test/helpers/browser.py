@@ -34,7 +34,7 @@ def launch():
 class Visit:
     """A page that is open; knows its errors and the hosts that it asked."""
 
-    def __init__(self, browser, address, *, offline=False):
+    def __init__(self, browser, address, *, offline=False, framed=False):
         self._context = browser.new_context(
             viewport={'width': 320, 'height': 400}, offline=offline)
         self._context.add_init_script(NOT_DRAWN)
@@ -48,6 +48,7 @@ class Visit:
             self.page.on(event, lambda asked: self.hosts.add(
                 urllib.parse.urlsplit(asked.url).hostname))
         self.page.goto(address if '://' in address else Path(address).as_uri())
+        self.scene = self.page.frames[1] if framed else self.page
         self.wait("window.__viserMutable?.nodePoseData['/top0/body']")
 
     def __enter__(self):
@@ -58,11 +59,11 @@ class Visit:
 
     def wait(self, condition):
         """Wait until a JavaScript expression is true; return it."""
-        return self.page.wait_for_function(condition).json_value()
+        return self.scene.wait_for_function(condition, timeout=PATIENCE_MS).json_value()
 
     def attitude(self, name='/top0/body'):
         """Return the quaternion x, y, z, w with which a node of the scene is drawn."""
-        w, *xyz = self.page.evaluate(f'window.__viserMutable.nodePoseData[{name!r}].wxyz')
+        w, *xyz = self.scene.evaluate(f'window.__viserMutable.nodePoseData[{name!r}].wxyz')
         return [*xyz, w]
 
     def read(self, pattern):
@@ -81,6 +82,11 @@ class Visit:
                                 '"Flex-root")][1]//input[@inputmode="decimal"]')
         box.fill(str(value))
         box.press('Enter')
+
+    def choose(self, label, option):
+        """Choose from a drop-down."""
+        self.page.get_by_label(label, exact=True).first.click()
+        self.page.get_by_role('option', name=option, exact=True).click()
 
     def tick(self, label):
         self.page.get_by_label(label, exact=True).click()

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The meshes of the body, and of its stand."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from trimesh import creation
+from trimesh.transformations import rotation_matrix
+
+from spinning_top_sim.physics.top import Shape
+
+Colour = tuple[int, int, int]
+BLUE, WHITE, GOLD, STEEL, GREY = (
+    (43, 98, 176), (245, 247, 250), (246, 178, 38), (92, 99, 110), (150, 155, 163))
+SPOKES, SMOOTH = 8, 96              # number of spokes and of the sides of a round
+
+
+class Part(NamedTuple):
+    """A mesh in the frame of the body; `opacity` as viser takes it."""
+
+    name: str
+    mesh: trimesh.Trimesh
+    colour: Colour
+    opacity: float | None = None
+
+
+def wheel(shape: Shape, length: float) -> list[Part]:
+    """Return a spoked wheel with a marked rim, on a tapered axle of a signed length."""
+    radius, height, centre = shape.radius, shape.height, (0.0, 0.0, shape.centre)
+    turns = [rotation_matrix(math.tau * k / SPOKES, (0, 0, 1)) for k in range(SPOKES)]
+    spoke = creation.box((0.72 * radius, 0.045 * radius, 0.045 * radius))
+    spoke.apply_translation((0.46 * radius, 0.0, 0.0))
+    mark = creation.box((0.2 * radius, 0.1 * radius, 1.03 * height))
+    mark.apply_translation((0.905 * radius, 0.0, 0.0))
+    marks = [mark.copy().apply_transform(turn) for turn in turns]
+    marked_spoke = spoke.copy().apply_scale((1.0, 1.6, 1.6))
+    hub = creation.cylinder(0.11 * radius, max(0.6 * height, 0.1 * radius), sections=SMOOTH)
+    thick = abs(length) * np.array([(0, 0), (.024, .1), (.024, .8), (.012, .95), (0, 1)])
+    axle = creation.revolve(np.column_stack((thick[:, 0], thick[:, 1] * np.sign(length))))
+    parts = [
+        Part('rim', creation.annulus(0.82 * radius, radius, height, sections=SMOOTH), BLUE),
+        Part('marks', _joined(marks[1:]), WHITE),
+        Part('mark', _joined([marks[0], marked_spoke]), GOLD),
+        Part('spokes', _joined([hub, *(spoke.copy().apply_transform(turn)
+                                       for turn in turns[1:])]), STEEL)]
+    for part in parts:
+        part.mesh.apply_translation(centre)
+    return [*parts, Part('axle', axle, STEEL)]
+
+
+def disc(shape: Shape, length: float) -> list[Part]:
+    """Return a grey disc with a hole, for a body that is not known."""
+    radius = abs(length)
+    mesh = creation.annulus(0.25 * radius, 0.5 * radius, 0.03 * radius, sections=SMOOTH)
+    return [Part('disc', mesh.apply_translation((0.0, 0.0, shape.centre)), GREY)]
+
+
+def stand(radius: float) -> trimesh.Trimesh:
+    """Return a peg of height 1 [radius] under the pivot, on a foot."""
+    return creation.revolve(radius * np.array(
+        [(0, -1), (.2, -1), (.2, -.98), (.05, -.93), (.03, -.6), (.012, -.02), (0, 0)]),
+        sections=SMOOTH)
+
+
+def _joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    joined = trimesh.util.concatenate(meshes)
+    assert isinstance(joined, trimesh.Trimesh)
+    return joined

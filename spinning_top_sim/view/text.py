@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The words of the page as HTML: what one sees, in numbers, the legend, and the whole file."""
+
+import html
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from string import Template
+
+from spinning_top_sim.physics.regimes import SENTENCES
+from spinning_top_sim.physics.top import Top
+from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.view.track import DescribedMotion, Track
+
+HERE = Path(__file__).parent
+STYLE, LIVE_STYLE = ((HERE / name).read_text('utf-8') for name in ('page.css', 'live.css'))
+BEYOND = 'No closed form is in reach of its numbers; the samples are shown as they are.'
+NEUTRAL = ('The body is not in this log, only its attitude: a grey disc shows it, with its axes '
+           'x (red), y (green) and z (blue).')
+VERTICAL = 1e-6                 # tilt from a vertical up to which there is no precession [rad]
+
+
+def number(value: float) -> str:
+    """Return a number with four digits at most."""
+    shown = 0.0 if abs(value) < 1e-9 else float(f'{value:.3g}' if abs(value) < 1e3
+                                                else f'{value:.4g}')
+    return f'{shown:g}'.replace('-', '−')
+
+
+def words(track: Track, motion: DescribedMotion | None, stamp_ns: int, since_ns: int) -> str:
+    """Return headline, sentence and numbers of a top, and stamp and time of what is drawn."""
+    seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
+    description = motion.description if motion else None
+    title, sentence = ((description.name, SENTENCES[description.name]) if description else
+                       ('motion', BEYOND) if motion else
+                       ('attitude', '' if track.known else NEUTRAL))
+    rows = _rows(track.top, motion) if motion else []
+    return ''.join((
+        '<div class="top-words">', f'<p>{html.escape(track.name)}</p>' if track.name else '',
+        f'<h1>{title}</h1>', f'<p>{sentence}</p>' if sentence else '', '<table>',
+        *(f'<tr><td>{label}</td><td>{value}{f"<small>{note}</small>" if note else ""}</td></tr>'
+          for label, value, note in rows),
+        f'</table><p class="stamp">t = {since_ns / NANOSECONDS:.3f} s, stamp '
+        f'{seconds}.{nanoseconds:09d}</p></div>'))
+
+
+def _rows(top: Top, motion: DescribedMotion) -> Iterable[tuple[str, str, str]]:
+    """Yield label, value and note of each number."""
+    moves = motion.description
+    if moves is not None:
+        low, high = (number(math.degrees(theta)) for theta in (moves.theta_min, moves.theta_max))
+        period = number(moves.nutation_period) if moves.nutation_period else ''
+        yield 'Tilt θ', f'{low}° to {high}°' if period else f'{low}°', (
+            f'nutation period {period} s' if period else '')
+        if moves.theta_max > VERTICAL and moves.theta_min < math.pi - VERTICAL:
+            slow, fast = number(moves.precession_min), number(moves.precession_max)
+            yield 'Precession φ′', f'{number(moves.mean_precession_rate)} rad/s', (
+                f'mean; from {slow} to {fast}' if period else '')
+            yield 'Spin ψ′', f'{number(moves.mean_spin_rate)} rad/s', 'mean' if period else ''
+    yield 'Angular mo&shy;mentum', (f'L₃ = {number(motion.l3)}, L<sub>z</sub> = '
+                                    f'{number(motion.lz)}'), (
+        'kg m²/s; axis, vertical')
+    least = 2.0 * math.sqrt(top.lambda1 * abs(top.gravity_torque))
+    if least:
+        yield 'Stable upright', f'if |L₃| &gt; {number(least)} kg m²/s', ''
+
+
+def legend(entries: Sequence[tuple[tuple[int, int, int], str]]) -> str:
+    """Return what the colours in the scene mean."""
+    return '<div class="top-legend">' + ''.join(
+        f'<div><i style="background:rgb{colour}"></i>{text}</div>'
+        for colour, text in entries) + '</div>'
+
+
+def document(title: str, scene: str, legend_html: str, words_html: str,
+             plots_html: Sequence[str]) -> str:
+    """Return a page that works without a server; `scene` is a page for its own frame."""
+    template = Template((HERE / 'file.html').read_text('utf-8'))
+    return template.substitute(
+        title=html.escape(title), style=STYLE, legend=legend_html, words=words_html,
+        plots=''.join(plots_html), scene=scene.replace('&', '&amp;').replace('"', '&quot;'))
