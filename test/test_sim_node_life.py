@@ -158,7 +158,8 @@ def test_overload_skips_what_is_live_records_everything_and_stays_reachable(tmp_
     with OwnNode(tmp_path, **rates, **others, tick_rate=10000.0, time_scale=100.0,
                  record__enabled=True) as node:
         node.listen('pose')
-        wait_for('a clock that slips', lambda: node.loop.slipped_ns)
+        wait_for('a clock that slips, and samples that are skipped', lambda: (
+            node.loop.slipped_ns and any(one.skipped for one in node.simulation.outputs)))
         level, message, said = node.diagnostics()
         node.diagnostics()
         assert (level, message) == (1, 'this machine cannot keep up')
