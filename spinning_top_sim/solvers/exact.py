@@ -40,7 +40,7 @@ class ExactSolution:
     Parameters
     ----------
     top : Top
-        What moves.
+        The top to simulate.
     start : State
         The state at t = 0; of a `ContinuedState` theta may be any number.
 
@@ -174,6 +174,8 @@ class ExactSolution:
 
 class _ExactStates(States):
     """The states of an exact solution, on the branch of its start."""
+
+    solver = 'exact'
 
     def __init__(self, solution: ExactSolution, times: Times) -> None:
         super().__init__(solution.top, solution.start, len(times))

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The choice among the solvers, and `solve`, which reads a motion at times."""
 
+from __future__ import annotations
+
 from contextlib import suppress
 
 import numpy as np
@@ -106,7 +108,7 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
     >>> top = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
     >>> motion = solve(top, State(theta=0.5, l3=1.6, lz=1.3), [0.0, 0.5, 1.0])
     >>> motion
-    <States of 3 times, 0 to 1 s>
+    <States by 'exact': 3 times from 0 to 1 s>
     >>> motion.theta.round(6)
     array([0.5     , 0.630905, 0.86732 ])
     """

@@ -40,8 +40,8 @@ ROWS = (('nutation period [s]', 'nutation_period', 1.0),
         ('greatest tilt [deg]', 'theta_max', DEGREES),
         ('least precession [rad/s]', 'precession_min', 1.0),
         ('greatest precession [rad/s]', 'precession_max', 1.0),
-        ('1 - m', 'separatrix_distance', 1.0),
-        ('L3^2/(4 lambda1 |P|)', 'gyroscopic_ratio', 1.0))
+        ('1 - m (separatrix: 0)', 'separatrix_distance', 1.0),
+        ('L3^2/(4 lambda1 |P|) (sleeps: > 1)', 'gyroscopic_ratio', 1.0))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
