@@ -40,6 +40,25 @@ class Plot(NamedTuple):
     energy: float | None = None
 
 
+class _Frame(NamedTuple):
+    """The ends of both axes."""
+
+    low: float
+    high: float
+    bottom: float
+    top: float
+
+    def place(self, x: Reals, y: Reals) -> list[list[float]]:
+        """Return places across and down [px] of points (n,)."""
+        across = (x - self.low) * ((WIDTH - LEFT - RIGHT) / (self.high - self.low))
+        down = (self.top - y) * ((HEIGHT - TOP - BOTTOM) / (self.top - self.bottom))
+        return np.column_stack((LEFT + across, TOP + down)).round(1).tolist()
+
+    def place_one(self, x: float, y: float) -> list[float]:
+        """Return the place of a point."""
+        return self.place(np.array([x]), np.array([y]))[0]
+
+
 def draw(plot: Plot) -> str:
     """
     Return a plot as an SVG element, or '' without data; `data-x` has the ends of its x axis.
@@ -49,45 +68,55 @@ def draw(plot: Plot) -> str:
     lines = [line for line in plot.lines if np.isfinite(line.y).any()]
     if not lines:
         return ''
-    low, high = _range([line.x for line in lines], 0.0)
-    bottom, top = _range([line.y for line in lines], 0.08)
-    across, down = (WIDTH - LEFT - RIGHT) / (high - low), (HEIGHT - TOP - BOTTOM) / (top - bottom)
-
-    def place(x: Reals, y: Reals) -> list[list[float]]:
-        return np.column_stack((LEFT + (x - low) * across,
-                                TOP + (top - y) * down)).round(1).tolist()
-
-    drawn = []
-    for x, text in _ticks(low, high, 5):
-        ((at, _),) = place(np.array([x]), np.array([0.0]))
-        drawn.append(f'<path class="grid" d="M{at} {TOP}V{HEIGHT - BOTTOM}"/>'
-                     f'<text x="{at}" y="{HEIGHT - 19}" text-anchor="middle">{text}</text>')
-    for y, text in _ticks(bottom, top, 5):
-        ((_, at),) = place(np.array([0.0]), np.array([y]))
-        drawn.append(f'<path class="grid" d="M{LEFT} {at}H{WIDTH - RIGHT}"/>'
-                     f'<text x="{LEFT - 5}" y="{at + 3}" text-anchor="end">{text}</text>')
-    for line in lines:
-        places = place(line.x, line.y)
-        drawn += ([f'<circle cx="{x}" cy="{y}" r="4" fill="{line.colour}"/>' for x, y in places]
-                  if line.dots else
-                  [f'<polyline stroke="{line.colour}" stroke-dasharray="{line.dash}" points="'
-                   + ' '.join(f'{x},{y}' for x, y in places) + '"/>'])
-    ((now, point),) = place(np.array([plot.now]), np.array([plot.energy or 0.0]))
-    dot = '' if plot.energy is None else f'<circle cy="{point}" r="5"/>'
-    mark = (f'<g class="now" transform="translate({now} 0)"><path d="M0 {TOP}V{HEIGHT - BOTTOM}"/>'
-            f'{dot}</g>' if math.isfinite(now) else '')
-    names = {line.name: line.colour for line in lines if line.name}
-    legend = ''.join(f'<tspan fill="{colour}" dx="9">●</tspan><tspan dx="3">{html.escape(name)}'
-                     '</tspan>' for name, colour in names.items()) if len(names) > 1 else ''
+    frame = _Frame(*_range([line.x for line in lines], 0.0),
+                   *_range([line.y for line in lines], 0.08))
     return (
         f'<svg class="plot" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{plot.title}" '
-        f'data-over="{"time" if plot.energy is None else "tilt"}" data-x="{low:.9g} {high:.9g}" '
-        f'data-px="{LEFT} {WIDTH - RIGHT}">'
+        f'data-over="{"time" if plot.energy is None else "tilt"}" '
+        f'data-x="{frame.low:.9g} {frame.high:.9g}" data-px="{LEFT} {WIDTH - RIGHT}">'
         f'<text class="title" x="8" y="14">{plot.title}</text>'
-        f'<text x="{WIDTH - RIGHT}" y="28" text-anchor="end">{legend}</text>'
+        f'<text x="{WIDTH - RIGHT}" y="28" text-anchor="end">{_legend(lines)}</text>'
         f'<text x="8" y="28">{plot.y_label}</text>'
         f'<text x="{(WIDTH + LEFT - RIGHT) / 2}" y="{HEIGHT - 5}" text-anchor="middle">'
-        f'{plot.x_label}</text>{"".join(drawn)}{mark}</svg>')
+        f'{plot.x_label}</text>{_grid(frame)}{"".join(_curve(frame, line) for line in lines)}'
+        f'{_mark(frame, plot)}</svg>')
+
+
+def _legend(lines: Sequence[Line]) -> str:
+    names = {line.name: line.colour for line in lines}
+    return ''.join(f'<tspan fill="{colour}" dx="9">●</tspan><tspan dx="3">{html.escape(name)}'
+                   '</tspan>' for name, colour in names.items()) if len(names) > 1 else ''
+
+
+def _grid(frame: _Frame) -> str:
+    drawn = []
+    for x, text in _ticks(frame.low, frame.high, 5):
+        at, _ = frame.place_one(x, 0.0)
+        drawn.append(f'<path class="grid" d="M{at} {TOP}V{HEIGHT - BOTTOM}"/>'
+                     f'<text x="{at}" y="{HEIGHT - 19}" text-anchor="middle">{text}</text>')
+    for y, text in _ticks(frame.bottom, frame.top, 5):
+        _, at = frame.place_one(0.0, y)
+        drawn.append(f'<path class="grid" d="M{LEFT} {at}H{WIDTH - RIGHT}"/>'
+                     f'<text x="{LEFT - 5}" y="{at + 3}" text-anchor="end">{text}</text>')
+    return ''.join(drawn)
+
+
+def _curve(frame: _Frame, line: Line) -> str:
+    places = frame.place(line.x, line.y)
+    if line.dots:
+        return ''.join(f'<circle cx="{x}" cy="{y}" r="4" fill="{line.colour}"/>'
+                       for x, y in places)
+    points = ' '.join(f'{x},{y}' for x, y in places)
+    return f'<polyline stroke="{line.colour}" stroke-dasharray="{line.dash}" points="{points}"/>'
+
+
+def _mark(frame: _Frame, plot: Plot) -> str:
+    if not math.isfinite(plot.now):
+        return ''
+    now, point = frame.place_one(plot.now, plot.energy or 0.0)
+    dot = '' if plot.energy is None else f'<circle cy="{point}" r="5"/>'
+    return (f'<g class="now" transform="translate({now} 0)">'
+            f'<path d="M0 {TOP}V{HEIGHT - BOTTOM}"/>{dot}</g>')
 
 
 def _range(parts: Sequence[Reals], margin: float) -> tuple[float, float]:
