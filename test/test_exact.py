@@ -7,6 +7,8 @@ data/reference_cases.json holds 32 motions at four times each, computed with 70 
 promises: 5e-15, relative for what is larger than 1.
 """
 
+import doctest
+import inspect
 import math
 import pickle
 import random
@@ -21,6 +23,7 @@ from helpers.reference import CASES, start_of, top_of
 from stress import tops
 
 from spinning_top_sim import State, Top, solve
+from spinning_top_sim.solvers import propagator
 from spinning_top_sim.solvers.cubic import cubic_roots
 from spinning_top_sim.solvers.decimal_math import precision
 from spinning_top_sim.solvers.exact import BLOCK, ExactSolution
@@ -338,3 +341,12 @@ def test_the_roots_of_the_cubic_are_right_relative_to_themselves(seed):
         with precision(60):
             found = cubic_roots(*(+f for f in (f0, f1, f2, f3)))
             assert max(abs(a / b - 1) for a, b in zip(found, true, strict=True)) < Decimal('1e-36')
+
+
+def test_solve_explains_itself():
+    assert doctest.testmod(propagator).attempted == 4 and not doctest.testmod(propagator).failed
+    assert len(str(inspect.signature(solve))) < 250
+    state = State(theta=0.5, l3=1.6, lz=1.4)
+    with pytest.raises(TypeError, match='must be a Top, top and start are swapped'):
+        solve(state, UNIT, [0.0])
+    assert repr(solve(UNIT, state, [], method='rk45')) == "<States by 'rk45': 0 times>"

@@ -145,7 +145,7 @@ def test_the_command_judges_a_log(beside, tmp_path, capsys):
                  str(junit), '--page', str(page)]) == 1
     found = json.loads(capsys.readouterr().out)
     assert found['faults'] == ['conjugated'] and not found['passed']
-    assert found['measures']['convergence_s'] is None
+    assert found['measures']['convergence_s'] == 0.0        # after the correction
     suite = ElementTree.parse(junit).getroot()
     assert suite.get('tests') == str(len(suite)) and suite.get('failures') == '1'
     assert [case.get('name') for case in suite if case.find('failure') is not None] == [

@@ -23,17 +23,18 @@ def test_plot_draws_the_columns():
     panels = {axes.get_ylabel() or axes.get_title(): axes for axes in figure.axes}
     for label, expected in (
             ('tilt θ [deg]', np.degrees(motion.theta_folded)),
-            ("precession φ' [rad/s]", motion.phi_dot),
-            ('energy drift', (motion.energy - motion.energy[0]) / abs(motion.energy[0]))):
+            ("rate φ' [rad/s]", motion.phi_dot),
+            ('relative drift', (motion.energy - motion.energy[0]) / abs(motion.energy[0]))):
         line = panels[label].lines[0]
         assert (line.get_xdata() == motion.t).all()
         assert (line.get_ydata() == expected).all()
     low, high = sorted(float(line.get_ydata()[0]) for line in panels['tilt θ [deg]'].lines[1:])
     assert low == pytest.approx(np.degrees(0.5))
     assert high == pytest.approx(np.degrees(motion.theta.max()), abs=0.05)
-    path = panels['from above'].lines[-1]
+    path = panels['the same from above'].lines[-1]
     assert (np.hypot(path.get_xdata(), path.get_ydata())
             == pytest.approx(np.sin(motion.theta), abs=1e-12))
+    assert all(axes.get_title() for axes in figure.axes)
     figure.savefig('/dev/null', format='png')
 
 

@@ -747,7 +747,8 @@ def test_what_is_no_log_is_refused(tmp_path, content, reason):
 def test_what_cannot_be_opened_is_named(tmp_path):
     os.mkfifo(tmp_path / 'pipe')
     for name, reason in (('missing', 'No such file or directory'),
-                         ('', 'it is no regular file'), ('pipe', 'it is no regular file')):
+                         ('', 'a folder must have one .mcap file, and this has pipe'),
+                         ('pipe', 'it is no regular file')):
         path = tmp_path / name
         with pytest.raises(LogError) as caught:
             LogReader(path)

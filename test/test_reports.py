@@ -101,7 +101,7 @@ def test_the_worst_problem_is_the_level_and_the_message(reported):
 def test_the_status_line(clock, reported):
     line = reported.report.status_line()
     assert line.startswith('t      1.25 s paused | ') and ' | x' not in line
-    assert 'L3 1.6 Lz 1.386' in line and 'no subscribers yet' in line
+    assert 'L3 1.6 Lz 1.386' in line and 'no subscribers yet' in line and 'energy drift ' in line
     clock.now += 1.0
     status_of(reported)
     reported.loop.command(2.0, 1.0)
@@ -135,10 +135,11 @@ def test_a_line_that_stays_stands_below_the_status_line_which_fits_the_terminal(
     assert out.getvalue() == '\r\x1b[Kone | two |\n\r\x1b[Kfour\ndone\n'
 
 
-def test_without_a_terminal_lines_are_whole(monkeypatch):
+def test_without_a_terminal_lines_are_the_first_parts_in_80_characters(monkeypatch):
     out, terminal = standard_output(monkeypatch, isatty=False), reports.Terminal()
     terminal.show('a | ' * 50 + 'z')
     terminal.end()
-    assert out.getvalue() == 'a | ' * 50 + 'z\n'
+    terminal.show('b' * 80)
+    assert out.getvalue() == 'a | ' * 19 + 'a\n' + 'b' * 80 + '\n'
     monkeypatch.setattr(reports.sys, 'stdout', None)
     terminal.show('c')                      # a closed standard output is no terminal

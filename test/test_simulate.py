@@ -4,6 +4,7 @@
 import csv
 import io
 import json
+import re
 import resource
 import subprocess
 import sys
@@ -153,7 +154,7 @@ def events_of(log):
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [
-    (['--duration', '0'], '--duration S, or the parameter duration'),
+    (['--duration', '0'], 'duration = 0.0: must be a number >= 1e-09 and <= 1e+08; give'),
     (['--duration', '1', '-p', 'top.lambda1:=-1'], 'top.lambda1 = -1'),
     (['--duration', '1', '-p', 'spin.l3=2'], "'spin.l3=2'"),
     (['--duration', '1', '--epoch', 'nan'], '--epoch nan'),
@@ -211,9 +212,9 @@ def test_log_and_table_hold_the_run_up_to_where_the_equations_end(tmp_path, caps
                                                        '/nowhere.yaml: No such file'),
     (['--duration', '1', '-o', '/nowhere/run.mcap'],
      'spinning-top simulate: '
-     'cannot record to /nowhere/run.mcap: there is no directory /nowhere\n'),
+     'cannot write /nowhere/run.mcap: there is no directory /nowhere\n'),
     (['--duration', '1', '-o', '/nowhere/run.csv'],
-     'spinning-top simulate: /nowhere/run.csv: No such file or directory\n')])
+     'spinning-top simulate: cannot write /nowhere/run.csv: there is no directory /nowhere\n')])
 def test_what_cannot_be_simulated_is_told_in_a_line(tmp_path, capsys, arguments, message):
     assert main(['-o', str(tmp_path / 'run.mcap'), '--quiet', *arguments]) == 1
     error = capsys.readouterr().err
@@ -263,11 +264,14 @@ def test_an_interrupted_run_is_a_shorter_log_of_all_streams_up_to_one_time(
 
     monkeypatch.setattr(Stream, 'encode', interrupted)
     assert main(['-o', str(path), '--duration', '40', '--quiet']) == 130
-    assert capsys.readouterr().err == 'spinning-top simulate: interrupted\n'
     monkeypatch.undo()
-    assert inspect.main([str(path), '--verify']) == 0
     log, _ = read(path)
     assert len(log['/pose']) > 100
+    kept = re.fullmatch(
+        f'spinning-top simulate: interrupted: {re.escape(str(path))} holds the run up to t = (.*) '
+        f's, {sum(map(len, log.values()))} messages, .* MB\n', capsys.readouterr().err)
+    assert 0.0 <= float(kept[1]) - max(log['/imu/data_raw']) / 1e9 < 0.005
+    assert inspect.main([str(path), '--verify']) == 0
 
 
 def test_progress_is_shown_on_a_terminal_only(monkeypatch):

@@ -143,7 +143,8 @@ def explain(outcome: Outcome, absolute: bool,
     after, best = min(tried, key=lambda pair: pair[0])
     if after > EXPLAINED * before:
         return None
-    text = f'{best.text}, the error falls from {_degrees(before)} to {_degrees(after)}'
+    text = (f'{best.text}, the error falls from {_degrees(before)} to {_degrees(after)}; all '
+            'measures are those after this correction')
     if not absolute and best in (NED_WORLD, GRAVITY_SIGN):
         best = best._replace(faults=('frame_ned', 'gravity_sign'))
         text += '; the two cannot be told apart without a heading'
@@ -169,16 +170,16 @@ def first_order_fault(before: float, after: float, rate: float) -> Fault | None:
     if before < FIRST_ORDER or after > FIRST_ORDER_LEFT * before:
         return None
     return Fault('first_order_integration',
-                 f'at {rate:g} Hz, with rates tan(|w| dt/2)/(|w| dt/2) times as large, the error '
-                 f'falls from {_degrees(before)} to {_degrees(after)}')
+                 f'integration is first order: correcting it reduces the error at {rate:g} Hz '
+                 f'from {_degrees(before)} to {_degrees(after)}')
 
 
 def lever_arm_fault(effect: float, arm: float) -> Fault | None:
     """Judge the tilt [rad] that a lever arm [m] causes."""
     if effect < LEVER_ARM:
         return None
-    return Fault('lever_arm', f'on a lever arm of {arm:g} m the attitude differs by '
-                 f'{_degrees(effect)} from that without: its acceleration is taken for gravity')
+    return Fault('lever_arm', f'{100.0 * arm:g} cm off the axis adds {_degrees(effect)}: motion '
+                 'is mistaken for gravity')
 
 
 def judge_bias(plus: Outcome, minus: Outcome, bias: Reals,
@@ -207,9 +208,8 @@ def judge_bias(plus: Outcome, minus: Outcome, bias: Reals,
     estimated = late < BIAS_REMAINS * early if math.isnan(found) else found > BIAS_FOUND
     if estimated or late < BIAS_LEFT_S:
         return measured, None
-    text = (f'a bias of the gyroscope of 1 deg/s leaves an error of the '
-            f'{"attitude" if absolute else "tilt"} of {late:.3g} deg, after {early:.3g} deg '
-            'earlier')
+    text = (f'with a gyroscope bias of 1 deg/s the {"attitude" if absolute else "tilt"} is '
+            f'{early:.3g} deg off, and {late:.3g} deg in the end: the bias is not learned')
     if not math.isnan(found):
         text += f', and the estimate has {found:.1%} of the bias'
     return measured, Fault('no_bias_estimate', text)
@@ -257,9 +257,9 @@ def divergence(outcome: Outcome, absolute: bool) -> Fault | None:
 
 
 def one_of_each(faults: Sequence[Fault]) -> Iterator[Fault]:
-    """Yield the first fault of each name, in the order of FAULTS."""
-    by_name = {fault.name: fault for fault in reversed(faults)}
-    yield from (by_name[name] for name in FAULTS if name in by_name)
+    """Yield the first fault of each name: a misreading, which hides the others, comes first."""
+    names = [fault.name for fault in faults]
+    yield from (fault for k, fault in enumerate(faults) if fault.name not in names[:k])
 
 
 def _degrees(angle: float) -> str:

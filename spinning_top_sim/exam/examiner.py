@@ -57,10 +57,18 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     """
     Examine an attitude filter.
 
+    The filter has a method ``update(gyroscope, accelerometer, magnetometer, dt)``: the mean
+    angular velocity over the step [rad/s], specific force [m/s^2, +g upwards at rest] and field
+    [T, or None] at its end, in the frame of the sensor, and the length of the step [s].  It
+    returns the attitude at the end of the step, q(world <- sensor) in the order x, y, z, w; x of
+    the world is east, y north and z up.  Attributes `covariance` and `bias` are optional, see
+    `trial.Filter`.
+
     Parameters
     ----------
     make_filter : callable
-        Returns a new filter, see `trial.Filter`; it is called for every run.
+        Returns a new filter: its class, a function, or one of `adapters.FILTERS`.  It is called
+        for every run.
     level : {'quick', 'full'}
         'full' has more seeds and motions.
     imu : mapping or path, optional
@@ -83,9 +91,15 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
 
     Raises
     ------
+    TypeError
+        If `make_filter` cannot be called, such as a filter itself.
     ValueError
         If the level, a parameter or a seed is not allowed.
     """
+    if not callable(make_filter):
+        raise TypeError(f'make_filter = {one_line(repr(make_filter))}: pass the class of the '
+                        'filter, a function that returns a new one, or one of '
+                        "spinning_top_sim.exam.adapters.FILTERS, such as FILTERS['vqf']")
     if level not in SEEDS:
         raise ValueError(f'level = {level!r}: must be one of {", ".join(SEEDS)}')
     values = _imu_parameters(imu)
@@ -223,17 +237,16 @@ class _Exam:
         self._absolute = bool(np.max(np.abs(one - two)) > 1e-9)
 
     def _noisy_runs(self) -> list[Outcome]:
-        """Return the outcomes of all seeds, and undo a misreading that explains their errors."""
-        original = self._runs_of_seeds()
-        self.outcomes += original
-        found = self._misreading(original[0].last()) if original else None
-        if found is None:
-            return original
-        self.faults += [Fault(name, found.text) for name in found.faults]
-        self._subject.correction = found
-        if found.given is not None:
-            return self._runs_of_seeds()
-        return [replace(outcome, estimates=found.read(outcome.estimates)) for outcome in original]
+        """Return the outcomes of all seeds, after undoing a misreading that explains errors."""
+        noisy = self._runs_of_seeds()
+        found = self._misreading(noisy[0].last()) if noisy else None
+        if found is not None:
+            self.faults += [Fault(name, found.text) for name in found.faults]
+            self._subject.correction = found
+            noisy = self._runs_of_seeds() if found.given is not None else [
+                replace(outcome, estimates=found.read(outcome.estimates)) for outcome in noisy]
+        self.outcomes += noisy
+        return noisy
 
     def _runs_of_seeds(self) -> list[Outcome]:
         """Return the outcomes on the slow motion; drop the seeds for which the filter failed."""

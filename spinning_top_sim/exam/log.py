@@ -192,10 +192,10 @@ def _judge(subject: str, outcome: Outcome, heading: bool) -> Report:
         corrected = replace(outcome, estimates=found.read(outcome.estimates))
     offset, late = diagnosis.stamp_fault(corrected.last(), heading)
     consistency = diagnosis.consistency([corrected], heading)
-    measured = {**diagnosis.marks([outcome], heading), 'stamp_offset_s': offset.seconds,
+    measured = {**diagnosis.marks([corrected], heading), 'stamp_offset_s': offset.seconds,
                 **diagnosis.nees_marks(consistency)}
     faults += [late] if late is not None else []
     if not faults:      # the first of these that applies
         faults += list(filter(None, (diagnosis.divergence(outcome, heading),
                                      diagnosis.covariance_fault(consistency))))[:1]
-    return Report(subject, list(diagnosis.one_of_each(faults)), measured, [outcome])
+    return Report(subject, list(diagnosis.one_of_each(faults)), measured, [corrected])

@@ -7,8 +7,26 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from xml.etree import ElementTree
 
+from spinning_top_sim.exam import diagnosis
 from spinning_top_sim.exam.diagnosis import FAULTS, Fault
+from spinning_top_sim.exam.measures import CONVERGED_DEG
 from spinning_top_sim.exam.trial import Outcome
+
+# Of each measure that needs a word: what it is, and from where on it is a fault.
+MEANINGS = {
+    'tilt_rms_deg': 'settled', 'tilt_max_deg': 'settled', 'heading_rms_deg': 'settled',
+    'convergence_s': f'until the tilt error stays below {CONVERGED_DEG:g} deg',
+    'heading_drift_deg_per_s': 'slope of the heading error',
+    'noise_gain': 'noise of the tilt over that of the accelerometer alone',
+    'stamp_offset_s': f'> 0: late; right from {diagnosis.AHEAD:g} to {diagnosis.DELAYED:g} steps',
+    'order': 'p of error ~ rate^-p on the fast motion',
+    'integration_error_deg': 'on the fast motion, without noise',
+    'lever_arm_deg': f'tilt by motion 10 cm off the axis; fault from '
+                     f'{math.degrees(diagnosis.LEVER_ARM):g}',
+    'bias_error_s': f'deg left by 1 deg/s; fault from {diagnosis.BIAS_LEFT_S:g} unless learned',
+    'bias_found': f'share of the bias in the estimate; learned from {diagnosis.BIAS_FOUND:g}',
+    'nees': 'error^2 of the tilt over its covariance; right from nees_low to nees_high',
+    'nees_attitude': 'the same of the whole attitude'}
 
 
 @dataclass(frozen=True)
@@ -50,9 +68,9 @@ class Report:
         return '\n'.join(lines)
 
     def measure_lines(self) -> list[str]:
-        """Return the measures in words, except those that could not be measured."""
-        return [f'{name:<26}{value:>12.4g}' for name, value in self.measures.items()
-                if not math.isnan(value)]
+        """Return the measures, with what they mean, except those that could not be measured."""
+        return [f'{name:<26}{value:>12.4g}  {MEANINGS.get(name, "")}'.rstrip()
+                for name, value in self.measures.items() if not math.isnan(value)]
 
     def as_json(self) -> str:
         """Return JSON with subject, passed, faults, evidence and measures, null for NaN."""

@@ -17,6 +17,8 @@ from spinning_top_sim.nodes.tick_loop import LoopState, TickLoop
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.live import LiveSimulation
 
+PIPED = 80                      # characters of a status line in a file or pipe
+
 
 class MotionReport:
     """Describes a running simulation; the caller holds the simulation's lock."""
@@ -97,8 +99,9 @@ class MotionReport:
         return ' | '.join(filter(None, (
             f't {loop.now_ns / NANOSECONDS:9.2f} s{flag}', self._regime, f'theta {theta:6.2f} deg',
             f'x{self._speed:.2f}' if is_running else '',
-            f'L3 {simulation.l3:.4g} Lz {simulation.lz:.4g}', f'{sent} messages' if sent
-            else 'no subscribers yet', f'dE/E {simulation.energy_drift:+.0e}')))
+            f'{sent} messages' if sent else 'no subscribers yet',
+            f'L3 {simulation.l3:.4g} Lz {simulation.lz:.4g}',
+            f'energy drift {simulation.energy_drift:+.0e}')))
 
 
 class Terminal:
@@ -108,8 +111,10 @@ class Terminal:
         self._open = False              # whether the cursor is at the end of a status line
 
     def show(self, line: str) -> None:
-        """Show a status line, on a terminal as much as fits."""
+        """Show a status line as far as it fits on the terminal, or into PIPED characters."""
         if sys.stdout is None or not sys.stdout.isatty():
+            if len(line) > PIPED:       # whole parts of it
+                line = line[:PIPED + 3].rpartition(' | ')[0] or line[:PIPED]
             self._write(f'{line}\n')
             return
         self._write(f'\r\x1b[K{line[:max(shutil.get_terminal_size().columns - 1, 1)]}')

@@ -117,9 +117,12 @@ class Simulator(Node):
         """End the motion and close the recording, whether the context is valid or not."""
         self._pacer.stop()
         self._terminal.end()
+        path = self._session.numbers().get('recorded file')
         summary = self._session.stop()
         if summary:
-            self._terminal.tell(summary)
+            self._terminal.tell(f'{summary}\n'
+                                f'next: spinning-top inspect {path}\n'
+                                f'      spinning-top view {path}')
 
     def finish(self) -> None:
         """End the process after the response that is being prepared."""

@@ -97,26 +97,26 @@ def plot(motion: Any) -> Figure:
             height_ratios=(2.2, 1.0, 0.8))
         draw_sphere(panels['sphere'], (*bounds, np.pi / 2), _lowest(z))
         draw_tip(panels['sphere'], x + 1j * y, z)
-        panels['sphere'].set_title('path of the axis')
+        panels['sphere'].set_title('path of the axis on the unit sphere')
         above = panels['above']
         circle = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 200))
         for theta in bounds:
             above.plot(np.sin(theta) * circle.real, np.sin(theta) * circle.imag, color=FAINT,
                        linewidth=0.8)
         above.plot(x, y, color=PATH)
-        above.set(title='from above', aspect='equal')
+        above.set(title='the same from above', aspect='equal')
         above.axis('off')
         panels['theta'].plot(motion.t, np.degrees(motion.theta_folded), color=COLOURS[0])
         for theta in bounds:
             panels['theta'].axhline(float(np.degrees(theta)), color=INK, linewidth=0.8,
                                     linestyle=':')
-        panels['theta'].set(ylabel='tilt θ [deg]', xlabel='t [s]')
+        panels['theta'].set(title='nutation', ylabel='tilt θ [deg]', xlabel='t [s]')
         panels['rate'].plot(motion.t, motion.phi_dot, color=COLOURS[1])
         panels['rate'].axhline(0.0, color=FAINT, linewidth=0.8, zorder=0)
-        panels['rate'].set(ylabel="precession φ' [rad/s]", xlabel='t [s]')
+        panels['rate'].set(title='precession', ylabel="rate φ' [rad/s]", xlabel='t [s]')
         panels['drift'].plot(motion.t, (energy - energy[0]) / (abs(energy[0]) or 1.0),
                              color=COLOURS[2])
-        panels['drift'].set(ylabel='energy drift', xlabel='t [s]')
+        panels['drift'].set(title='energy', ylabel='relative drift', xlabel='t [s]')
     return figure
 
 

@@ -64,8 +64,9 @@ class Description:
             tilt = f'theta from {_span(low, high)} deg every {self.nutation_period:.6g} s'
             rates = f' ({_span(self.precession_min, self.precession_max)})'
         return (f'{self.name}: {tilt}; precession {self.mean_precession_rate:.6g} rad/s{rates}, '
-                f'spin {self.mean_spin_rate:.6g} rad/s; L3^2/(4 lambda1 |P|) = '
-                f'{self.gyroscopic_ratio:.4g}, 1 - m = {self.separatrix_distance:.3g}')
+                f'spin {self.mean_spin_rate:.6g} rad/s; spin ratio L3^2/(4 lambda1 |P|) = '
+                f'{self.gyroscopic_ratio:.4g} (upright, it sleeps above 1), distance from the '
+                f'separatrix 1 - m = {self.separatrix_distance:.3g}')
 
 
 def _span(low: float, high: float) -> str:

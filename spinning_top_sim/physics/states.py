@@ -46,7 +46,7 @@ class States:
     Attributes
     ----------
     top, start : Top, State
-        What moves, and its state at t = 0.
+        The top, and its state at t = 0.
     t : (n,) array
         Times since the start of the motion [s].
     theta, phi, psi : (n,) array
@@ -70,12 +70,18 @@ class States:
         and of the angular velocity, which cost no copy.
     """
 
+    solver = 'rk45'             # that computes them
+
     def __init__(self, top: Top, start: State, n: int) -> None:
         self.top, self.start, self._n = top, start, n
         self._l3, self._lz = start.l3, start.lz
 
     def __len__(self) -> int:
         return self._n
+
+    def __repr__(self) -> str:
+        span = f' from {self.t.min():g} to {self.t.max():g} s' if self._n else ''
+        return f'<States by {self.solver!r}: {self._n} times{span}>'
 
     @cached_property
     def t(self) -> Column:

@@ -34,6 +34,18 @@ _FOOTER_SIZE = HEAD.size + 8 + 8 + 4
 _BLOCK = 1 << 16
 
 
+def only_log(path: Path) -> Path:
+    """Return the path of a file, or of the one log in a folder.  Raises LogError."""
+    if not path.is_dir():
+        return path
+    found = sorted(path.glob('*.mcap'))
+    if len(found) != 1:
+        names = ', '.join(one.name for one in found or sorted(path.iterdir())[:10]) or 'nothing'
+        raise LogError(f'cannot read {path}: a folder must have one .mcap file, and this '
+                       f'has {names}')
+    return found[0]
+
+
 class LogFile:
     """A file up to the size that it has now; raises LogError where it cannot be read."""
 

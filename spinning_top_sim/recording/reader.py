@@ -24,7 +24,13 @@ from mcap.writer import MCAP0_MAGIC
 from spinning_top_sim.recording import records
 from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.errors import LogError
-from spinning_top_sim.recording.log_file import MAGIC_SIZE, LogFile, known_topics, read_summary
+from spinning_top_sim.recording.log_file import (
+    MAGIC_SIZE,
+    LogFile,
+    known_topics,
+    only_log,
+    read_summary,
+)
 from spinning_top_sim.recording.records import HEAD, DamagedError, LogMessage, Messages
 from spinning_top_sim.recording.rosbag2 import Qos, qos_profiles
 from spinning_top_sim.recording.scan import Part, Scan
@@ -86,7 +92,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     Parameters
     ----------
     path : str or path
-        The file.
+        The file, or a folder of `ros2 bag` with one .mcap file.
     max_bytes : int
         Largest record, and largest uncompressed chunk, that is read into memory.
 
@@ -97,7 +103,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     """
 
     def __init__(self, path: str | os.PathLike[str], max_bytes: int = records.MAX_BYTES) -> None:
-        self.path = Path(path)
+        self.path = only_log(Path(path))
         self.left_out = 0       # damaged chunks that `messages` has skipped
         self.file = LogFile(self.path, max_bytes)
         self.size = self.file.size

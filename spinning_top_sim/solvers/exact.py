@@ -42,7 +42,7 @@ class ExactSolution:
     Parameters
     ----------
     top : Top
-        What moves.
+        The top to simulate.
     start : State
         The state at t = 0; of a `ContinuedState` theta may be any number.
 
@@ -186,6 +186,8 @@ class ExactSolution:
 
 class _ExactStates(States):
     """The states of an exact solution, on the branch of its start."""
+
+    solver = 'exact'
 
     def __init__(self, solution: ExactSolution, times: Times) -> None:
         super().__init__(solution.top, solution.start, len(times))

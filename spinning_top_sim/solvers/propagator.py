@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every solver has, the choice among them, and `solve`, which reads a motion at times."""
 
+from __future__ import annotations
+
 from contextlib import suppress
 from typing import Protocol
 
@@ -23,7 +25,7 @@ class Propagator(Protocol):
     """
     A motion from its start at t = 0; every time counts from there.
 
-    top, start : what moves, and from where
+    top, start : the top, and its state at t = 0
     """
 
     top: Top
@@ -119,7 +121,7 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
     Parameters
     ----------
     top : Top
-        What moves.
+        The top to simulate.
     start : State
         The state at t = 0.
     t : (n,) array_like
@@ -130,7 +132,7 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
     rtol, atol : float
         Tolerated error of a step; atol is rtol/10 by default.
     equations : {'transport', 'euler'}
-        Of the steps: regular everywhere, or to the letter of the paper, for study.
+        Equations of motion that 'rk45' integrates: regular everywhere, or those of the paper.
 
     Returns
     -------
@@ -139,12 +141,28 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
 
     Raises
     ------
+    TypeError
+        If `top` and `start` are swapped, or something else.
     ValueError
         Naming the argument, its value and what is allowed.
     IntegrationError
         Where the 'euler' equations cannot go on, a step collapses, or the last time is more than
         1e7 steps of the present size away.
+
+    Examples
+    --------
+    >>> top = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
+    >>> motion = solve(top, State(theta=0.5, l3=1.6, lz=1.4), [0.0, 0.5, 1.0])
+    >>> motion
+    <States by 'exact': 3 times from 0 to 1 s>
+    >>> motion.theta.round(3).tolist()
+    [0.5, 0.604, 0.722]
     """
+    for name, value, kind in (('top', top, Top), ('start', start, State)):
+        if not isinstance(value, kind):
+            swapped = isinstance(top, State) and isinstance(start, Top)
+            raise TypeError(f'{name} is a {type(value).__name__}: must be a {kind.__name__}'
+                            f'{", top and start are swapped" * swapped}')
     try:
         times = np.asarray(t).astype(np.float64, casting='same_kind')
     except (TypeError, ValueError) as error:

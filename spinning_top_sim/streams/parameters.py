@@ -191,8 +191,8 @@ TABLE: tuple[Parameter, ...] = (
     _at_once('spin.lz', None, 'Angular momentum along the vertical; a change is a command; unset: '
              'L3 cos(initial.theta), the cusp', 'kg m^2/s'),
     _at_reset('solver.method', 'rk45', 'Dormand-Prince steps or the closed form', choices=METHODS),
-    _at_reset('solver.equations', 'transport', "rk45: regular form, or the paper's to the letter",
-              choices=EQUATIONS),
+    _at_reset('solver.equations', 'transport', 'rk45: equations of motion, regular '
+              'everywhere or those of the paper', choices=EQUATIONS),
     _at_reset('solver.rtol', 1e-11, 'rk45: relative tolerance of a step', '', 1e-14, 1e-2),
     _at_reset('solver.atol', 1e-12, 'rk45: absolute tolerance of a step', '', 0.0, 1e-2),
     _at_once('max_error', 1e-6, 'rk45: warn in /diagnostics when the orientation is further '

@@ -12,7 +12,7 @@ from spinning_top_sim.tools.analysis import Attitudes
 from spinning_top_sim.tools.survey import MotionReport
 
 PAGE_NUTATIONS, PAGE_S = 8, 5.0     # duration of the page; in seconds without nutation
-FRAMES_PER_S, LONGEST_S = 20, 10.0
+FRAMES_PER_S, LONGEST_S, GIF_PIXELS = 20, 10.0, 640
 
 
 def draw_page(name: str, motion: MotionReport, data: Attitudes, path: Path) -> None:
@@ -24,10 +24,10 @@ def draw_page(name: str, motion: MotionReport, data: Attitudes, path: Path) -> N
     figure.savefig(path, dpi=120)
 
 
-def animate(motion: MotionReport, data: Attitudes, path: Path) -> None:
+def animate(_: str, motion: MotionReport, data: Attitudes, path: Path) -> None:
     """Draw the turning top as a GIF."""
     pictures.animate(_columns(motion, data, LONGEST_S), FRAMES_PER_S, 1.0).save(
-        path, writer=PillowWriter(fps=FRAMES_PER_S))
+        path, writer=PillowWriter(fps=FRAMES_PER_S), dpi=GIF_PIXELS / 4.0)     # of 4 inches
 
 
 def _columns(motion: MotionReport, data: Attitudes, seconds: float) -> SimpleNamespace:

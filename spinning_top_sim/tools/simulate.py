@@ -95,16 +95,26 @@ def _run(arguments: argparse.Namespace) -> int:
     export.check(arguments.export, [stream.topic for stream in journal.recorded_streams(
         simulation.streams, values)], values)
     stops = _parse_stops(arguments.command, round(values['duration'] * NANOSECONDS))
-    with cli.progress('simulated', values['duration'], 's', quiet=arguments.quiet) as show:
-        if file_format == 'mcap':
-            summary = write_log(output, simulation, stops, show, arguments.namespace)
-        else:
-            table = Table(period_ns(values['pose.rate']))
-            write = _write_csv if file_format == 'csv' else _write_parquet
-            # A command changes the rows after its time.
-            write(output, (rows for done in _play(simulation, [table], stops, show)
-                           if isinstance(done, Block) for _, _, rows in done.parts))
-            summary = ', '.join(UNITS)
+    cli.check_output(output)
+    reached = [0.0]         # by what is written [s]
+    try:
+        with cli.progress('simulated', values['duration'], 's', quiet=arguments.quiet) as bar:
+            def show(t: float) -> None:
+                reached[0] = t
+                bar(t)
+
+            if file_format == 'mcap':
+                summary = write_log(output, simulation, stops, show, arguments.namespace)
+            else:
+                table = Table(period_ns(values['pose.rate']))
+                write = _write_csv if file_format == 'csv' else _write_parquet
+                # A command changes the rows after its time.
+                write(output, (rows for done in _play(simulation, [table], stops, show)
+                               if isinstance(done, Block) for _, _, rows in done.parts))
+                summary = ', '.join(UNITS)
+    except KeyboardInterrupt as error:
+        kept = ', '.join(filter(None, (f'the run up to t = {reached[0]:g} s', str(error))))
+        raise KeyboardInterrupt(f'{output} holds {kept}') from error
     lines = [f'{output}: {summary}']
     if arguments.export:
         with LogReader(output) as reader:
@@ -126,7 +136,8 @@ def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
                  if name in ('seed', 'duration') and value is not None)
     values = parameters.checked(given)
     if not values['duration'] > 0.0:
-        raise ValueError('--duration S, or the parameter duration, must be given')
+        allowed = parameters.BY_NAME['duration'].allowed.replace('0 or ', '')
+        raise ValueError(f'duration = {values["duration"]!r}: {allowed}; give --duration S')
     return values
 
 
@@ -179,6 +190,7 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
     streams = journal.recorded_streams(simulation.streams, values)
     commands_topic, events_topic = len(streams), len(streams) + 1
     types = {stream.topic: stream.type_name for stream in streams} | dict(journal.TOPICS)
+    interrupted = None
     file = create_file(
         path, [RecordedTopic(journal.resolve_topic(name, namespace), type_name)
                for name, type_name in types.items()],
@@ -194,12 +206,17 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
                 file.append(events_topic, epoch_ns + t_ns, journal.event(
                     'command', t_ns, t_ns, l3=l3, lz=lz))
                 file.append(commands_topic, epoch_ns + t_ns, journal.command(l3, lz))
+    except KeyboardInterrupt as error:
+        interrupted = error
     finally:
         try:
             file.write_chunk()
         finally:
             file.finish()
-    return f'{file.messages} messages, {file.size / 1e6:.1f} MB'
+    summary = f'{file.messages} messages, {file.size / 1e6:.1f} MB'
+    if interrupted is not None:
+        raise KeyboardInterrupt(summary) from interrupted
+    return summary
 
 
 class Table(Stream):
