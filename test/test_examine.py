@@ -29,6 +29,7 @@ from spinning_top_sim.exam.command import main
 from spinning_top_sim.exam.diagnosis import FAULTS
 from spinning_top_sim.exam.page import draw_page
 from spinning_top_sim.exam.pytest_plugin import pass_exam  # noqa: F401, a fixture
+from spinning_top_sim.exam.report import MEANINGS, Report
 from spinning_top_sim.exam.trial import InvalidOutputError, follow
 
 pytest.importorskip('vqf')
@@ -115,12 +116,18 @@ def test_covariances_may_be_about_the_axes_of_sensor_or_world(report, factor, fa
 def test_a_misreading_is_named_with_its_evidence(report, name):
     found = report('vqf', name)
     assert found.faults == [name] and not found.passed, found
+    if name in {hypothesis for one in (*diagnosis.READINGS, *diagnosis.REPEATED)
+                for hypothesis in one.faults}:      # it is undone
+        assert found.measures['tilt_rms_deg'] < 0.1 and found.measures['convergence_s'] < 1.0
+        assert found.outcomes[0].errors.tilt[-1] < 0.01
     assert name in str(found) and found.found[0].evidence in str(found)
 
 
 @pytest.mark.parametrize('name', ['first_order_integration', 'lever_arm', 'no_bias_estimate'])
 def test_a_fault_of_the_method_is_named(report, name):
     assert report(name).faults == [name]
+    found = report(name, 'component_order')
+    assert found.faults == ['component_order', name]        # which hides the other comes first
     assert set(FAULTY) == set(FAULTS)
 
 
@@ -131,6 +138,9 @@ def test_a_filter_without_faults_passes(report):
     assert marks['tilt_rms_deg'] < 0.03 and marks['convergence_s'] < 1.0
     assert marks['bias_found'] == pytest.approx(1.0, abs=0.01)
     assert marks['nees_low'] < marks['nees'] < marks['nees_high']
+    assert {*MEANINGS, 'nees_low', 'nees_high', 'nees_attitude_low', 'nees_attitude_high'} == {
+        *marks}, 'each measure is explained'
+    assert 'fault from 1\n' in str(found)
 
 
 def test_vqf_passes_with_and_without_magnetometer(report):
@@ -221,8 +231,16 @@ def test_whatever_a_filter_says_can_be_written(tmp_path):
     assert 'raises ValueError: red\\x1b[31m and $a^$ \\ud800' in report.found[0].evidence
     assert report.subject == 'a\\x1b $a^$ \\ud800'
     ElementTree.fromstring(report.as_junit().encode())
+    assert '"x": null' in Report('', (), {'x': math.inf}).as_json()
     draw_page(report, tmp_path / 'page.svg')
     assert '$a^$' in (tmp_path / 'page.svg').read_text()
+
+
+def test_the_page_has_two_panels_with_plain_numbers(report, tmp_path):
+    draw_page(report('vqf'), tmp_path / 'page.svg')
+    page = (tmp_path / 'page.svg').read_text()
+    assert '<!-- 0.01 -->' in page and 'mathdefault' not in page
+    assert page.count('<!-- t [s] -->') == 2 and '<!-- tilt error [deg] -->' in page
 
 
 def test_a_run_that_fails_leaves_the_others():
@@ -268,6 +286,12 @@ def test_a_process_of_its_own_changes_nothing(report):
 def test_wrong_arguments_are_refused(options, says):
     with pytest.raises(ValueError, match=re.escape(says)):
         examine(Vqf, **options)
+
+
+@pytest.mark.parametrize('filter_', ['vqf', Vqf()])
+def test_what_makes_no_filter_is_refused(filter_):
+    with pytest.raises(TypeError, match=r"make_filter = .*: pass the class .*FILTERS\['vqf'\]"):
+        examine(filter_)
 
 
 def test_the_command_examines_a_published_filter(capsys):

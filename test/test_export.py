@@ -126,7 +126,7 @@ def test_kalibr_gets_the_parameters(folder):
     (['--export', 'tum:DIR/a'], 'the log has no ground_truth/imu_odom', 2),
     (['--export', 'euroc_imu:DIR/a', '-p', 'imu.enabled:=false'], 'no imu/data_raw', 2),
     (['--export', 'kalibr:DIR/a'], 'imu.accelerometer_noise_density = 0.0', 2),
-    (['--export', 'euroc_imu:DIR/there'], 'there: File exists', 1)])
+    (['--export', 'euroc_imu:DIR/there'], 'there: it exists, and nothing is overwritten', 1)])
 def test_what_cannot_be_exported_is_told_before_anything_is_computed(
         tmp_path, capsys, arguments, reason, code):
     (tmp_path / 'there').write_text('precious')
@@ -163,4 +163,4 @@ def test_inspect_refuses_what_the_log_lacks_and_what_is_there(tmp_path, folder, 
     assert inspect.main([str(log), *exports(tmp_path, 'tum')]) == 2
     assert 'no ground_truth/imu_odom' in capsys.readouterr().err
     assert inspect.main([str(folder / 'run.mcap'), *exports(folder, 'tum')]) == 1
-    assert 'File exists' in capsys.readouterr().err
+    assert 'nothing is overwritten' in capsys.readouterr().err

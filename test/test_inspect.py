@@ -441,7 +441,7 @@ def test_a_strangers_log_is_listed_and_its_names_do_not_act_on_the_terminal(tmp_
     assert content['topics']['/thing']['count'] == 11
     assert content['topics']['/thing']['rate'] == pytest.approx(10.0)
     code, out, _ = told(capsys, path)
-    assert code == 0 and 'not recorded by spinning_top_sim' in out and '/thing' in out
+    assert code == 0 and out.count('not recorded by spinning_top_sim') == 1 and '/thing' in out
     assert out.replace('\n', '').isprintable()
     assert '/\\x1b[2J\\u202e\\x9b\\nline' in out and 'a/\\x1b]0;b\\x07' in out
     code, _, err = told(capsys, path, '--verify')
@@ -532,13 +532,35 @@ def test_pictures_are_drawn(short, tmp_path, capsys):
     pixels = np.asarray(image.open(page).convert('L'))
     assert min(pixels.shape) > 600 and 0.02 < np.mean(pixels < 250) < 0.5
     frames = image.open(film)
-    assert frames.n_frames == 7 and frames.info['duration'] == 50
+    assert frames.n_frames == 7 and frames.info['duration'] == 50 and frames.width == 640
     assert film.stat().st_size < 400_000
     shown = []
     for number in (0, 6):
         frames.seek(number)
         shown.append(np.asarray(frames.convert('RGB'), int))
     assert np.mean(np.abs(shown[1] - shown[0]).max(axis=2) > 30) > 0.01
+
+
+@pytest.mark.parametrize('option', ['--plot', '--animate'])
+def test_pictures_overwrite_nothing_and_an_interrupted_one_leaves_no_file(
+        short, tmp_path, capsys, monkeypatch, option):
+    plots = pytest.importorskip('spinning_top_sim.tools.plots')
+    path = tmp_path / 'keep'
+    path.write_text('precious')
+    code, out, err = told(capsys, short, option, path)
+    assert (code, out, path.read_text()) == (1, '', 'precious')
+    assert err == (f'spinning-top inspect: cannot write {path}: it exists, and nothing is '
+                   'overwritten\n')
+
+    def interrupted(*arguments):
+        arguments[-1].write_text('a part')
+        raise KeyboardInterrupt
+
+    path.unlink()
+    monkeypatch.setattr(plots, {'--plot': 'draw_page', '--animate': 'animate'}[option],
+                        interrupted)
+    assert told(capsys, short, option, path)[0] == 130
+    assert not any(tmp_path.iterdir())
 
 
 def test_without_matplotlib_there_is_a_hint(short, tmp_path, capsys, monkeypatch):
@@ -563,8 +585,7 @@ def test_neither_ros_nor_scipy_nor_pictures_are_imported_unasked(short, tmp_path
     assert run.stdout.strip().endswith('loaded: [] []')
 
 
-def test_a_folder_with_one_log_is_that_log_and_pictures_overwrite_nothing(
-        short, tmp_path, capsys):
+def test_a_folder_with_one_log_is_that_log(short, tmp_path, capsys):
     (tmp_path / 'bag').mkdir()
     assert inspect.main([str(tmp_path / 'bag')]) == 1
     assert capsys.readouterr().err == (
@@ -573,10 +594,3 @@ def test_a_folder_with_one_log_is_that_log_and_pictures_overwrite_nothing(
     (tmp_path / 'bag/bag_0.mcap').symlink_to(short)
     assert inspect.main([str(tmp_path / 'bag')]) == 0
     assert capsys.readouterr().out.startswith(f'{tmp_path}/bag/bag_0.mcap: whole')
-    (tmp_path / 'keep.png').write_text('precious')
-    for option in ('--plot', '--animate'):
-        assert inspect.main([str(short), option, str(tmp_path / 'keep.png')]) == 1
-        assert capsys.readouterr().err == (
-            f'spinning-top inspect: cannot write {tmp_path}/keep.png: it exists, and nothing is '
-            'overwritten\n')
-    assert (tmp_path / 'keep.png').read_text() == 'precious'

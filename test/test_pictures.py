@@ -34,6 +34,7 @@ def test_plot_draws_the_columns():
     path = panels['the same from above'].lines[-1]
     assert (np.hypot(path.get_xdata(), path.get_ydata())
             == pytest.approx(np.sin(motion.theta), abs=1e-12))
+    assert all(axes.get_title() for axes in figure.axes)
     figure.savefig('/dev/null', format='png')
 
 

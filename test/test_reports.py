@@ -101,7 +101,7 @@ def test_the_worst_problem_is_the_level_and_the_message(reported):
 def test_the_status_line(clock, reported):
     line = reported.report.status_line()
     assert line.startswith('t      1.25 s paused | ') and ' | x' not in line
-    assert 'L3 1.6 Lz 1.386' in line and 'no subscribers yet' in line
+    assert 'L3 1.6 Lz 1.386' in line and 'no subscribers yet' in line and 'energy drift ' in line
     clock.now += 1.0
     status_of(reported)
     reported.loop.command(2.0, 1.0)

@@ -90,6 +90,7 @@ def test_however_it_is_ended_the_log_is_whole(peer, tmp_path, numbers):
     assert_received_from(pose.raw, logged)
     assert decoded(path)[node.topic('pose')] == len(logged)
     assert path.name in node.out, 'it says what it has recorded'
+    assert f'next: spinning-top inspect {path}\n      spinning-top view {path}\n' in node.out
 
 
 @pytest.mark.parametrize(('number', 'delays'), [

@@ -60,12 +60,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--imu', metavar='FILE', help='parameter file of the IMU, as in config/imu')
     add('--seeds', type=int, metavar='N', help='number of noisy runs')
     add('--json', action='store_true', help='print everything as JSON')
-    add('--junit', type=Path, metavar='FILE', help='write JUnit XML')
+    add('--junit', type=Path, metavar='FILE', help='write JUnit XML; an existing file is replaced')
     add('--page', type=Path, metavar='FILE',
-        help='draw a page of figures (.png, .pdf, .svg); needs matplotlib')
+        help='draw a page of figures (.png, .pdf, .svg); needs matplotlib; an existing file is '
+        'never overwritten')
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    cli.check_output(arguments.page)
     report = _report(arguments)
     if arguments.json:
         print(report.as_json())
@@ -75,8 +77,8 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.junit is not None:
         arguments.junit.write_text(report.as_junit(), encoding='utf-8')
     if arguments.page is not None:
-        from spinning_top_sim.exam.page import draw_page  # noqa: PLC0415 - needs matplotlib
-
+        with needed('a page', 'plot'):
+            from spinning_top_sim.exam.page import draw_page  # noqa: PLC0415
         draw_page(report, arguments.page)
     return cli.OK if report.passed else cli.FAILED
 

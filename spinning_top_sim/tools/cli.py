@@ -6,9 +6,11 @@ import contextlib
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import NoReturn, TextIO
 
 from spinning_top_sim.installation import version
+from spinning_top_sim.recording.errors import why_not_written
 
 OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130         # argparse uses 2, too
 
@@ -62,6 +64,16 @@ def run(name: str, help_text: str | None, argv: Sequence[str] | None,
         what = f'; {interrupt}' if interrupt.args else ''
         print_line(f'{parser.prog}: interrupted{what}', sys.stderr)
         return INTERRUPTED
+
+
+def check_output(*paths: Path | None) -> None:
+    """Raise OSError if one of these files cannot be made, such as because it exists."""
+    for path in filter(None, paths):
+        try:
+            open(path, 'xb').close()
+            path.unlink()
+        except OSError as error:
+            raise OSError(f'cannot write {path}: {why_not_written(path, error)}') from error
 
 
 def printable(text: str) -> str:

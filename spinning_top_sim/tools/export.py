@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.topics import all_streams
+from spinning_top_sim.tools import cli
 from spinning_top_sim.tools.recorded_run import RunDescription
 
 BLOCK = 16384               # messages that are read together
@@ -63,8 +64,7 @@ def check(exports: Sequence[tuple[str, Path]], topics: Collection[str],
             if not values[name] > 0.0:
                 raise ValueError(f'--export kalibr: {name} = {values[name]!r}: kalibr reads only '
                                   'what is > 0')
-        if path.exists():
-            raise FileExistsError(f'{path}: File exists')
+        cli.check_output(path)
 
 
 def write(reader: LogReader, run: RunDescription,

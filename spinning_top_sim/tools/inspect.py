@@ -52,11 +52,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     add = parser.add_argument
-    add('log', type=Path, help='an MCAP file, of this package or any other')
+    add('log', type=Path, help='an MCAP file, of this package or any other, or a folder with one')
     add('--plot', type=Path, metavar='FILE',
-        help='draw a page of figures (.png, .pdf, .svg); needs matplotlib')
+        help='draw a page of figures (.png, .pdf, .svg); needs matplotlib; an existing file is '
+        'never overwritten')
     add('--animate', type=Path, metavar='GIF',
-        help='draw the turning top; needs matplotlib')
+        help='draw the turning top; likewise')
     add('--verify', action='store_true',
         help='compute the run again and compare every message byte for byte')
     export.add_argument(parser)
@@ -64,9 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    for picture in filter(None, (arguments.plot, arguments.animate)):
-        if picture.exists():
-            raise LogError(f'cannot write {picture}: it exists, and nothing is overwritten')
+    cli.check_output(arguments.plot, arguments.animate)
     with LogReader(arguments.log) as reader:
         found, verdict = survey(reader), None
         exported: list[str] = []
@@ -106,11 +105,13 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> None:
         raise LogError('nothing to draw: no attitude of a top in this log')
     with needed('a picture', 'plot'):
         from spinning_top_sim.tools import plots  # noqa: PLC0415
-    motion, data = found.shown
-    if arguments.plot is not None:
-        plots.draw_page(found.path.name, motion, data, arguments.plot)
-    if arguments.animate is not None:
-        plots.animate(motion, data, arguments.animate)
+    for path, draw in ((arguments.plot, plots.draw_page), (arguments.animate, plots.animate)):
+        if path is not None:
+            try:
+                draw(found.path.name, *found.shown, path)
+            except BaseException:       # also KeyboardInterrupt
+                path.unlink(missing_ok=True)
+                raise
 
 
 def _as_json(found: Survey, verdict: Verdict | None) -> object:
@@ -157,7 +158,7 @@ def _as_text(found: Survey, verdict: Verdict | None) -> Iterator[str]:
     yield f'{found.path}: {state}, {(damage.end_ns - damage.start_ns) / NANOSECONDS:.6g} s'
     yield from damage.lines()
     if run is None:
-        yield f'not recorded by spinning_top_sim: {found.foreign_reason}'
+        yield found.foreign_reason
         yield from _topics(found)
         return
     values = run.values_at_start

@@ -24,14 +24,10 @@ def draw_page(name: str, motion: MotionReport, data: Attitudes, path: Path) -> N
     figure.savefig(path, dpi=120)
 
 
-def animate(motion: MotionReport, data: Attitudes, path: Path) -> None:
-    """Draw the turning top as a GIF; an interrupted one leaves no file."""
-    try:
-        pictures.animate(_columns(motion, data, LONGEST_S), FRAMES_PER_S, 1.0).save(
-            path, writer=PillowWriter(fps=FRAMES_PER_S), dpi=GIF_PIXELS / 4.0)   # of 4 inches
-    except BaseException:
-        path.unlink(missing_ok=True)
-        raise
+def animate(_: str, motion: MotionReport, data: Attitudes, path: Path) -> None:
+    """Draw the turning top as a GIF."""
+    pictures.animate(_columns(motion, data, LONGEST_S), FRAMES_PER_S, 1.0).save(
+        path, writer=PillowWriter(fps=FRAMES_PER_S), dpi=GIF_PIXELS / 4.0)     # of 4 inches
 
 
 def _columns(motion: MotionReport, data: Attitudes, seconds: float) -> SimpleNamespace:

@@ -40,7 +40,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
-    parser.add_argument('log', type=Path, help='the MCAP file, of this package or any other')
+    parser.add_argument('log', type=Path, help='the MCAP file, of this package or any other, or a '
+                        'folder with one')
     parser.add_argument(
         '-o', '--output', type=Path, metavar='FILE',
         help='the new file; it must not exist (default: <log>_recovered.mcap beside the log)')
@@ -48,8 +49,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     log: Path = arguments.log
-    output: Path = arguments.output or log.parent / f'{log.stem}_recovered.mcap'
     with LogReader(log) as reader, cli.progress('recovered', reader.size, 'bytes') as show:
+        log = reader.path
+        output: Path = arguments.output or log.parent / f'{log.stem}_recovered.mcap'
         recovered = recover(reader, output, show)
     damage = reader.damage
     for line in damage.lines():
