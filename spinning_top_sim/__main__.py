@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from types import ModuleType
 
-from spinning_top_sim.installation import version
+from spinning_top_sim.tools.cli import Parser
 
 # Name: the module with its `main` and `add_arguments`, and what it does.
 COMMANDS = {
@@ -43,11 +43,10 @@ def _module(name: str) -> ModuleType:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        'spinning-top', description='Simulate the heavy symmetric top, with exact truth.',
-        epilog='spinning-top COMMAND --help tells the options of a command.')
-    parser.add_argument('--version', action='version', version=f'%(prog)s {version()}')
-    commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
+    parser = Parser('', 'Simulate the heavy symmetric top, with exact truth.',
+                    'spinning-top COMMAND --help tells the options of a command.')
+    commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True,
+                                     parser_class=argparse.ArgumentParser)
     for name, (_, what) in COMMANDS.items():
         commands.add_parser(name, help=what, add_help=False)
     return parser

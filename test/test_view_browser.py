@@ -78,7 +78,8 @@ def test_live(browser, peer, tmp_path):
             visit.press('Pause')
             (paused_at,) = visit.read(r'pause: paused at t = ([\d.]+) s')
             wait_for('the last pose to be shown', lambda: visit.read(STAMP) == stamp_of(poses))
-            assert apart(visit.attitude(), poses.last().pose.orientation) < 1e-6
+            wait_for('its attitude', lambda: apart(
+                visit.attitude(), poses.last().pose.orientation) < 1e-6)
             # t = 0 is that of the reset as soon as the next /diagnostics have come.
             wait_for('the simulated time of the sample', lambda: -1e-3 < float(paused_at) - float(
                 visit.read(r't = ([\d.]+) s, stamp')[0]) < 0.011)

@@ -31,7 +31,7 @@ from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.trial import INTERRUPTED, NodeError
 from spinning_top_sim.installation import needed
 from spinning_top_sim.recording.errors import LogError
-from spinning_top_sim.tools import cli
+from spinning_top_sim.tools import cli, scene_file
 
 # Options for each kind of subject.
 OPTIONS = {'a log': ('topic', 'truth', 'heading'), 'a node': ('topic', 'level', 'imu', 'seeds'),
@@ -57,7 +57,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--filter', choices=FILTERS, metavar='NAME',
         help=f'examine a published filter: {", ".join(FILTERS)}')
     add('--level', choices=SEEDS, help='level of the exam of a filter or node; default: quick')
-    add('--imu', metavar='FILE', help='parameter file of the IMU, as in config/imu')
+    add('--imu', metavar='NAME', help='errors of an IMU: name of an installed one, or path of '
+        'a parameter file; "help" lists the names')
     add('--seeds', type=int, metavar='N', help='number of noisy runs')
     add('--json', action='store_true', help='print everything as JSON')
     add('--junit', type=Path, metavar='FILE', help='write JUnit XML; an existing file is replaced')
@@ -89,6 +90,8 @@ def _options(arguments: argparse.Namespace) -> dict[str, Any]:
                '--filter' if arguments.filter is not None else 'a node')
     options = {name: value for names in OPTIONS.values() for name in names
                if (value := getattr(arguments, name)) is not None}
+    if arguments.imu is not None:
+        (options['imu'],) = scene_file.chosen_files(argparse.Namespace(imu=arguments.imu))
     for name in options.keys() - OPTIONS[subject]:
         raise ValueError(f'--{name}: {subject} takes --{", --".join(OPTIONS[subject])} only')
     return options

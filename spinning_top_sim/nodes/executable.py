@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from importlib.util import find_spec
+from itertools import pairwise
 from os import _exit
 from typing import TYPE_CHECKING, Protocol, cast
 
@@ -50,6 +51,9 @@ def run(name: str, argv: Sequence[str] | None,
     _handle(signal.SIGINT, lambda *_: _exit(130))
     _open_standard_streams()
     try:
+        for option, path in pairwise(argv):
+            if option == '--params-file' and not os.path.isfile(path):
+                raise ValueError(f'--params-file {path}: there is no such file')
         make_node = prepare(argv)
         import rclpy  # noqa: PLC0415
         # From `init` on, rclpy shuts the context down at SIGINT and SIGTERM.  A launched node gets

@@ -21,7 +21,7 @@ class Parser(argparse.ArgumentParser):
     """The arguments of `spinning-top NAME`; wrong ones are refused in one line."""
 
     def __init__(self, name: str, description: str | None, epilog: str | None = None) -> None:
-        super().__init__(f'spinning-top {name}', description=description, epilog=epilog,
+        super().__init__(f'spinning-top {name}'.strip(), description=description, epilog=epilog,
                          formatter_class=argparse.RawDescriptionHelpFormatter)
         self.add_argument('--version', action='version', version=f'%(prog)s {version()}')
 

@@ -5,7 +5,7 @@ import hashlib
 import math
 from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -144,8 +144,13 @@ def parse(content: object, source: str, folder: Path = Path()) -> Specification:
     working directory.  `dataclasses.asdict` of a specification can be parsed again.
     Raises OSError, or ValueError, which names the source, the value and what is allowed.
     """
+    known = [one.name for one in fields(Specification)]
     try:
-        return _checked(Specification(**content), folder)       # type: ignore[arg-type]
+        if not isinstance(content, Mapping) or not {'runs', 'duration'} <= content.keys():
+            raise ValueError('must be a mapping with runs and duration')
+        for name in content.keys() - known:
+            raise ValueError(f'there is no entry {name}: must be one of {", ".join(known)}')
+        return _checked(Specification(**content), folder)
     except (TypeError, ValueError) as error:
         raise ValueError(f'{source}: {error}') from error
 

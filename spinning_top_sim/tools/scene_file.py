@@ -61,7 +61,7 @@ def chosen_files(arguments: argparse.Namespace) -> list[Path]:
     """
     paths = []
     for kind in ('scene', 'imu'):
-        name = getattr(arguments, kind)
+        name = getattr(arguments, kind, None)
         if name is None:
             continue
         files = parameter_files(kind)

@@ -10,7 +10,8 @@ import signal
 import subprocess
 import sys
 import webbrowser
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -45,8 +46,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _parser().parse_args(words)
     if arguments.log:
         return cli.run('view', DESCRIPTION, words, add_arguments, _show_logs, (LogError,))
-    with _node(arguments, argv[len(words):]):
-        return run('view', argv, _prepare)
+    with contextlib.ExitStack() as stack:
+        return run('view', argv, partial(_prepare, stack, arguments))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -56,15 +57,11 @@ def _parser() -> argparse.ArgumentParser:
 
 
 @contextlib.contextmanager
-def _node(arguments: argparse.Namespace, ros_arguments: Sequence[str]) -> Iterator[None]:
-    """Run a node of the scene or IMU that is asked for, if one is, while the page is shown."""
-    options = [word for kind in ('scene', 'imu') if getattr(arguments, kind)
-               for word in (f'--{kind}', getattr(arguments, kind))]
-    if not options:
-        yield
-        return
+def _node(files: Iterable[Path], ros_arguments: Sequence[str]) -> Iterator[None]:
+    """Run a node with these parameter files while the page is shown."""
     node = subprocess.Popen([
-        sys.executable, '-m', 'spinning_top_sim', 'node', *options,
+        sys.executable, '-m', 'spinning_top_sim', 'node', '--ros-args',
+        *(word for path in files for word in ('--params-file', str(path))), '--',
         *(ros_arguments or ['--ros-args']), '-p', 'status_period:=0.0'])
     try:
         yield
@@ -134,12 +131,20 @@ def _open_page(arguments: argparse.Namespace, title: str) -> Page:
     return page
 
 
-def _prepare(argv: list[str]) -> Callable[[], RunnableNode]:
-    arguments = _parser().parse_args(without_ros_arguments(argv))
+def _prepare(stack: contextlib.ExitStack, arguments: argparse.Namespace, argv: list[str],
+             ) -> Callable[[], RunnableNode]:
+    """Return what opens the page; a node of a scene or IMU runs until `stack` is closed."""
     if arguments.html is not None:
         raise ValueError(f'--html {arguments.html}: must have a log')
+    files = scene_file.chosen_files(arguments)
     from spinning_top_sim.view.live import LiveView  # noqa: PLC0415
-    return lambda: LiveView(_open_page(arguments, 'spinning_top'))
+
+    def make_node() -> RunnableNode:
+        view = LiveView(_open_page(arguments, 'spinning_top'))
+        if files:
+            stack.enter_context(_node(files, argv[len(without_ros_arguments(argv)):]))
+        return view
+    return make_node
 
 
 if __name__ == '__main__':
