@@ -136,7 +136,10 @@ class Controls:
         if not self._lock.locked():
             if numbers['state'] in ('paused', 'running'):
                 self._show_paused(numbers['state'] == 'paused')
-            set_value(self._record, recorder == 'recording')
+            # A click whose callback has not come yet would be undone.
+            is_on, clicked_at = recorder == 'recording', self._record.update_timestamp
+            if self._record.value != is_on and time.time() - clicked_at > LEFT_ALONE_S:
+                set_value(self._record, is_on)
 
     def tell_end(self, reason: str) -> None:
         """Show why no samples come, until the next `tell_status`."""
