@@ -11,8 +11,6 @@ from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from types import ModuleType
 
-from spinning_top_sim.tools.cli import Parser
-
 # Name: the module with its `main` and `add_arguments`, and what it does.
 COMMANDS = {
     'node': ('nodes.sim_node', 'simulate a top in real time as a ROS 2 node'),
@@ -32,8 +30,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv = sys.argv[1:] if argv is None else argv
     if '_ARGCOMPLETE' in os.environ:
         _complete()
-    name = _parser().parse_args(argv[:1]).command
     with _quiet_interrupt():
+        name = _parser().parse_args(argv[:1]).command
         command: Callable[[Sequence[str]], int] = _module(name).main
     return command(argv[1:])
 
@@ -43,6 +41,7 @@ def _module(name: str) -> ModuleType:
 
 
 def _parser() -> argparse.ArgumentParser:
+    from spinning_top_sim.tools.cli import Parser  # noqa: PLC0415
     parser = Parser('', 'Simulate the heavy symmetric top, with exact truth.',
                     'spinning-top COMMAND --help tells the options of a command.')
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True,
@@ -70,8 +69,10 @@ def _quiet_interrupt() -> Iterator[None]:
     before = signal.getsignal(signal.SIGINT)
     if before is signal.default_int_handler:
         signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
-    yield
-    signal.signal(signal.SIGINT, before)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 if __name__ == '__main__':

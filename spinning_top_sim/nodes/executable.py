@@ -51,10 +51,10 @@ def run(name: str, argv: Sequence[str] | None,
     _handle(signal.SIGINT, lambda *_: _exit(130))
     _open_standard_streams()
     try:
+        make_node = prepare(argv)
         for option, path in pairwise(argv):
             if option == '--params-file' and not os.path.isfile(path):
                 raise ValueError(f'--params-file {path}: there is no such file')
-        make_node = prepare(argv)
         import rclpy  # noqa: PLC0415
         # From `init` on, rclpy shuts the context down at SIGINT and SIGTERM.  A launched node gets
         # SIGINT twice, from the terminal and from launch.

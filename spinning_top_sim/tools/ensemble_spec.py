@@ -149,7 +149,7 @@ def parse(content: object, source: str, folder: Path = Path()) -> Specification:
         if not isinstance(content, Mapping) or not {'runs', 'duration'} <= content.keys():
             raise ValueError('must be a mapping with runs and duration')
         for name in content.keys() - known:
-            raise ValueError(f'there is no entry {name}: must be one of {", ".join(known)}')
+            raise ValueError(f'there is no entry {name!r}: must be one of {", ".join(known)}')
         return _checked(Specification(**content), folder)
     except (TypeError, ValueError) as error:
         raise ValueError(f'{source}: {error}') from error
