@@ -99,9 +99,6 @@ def test_live(browser, peer, tmp_path):
                        "e => e.textContent.includes('torque'))")
 
             # A chosen scene is another top, from its start.
-            visit.choose('scene', 'fast_gyroscope')
-            visit.read('fast_gyroscope, reset: at t = 0')
-            visit.read(r'nutation period 0\.0126 s')
             visit.choose('scene', 'wavy')
             visit.read('wavy, reset: at t = 0')
             visit.read('[Ww]aves')
