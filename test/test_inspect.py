@@ -7,7 +7,6 @@ What is measured is compared with the closed form, which test_exact.py holds aga
 
 import itertools
 import json
-import math
 import os
 import re
 import struct
@@ -16,15 +15,14 @@ import sys
 
 import numpy as np
 import pytest
+from helpers.inspected import as_json, log_of, rewritten, told
 from helpers.reference import ROOT, SCENES, scene_parameters
-from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from spinning_top_sim import tools
-from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.tools import inspect, recorded_run, recover, simulate
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.tools import inspect, recover, simulate
 from spinning_top_sim.tools.survey import survey
 
 NAMES = {'cusp': 'cusps', 'fast_gyroscope': 'cusps', 'free_top': 'free top', 'heavy_top': 'loops',
@@ -34,11 +32,6 @@ NAMES = {'cusp': 'cusps', 'fast_gyroscope': 'cusps', 'free_top': 'free top', 'he
          'steady_slow': 'steady precession', 'waking_sleeper': 'cusps', 'wavy': 'waves'}
 # The tilt rests, or nearly: there is no nutation in the data.
 RESTING = {'sleeping', 'steady_fast', 'steady_slow'}
-
-
-def log_of(path, *arguments):
-    assert simulate.main(['-o', str(path), '--quiet', *map(str, arguments)]) == 0
-    return path
 
 
 @pytest.fixture(scope='module')
@@ -60,78 +53,9 @@ def short(folder):
     return log_of(folder / 'short.mcap', '--duration', 0.5, '--command', '0.3:1.7:1.4')
 
 
-@pytest.fixture(scope='module')
-def columns(folder):
-    """The exact solution in columns, with a command between two stretches; several chunks."""
-    return log_of(folder / 'columns.mcap', '--duration', 11, '--command', '3.1:1.7:1.4',
-                  '-p', 'solver.method:=exact', '-p', 'imu.accelerometer_random_walk:=0.01',
-                  '-p', 'markers.enabled:=true')
-
-
-def told(capsys, *arguments):
-    """Run inspect; return exit code, output and complaints."""
-    code = inspect.main([str(argument) for argument in arguments])
-    captured = capsys.readouterr()
-    return code, captured.out, captured.err
-
-
-def as_json(capsys, *arguments):
-    code, out, _ = told(capsys, *arguments, '--json')
-    return code, json.loads(out)
-
-
 def surveyed(path):
     with LogReader(path) as reader:
         return survey(reader)
-
-
-def chunks_of(path):
-    with open(path, 'rb') as file:
-        return make_reader(file).get_summary().chunk_indexes
-
-
-def rewritten(source, target, change=lambda topic, number, data: data, metadata=None,
-              stamp=lambda topic, number, stamp_ns: stamp_ns):
-    """
-    Copy a log with checksums that are right.
-
-    change : takes topic, number in it and data of a message; returns other data, None to drop it,
-        or a list of data
-    metadata : what is another in the metadata of the run
-    stamp : takes topic, number and log time [ns]; returns the log time
-    """
-    numbers = {}
-    with open(source, 'rb') as old, open(target, 'wb') as new:
-        reader, writer = make_reader(old), Writer(new)
-        writer.start('ros2')
-        for record in reader.iter_metadata():
-            ours = metadata if record.name == 'spinning_top_sim' else None
-            writer.add_metadata(record.name, {**record.metadata, **(ours or {})})
-        summary = reader.get_summary()
-        schemas = {number: writer.register_schema(schema.name, schema.encoding, schema.data)
-                   for number, schema in summary.schemas.items()}
-        channels = {number: writer.register_channel(
-            channel.topic, channel.message_encoding, schemas[channel.schema_id],
-            channel.metadata) for number, channel in summary.channels.items()}
-        for _, channel, message in reader.iter_messages():
-            topic = channel.topic
-            number = numbers[topic] = numbers.get(topic, -1) + 1
-            data, at_ns = (change(topic, number, message.data),
-                           stamp(topic, number, message.log_time))
-            for one in data if isinstance(data, list) else [data]:
-                if one is not None:
-                    writer.add_message(channels[channel.id], at_ns, one, at_ns)
-        writer.finish()
-    return target
-
-
-def with_flipped_bit(data, byte, bit=0):
-    changed = bytearray(data)
-    changed[byte] ^= 1 << bit
-    return bytes(changed)
-
-
-# --------------------------------------------------------------------------------- measuring
 
 
 @pytest.mark.parametrize(('scene', 'method'), [
@@ -240,164 +164,6 @@ def test_missing_samples_are_told_where_they_are(short, tmp_path, capsys, kept, 
                if topic['stream'] and name != '/pose')
 
 
-# ---------------------------------------------------------------------------------- verifying
-
-
-def verified(capsys, path):
-    code, content = as_json(capsys, path, '--verify')
-    assert code == (0 if content['verify']['identical'] else 1)
-    return content['verify']
-
-
-@pytest.mark.parametrize('name', ['stepped', 'columns'])
-def test_offline_logs_verify_and_a_changed_bit_is_found_wherever_it_is(
-        name, tmp_path, capsys, request):
-    path = request.getfixturevalue(name)
-    verdict = verified(capsys, path)
-    assert verdict['identical'] and verdict['warnings'] == []
-    counts, sizes = {}, {}
-    with LogReader(path) as reader:
-        for message in reader.messages():
-            counts[message.topic] = counts.get(message.topic, 0) + 1
-            sizes[message.topic] = len(message.data)
-    counts.pop(next(name for name in counts if name.endswith('/events')))
-    assert verdict['compared'] == counts
-    rng = np.random.default_rng(5)
-    places = {topic: (int(rng.integers(4, sizes[topic])), int(rng.integers(8)))
-              for topic in counts}
-    verdict = verified(capsys, rewritten(
-        path, tmp_path / 'changed.mcap', lambda topic, number, data: (
-            with_flipped_bit(data, *places[topic])
-            if topic in places and number == min(1, counts[topic] - 1) else data)))
-    first = verdict['first']
-    assert verdict['different'] == len(counts)
-    assert not (verdict['missing'] or verdict['unexpected'])
-    assert first['byte'] == places[first['topic']][0]
-    assert first['logged'] != first['computed']
-
-
-def test_a_difference_names_field_stamp_and_both_values(short, tmp_path, capsys):
-    path = rewritten(short, tmp_path / 'run.mcap', lambda topic, number, data: (
-        with_flipped_bit(data, len(data) - 8) if (topic, number) == ('/pose', 7) else data))
-    code, out, _ = told(capsys, path, '--verify')
-    assert code == 1
-    said = re.search(r'first: /pose at 1\.070000000 s, byte \d+, pose\.orientation\[3\]: '
-                     r'in the log (\S+), computed (\S+)', out)
-    logged, computed = float(said[1]), float(said[2])
-    assert 0.0 < abs(logged - computed) < 3e-16
-
-
-def test_a_missing_message_and_a_changed_journal_are_found(short, tmp_path, capsys):
-    """A digit of a commanded momentum: the motion after it is another."""
-    verdict = verified(capsys, rewritten(
-        short, tmp_path / 'fewer.mcap', lambda topic, number, data: (
-            None if (topic, number) == ('/pose', 10) else data)))
-    assert (verdict['missing'], verdict['unexpected'], verdict['different']) == (1, 0, 0)
-    assert verdict['first']['stamp_ns'] == 1_100_000_000
-    verdict = verified(capsys, rewritten(
-        short, tmp_path / 'run.mcap', lambda topic, number, data: (
-            data.replace(b'"l3": 1.7', b'"l3": 1.8') if topic.endswith('/events') else data)))
-    assert not verdict['identical'] and verdict['different'] > 100
-    verdict = verified(capsys, rewritten(
-        short, tmp_path / 'cut.mcap', lambda topic, number, data: (
-            data.replace(b'"l3": 1.7', b'"l3"; 1.7') if topic.endswith('/events') else data)))
-    assert not verdict['identical'] and verdict['first']['topic'].endswith('/events')
-
-
-def test_another_machine_is_warned_of(short, capsys, monkeypatch):
-    here = provenance.surroundings()
-    monkeypatch.setattr(provenance, 'surroundings', lambda: {**here, 'platform': 'abacus'})
-    verdict = verified(capsys, short)
-    assert verdict['identical']
-    assert len(verdict['warnings']) == 1 and 'abacus' in verdict['warnings'][0]
-
-
-def test_live_logs_verify(tmp_path, capsys):
-    """From the start, and from the middle with commands before; rates change, resets happen."""
-    pytest.importorskip('rclpy')
-    from geometry_msgs.msg import PoseStamped
-    from helpers.node_harness import Peer, SimNode
-
-    whole, part = tmp_path / 'whole.mcap', tmp_path / 'part.mcap'
-    options = {'status_period': 0.0, 'record.uri': str(whole), 'start_paused': True,
-               'imu.gyroscope_noise_density': 0.01, 'increments.enabled': True,
-               'imu.sampling': 'mean', 'imu.lever_arm': [0.1, -0.2, 0.3]}
-    with SimNode(tmp_path, options, namespace='/live') as node, Peer() as peer:
-        pose = peer.listen(node.topic('pose'), PoseStamped)
-
-        def set_now(**values):
-            assert all(result.successful for result in peer.set_each(node, **values))
-            pose.wait_more(5)
-        assert peer.set_together(node, spin__l3=1.7, spin__lz=1.4).successful
-        assert peer.switch(node, 'record', True).success
-        assert peer.set_together(node, spin__l3=1.65, spin__lz=1.4).successful   # before t = 0
-        peer.switch(node, 'set_pause', False)
-        pose.wait(10)
-        set_now(imu__rate=125.0, pose__rate=50.0)
-        set_now(spin__lz=1.3)
-        assert peer.switch(node, 'record', False).success
-        set_now(record__uri=str(part), joint_states__rate=33.0)
-        assert peer.switch(node, 'record', True).success
-        set_now(spin__l3=1.8)
-        set_now(imu__rate=250.0, imu__gyroscope_noise_density=0.02, solver__method='exact')
-        assert peer.trigger(node, 'reset').success
-        pose.wait_more(5)
-        peer.switch(node, 'set_pause', True)
-        assert peer.trigger(node, 'reset').success
-        assert peer.set_together(node, spin__l3=1.9, spin__lz=1.3).successful    # before t = 0
-        assert peer.trigger(node, 'step').success
-        peer.switch(node, 'set_pause', False)
-        set_now(ground_truth_imu__rate=100.0)
-        assert node.end() == 0, node.err
-    for path, causes in ((whole, ['start', 'command', 'command']),
-                         (part, ['start', 'command', 'reset', 'reset', 'command'])):
-        code, content = as_json(capsys, path, '--verify')
-        verdict = content['verify']
-        assert verdict['identical'] and code == 0, verdict
-        assert sum(verdict['compared'].values()) > 100
-        assert [motion['cause'] for motion in content['motions']] == causes
-        assert all(topic['missing'] == 0
-                   for topic in content['topics'].values() if topic['stream'])
-        assert all(error['max'] < 1e-9 for error in content['orientation_error'].values())
-
-
-# ------------------------------------------------------------------------------ what is told
-
-
-def test_a_torn_file_is_told_and_what_is_left_verifies(columns, tmp_path, capsys):
-    torn = tmp_path / 'torn.mcap'
-    last = chunks_of(columns)[-1]
-    torn.write_bytes(columns.read_bytes()[:last.chunk_start_offset + last.chunk_length // 2])
-    code, out, _ = told(capsys, torn, '--verify')
-    assert code == 1
-    assert 'torn.mcap: truncated' in out and 'lost: ' in out
-    assert re.search(r'verify: identical, all \d+ messages', out)
-    code, content = as_json(capsys, torn)
-    assert code == 1 and not content['whole'] and content['damage']['torn']
-    assert content['damage']['lost_bytes'] > 0
-    assert content['motions'][0]['measured']['nutations'] > 3
-
-
-def test_an_incomplete_log_is_told_in_the_same_words_before_and_after_recover(
-        columns, tmp_path, capsys):
-    torn, whole = tmp_path / 'torn.mcap', tmp_path / 'whole.mcap'
-    data = bytearray(columns.read_bytes())
-    chunk = chunks_of(columns)[1]
-    middle = chunk.chunk_start_offset + chunk.chunk_length // 2
-    data[middle:middle + 99] = bytes(99)
-    torn.write_bytes(data)
-    assert recover.main([str(torn), '-o', str(whole)]) == 3
-    capsys.readouterr()
-    texts = []
-    for path in (torn, whole):
-        code, out, _ = told(capsys, path, '--verify')
-        assert code == 1
-        texts.append([line for line in out.splitlines() if line.startswith('verify: ')])
-    assert texts[0] == texts[1]
-    assert re.match(r'verify: incomplete, \d+ messages missing; the other \d+ are identical',
-                    texts[0][0])
-
-
 def test_text_tells_the_numbers_and_help_fits_into_80_columns(stepped, capsys):
     text = told(capsys, stepped)[1]
     assert 'whole, 3 s' in text and '/a/b/ground_truth/imu' in text
@@ -477,51 +243,6 @@ def test_odd_metadata_end_in_words(short, tmp_path, capsys, key, text):
     code, out, _ = told(capsys, path, '--verify')
     assert code in (0, 1) and '/pose' in out
     assert 'cannot be used' in out or 'motion 1' in out or 'cannot be followed' in out
-
-
-@pytest.mark.parametrize('event', [
-    {'event': 'command', 'l3': math.nan, 'lz': 1.0},
-    {'event': 'command', 'sent_ns': 2 ** 63, 'l3': 1.0, 'lz': 1.0},
-    {'event': []}, {'event': 'state', 'l3': 1.0, 'lz': 1.0},
-    {'event': 'reset', 'parameters': {}, 'epoch_ns': 10 ** 18}])
-def test_an_odd_entry_of_the_journal_is_told(short, tmp_path, capsys, event):
-    """It is left out: the run is followed to its end all the same."""
-    data = journal.event(**{'name': event['event'], 't_ns': 0, 'sent_ns': 300_000_000, **{
-        name: value for name, value in event.items() if name != 'event'}})
-    path = rewritten(short, tmp_path / 'odd.mcap', lambda topic, number, old: (
-        [old, data] if topic.endswith('/events') and number == 1 else old))
-    code, content = as_json(capsys, path, '--verify')
-    assert code == 1 and len(content['motions']) >= 2
-    assert any('entry at 1.300000000 s: ' in note or 'cannot be followed' in note
-               for note in content['notes'])
-
-
-def test_a_run_that_no_log_of_its_size_holds_is_not_computed(
-        short, tmp_path, capsys, monkeypatch):
-    """A stamp of the year 2096: neither 10^12 samples nor 10^12 steps."""
-    path = rewritten(short, tmp_path / 'late.mcap', stamp=lambda topic, number, stamp_ns: (
-        4 * 10 ** 18 if (topic, number) == ('/pose', 50) else stamp_ns))
-    code, out, _ = told(capsys, path, '--verify')
-    assert code == 1 and 'lacks most samples of this run' in out
-    monkeypatch.setattr(recorded_run, 'STEPS_A_BYTE', 0)        # they would take a minute
-    t_ns = 3_999_999_998_000_000_000
-    far = journal.event('command', t_ns, t_ns, l3=1.7, lz=1.4)
-    path = rewritten(short, tmp_path / 'far.mcap', lambda topic, number, data: (
-        far if topic.endswith('/events') and number == 1 else data),
-        stamp=lambda topic, number, stamp_ns: (
-            4 * 10 ** 18 if topic.endswith('/events') and number == 1 else stamp_ns))
-    assert 'integration steps are too many' in told(capsys, path)[1]
-
-
-def test_topics_are_known_by_their_names_in_a_log_put_together_anew(stepped):
-    with LogReader(stepped) as reader:
-        run = recorded_run.read_run_description(reader)
-        found = recorded_run._topics(reader.topics[::-1], run.values_at_recording)
-    assert found.items() > run.topics.items()
-    assert {*found} - {*run.topics} == {'~/commands', '~/events'}
-
-
-# ---------------------------------------------------------------------------------- pictures
 
 
 def test_pictures_are_drawn(short, tmp_path, capsys):

@@ -9,12 +9,7 @@ from pathlib import Path
 
 import pytest
 from helpers.examples import examples
-from helpers.mutations import mutate
-from hypothesis import assume, given
-from hypothesis import strategies as st
-from mcap.opcode import Opcode
-from mcap.writer import MCAP0_MAGIC
-from test_recover import (
+from helpers.logs import (
     ALL_KEPT,
     FAILED,
     MESSAGES_PER_CHUNK,
@@ -27,6 +22,11 @@ from test_recover import (
     write_log,
     write_stranger,
 )
+from helpers.mutations import mutate
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.exam.log import LAYOUTS, examine_log
 from spinning_top_sim.exam.report import Report

@@ -1,85 +1,49 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Reading and recovering logs that are torn, flipped, foreign or no logs at all.
+Reading and recovering logs that are torn or flipped.
 
 What was recovered is read by rosbags, mcap-ros2-support and mcap, none of them written here; so
 are the places of records in a file.  Children are killed for good after a timeout.
 """
 
-import contextlib
 import functools
-import io
 import os
 import random
-import resource
-import signal
 import struct
-import subprocess
-import sys
-import tracemalloc
-import zlib
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import yaml  # type: ignore[import-untyped]
+from helpers.logs import (
+    ALL_KEPT,
+    CHUNKS,
+    FAILED,
+    JAZZY,
+    MESSAGES_PER_CHUNK,
+    NUMBER,
+    POINT,
+    SOME_LOST,
+    TOPICS,
+    metadata_of,
+    places,
+    records_of,
+    run,
+    seen_by_mcap,
+    seen_by_rosbags,
+    seen_by_us,
+    torn,
+    write_anew,
+    write_log,
+)
+from helpers.recordings import METADATA
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Message
-from mcap.stream_reader import StreamReader
-from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
 from mcap_ros2.decoder import DecoderFactory
-from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as BagWriter
-from rosbags.typesys import Stores, get_typestore
-from test_recording import METADATA
 
-from spinning_top_sim.recording import log_file
 from spinning_top_sim.recording.definitions import find_definition
-from spinning_top_sim.recording.errors import LogError
-from spinning_top_sim.recording.mcap_writer import McapWriter, record_bytes
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic
-from spinning_top_sim.recording.salvage import recover
+from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
 from spinning_top_sim.recording.writer import create_file
-from spinning_top_sim.tools.recover import main
-
-ROOT = Path(__file__).parents[1]
-JAZZY = get_typestore(Stores.ROS2_JAZZY)
-POINT = 'geometry_msgs/msg/Point'
-NUMBER = 'std_msgs/msg/Float64'
-TOPICS = (
-    RecordedTopic('/top/point', POINT),
-    RecordedTopic('/top/number', NUMBER, {'depth': 3, 'reliability': 2}),
-)
-EPOCH_NS = 1_700_000_000_000_000_000
-CHUNKS = 3
-MESSAGES_PER_CHUNK = 12
-ALL_KEPT, FAILED, SOME_LOST = 0, 1, 3
-
-
-def cdr(number: int) -> tuple[int, bytes]:
-    """Return a topic and a message for it."""
-    if number % 3:
-        return 0, bytes(JAZZY.serialize_cdr(
-            JAZZY.types[POINT](float(number), -2.0, 1 / 3), POINT))
-    return 1, bytes(JAZZY.serialize_cdr(JAZZY.types[NUMBER](float(number)), NUMBER))
-
-
-def write_log(path, chunks=CHUNKS, compression='zstd', messages_per_chunk=MESSAGES_PER_CHUNK):
-    """Write a log by our writer, chunk borders where they are wanted; return its messages."""
-    file = create_file(path, TOPICS, METADATA, compression=compression)
-    messages = []
-    for number in range(chunks * messages_per_chunk):
-        index, data = cdr(number)
-        stamp = EPOCH_NS + number * 1_234_567
-        file.append(index, stamp, data)
-        messages.append((TOPICS[index].name, stamp, data))
-        if (number + 1) % messages_per_chunk == 0:
-            file.write_chunk()
-    file.finish()
-    return messages
 
 
 @pytest.fixture(scope='module')
@@ -110,76 +74,6 @@ def no_sync(monkeypatch):
     monkeypatch.setattr(yaml, 'safe_load', functools.cache(yaml.safe_load))
 
 
-def write_anew(path, content):
-    """Write a file, not over the one before: that would wait for the disk."""
-    path.unlink(missing_ok=True)
-    path.write_bytes(content)
-
-
-def records_of(content: bytes) -> list[tuple[int, int, int]]:
-    """Return opcode, start and end of every record, of a whole file."""
-    found = []
-    offset = len(MCAP0_MAGIC)
-    while offset < len(content) - len(MCAP0_MAGIC):
-        opcode, length = struct.unpack_from('<BQ', content, offset)
-        found.append((opcode, offset, offset + 9 + length))
-        offset += 9 + length
-    return found
-
-
-def place_of(content: bytes, wanted: int) -> tuple[int, int]:
-    """Return start and end of the only record of a kind."""
-    (place,) = [(start, end) for opcode, start, end in records_of(content) if opcode == wanted]
-    return place
-
-
-def run(*argv) -> tuple[int, str, str]:
-    """Run the command in this process; return exit code, output and errors."""
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = main([str(argument) for argument in argv])
-    return code, out.getvalue(), err.getvalue()
-
-
-def run_process(*argv, **options) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, '-m', 'spinning_top_sim.tools.recover', *map(str, argv)],
-        env=os.environ | {'PYTHONPATH': str(ROOT)}, capture_output=True, text=True, timeout=60,
-        check=False, **options)
-
-
-def seen_by_us(path) -> list[tuple[str, int, bytes]]:
-    with LogReader(path) as reader:
-        return [(message.topic, message.log_time, message.data) for message in reader.messages()]
-
-
-def seen_by_mcap(path) -> list[tuple[str, int, bytes]]:
-    """Return what mcap reads by the index; the file must hold in itself by its checksums, too."""
-    with open(path, 'rb') as file:
-        list(StreamReader(file, validate_crcs=True).records)
-        file.seek(0)
-        reader = make_reader(file, validate_crcs=True)
-        summary = reader.get_summary()
-        read = [(channel.topic, message.log_time, message.data)
-                for _, channel, message in reader.iter_messages()]
-    assert summary.statistics.message_count == len(read)
-    return read
-
-
-def seen_by_rosbags(path) -> list[tuple[str, int, bytes]]:
-    with AnyReader([Path(path)]) as reader:
-        read = [(connection.topic, stamp, bytes(data))
-                for connection, stamp, data in reader.messages()]
-        for connection, _, data in reader.messages():
-            reader.deserialize(data, connection.msgtype)
-    return read
-
-
-def metadata_of(path) -> dict[str, dict[str, str]]:
-    with open(path, 'rb') as file:
-        return {record.name: record.metadata for record in make_reader(file).iter_metadata()}
-
-
 def check_with_all_readers(path, messages) -> None:
     """A recovered log of ours: the messages, for everyone, and what it says of the run."""
     assert seen_by_us(path) == seen_by_mcap(path) == seen_by_rosbags(path) == messages
@@ -196,8 +90,6 @@ def check_with_all_readers(path, messages) -> None:
         assert reader.metadata == metadata
         assert [topic.name for topic in reader.topics] == [topic.name for topic in TOPICS]
 
-
-# Truncated
 
 def test_every_cut_keeps_every_whole_chunk(tmp_path, log, no_sync):
     """The exit code says whether a message was in what is gone."""
@@ -240,29 +132,10 @@ def test_every_cut_keeps_every_whole_chunk(tmp_path, log, no_sync):
         check_with_all_readers(output, log.messages[:whole_chunks * MESSAGES_PER_CHUNK])
 
 
-# Wrong bytes
-
-def places(log, each=8):
-    """Some bytes of every record: most of its head, and seeded ones of the rest; and the magic."""
-    choice = random.Random(5)
-    yield from range(len(MCAP0_MAGIC))
-    for _, start, end in log.records:
-        head = range(start, min(start + each, end))
-        yield from head
-        yield from choice.sample(range(head.stop, end), min(each, end - head.stop))
-    yield from range(len(log.content) - len(MCAP0_MAGIC), len(log.content))
-
-
 def flipped(content: bytes, position: int, bit: int) -> bytes:
     changed = bytearray(content)
     changed[position] ^= 1 << bit
     return bytes(changed)
-
-
-def longer(record: bytes, number: int) -> bytes:
-    """Return a record whose length is a number of bytes more than it has."""
-    (length,) = struct.unpack_from('<Q', record, 1)
-    return record[:1] + struct.pack('<Q', length + number) + record[9:]
 
 
 def test_a_flipped_bit_is_never_passed_over(tmp_path, log, no_sync):
@@ -329,11 +202,6 @@ def test_flipped_bits_in_a_torn_file_spare_the_other_chunks(tmp_path, log, no_sy
 
 def start_of(log, opcode, number=0):
     return [start for kind, start, _ in log.records if kind == opcode][number]
-
-
-def torn(log, content=None):
-    """Return a log up to the end of its last chunk; nothing in it repeats what stands before."""
-    return (content or log.content)[:log.chunks[-1][2]]
 
 
 # What is done to the bytes; the chunks that are kept, or the topic that is; the exit code; what
@@ -409,8 +277,6 @@ def test_a_wild_length_that_seems_to_lead_to_a_record_takes_no_other_chunk(tmp_p
     assert [data for _, _, data in seen_by_us(path)] == [decoy, b'third']
 
 
-# Whole
-
 @pytest.mark.parametrize('compression', ['zstd', 'none'])
 def test_recovering_a_whole_file_changes_nothing(tmp_path, compression):
     path = tmp_path / 'run.mcap'
@@ -439,20 +305,6 @@ def test_a_topic_tells_all_that_its_channel_says(log, tmp_path):
     assert topic.metadata['topic_type_hash'] == JAZZY.hash_rihs01(NUMBER)
 
 
-def test_messages_can_be_chosen(log, tmp_path):
-    (tmp_path / 'run.mcap').write_bytes(log.content)
-    (tmp_path / 'torn.mcap').write_bytes(log.content[:log.chunks[-1][2]])
-    start, end = log.messages[9][1], log.messages[30][1]    # both of the topic that is chosen
-    for name in ('run.mcap', 'torn.mcap'):
-        with LogReader(tmp_path / name) as reader:
-            chosen = list(reader.messages(topics=['/top/number'], start=start, end=end))
-            assert [(message.topic, message.log_time, message.data) for message in chosen] == [
-                message for message in log.messages[9:30] if message[0] == '/top/number']
-            assert [message.sequence for message in chosen] == list(range(3, 10))
-            assert not list(reader.messages(topics=[]))
-            assert not list(reader.messages(start=end, end=start))
-
-
 @pytest.mark.parametrize('torn', [False, True])
 def test_messages_come_in_the_order_of_their_log_times(tmp_path, torn):
     """Within chunks and across them; equal times in file order."""
@@ -472,327 +324,3 @@ def test_messages_come_in_the_order_of_their_log_times(tmp_path, torn):
         read = [(message.log_time, struct.unpack('<I', message.data)[0])
                 for message in reader.messages()]
     assert read == sorted((stamp, number) for number, stamp in enumerate(stamps))
-
-
-# Of strangers
-
-STRANGERS = {
-    'plain': {},
-    'unchunked': {'use_chunking': False},
-    'lz4': {'compression': CompressionType.LZ4},
-    'no index': {'index_types': IndexType.NONE},
-    'no index of metadata': {'index_types': IndexType.CHUNK | IndexType.MESSAGE},
-    'no statistics': {'use_statistics': False},
-    'nothing repeated': {'repeat_channels': False, 'repeat_schemas': False},
-    'nothing but messages': {
-        'use_chunking': False, 'use_statistics': False, 'use_summary_offsets': False,
-        'repeat_channels': False, 'repeat_schemas': False, 'index_types': IndexType.NONE,
-        'enable_crcs': False},
-}
-
-
-def write_stranger(path, options, profile='', count=300):
-    """Write JSON and schemaless messages by mcap's own writer, with an attachment."""
-    messages = []
-    with open(path, 'wb') as file:
-        writer = Writer(file, chunk_size=1000, **options)
-        writer.start(profile=profile, library='a stranger')
-        writer.add_metadata('note', {'a': 'ä', 'b': ''})
-        schema = writer.register_schema('thing', 'jsonschema', b'{"type": "object"}')
-        channels = {
-            '/json': writer.register_channel('/json', 'json', schema, {'unit': 'm'}),
-            '/raw': writer.register_channel('/raw', 'octets', 0)}
-        for number in range(count):
-            topic = ('/json', '/raw')[number % 2]
-            data = b'{"n": %d}' % number if topic == '/json' else (
-                random.Random(number).randbytes(number % 70))
-            writer.add_message(channels[topic], 1000 + number, data, 2000 + number)
-            messages.append((topic, 1000 + number, data))
-            if number == count // 2:
-                writer.add_attachment(3, 4, 'calibration.bin', 'x/y', b'\x06' * 3000)
-        writer.finish()
-    return messages
-
-
-@pytest.mark.parametrize('kind', STRANGERS)
-def test_a_strangers_file_is_read_and_recovered(tmp_path, kind):
-    path, output = tmp_path / 'stranger.mcap', tmp_path / 'whole.mcap'
-    messages = write_stranger(path, STRANGERS[kind])
-    assert seen_by_us(path) == messages
-    with LogReader(path) as reader:
-        assert reader.damage.lossless
-        assert not reader.damage.truncated
-        assert not reader.damage.missing_messages
-        assert reader.metadata == {'note': {'a': 'ä', 'b': ''}}
-        assert [(topic.name, topic.type_name, topic.encoding) for topic in reader.topics] == [
-            ('/json', 'thing', 'json'), ('/raw', '', 'octets')]
-        assert reader.topics[0].metadata == {'unit': 'm'}
-    code, out, err = run(path, '-o', output)
-    assert code == ALL_KEPT, (out, err)
-    assert seen_by_us(output) == seen_by_mcap(output) == messages
-    with open(output, 'rb') as file:
-        reader = make_reader(file)
-        assert reader.get_header() == Header(profile='', library='a stranger')
-        assert [(record.name, record.metadata) for record in reader.iter_metadata()] == [
-            ('note', {'a': 'ä', 'b': ''})]
-        (attachment,) = reader.iter_attachments()
-        assert [message.publish_time for _, _, message in reader.iter_messages()] == [
-            stamp + 1000 for _, stamp, _ in messages]
-    assert (attachment.name, attachment.media_type, attachment.data) == (
-        'calibration.bin', 'x/y', b'\x06' * 3000)
-    with LogReader(output) as reader:
-        assert reader.whole
-
-
-@pytest.mark.parametrize('kind', ['plain', 'unchunked'])
-def test_a_torn_file_of_a_stranger_keeps_what_stands_before_the_tear(tmp_path, kind, no_sync):
-    path, torn, output = (tmp_path / name for name in ('a.mcap', 'torn.mcap', 'whole.mcap'))
-    messages = write_stranger(path, STRANGERS[kind], count=60)
-    content = path.read_bytes()
-    records = records_of(content)
-    ends = [end for opcode, _, end in records if opcode in (Opcode.CHUNK, Opcode.MESSAGE)]
-    firsts = [first_message(content[start:end], messages)
-              for opcode, start, end in records if opcode == Opcode.CHUNK]
-    firsts = [*firsts[1:], len(messages)] if firsts else range(1, len(messages) + 1)
-    for size in range(8, len(content), 101):
-        write_anew(torn, content[:size])
-        whole = sum(end <= size for end in ends)
-        kept = firsts[whole - 1] if whole else 0
-        code, _, err = run(torn, '-o', output)
-        assert (code == FAILED) == (kept == 0), (size, err)
-        if kept:
-            assert seen_by_us(output) == seen_by_mcap(output) == messages[:kept], size
-            output.unlink()
-
-
-def first_message(chunk: bytes, messages) -> int:
-    """Return the number of the message that a chunk of `write_stranger` begins with."""
-    start_time, = struct.unpack_from('<Q', chunk, 9)
-    return start_time - messages[0][1]
-
-
-def test_a_bag_of_rosbags_is_recovered(tmp_path):
-    with BagWriter(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connection = writer.add_connection('/number', NUMBER, typestore=JAZZY)
-        for number in range(200):
-            writer.write(connection, number, bytes(JAZZY.serialize_cdr(
-                JAZZY.types[NUMBER](float(number)), NUMBER)))
-    (path,) = (tmp_path / 'bag').glob('*.mcap')
-    expected = seen_by_rosbags(path)
-    assert len(expected) == 200
-    code, out, err = run(path, '-o', tmp_path / 'whole.mcap')
-    assert code == ALL_KEPT, (out, err)
-    output = tmp_path / 'whole.mcap'
-    assert seen_by_rosbags(output) == seen_by_mcap(output) == seen_by_us(output) == expected
-    assert 'name: /number\n' in metadata_of(output)['rosbag2']['serialized_metadata']
-
-
-def test_messages_in_and_out_of_chunks_keep_their_order(tmp_path):
-    """All have one stamp, so that only their places in the file order them."""
-    def message(data: bytes) -> bytes:
-        return record_bytes(Message(channel_id=1, log_time=5, publish_time=5, sequence=0,
-                                    data=data))
-
-    plain = message(b'b') + message(b'c')
-    path, output = tmp_path / 'a.mcap', tmp_path / 'whole.mcap'
-    path.write_bytes(b''.join([
-        MCAP0_MAGIC, record_bytes(Header(profile='', library='a stranger')),
-        record_bytes(Channel(id=1, topic='/raw', message_encoding='x', metadata={}, schema_id=0)),
-        message(b'a'),
-        record_bytes(Chunk(compression='', data=plain, uncompressed_size=len(plain),
-                           uncompressed_crc=zlib.crc32(plain), message_start_time=5,
-                           message_end_time=5)),
-        message(b'd'), record_bytes(DataEnd(0)),
-        record_bytes(Footer(summary_start=0, summary_offset_start=0, summary_crc=0)),
-        MCAP0_MAGIC]))
-    assert run(path, '-o', output)[0] == ALL_KEPT
-    for file in (path, output):
-        assert [data for _, _, data in seen_by_us(file)] == [b'a', b'b', b'c', b'd']
-    with open(output, 'rb') as file:
-        assert [message.data for _, _, message in make_reader(file).iter_messages(
-            log_time_order=False)] == [b'a', b'b', b'c', b'd']
-
-
-@pytest.mark.parametrize('number', [-2, 8])
-def test_a_message_of_another_length_is_not_believed(tmp_path, number):
-    path, output = tmp_path / 'a.mcap', tmp_path / 'whole.mcap'
-    messages = write_stranger(path, STRANGERS['unchunked'], count=20)
-    content = path.read_bytes()
-    places = [(start, end) for opcode, start, end in records_of(content)
-              if opcode == Opcode.MESSAGE]
-    data_end, _ = place_of(content, Opcode.DATA_END)
-    start, end = places[6]
-    path.write_bytes(content[:start] + longer(content[start:end], number) + content[end:data_end])
-    code, out, _ = run(path, '-o', output)
-    assert code == SOME_LOST
-    assert f'message at byte {start} ' in out
-    # Without chunks and summary nothing proves where another message begins.
-    assert seen_by_us(output) == seen_by_mcap(output) == messages[:6]
-
-
-# The command and its errors
-
-def test_exit_codes(tmp_path, log):
-    whole, torn, head = (tmp_path / f'{name}.mcap' for name in ('whole', 'torn', 'head'))
-    whole.write_bytes(log.content)
-    torn.write_bytes(log.content[:log.chunks[2][2] - 1])
-    head.write_bytes(log.content[:log.chunks[0][1]])
-    done = run_process(whole)
-    assert (done.returncode, done.stderr) == (ALL_KEPT, '')
-    assert 'kept all: 36 messages in 3 chunks' in done.stdout
-    code, out, err = run(torn, '--output', tmp_path / 'out.mcap')
-    assert (code, err) == (SOME_LOST, '')
-    _, start, end = log.chunks[2]
-    assert f'lost: {end - 1 - start} bytes, an unknown number of messages\n' in out
-    assert f'lost: chunk at byte {start} (' in out and 'kept: 24 messages in 2 chunks' in out
-    assert run(head) == (
-        FAILED, '', 'spinning-top recover: '
-                    f'nothing to save in {head}: there is no whole message in it\n')
-    with pytest.raises(SystemExit, match='2'):
-        run()
-
-
-def test_a_recovery_tells_what_it_has_written(tmp_path, log):
-    path, output, told = tmp_path / 'run.mcap', tmp_path / 'whole.mcap', []
-    path.write_bytes(log.content)
-    with LogReader(path) as reader:
-        done = recover(reader, output, told.append)
-    assert (done.size, done.messages, done.chunk_count) == (
-        output.stat().st_size, len(log.messages), len(log.chunks))
-    assert told == sorted(told) and told[-1] == len(log.content) and len(told) > len(log.chunks)
-
-
-def test_memory_does_not_grow_with_the_file(tmp_path):
-    """Twenty times as many chunks: no more than their index, less than a fifth of the file."""
-    peaks = []
-    for chunks in (10, 200):
-        path = tmp_path / f'{chunks}.mcap'
-        file = create_file(path, TOPICS[1:2], {}, compression='none')
-        for number in range(chunks):
-            file.append(0, number, random.Random(number).randbytes(50_000))
-            file.write_chunk()
-        file.finish()
-        path.write_bytes(path.read_bytes()[:-100])
-        tracemalloc.start()
-        try:
-            assert run(path)[0] == ALL_KEPT
-            with LogReader(path) as reader:
-                assert sum(1 for _ in reader.messages()) == chunks
-            peaks.append(tracemalloc.get_traced_memory()[1])
-        finally:
-            tracemalloc.stop()
-    assert peaks[1] - peaks[0] < 1_000_000
-
-
-def test_nothing_is_overwritten(tmp_path, log):
-    path, other = tmp_path / 'run.mcap', tmp_path / 'other.mcap'
-    path.write_bytes(log.content)
-    other.write_text('precious')
-    (tmp_path / 'link.mcap').symlink_to(tmp_path / 'nowhere')
-    for output in (path, other, tmp_path / 'link.mcap'):
-        code, out, err = run(path, '-o', output)
-        assert (code, out) == (FAILED, '')
-        assert err == (
-            'spinning-top recover: '
-            f'cannot write {output}: it exists, and nothing is overwritten\n')
-    assert path.read_bytes() == log.content
-    assert other.read_text() == 'precious'
-    assert len(list(tmp_path.iterdir())) == 3
-
-
-def test_a_full_disk_leaves_nothing_behind(monkeypatch, tmp_path, log):
-    # What is measured for `make coverage` could not be written either.
-    monkeypatch.delenv('COVERAGE_PROCESS_CONFIG', raising=False)
-    path = tmp_path / 'run.mcap'
-    path.write_bytes(log.content)
-    limit = len(log.content) - 1000
-    done = run_process(path, preexec_fn=lambda: resource.setrlimit(
-        resource.RLIMIT_FSIZE, (limit, limit)))
-    assert done.returncode == FAILED
-    assert done.stderr == (
-        f'spinning-top recover: cannot write {tmp_path / "run_recovered.mcap"}: File too large\n')
-    assert [item.name for item in tmp_path.iterdir()] == ['run.mcap']
-
-
-def test_an_output_that_cannot_be_made_is_named(tmp_path, log):
-    path = tmp_path / 'run.mcap'
-    path.write_bytes(log.content)
-    code, _, err = run(path, '-o', tmp_path / 'none' / 'whole.mcap')
-    assert code == FAILED
-    assert err == ('spinning-top recover: '
-                   f'cannot write {tmp_path}/none/whole.mcap: there is no directory '
-                   f'{tmp_path}/none\n')
-    code, _, err = run(path, '-o', path / 'whole.mcap')
-    assert code == FAILED
-    assert 'Not a directory' in err
-    assert run(path, '-o', '/proc/whole.mcap')[2] == (
-        'spinning-top recover: cannot write /proc/whole.mcap: no files can be made in /proc\n')
-
-
-@pytest.mark.parametrize(('content', 'reason'), [
-    (b'', 'it is empty'),
-    (MCAP0_MAGIC[:5], 'it is no MCAP file'),
-    (b'SQLite format 3\x00' + bytes(100), 'it is no MCAP file'),
-    (b'\n', 'it is no MCAP file'),
-])
-def test_what_is_no_log_is_refused(tmp_path, content, reason):
-    path = tmp_path / 'file.mcap'
-    path.write_bytes(content)
-    with pytest.raises(LogError) as caught:
-        LogReader(path)
-    assert str(caught.value) == f'cannot read {path}: {reason}'
-    assert run(path) == (FAILED, '', f'spinning-top recover: cannot read {path}: {reason}\n')
-
-
-def test_what_cannot_be_opened_is_named(tmp_path):
-    os.mkfifo(tmp_path / 'pipe')
-    for name, reason in (('missing', 'No such file or directory'),
-                         ('', 'a folder must hold one .mcap file; in it: none'),
-                         ('pipe', 'it is no regular file')):
-        path = tmp_path / name
-        with pytest.raises(LogError) as caught:
-            LogReader(path)
-        assert str(caught.value) == f'cannot read {path}: {reason}'
-        assert run(path, '-o', tmp_path / 'x') == (FAILED, '', 'spinning-top recover: '
-                                                               f'{caught.value}\n')
-
-
-def test_a_disk_that_fails_while_it_is_read_is_an_error(tmp_path, log, monkeypatch):
-    (tmp_path / 'run.mcap').write_bytes(log.content)
-    real = open
-
-    def open_bad(path, *arguments, **options):
-        file = real(path, *arguments, **options)
-
-        class Bad:
-            def __getattr__(self, name):
-                return getattr(file, name)
-
-            def read(self, size):
-                if file.tell() >= log.chunks[1][1]:
-                    raise OSError(5, os.strerror(5))
-                return file.read(size)
-
-        return Bad()
-
-    torn = log.content[:log.chunks[-1][2]]
-    (tmp_path / 'run.mcap').write_bytes(torn + bytes(40))
-    monkeypatch.setattr(log_file, 'open', open_bad, raising=False)
-    code, _, err = run(tmp_path / 'run.mcap')
-    assert code == FAILED
-    assert err == ('spinning-top recover: '
-                   f'cannot read {tmp_path / "run.mcap"}: Input/output error\n')
-    assert [path.name for path in tmp_path.iterdir()] == ['run.mcap']
-
-
-@pytest.mark.parametrize(('number', 'code'), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_leaves_nothing_behind(tmp_path, log, monkeypatch, number, code):
-    (tmp_path / 'run.mcap').write_bytes(log.content)
-    monkeypatch.setattr(McapWriter, 'finish', lambda *_, **__: signal.raise_signal(number))
-    found = None
-    try:
-        found, _, _ = run(tmp_path / 'run.mcap')
-    except SystemExit as end:
-        found = end.code
-    assert found == code
-    assert [path.name for path in tmp_path.iterdir()] == ['run.mcap']

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Logs for the tests of `recover` and of the readers, and what three readers see in them."""
+
+import contextlib
+import io
+import random
+import struct
+from pathlib import Path
+
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from helpers.recordings import METADATA
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.rosbag2 import RecordedTopic
+from spinning_top_sim.recording.writer import create_file
+from spinning_top_sim.tools.recover import main
+
+JAZZY = get_typestore(Stores.ROS2_JAZZY)
+POINT = 'geometry_msgs/msg/Point'
+NUMBER = 'std_msgs/msg/Float64'
+TOPICS = (
+    RecordedTopic('/top/point', POINT),
+    RecordedTopic('/top/number', NUMBER, {'depth': 3, 'reliability': 2}),
+)
+EPOCH_NS = 1_700_000_000_000_000_000
+CHUNKS = 3
+MESSAGES_PER_CHUNK = 12
+ALL_KEPT, FAILED, SOME_LOST = 0, 1, 3
+
+
+def cdr(number: int) -> tuple[int, bytes]:
+    """Return a topic and a message for it."""
+    if number % 3:
+        return 0, bytes(JAZZY.serialize_cdr(
+            JAZZY.types[POINT](float(number), -2.0, 1 / 3), POINT))
+    return 1, bytes(JAZZY.serialize_cdr(JAZZY.types[NUMBER](float(number)), NUMBER))
+
+
+def write_log(path, chunks=CHUNKS, compression='zstd', messages_per_chunk=MESSAGES_PER_CHUNK):
+    """Write a log by our writer, chunk borders where they are wanted; return its messages."""
+    file = create_file(path, TOPICS, METADATA, compression=compression)
+    messages = []
+    for number in range(chunks * messages_per_chunk):
+        index, data = cdr(number)
+        stamp = EPOCH_NS + number * 1_234_567
+        file.append(index, stamp, data)
+        messages.append((TOPICS[index].name, stamp, data))
+        if (number + 1) % messages_per_chunk == 0:
+            file.write_chunk()
+    file.finish()
+    return messages
+
+
+def write_anew(path, content):
+    """Write a file, not over the one before: that would wait for the disk."""
+    path.unlink(missing_ok=True)
+    path.write_bytes(content)
+
+
+def records_of(content: bytes) -> list[tuple[int, int, int]]:
+    """Return opcode, start and end of every record, of a whole file."""
+    found = []
+    offset = len(MCAP0_MAGIC)
+    while offset < len(content) - len(MCAP0_MAGIC):
+        opcode, length = struct.unpack_from('<BQ', content, offset)
+        found.append((opcode, offset, offset + 9 + length))
+        offset += 9 + length
+    return found
+
+
+def run(*argv) -> tuple[int, str, str]:
+    """Run the command in this process; return exit code, output and errors."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main([str(argument) for argument in argv])
+    return code, out.getvalue(), err.getvalue()
+
+
+def seen_by_us(path) -> list[tuple[str, int, bytes]]:
+    with LogReader(path) as reader:
+        return [(message.topic, message.log_time, message.data) for message in reader.messages()]
+
+
+def seen_by_mcap(path) -> list[tuple[str, int, bytes]]:
+    """Return what mcap reads by the index; the file must hold in itself by its checksums, too."""
+    with open(path, 'rb') as file:
+        list(StreamReader(file, validate_crcs=True).records)
+        file.seek(0)
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        read = [(channel.topic, message.log_time, message.data)
+                for _, channel, message in reader.iter_messages()]
+    assert summary.statistics.message_count == len(read)
+    return read
+
+
+def seen_by_rosbags(path) -> list[tuple[str, int, bytes]]:
+    with AnyReader([Path(path)]) as reader:
+        read = [(connection.topic, stamp, bytes(data))
+                for connection, stamp, data in reader.messages()]
+        for connection, _, data in reader.messages():
+            reader.deserialize(data, connection.msgtype)
+    return read
+
+
+def metadata_of(path) -> dict[str, dict[str, str]]:
+    with open(path, 'rb') as file:
+        return {record.name: record.metadata for record in make_reader(file).iter_metadata()}
+
+
+def places(log, each=8):
+    """Some bytes of every record: most of its head, and seeded ones of the rest; and the magic."""
+    choice = random.Random(5)
+    yield from range(len(MCAP0_MAGIC))
+    for _, start, end in log.records:
+        head = range(start, min(start + each, end))
+        yield from head
+        yield from choice.sample(range(head.stop, end), min(each, end - head.stop))
+    yield from range(len(log.content) - len(MCAP0_MAGIC), len(log.content))
+
+
+def torn(log, content=None):
+    """Return a log up to the end of its last chunk; nothing in it repeats what stands before."""
+    return (content or log.content)[:log.chunks[-1][2]]
+
+
+STRANGERS = {
+    'plain': {},
+    'unchunked': {'use_chunking': False},
+    'lz4': {'compression': CompressionType.LZ4},
+    'no index': {'index_types': IndexType.NONE},
+    'no index of metadata': {'index_types': IndexType.CHUNK | IndexType.MESSAGE},
+    'no statistics': {'use_statistics': False},
+    'nothing repeated': {'repeat_channels': False, 'repeat_schemas': False},
+    'nothing but messages': {
+        'use_chunking': False, 'use_statistics': False, 'use_summary_offsets': False,
+        'repeat_channels': False, 'repeat_schemas': False, 'index_types': IndexType.NONE,
+        'enable_crcs': False},
+}
+
+
+def write_stranger(path, options, profile='', count=300):
+    """Write JSON and schemaless messages by mcap's own writer, with an attachment."""
+    messages = []
+    with open(path, 'wb') as file:
+        writer = Writer(file, chunk_size=1000, **options)
+        writer.start(profile=profile, library='a stranger')
+        writer.add_metadata('note', {'a': 'ä', 'b': ''})
+        schema = writer.register_schema('thing', 'jsonschema', b'{"type": "object"}')
+        channels = {
+            '/json': writer.register_channel('/json', 'json', schema, {'unit': 'm'}),
+            '/raw': writer.register_channel('/raw', 'octets', 0)}
+        for number in range(count):
+            topic = ('/json', '/raw')[number % 2]
+            data = b'{"n": %d}' % number if topic == '/json' else (
+                random.Random(number).randbytes(number % 70))
+            writer.add_message(channels[topic], 1000 + number, data, 2000 + number)
+            messages.append((topic, 1000 + number, data))
+            if number == count // 2:
+                writer.add_attachment(3, 4, 'calibration.bin', 'x/y', b'\x06' * 3000)
+        writer.finish()
+    return messages

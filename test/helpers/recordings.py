@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages for the tests of the recorder, and what readers find of them."""
+
+import struct
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.reader import NonSeekingReader
+from mcap.records import Channel as ChannelRecord
+from rosbags.typesys import Stores, get_typestore
+
+from spinning_top_sim.recording.rosbag2 import RecordedTopic, qos_profiles
+
+JAZZY = get_typestore(Stores.ROS2_JAZZY)
+POSE = 'geometry_msgs/msg/PoseStamped'
+ARRAY = 'std_msgs/msg/Float64MultiArray'
+TOPICS = (
+    RecordedTopic('/top/pose', POSE),
+    RecordedTopic('/top/spinning_top/invariants', ARRAY, {'depth': 3, 'reliability': 2}),
+    RecordedTopic('/top/silent', POSE),
+)
+METADATA = {'seed': '7', 'top.mass': '0.5', 'note': 'θ: "quoted"\nline'}
+EPOCH_NS = 1_700_000_000_000_000_000
+
+
+def pose_cdr(number: int) -> bytes:
+    types = JAZZY.types
+    pose = types['geometry_msgs/msg/Pose'](
+        types['geometry_msgs/msg/Point'](1.0, 2.0, float(number)),
+        types['geometry_msgs/msg/Quaternion'](0.0, 0.6, 0.0, 0.8))
+    stamp = types['builtin_interfaces/msg/Time'](1_700_000_000, number)
+    header = types['std_msgs/msg/Header'](stamp, 'world')
+    return bytes(JAZZY.serialize_cdr(types[POSE](header, pose), POSE))
+
+
+def array_cdr(number: int) -> bytes:
+    """The CDR of a Float64MultiArray without labels, packed by hand."""
+    return struct.pack('<4sIII4xd', b'\x00\x01\x00\x00', 0, 0, 1, float(number))
+
+
+def some_messages(count: int) -> list[tuple[int, int, bytes]]:
+    """Messages of the first two topics in turn, 1 ms apart."""
+    makers = (pose_cdr, array_cdr)
+    return [(n % 2, EPOCH_NS + n * 1_000_000, makers[n % 2](n)) for n in range(count)]
+
+
+def complete_messages(path):
+    """Return (topic, channel, message) of every complete chunk, in file order; torn files too."""
+    found = []
+    with open(path, 'rb') as file:
+        reader = NonSeekingReader(file)
+        try:
+            for _, channel, message in reader.iter_messages(log_time_order=False):
+                found.append((channel.topic, channel, message))
+        except McapError:
+            pass
+    return found
+
+
+def parsed_qos(text):
+    return qos_profiles(ChannelRecord(1, '/a', 'cdr', {'offered_qos_profiles': text}, 1))
+
+
+def rows_of(begin: int, end: int):
+    """Return a block of messages of the first topic, stamped by their numbers."""
+    data = b''.join(map(pose_cdr, range(begin, end)))
+    return 0, np.arange(begin, end), np.frombuffer(data, np.uint8).reshape(end - begin, -1)

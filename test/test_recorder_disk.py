@@ -1,0 +1,394 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The recorder on a slow, full or failing disk: a bounded loss, told with its reason."""
+
+import os
+import random
+import re
+import shutil
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from contextlib import closing
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from helpers.recordings import (
+    ARRAY,
+    METADATA,
+    TOPICS,
+    complete_messages,
+    parsed_qos,
+    pose_cdr,
+    rows_of,
+    some_messages,
+)
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from rosbags.rosbag2 import Reader
+
+from spinning_top_sim.recording import writer
+from spinning_top_sim.recording.errors import RecordingError
+from spinning_top_sim.recording.mcap_writer import McapWriter
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
+from spinning_top_sim.recording.writer import McapRecorder, create_file
+
+ROOT = Path(__file__).parents[1]
+PATIENCE_S = 20.0  # for what happens at once on an idle machine
+
+
+def numbers_in(path):
+    """Return the stamps of a log whose messages are stamped 0, 1, 2, ..."""
+    return [message.log_time for _, _, message in complete_messages(path)]
+
+
+def is_indexed(path):
+    """Return whether a file has its summary; ordinary readers refuse it without."""
+    with LogReader(path) as reader:
+        return reader.whole
+
+
+def eventually(condition):
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, 'did not happen in time'
+        time.sleep(0.005)
+
+
+@pytest.mark.parametrize('value', [
+    '1.5', '[1]', '{}', 'true', '"7"', '~', '.nan', 'keep_some', str(1 << 63), '-' + '9' * 20])
+def test_a_policy_that_is_not_understood_is_the_default(value):
+    keys = ('history', 'depth', 'reliability', 'deadline')
+    text = '- ' + '\n  '.join(f'{key}: {value}' for key in keys)
+    assert parsed_qos(text) == (DEFAULT_QOS,)
+
+
+def test_an_existing_file_is_left_alone(tmp_path):
+    path = tmp_path / 'run.mcap'
+    path.write_text('precious')
+    with pytest.raises(RecordingError, match=r'run\.mcap.*exists'):
+        McapRecorder(path, TOPICS, METADATA, min_free_bytes=0)
+    assert path.read_text() == 'precious'
+
+
+def test_a_missing_directory_is_named(tmp_path):
+    with pytest.raises(RecordingError, match=f'no directory {tmp_path}/logs'):
+        McapRecorder(tmp_path / 'logs' / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+
+
+def test_too_little_space_at_the_start_leaves_no_file(tmp_path):
+    with pytest.raises(RecordingError, match=r'run\.mcap: \d+ bytes are free .* 10{30}'):
+        McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=10 ** 30)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_head_that_cannot_be_written_leaves_no_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, 'fsync', refuse_to_sync)
+    with pytest.raises(RecordingError, match=r'run\.mcap: Input/output error'):
+        McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+    assert not list(tmp_path.iterdir())
+
+
+def refuse_to_sync(descriptor):
+    raise OSError(5, os.strerror(5))
+
+
+def test_topics_twice_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="'/top/pose' is listed twice"):
+        McapRecorder(tmp_path / 'run.mcap', [TOPICS[0], TOPICS[0]], {})
+
+
+def test_a_file_and_its_name_are_on_the_disk_when_it_is_closed(tmp_path, monkeypatch):
+    """First the content, then the directory: a name without content would be a broken log."""
+    synced = []
+    monkeypatch.setattr(os, 'fsync', lambda fd: synced.append(os.readlink(f'/proc/self/fd/{fd}')))
+    path = tmp_path / 'run.mcap'
+    file = create_file(path, TOPICS, METADATA, compression='zstd')
+    assert synced == [str(path), str(tmp_path)]
+    synced.clear()
+    file.append(0, 1, pose_cdr(1))
+    file.write_chunk()
+    file.finish()
+    assert synced == [str(path), str(tmp_path)]
+
+
+def test_closing_twice_changes_nothing(tmp_path):
+    recorder = McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+    recorder.write(0, 1, pose_cdr(1))
+    first = recorder.close()
+    content = first.path.read_bytes()
+    recorder.write(0, 2, pose_cdr(2))
+    second = recorder.close()
+    assert recorder.state == 'closed'
+    assert (first.counts, first.bytes, first.error, first.lost) == (
+        second.counts, second.bytes, None, 0)
+    assert is_indexed(first.path)
+    assert second.lost == recorder.counters.lost == 1
+    assert first.bytes == len(content) == len(second.path.read_bytes())
+
+
+def test_a_disk_that_fails_under_rows_is_told_and_nothing_follows(tmp_path, monkeypatch):
+    """The thread that writes has the error; the caller gets it, and can still finish the file."""
+    file = create_file(tmp_path / 'run.mcap', TOPICS, METADATA, compression='zstd')
+    file.append_rows([rows_of(0, 100)])
+    file.write_chunk()
+    pwrite = os.pwrite
+
+    def refuse(*_):
+        raise OSError(28, os.strerror(28))
+
+    monkeypatch.setattr(os, 'pwrite', refuse)
+    with pytest.raises(OSError, match='No space'):
+        for number in range(100, 1000, 100):
+            file.append_rows([rows_of(number, number + 100)])
+        file.write_chunk()
+    monkeypatch.setattr(os, 'pwrite', pwrite)
+    file.write_chunk()          # what was told once is not told again
+    file.finish()
+    assert is_indexed(tmp_path / 'run.mcap')
+    assert numbers_in(tmp_path / 'run.mcap') == list(range(100))
+
+
+def test_a_full_queue_says_so_and_loses_nothing(tmp_path, monkeypatch):
+    blocked, disk_is_back = threading.Event(), threading.Event()
+    append = McapWriter.append
+
+    def append_slowly(self, *message):
+        blocked.set()
+        disk_is_back.wait(PATIENCE_S)
+        return append(self, *message)
+
+    monkeypatch.setattr(McapWriter, 'append', append_slowly)
+    monkeypatch.setattr(writer, 'QUEUE_BYTES', 10_000)
+    recorder = McapRecorder(
+        tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.01, min_free_bytes=0)
+    recorder.write(0, 0, pose_cdr(0))
+    assert blocked.wait(PATIENCE_S)  # with the first message, out of the queue
+    written = 1
+    while recorder.room:
+        recorder.write(0, written, pose_cdr(written))
+        written += 1
+    assert 10 < written < 100
+    assert not recorder.wait_for_room(0.01)
+    recorder.write(0, written, pose_cdr(written))  # a burst may go on
+    disk_is_back.set()
+    assert recorder.wait_for_room(PATIENCE_S)
+    summary = recorder.close()
+    assert (summary.lost, summary.error) == (0, None)
+    assert numbers_in(summary.path) == list(range(written + 1))
+
+
+@pytest.mark.parametrize('ending', ['pass', 'os.kill(os.getpid(), signal.SIGINT)'])
+def test_an_interpreter_that_ends_without_closing_leaves_a_whole_file(tmp_path, ending):
+    code = f"""
+        import os, signal, sys
+        from spinning_top_sim.recording.rosbag2 import RecordedTopic
+        from spinning_top_sim.recording.writer import McapRecorder
+        topics = [RecordedTopic('/a', {ARRAY!r})]
+        recorder = McapRecorder(sys.argv[1], topics, {{}}, min_free_bytes=0, max_loss=60.0)
+        for number in range(100):
+            recorder.write(0, number, bytes(8))
+        {ending}
+        """
+    subprocess.run([sys.executable, '-c', textwrap.dedent(code), tmp_path / 'run.mcap'],
+                   env=os.environ | {'PYTHONPATH': str(ROOT)}, capture_output=True, timeout=60,
+                   check=False)
+    with Reader(tmp_path / 'run.mcap') as reader:
+        assert [stamp for _, stamp, _ in reader.messages()] == list(range(100))
+
+
+@pytest.mark.parametrize('fsync_s', [0.0, 0.45])
+def test_what_is_handed_over_is_on_the_disk_within_max_loss(tmp_path, monkeypatch, fsync_s):
+    """On a simulated clock, which waiting and a slow disk advance; messages come all the time."""
+    max_loss, step_s = 1.0, 0.01
+    now, on_disk, flushes, waits = 0.0, 0, 0, []
+    handed_over = []    # times
+
+    class Event(threading.Event):
+        def wait(self, timeout=None):
+            advance(timeout)
+
+    class Thread:
+        """The thread that records is this one, and what it starts is done at once."""
+
+        join = is_alive = lambda *_: None
+
+        def __init__(self, target, args=(), **_):
+            self.start = (lambda: target(*args)) if args else (lambda: None)
+
+    def advance(duration):
+        nonlocal now
+        if not recorder._accepting:
+            return
+        for _ in range(max(1, round(duration / step_s))):
+            now += step_s
+            recorder.write(0, len(handed_over), b'')
+            handed_over.append(now)
+            waits.append(now - handed_over[on_disk])
+        if now > 20.0:
+            recorder._accepting = False
+
+    def fsync(_):
+        nonlocal on_disk, flushes
+        written = recorder.counters.messages
+        advance(fsync_s)
+        on_disk = written
+        flushes += 1
+
+    monkeypatch.setattr(writer, 'time', SimpleNamespace(monotonic=lambda: now))
+    monkeypatch.setattr(writer, 'threading', SimpleNamespace(
+        Event=Event, Thread=Thread, TIMEOUT_MAX=threading.TIMEOUT_MAX))
+    recorder = McapRecorder(
+        tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=max_loss, min_free_bytes=0)
+    monkeypatch.setattr(os, 'fsync', fsync)
+    recorder._run()
+    summary = recorder.close()
+    assert (summary.error, summary.lost) == (None, 0)
+    assert flushes > 30
+    assert len(waits) > 1900 and 0.9 * max_loss / 2 < max(waits) <= max_loss
+
+
+@pytest.fixture
+def slow_disk(monkeypatch):
+    """Have every fsync wait from now on until the event is set."""
+    disk_is_back, fsync = threading.Event(), os.fsync
+    monkeypatch.setattr(os, 'fsync', lambda fd: (disk_is_back.wait(PATIENCE_S), fsync(fd)))
+    return disk_is_back
+
+
+def test_recording_goes_on_while_the_disk_is_slow_and_says_what_may_be_lost(tmp_path, slow_disk):
+    path = tmp_path / 'run.mcap'
+    slow_disk.set()
+    with closing(McapRecorder(
+            path, TOPICS, METADATA, max_loss=0.05, min_free_bytes=0)) as recorder:
+        assert (recorder.warning, recorder.possible_loss) == (None, 0.0)
+        slow_disk.clear()
+        for number in range(3):
+            recorder.write(0, number, pose_cdr(number))
+            eventually(lambda n=number: numbers_in(path) == list(range(n + 1)))
+        eventually(lambda: recorder.warning)
+        assert recorder.possible_loss > 0.05
+        assert re.fullmatch(rf'the disk of {path} is slow: a power loss would take the last '
+                            r'\d+\.\d s, more than max_loss = 0\.05 s', recorder.warning)
+        assert recorder.state == 'recording'
+        slow_disk.set()
+        eventually(lambda: recorder.possible_loss == 0.0)
+        assert recorder.warning is None
+    assert numbers_in(path) == [0, 1, 2]
+
+
+def test_a_sync_that_hangs_does_not_hang_the_end(tmp_path, slow_disk):
+    slow_disk.set()
+    recorder = McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02,
+                                 min_free_bytes=0)
+    slow_disk.clear()
+    recorder.write(0, 1, pose_cdr(1))
+    eventually(lambda: recorder.warning)
+    assert 'could not be closed within 0.05 s' in (recorder.close(timeout=0.05).error or '')
+    slow_disk.set()
+    assert is_indexed(recorder.close(timeout=PATIENCE_S).path)
+
+
+@pytest.fixture
+def disk(monkeypatch):
+    """A disk on which a file has at most `disk.size` bytes."""
+    disk, pwrite = SimpleNamespace(size=1 << 30), os.pwrite
+
+    def write(descriptor, data, offset):
+        if offset >= disk.size:
+            raise OSError(28, os.strerror(28))
+        return pwrite(descriptor, data[:disk.size - offset], offset)
+
+    monkeypatch.setattr(os, 'pwrite', write)
+    return disk
+
+
+@pytest.mark.parametrize(('room', 'max_loss'), [(100_000, 100.0), (100, 0.02)])
+def test_a_full_disk_stops_the_recording_and_costs_what_is_not_written(
+        tmp_path, disk, monkeypatch, room, max_loss):
+    """A torn chunk is cut off, and where it stood there is room for the summary; or only that."""
+    monkeypatch.setattr(writer, 'QUEUE_BYTES', 4_000_000)
+    path, rng = tmp_path / 'run.mcap', random.Random(3)
+    at_end = max_loss < 1.0
+    recorder = McapRecorder(path, TOPICS, METADATA, min_free_bytes=0, max_loss=max_loss)
+    for number in range(2000):      # half full, so that chunks of 1 MB are made
+        recorder.write(0, number, rng.randbytes(1000))
+    eventually(lambda: recorder.counters.messages > (1999 if at_end else 1000))
+    disk.size = recorder.counters.bytes + room
+    for number in range(2000, 2000 if at_end else 5000):
+        recorder.write(0, number, rng.randbytes(1000))
+    summary = recorder.close()
+    recorder.write(0, 0, b'after the end')
+    kept = summary.messages
+    assert recorder.error == f'recording to {path} stopped: No space left on device'
+    assert recorder.state == 'failed' and summary.error == recorder.error and recorder.room
+    assert kept == 2000 if at_end else kept > 1000
+    assert recorder.counters.lost == (2001 if at_end else 5001) - kept
+    assert is_indexed(path) != at_end
+    assert numbers_in(path) == list(range(kept)) and summary.bytes == path.stat().st_size
+
+
+FAULTS = {
+    'the file was deleted': lambda path, patch: path.unlink(),
+    'the file was deleted ': lambda path, patch: shutil.rmtree(path.parent),
+    'Input/output error': lambda path, patch: patch.setattr(os, 'fsync', refuse_to_sync),
+    '0 bytes are free on the disk, fewer than min_free_bytes = 1': lambda path, patch: (
+        patch.setattr(os, 'fstatvfs', lambda _: SimpleNamespace(f_bavail=0, f_frsize=4096))),
+}
+
+
+@pytest.mark.parametrize('reason', FAULTS)
+def test_a_fault_stops_the_recording_with_its_reason(tmp_path, monkeypatch, reason):
+    path = tmp_path / 'logs' / 'run.mcap'
+    path.parent.mkdir()
+    recorder = McapRecorder(path, TOPICS, METADATA, max_loss=0.02, min_free_bytes=1)
+    recorder.write(0, 0, pose_cdr(0))
+    FAULTS[reason](path, monkeypatch)
+    recorder.write(0, 1, pose_cdr(1))
+    eventually(lambda: recorder.state == 'failed')
+    recorder.write(0, 2, b'late')
+    summary = recorder.close()
+    assert recorder.error == summary.error == f'recording to {path} stopped: {reason.strip()}'
+    assert recorder.room and summary.messages + summary.lost == 3 and summary.lost >= 1
+    if path.exists():
+        assert is_indexed(path) and numbers_in(path) == list(range(summary.messages))
+
+
+def test_a_message_that_cannot_be_packed_is_no_exception_for_the_simulation(tmp_path):
+    recorder = McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+    recorder.write(0, -1, b'')
+    summary = recorder.close()
+    assert recorder.state == 'failed' and 'stopped: error:' in (summary.error or '')
+    assert (is_indexed(summary.path), summary.lost) == (True, 1)
+
+
+def test_an_interrupted_write_shifts_nothing(tmp_path, monkeypatch):
+    """An interrupt in the middle of a chunk; the chunk is written again, and all places hold."""
+    path = tmp_path / 'run.mcap'
+    file = create_file(path, TOPICS, METADATA, compression='none')
+    size = file.size
+    pwrite = os.pwrite
+
+    def interrupted(descriptor, data, offset):
+        pwrite(descriptor, data[:len(data) // 2], offset)
+        if offset > size:
+            raise KeyboardInterrupt
+        return len(data) // 2
+
+    for index, stamp, data in some_messages(100):
+        file.append(index, stamp, data)
+    monkeypatch.setattr(os, 'pwrite', interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        file.write_chunk()
+    monkeypatch.setattr(os, 'pwrite', pwrite)
+    assert file.size == path.stat().st_size == size
+    file.write_chunk()
+    file.finish()
+    with path.open('rb') as stream:
+        list(StreamReader(stream, validate_crcs=True).records)
+        stream.seek(0)
+        assert len(list(make_reader(stream, validate_crcs=True).iter_messages())) == 100
+    assert len(complete_messages(path)) == 100

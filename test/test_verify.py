@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`inspect --verify`: logs are computed again, and each difference is found and named."""
+
+import math
+import re
+
+import numpy as np
+import pytest
+from helpers.inspected import as_json, log_of, rewritten, told
+from mcap.reader import make_reader
+
+from spinning_top_sim.recording import provenance
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.streams import journal
+from spinning_top_sim.tools import recorded_run, recover
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp('inspect')
+
+
+@pytest.fixture(scope='module')
+def stepped(folder):
+    """Four motions by steps, with noise, in a namespace."""
+    return log_of(folder / 'stepped.mcap', '--duration', 3, '--command', '1.0:2.0:1.5',
+                  '--command', '0:1.7:1.4', '--command', '2.0031:1.6:1.0', '--namespace', '/a/b',
+                  '-p', 'imu.gyroscope_noise_density:=0.01', '-p', 'markers.enabled:=true')
+
+
+@pytest.fixture(scope='module')
+def short(folder):
+    """Two motions in half a second."""
+    return log_of(folder / 'short.mcap', '--duration', 0.5, '--command', '0.3:1.7:1.4')
+
+
+@pytest.fixture(scope='module')
+def columns(folder):
+    """The exact solution in columns, with a command between two stretches; several chunks."""
+    return log_of(folder / 'columns.mcap', '--duration', 11, '--command', '3.1:1.7:1.4',
+                  '-p', 'solver.method:=exact', '-p', 'imu.accelerometer_random_walk:=0.01',
+                  '-p', 'markers.enabled:=true')
+
+
+def chunks_of(path):
+    with open(path, 'rb') as file:
+        return make_reader(file).get_summary().chunk_indexes
+
+
+def with_flipped_bit(data, byte, bit=0):
+    changed = bytearray(data)
+    changed[byte] ^= 1 << bit
+    return bytes(changed)
+
+
+def verified(capsys, path):
+    code, content = as_json(capsys, path, '--verify')
+    assert code == (0 if content['verify']['identical'] else 1)
+    return content['verify']
+
+
+@pytest.mark.parametrize('name', ['stepped', 'columns'])
+def test_offline_logs_verify_and_a_changed_bit_is_found_wherever_it_is(
+        name, tmp_path, capsys, request):
+    path = request.getfixturevalue(name)
+    verdict = verified(capsys, path)
+    assert verdict['identical'] and verdict['warnings'] == []
+    counts, sizes = {}, {}
+    with LogReader(path) as reader:
+        for message in reader.messages():
+            counts[message.topic] = counts.get(message.topic, 0) + 1
+            sizes[message.topic] = len(message.data)
+    counts.pop(next(name for name in counts if name.endswith('/events')))
+    assert verdict['compared'] == counts
+    rng = np.random.default_rng(5)
+    places = {topic: (int(rng.integers(4, sizes[topic])), int(rng.integers(8)))
+              for topic in counts}
+    verdict = verified(capsys, rewritten(
+        path, tmp_path / 'changed.mcap', lambda topic, number, data: (
+            with_flipped_bit(data, *places[topic])
+            if topic in places and number == min(1, counts[topic] - 1) else data)))
+    first = verdict['first']
+    assert verdict['different'] == len(counts)
+    assert not (verdict['missing'] or verdict['unexpected'])
+    assert first['byte'] == places[first['topic']][0]
+    assert first['logged'] != first['computed']
+
+
+def test_a_difference_names_field_stamp_and_both_values(short, tmp_path, capsys):
+    path = rewritten(short, tmp_path / 'run.mcap', lambda topic, number, data: (
+        with_flipped_bit(data, len(data) - 8) if (topic, number) == ('/pose', 7) else data))
+    code, out, _ = told(capsys, path, '--verify')
+    assert code == 1
+    said = re.search(r'first: /pose at 1\.070000000 s, byte \d+, pose\.orientation\[3\]: '
+                     r'in the log (\S+), computed (\S+)', out)
+    logged, computed = float(said[1]), float(said[2])
+    assert 0.0 < abs(logged - computed) < 3e-16
+
+
+def test_a_missing_message_and_a_changed_journal_are_found(short, tmp_path, capsys):
+    """A digit of a commanded momentum: the motion after it is another."""
+    verdict = verified(capsys, rewritten(
+        short, tmp_path / 'fewer.mcap', lambda topic, number, data: (
+            None if (topic, number) == ('/pose', 10) else data)))
+    assert (verdict['missing'], verdict['unexpected'], verdict['different']) == (1, 0, 0)
+    assert verdict['first']['stamp_ns'] == 1_100_000_000
+    verdict = verified(capsys, rewritten(
+        short, tmp_path / 'run.mcap', lambda topic, number, data: (
+            data.replace(b'"l3": 1.7', b'"l3": 1.8') if topic.endswith('/events') else data)))
+    assert not verdict['identical'] and verdict['different'] > 100
+    verdict = verified(capsys, rewritten(
+        short, tmp_path / 'cut.mcap', lambda topic, number, data: (
+            data.replace(b'"l3": 1.7', b'"l3"; 1.7') if topic.endswith('/events') else data)))
+    assert not verdict['identical'] and verdict['first']['topic'].endswith('/events')
+
+
+def test_another_machine_is_warned_of(short, capsys, monkeypatch):
+    here = provenance.surroundings()
+    monkeypatch.setattr(provenance, 'surroundings', lambda: {**here, 'platform': 'abacus'})
+    verdict = verified(capsys, short)
+    assert verdict['identical']
+    assert len(verdict['warnings']) == 1 and 'abacus' in verdict['warnings'][0]
+
+
+def test_live_logs_verify(tmp_path, capsys):
+    """From the start, and from the middle with commands before; rates change, resets happen."""
+    pytest.importorskip('rclpy')
+    from geometry_msgs.msg import PoseStamped
+    from helpers.node_harness import Peer, SimNode
+
+    whole, part = tmp_path / 'whole.mcap', tmp_path / 'part.mcap'
+    options = {'status_period': 0.0, 'record.uri': str(whole), 'start_paused': True,
+               'imu.gyroscope_noise_density': 0.01, 'increments.enabled': True,
+               'imu.sampling': 'mean', 'imu.lever_arm': [0.1, -0.2, 0.3]}
+    with SimNode(tmp_path, options, namespace='/live') as node, Peer() as peer:
+        pose = peer.listen(node.topic('pose'), PoseStamped)
+
+        def set_now(**values):
+            assert all(result.successful for result in peer.set_each(node, **values))
+            pose.wait_more(5)
+        assert peer.set_together(node, spin__l3=1.7, spin__lz=1.4).successful
+        assert peer.switch(node, 'record', True).success
+        assert peer.set_together(node, spin__l3=1.65, spin__lz=1.4).successful   # before t = 0
+        peer.switch(node, 'set_pause', False)
+        pose.wait(10)
+        set_now(imu__rate=125.0, pose__rate=50.0)
+        set_now(spin__lz=1.3)
+        assert peer.switch(node, 'record', False).success
+        set_now(record__uri=str(part), joint_states__rate=33.0)
+        assert peer.switch(node, 'record', True).success
+        set_now(spin__l3=1.8)
+        set_now(imu__rate=250.0, imu__gyroscope_noise_density=0.02, solver__method='exact')
+        assert peer.trigger(node, 'reset').success
+        pose.wait_more(5)
+        peer.switch(node, 'set_pause', True)
+        assert peer.trigger(node, 'reset').success
+        assert peer.set_together(node, spin__l3=1.9, spin__lz=1.3).successful    # before t = 0
+        assert peer.trigger(node, 'step').success
+        peer.switch(node, 'set_pause', False)
+        set_now(ground_truth_imu__rate=100.0)
+        assert node.end() == 0, node.err
+    for path, causes in ((whole, ['start', 'command', 'command']),
+                         (part, ['start', 'command', 'reset', 'reset', 'command'])):
+        code, content = as_json(capsys, path, '--verify')
+        verdict = content['verify']
+        assert verdict['identical'] and code == 0, verdict
+        assert sum(verdict['compared'].values()) > 100
+        assert [motion['cause'] for motion in content['motions']] == causes
+        assert all(topic['missing'] == 0
+                   for topic in content['topics'].values() if topic['stream'])
+        assert all(error['max'] < 1e-9 for error in content['orientation_error'].values())
+
+
+def test_a_torn_file_is_told_and_what_is_left_verifies(columns, tmp_path, capsys):
+    torn = tmp_path / 'torn.mcap'
+    last = chunks_of(columns)[-1]
+    torn.write_bytes(columns.read_bytes()[:last.chunk_start_offset + last.chunk_length // 2])
+    code, out, _ = told(capsys, torn, '--verify')
+    assert code == 1
+    assert 'torn.mcap: truncated' in out and 'lost: ' in out
+    assert re.search(r'verify: identical, all \d+ messages', out)
+    code, content = as_json(capsys, torn)
+    assert code == 1 and not content['whole'] and content['damage']['torn']
+    assert content['damage']['lost_bytes'] > 0
+    assert content['motions'][0]['measured']['nutations'] > 3
+
+
+def test_an_incomplete_log_is_told_in_the_same_words_before_and_after_recover(
+        columns, tmp_path, capsys):
+    torn, whole = tmp_path / 'torn.mcap', tmp_path / 'whole.mcap'
+    data = bytearray(columns.read_bytes())
+    chunk = chunks_of(columns)[1]
+    middle = chunk.chunk_start_offset + chunk.chunk_length // 2
+    data[middle:middle + 99] = bytes(99)
+    torn.write_bytes(data)
+    assert recover.main([str(torn), '-o', str(whole)]) == 3
+    capsys.readouterr()
+    texts = []
+    for path in (torn, whole):
+        code, out, _ = told(capsys, path, '--verify')
+        assert code == 1
+        texts.append([line for line in out.splitlines() if line.startswith('verify: ')])
+    assert texts[0] == texts[1]
+    assert re.match(r'verify: incomplete, \d+ messages missing; the other \d+ are identical',
+                    texts[0][0])
+
+
+@pytest.mark.parametrize('event', [
+    {'event': 'command', 'l3': math.nan, 'lz': 1.0},
+    {'event': 'command', 'sent_ns': 2 ** 63, 'l3': 1.0, 'lz': 1.0},
+    {'event': []}, {'event': 'state', 'l3': 1.0, 'lz': 1.0},
+    {'event': 'reset', 'parameters': {}, 'epoch_ns': 10 ** 18}])
+def test_an_odd_entry_of_the_journal_is_told(short, tmp_path, capsys, event):
+    """It is left out: the run is followed to its end all the same."""
+    data = journal.event(**{'name': event['event'], 't_ns': 0, 'sent_ns': 300_000_000, **{
+        name: value for name, value in event.items() if name != 'event'}})
+    path = rewritten(short, tmp_path / 'odd.mcap', lambda topic, number, old: (
+        [old, data] if topic.endswith('/events') and number == 1 else old))
+    code, content = as_json(capsys, path, '--verify')
+    assert code == 1 and len(content['motions']) >= 2
+    assert any('entry at 1.300000000 s: ' in note or 'cannot be followed' in note
+               for note in content['notes'])
+
+
+def test_a_run_that_no_log_of_its_size_holds_is_not_computed(
+        short, tmp_path, capsys, monkeypatch):
+    """A stamp of the year 2096: neither 10^12 samples nor 10^12 steps."""
+    path = rewritten(short, tmp_path / 'late.mcap', stamp=lambda topic, number, stamp_ns: (
+        4 * 10 ** 18 if (topic, number) == ('/pose', 50) else stamp_ns))
+    code, out, _ = told(capsys, path, '--verify')
+    assert code == 1 and 'lacks most samples of this run' in out
+    monkeypatch.setattr(recorded_run, 'STEPS_A_BYTE', 0)        # they would take a minute
+    t_ns = 3_999_999_998_000_000_000
+    far = journal.event('command', t_ns, t_ns, l3=1.7, lz=1.4)
+    path = rewritten(short, tmp_path / 'far.mcap', lambda topic, number, data: (
+        far if topic.endswith('/events') and number == 1 else data),
+        stamp=lambda topic, number, stamp_ns: (
+            4 * 10 ** 18 if topic.endswith('/events') and number == 1 else stamp_ns))
+    assert 'integration steps are too many' in told(capsys, path)[1]
+
+
+def test_topics_are_known_by_their_names_in_a_log_put_together_anew(stepped):
+    with LogReader(stepped) as reader:
+        run = recorded_run.read_run_description(reader)
+        found = recorded_run._topics(reader.topics[::-1], run.values_at_recording)
+    assert found.items() > run.topics.items()
+    assert {*found} - {*run.topics} == {'~/commands', '~/events'}
