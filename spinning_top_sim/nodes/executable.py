@@ -52,19 +52,10 @@ def run(name: str, argv: Sequence[str] | None,
     _open_standard_streams()
     try:
         make_node = prepare(argv)
-        for option, path in pairwise(argv):
-            if option == '--params-file' and not os.path.isfile(path):
-                raise ValueError(f'--params-file {path}: there is no such file')
-        import rclpy  # noqa: PLC0415
-        # From `init` on, rclpy shuts the context down at SIGINT and SIGTERM.  A launched node gets
-        # SIGINT twice, from the terminal and from launch.
-        interrupts: list[int] = []
-        _handle(signal.SIGINT, lambda number, _: interrupts.append(number))
-        for number in (signal.SIGHUP, signal.SIGQUIT):
-            _handle(number, lambda *_: signal.raise_signal(signal.SIGTERM))
-        rclpy.init(args=[name, *argv])
+        interrupts = _initialize_ros([name, *argv])
     except Exception as error:
         return _cannot_start(name, error)
+    import rclpy  # noqa: PLC0415
     node, started = None, False
     try:
         node = make_node()
@@ -87,6 +78,22 @@ def run(name: str, argv: Sequence[str] | None,
             node.destroy_node()
         rclpy.try_shutdown()
         _ignore_signals()       # rclpy has restored the handler that it found
+
+
+def _initialize_ros(argv: list[str]) -> list[int]:
+    """Initialize rclpy; return the list to which a SIGINT from now on is appended."""
+    for option, path in pairwise(argv):
+        if option == '--params-file' and not os.path.isfile(path):
+            raise ValueError(f'--params-file {path}: there is no such file')
+    import rclpy  # noqa: PLC0415
+    # From `init` on, rclpy shuts the context down at SIGINT and SIGTERM.  A launched node gets
+    # SIGINT twice, from the terminal and from launch.
+    interrupts: list[int] = []
+    _handle(signal.SIGINT, lambda number, _: interrupts.append(number))
+    for number in (signal.SIGHUP, signal.SIGQUIT):
+        _handle(number, lambda *_: signal.raise_signal(signal.SIGTERM))
+    rclpy.init(args=argv)
+    return interrupts
 
 
 def _open_standard_streams() -> None:

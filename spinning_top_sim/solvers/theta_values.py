@@ -78,12 +78,16 @@ class ThetaFunctions:
             np.array(self.prefactors) < SIN_ODD, self.coefficients[-1], 0.0)
         self.bounds = np.sort(2.0 * np.arctan2(np.hypot(beta, beta_imag),
                                                np.hypot(alpha, alpha_imag)))
-        self.planar_rotation: tuple[float, float] | None = None
-        if len(self.zeros) == 2:
-            first, second = (np.arctan2(beta, alpha) / QUARTER).tolist()
-            slope = (second - first + 2.0) % 4.0 - 2.0
-            start = (first + slope * motion.quarter0 + 1.0) % 4.0 - 1.0
-            self.planar_rotation = start - slope * motion.quarter0, slope
+        self.planar_rotation = _planar_rotation(
+            np.arctan2(beta, alpha) / QUARTER, motion.quarter0) if len(self.zeros) == 2 else None
+
+
+def _planar_rotation(quarters: Matrix, quarter0: int) -> tuple[float, float]:
+    """Return (i, j) of `ThetaFunctions`; `quarters` are the half angles at N = 0 and N = 1."""
+    first, second = quarters.tolist()
+    slope = (second - first + 2.0) % 4.0 - 2.0
+    start = (first + slope * quarter0 + 1.0) % 4.0 - 1.0
+    return start - slope * quarter0, slope
 
 
 class ThetaValues:

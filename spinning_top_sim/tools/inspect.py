@@ -167,11 +167,7 @@ def _as_text(found: Survey, verdict: Verdict | None) -> Iterator[str]:
         solver += f" ({values['solver.equations']}, rtol {values['solver.rtol']:g})"
     yield f'spinning_top_sim {run.surroundings["version"]}, {solver}, seed {values["seed"]}'
     yield from _topics(found)
-    counts = Counter(event.name for event in run.events)
-    yield ('no journal: commands and resets are unknown' if run.events_topic is None else
-           f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
-           f'{counts["parameters"]} changes of parameters'
-           + (f', {counts["state"]} states set' if counts['state'] else ''))
+    yield _journal(run)
     yield from found.notes
     for number, motion in enumerate(found.motions, start=1):
         yield from _motion(number, motion, damage.start_ns)
@@ -184,6 +180,15 @@ def _as_text(found: Survey, verdict: Verdict | None) -> Iterator[str]:
              for topic in found.topics if topic in {**found.drifts, **found.errors}])
     if verdict is not None:
         yield from _verdict(verdict)
+
+
+def _journal(run: RunDescription) -> str:
+    if run.events_topic is None:
+        return 'no journal: commands and resets are unknown'
+    counts = Counter(event.name for event in run.events)
+    return (f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
+            f'{counts["parameters"]} changes of parameters'
+            + (f', {counts["state"]} states set' if counts['state'] else ''))
 
 
 def _topics(found: Survey) -> Iterator[str]:

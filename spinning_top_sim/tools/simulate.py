@@ -99,11 +99,7 @@ def _run(arguments: argparse.Namespace) -> int:
         if file_format == 'mcap':
             summary = write_log(output, simulation, stops, show, arguments.namespace)
         else:
-            table = Table(period_ns(values['pose.rate']))
-            write = _write_csv if file_format == 'csv' else _write_parquet
-            # A command changes the rows after its time.
-            write(output, (rows for done in _play(simulation, [table], stops, show)
-                           if isinstance(done, Block) for _, _, rows in done.parts))
+            _write_table(output, file_format, simulation, stops, show)
             summary = ', '.join(UNITS)
     lines = [f'{output}: {summary}']
     if arguments.export:
@@ -113,6 +109,15 @@ def _run(arguments: argparse.Namespace) -> int:
         for line in lines:
             cli.print_line(line)
     return cli.OK
+
+
+def _write_table(path: Path, file_format: str, simulation: Simulation, stops: Sequence[Stop],
+                 show: Callable[[float], object]) -> None:
+    table = Table(period_ns(simulation.values['pose.rate']))
+    write = _write_csv if file_format == 'csv' else _write_parquet
+    # A command changes the rows after its time.
+    write(path, (rows for done in _play(simulation, [table], stops, show)
+                 if isinstance(done, Block) for _, _, rows in done.parts))
 
 
 def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
