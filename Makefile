@@ -51,6 +51,7 @@ run:
 	@mkdir -p '$(LOGS)'
 	@echo 'Scene $(SCENE), recording into $(LOGS)/, until Ctrl-C. Another terminal of this machine' \
 	    'listens after:'
+	@echo '  . $(VENV)/bin/activate'
 	@echo "  export ROS_DOMAIN_ID=$$ROS_DOMAIN_ID" \
 	    "ROS_AUTOMATIC_DISCOVERY_RANGE=$$ROS_AUTOMATIC_DISCOVERY_RANGE"
 	@exec $(BIN)/spinning-top' node --scene '$(SCENE)' --ros-args -p record.enabled:=true \

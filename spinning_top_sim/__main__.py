@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from types import ModuleType
 
+from spinning_top_sim.installation import needed
+
 # Name: the module with its `main` and `add_arguments`, and what it does.
 COMMANDS = {
     'node': ('nodes.sim_node', 'simulate a top in real time as a ROS 2 node'),
@@ -32,7 +34,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         _complete()
     with _quiet_interrupt():
         name = _parser().parse_args(argv[:1]).command
-        command: Callable[[Sequence[str]], int] = _module(name).main
+        try:
+            with needed('it'):
+                command: Callable[[Sequence[str]], int] = _module(name).main
+        except ImportError as error:
+            print(f'spinning-top {name}: {error}', file=sys.stderr)
+            return 1
     return command(argv[1:])
 
 

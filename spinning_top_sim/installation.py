@@ -46,9 +46,9 @@ def needed(what: str, wanted: str = '') -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        raise ImportError(f'{what} needs {error.name}, which is not installed: '
-                          f'{remedy(wanted or str(error.name))}'
-                          ) from error
+        library, *_ = str(error.name).split('.')
+        raise ImportError(f'{what} needs {library}, which is not installed: '
+                          f'{remedy(wanted or library)}') from error
 
 
 def remedy(wanted: str) -> str:
@@ -57,8 +57,12 @@ def remedy(wanted: str) -> str:
 
     wanted : an extra of the package, or the name of one library that it requires
     """
+    try:
+        requirements = metadata.requires(NAME) or []
+    except metadata.PackageNotFoundError:       # this is a checkout
+        requirements, wanted = [], str(share())
     lines = []
-    for line in metadata.requires(NAME) or ():
+    for line in requirements:
         requirement, _, condition = (part.strip() for part in line.partition(';'))
         library, *_ = re.split('[^\\w.-]', requirement)
         if library == wanted or re.findall(r'[\w.-]+', condition)[1:] == [wanted]:

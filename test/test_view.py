@@ -286,7 +286,7 @@ def test_a_page_as_a_file_is_never_overwritten(log, tmp_path, capsys):
     path.write_text('mine')
     assert command.main([str(log), '--html', str(path)]) == 1
     assert capsys.readouterr().err == (
-        f'spinning-top view: {path} exists, and nothing is overwritten\n')
+        f'spinning-top view: cannot write {path}: it exists, and nothing is overwritten\n')
     assert path.read_text() == 'mine'
 
 

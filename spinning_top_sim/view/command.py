@@ -89,8 +89,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _show_logs(arguments: argparse.Namespace) -> int:
     if len(arguments.log) > 2:
         raise ValueError(f'{len(arguments.log)} logs: must be one or two')
-    if arguments.html is not None and arguments.html.exists():
-        raise FileExistsError(f'{arguments.html} exists, and nothing is overwritten')
+    if arguments.html is not None:
+        cli.check_output(arguments.html)
     with needed('the page', 'view'):
         from spinning_top_sim.view.log import Player, read_logs  # noqa: PLC0415
     logs = read_logs(arguments.log)

@@ -246,11 +246,12 @@ class LiveView(Node):
         """Set the top and the start of an installed scene, and reset.  Raises RefusedError."""
         values = parameters.checked(read_scene(parameter_files('scene')[scene]))
         values['spin.lz'] = parameters.start_state(values).lz
-        self._set({name: value for name, value in values.items()
-                   if name.startswith(('top.', 'initial.', 'spin.'))})
-        said = self.call('reset')
-        self._stale = True
-        return f'{scene}, {said}'
+        try:
+            self._set({name: value for name, value in values.items()
+                       if name.startswith(('top.', 'initial.', 'spin.'))})
+            return f'{scene}, {self.call("reset")}'
+        finally:
+            self._stale = True      # the node may do what it has not answered in time
 
     def _set(self, values: Mapping[str, object]) -> None:
         """Set parameters of the sim_node.  Raises RefusedError."""
