@@ -24,7 +24,8 @@ class Vibration:
 
     Each axis is a sum of sines: that of `imu.vibration.frequency`, with the phase 0 at t = 0, and
     `LINES` for a spectral density.  Of these, each has a band of the same width; its power is that
-    of the band, its place in the band and its phase follow from the seed.
+    of the band.  Its place in the middle half of the band and its phase follow from the seed.  So
+    no beat is longer than two over the width of a band, and short records have the power.
 
     response : the complex gain of the sensor at frequencies [Hz]
 
@@ -82,7 +83,7 @@ def _lines(values: Mapping[str, Any], kind: str, purpose: noise.Purpose,
         uniform = np.arctan2(normal[0], normal[1]) / math.tau + 0.5
         edges = np.linspace(profile[0, 0], profile[-1, 0], LINES + 1)
         powers = np.diff([power_below(profile.tolist(), edge) for edge in edges.tolist()])
-        sines = np.stack((edges[:-1] + (edges[1] - edges[0]) * uniform[0],
+        sines = np.stack((edges[:-1] + (edges[1] - edges[0]) * (0.25 + 0.5 * uniform[0]),
                           np.broadcast_to(np.sqrt(2.0 * powers), (3, LINES)), uniform[1]))
         lines = np.concatenate((lines, sines.transpose(2, 0, 1)))
     gain = response(lines[:, 0])
