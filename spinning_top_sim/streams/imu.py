@@ -20,9 +20,11 @@ from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.integrals import Increments
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams import noise
+from spinning_top_sim.streams.bandwidth import LowPass
 from spinning_top_sim.streams.intervals import Intervals
 from spinning_top_sim.streams.parameters import BY_NAME, IDENTITY
 from spinning_top_sim.streams.stream import Samples, period_ns
+from spinning_top_sim.streams.vibration import Vibration
 
 KINDS = ('gyroscope', 'accelerometer')
 # Parameters of the errors that both kinds of axes have.
@@ -46,6 +48,17 @@ class Imu:
         self.sensor: Callable[[int], Sensor] = lru_cache(4)(partial(Sensor, values))
         self.takes_means = values['imu.sampling'] == 'mean'
         self.intervals = Intervals(period_ns(values['imu.rate']))
+        bandwidth = values['imu.bandwidth']
+        self._low_pass = (LowPass(bandwidth, values['imu.bandwidth_order']) if bandwidth
+                          else None)
+        vibration = Vibration(values, self._low_pass.response if self._low_pass else np.ones_like)
+        self._vibration = None if vibration.is_off else vibration
+
+    @property
+    def keep_ns(self) -> int:
+        """The time before a sample that its reading may need [ns]."""
+        memory_ns = self._low_pass.memory_ns if self._low_pass else 0
+        return max(self.intervals.keep_ns, memory_ns)
 
     @property
     def present_sensor(self) -> 'Sensor':
@@ -74,8 +87,8 @@ class Imu:
 
     def true(self, states: States) -> tuple[Vector, Vector]:
         """Return angular velocity [rad/s] and specific force [m/s^2] in the frame of the IMU."""
-        return (self._from_body(states.rows_angular_velocity),
-                self._from_body(states.specific_force(self._lever_arm)))
+        return (self.from_body(states.rows_angular_velocity),
+                self.from_body(states.specific_force(self._lever_arm)))
 
     def means(self, samples: Samples) -> tuple[Vector, Vector]:
         """Return the means of `true` over the intervals that end at these samples."""
@@ -89,11 +102,36 @@ class Imu:
                 (*increments.angles, *increments.forces),
                 (*states.rows_angular_velocity, *states.specific_force(self._lever_arm)),
                 strict=True))
-        return self._from_body((w1, w2, w3)), self._from_body((f1, f2, f3))
+        return self.from_body((w1, w2, w3)), self.from_body((f1, f2, f3))
 
     def sampled(self, samples: Samples) -> tuple[Vector, Vector]:
         """Return the readings of a perfect sensor: values or means, as `imu.sampling` says."""
         return samples.once(self.means) if self.takes_means else self.true(samples.states)
+
+    def felt(self, samples: Samples) -> tuple[Vector, Vector]:
+        """Return `sampled` with bandwidth and vibration of the sensor, before its errors."""
+        exact = self.sampled(samples) if self._low_pass is None else self._filtered(samples)
+        if self._vibration is None:
+            return exact
+        return self._vibration.add(exact, samples.t_ns, self.intervals.lengths(samples.times)
+                                   if self.takes_means else 0.0)
+
+    def _filtered(self, samples: Samples) -> tuple[Vector, Vector]:
+        assert self._low_pass is not None
+        w1, w2, w3, f1, f2, f3 = self._low_pass.filtered(
+            samples.path, samples.times, lambda states: np.stack(np.broadcast_arrays(
+                *itertools.chain(*self.true(states)))))
+        return (w1, w2, w3), (f1, f2, f3)
+
+    def measured_increments(self, samples: Samples) -> tuple[Quaternion, Vector]:
+        """Return `increments` with the errors of the sensor and its vibration."""
+        exact, sensor = self.increments(samples), self.present_sensor
+        if sensor.is_perfect and self._vibration is None:
+            return exact
+        means, seconds = samples.once(self.means), self.intervals.lengths(samples.times)
+        felt = means if self._vibration is None else self._vibration.add(
+            means, samples.t_ns, seconds)
+        return sensor.disturb(exact, means, sensor.read(felt, samples.times), seconds)
 
     def increments(self, samples: Samples) -> tuple[Quaternion, Vector]:
         """Return rotation and velocity increment [m/s] over the intervals that end there."""
@@ -102,7 +140,7 @@ class Imu:
         v1, v2, v3 = increments.velocity
         if self._is_rotated:
             x, y, z = attitude.in_body(self._mounting, (x, y, z))
-        return (x, y, z, w), self._from_body((v1, v2, v3))
+        return (x, y, z, w), self.from_body((v1, v2, v3))
 
     def _body_increments(self, samples: Samples) -> Increments:
         return self.intervals.increments(samples.path, samples.times, self._lever_arm)
@@ -110,9 +148,10 @@ class Imu:
     def motion(self, states: States) -> tuple[Vector, Vector]:
         """Return position in the world [m], and velocity in the frame of the IMU [m/s]."""
         return (attitude.in_world(states.rows_quaternion, self._lever_arm),
-                self._from_body(states.velocity(self._lever_arm)))
+                self.from_body(states.velocity(self._lever_arm)))
 
-    def _from_body(self, vector: Vector) -> Vector:
+    def from_body(self, vector: Vector) -> Vector:
+        """Return a vector in the frame of the IMU."""
         # The mounting is q(body <- IMU), and `in_body` applies the inverse of its argument.
         return attitude.in_body(self._mounting, vector) if self._is_rotated else vector
 
@@ -179,7 +218,8 @@ class Sensor:
         return attitude.product(exact, attitude.quaternion_of_vector((x, y, z)))
 
     def disturb(self, exact: tuple[Quaternion, Vector], means: tuple[Vector, Vector],
-                times: range, seconds: Column) -> tuple[Quaternion, Vector]:
+                readings: tuple[Vector, Vector], seconds: Column,
+                ) -> tuple[Quaternion, Vector]:
         """
         Return the measured increments over intervals.
 
@@ -188,13 +228,13 @@ class Sensor:
 
         exact : the true increments
         means : the true mean rates [rad/s] and forces [m/s^2]
-        times : ends of the intervals [ns]
-        seconds : their lengths (n,) [s]
+        readings : those of the sensor, of the same
+        seconds : lengths of the intervals (n,) [s]
         """
         rotation, (v1, v2, v3) = exact
         r1, r2, r3, *force = (
             seconds * (reading - mean) for reading, mean in zip(
-                itertools.chain(*self.read(means, times)), itertools.chain(*means), strict=True))
+                itertools.chain(*readings), itertools.chain(*means), strict=True))
         x, y, z = attitude.rotation_vector(rotation)
         f1, f2, f3 = attitude.in_body(
             attitude.quaternion_of_vector((-0.5 * x, -0.5 * y, -0.5 * z)),

@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The magnetometer, in the frame of the IMU: the magnetic field and the errors of the sensor."""
 
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Quaternion, Vector
 from spinning_top_sim.streams import noise
+from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.imu import converted, transformed
 
 
@@ -18,6 +21,7 @@ class Magnetometer:
     A magnetometer that takes a sample every `period_ns`.
 
     variance : of white noise and rounding together [T^2]
+    is_disturbed : whether there are `mag.disturbance` events
 
     (V. Renaudin et al., "Complete triaxis magnetometer calibration in the magnetic domain",
     Journal of Sensors 2010: soft iron, hard iron, noise)
@@ -34,10 +38,26 @@ class Magnetometer:
             np.array(values['mag.hard_iron'])[:, np.newaxis],
             [noise.Path(seed, noise.Purpose.MAG_WALK, (3 * (math.inf,),), (3 * (walk,),))]
             if walk else ())
+        self._events = [np.reshape(values[f'mag.disturbance.{frame}'], (-1, 5)).tolist()
+                        for frame in ('world', 'body')]
+        self.is_disturbed = any(itertools.chain(*itertools.chain(*self._events)))
 
     def true(self, orientation: Quaternion) -> Vector:
         """Return the field [T] in frames with these orientations in the world."""
         return attitude.in_body(orientation, self._field)
+
+    def disturbed(self, exact: Vector, orientation: Quaternion,
+                  from_body: Callable[[Vector], Vector], t_ns: NDArray[np.int64]) -> Vector:
+        """
+        Return the field `exact` [T] with the disturbances at these times (n,) [ns].
+
+        orientation : of the IMU in the world
+        from_body : returns a vector of the body in the frame of the IMU
+        """
+        world, body = (_at(events, t_ns) for events in self._events)
+        x, y, z = (one + outside + magnet for one, outside, magnet in zip(
+            exact, attitude.in_body(orientation, world), from_body(body), strict=True))
+        return x, y, z
 
     def read(self, exact: Vector, times: range) -> Vector:
         """Return the readings [T] of the field `exact` at these times [ns]."""
@@ -46,3 +66,12 @@ class Magnetometer:
                    for value, one_bias, one_white in zip(
                        transformed(self._soft_iron, exact), bias, white, strict=True))
         return x, y, z
+
+
+def _at(events: Sequence[Sequence[float]], t_ns: NDArray[np.int64]) -> Vector:
+    """Return the sum of the fields [T] of those events that go on at times (n,) [ns]."""
+    total = np.zeros((3, len(t_ns)))
+    for begin, end, *field in events:
+        goes_on = (t_ns >= round(begin * NANOSECONDS)) & (t_ns < round(end * NANOSECONDS))
+        total += np.where(goes_on, np.array(field)[:, np.newaxis], 0.0)
+    return total[0], total[1], total[2]

@@ -26,7 +26,7 @@ class Purpose(enum.IntEnum):
     """What a random number is used for; numbers for different purposes are independent."""
 
     WHITE, TURN_ON, WALK, GAUSS_MARKOV, FLICKER, ORIENTATION = range(6)
-    TIMING, MAG_WHITE, MAG_WALK = range(6, 9)
+    TIMING, MAG_WHITE, MAG_WALK, VIBRATION_RATE, VIBRATION_FORCE = range(6, 11)
 
 
 def white(seed: int, purpose: Purpose, numbers: NDArray[np.int64], columns: int,

@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 from spinning_top_sim.physics.top import State, Top, shown
@@ -38,6 +39,7 @@ class Parameter:
     above : exclusive lower bound
     smallest : smallest number that is allowed besides 0
     choices : allowed strings
+    is_repeated : whether a list may have several times as many numbers as the default
     """
 
     name: str
@@ -49,6 +51,7 @@ class Parameter:
     above: float | None = None
     smallest: float | None = None
     choices: tuple[str, ...] = ()
+    is_repeated: bool = False
     effect: Effect = field(kw_only=True)
 
     @property
@@ -77,7 +80,8 @@ class Parameter:
                 type(None): 'a number'}.get(type(self.default))
         if isinstance(self.default, tuple):
             kind = ('a list of strings' if isinstance(self.default[0], str)
-                    else f'a list of {len(self.default)} numbers')
+                    else f'a list of {len(self.default)} numbers'
+                    + (', or a multiple of that,' if self.is_repeated else ''))
         return f'must be {kind} {self._bounds()}'.rstrip()
 
     def check(self, value: Value) -> Value:
@@ -98,7 +102,9 @@ class Parameter:
                 return False
             if isinstance(default[0], str):
                 return all(isinstance(item, str) for item in value)
-            return len(value) == len(default) and all(map(self._is_in_range, value))
+            count = len(value) // len(default) if self.is_repeated else 1
+            return len(value) == max(count, 1) * len(default) and all(
+                map(self._is_in_range, value))
         if isinstance(default, bool | str):
             return isinstance(value, type(default)) and (not self.choices or value in self.choices)
         return (self.is_double or isinstance(value, int)) and self._is_in_range(value)
@@ -216,6 +222,20 @@ TABLE: tuple[Parameter, ...] = (
               'yaw about fixed axes', 'rad', -1e6, 1e6),
     _at_reset('imu.sampling', 'instant', 'A sample is the value at its stamp, or the mean over '
               'the period before it', choices=('instant', 'mean')),
+    _at_reset('imu.bandwidth', 0.0, 'Frequency at which the gain of the IMU is -3 dB, 0 = '
+              'unlimited; not with imu.sampling = mean', 'Hz', 0.0, 1e5, smallest=1.0),
+    _at_reset('imu.bandwidth_order', 1, 'Order of this low pass; 2: Butterworth', '', 1, 2),
+    _at_reset('imu.vibration.frequency', 100.0, 'Frequency of the sine that the IMU vibrates with',
+              'Hz', above=0.0, maximum=1e6),
+    _at_reset('imu.vibration.force', (0.0, 0.0, 0.0), 'Amplitude of this sine in the specific '
+              'force', 'm/s^2', -1e6, 1e6),
+    _at_reset('imu.vibration.rate', (0.0, 0.0, 0.0), 'Amplitude of this sine in the angular '
+              'velocity', 'rad/s', -1e6, 1e6),
+    *(_at_reset(f'imu.vibration.{kind}_psd', (0.0, 0.0), f'Vibration of the {text} of each axis: '
+                f'ascending frequencies [Hz], each with its one-sided spectral density [{unit}]; '
+                'zeros: none', '', 0.0, 1e6, is_repeated=True) for kind, text, unit in (
+          ('force', 'specific force', '(m/s^2)^2/Hz'),
+          ('rate', 'angular velocity', '(rad/s)^2/Hz'))),
     *_axes('gyroscope', 'rad/s', 'rad/s^2/sqrt(Hz)'),
     *_axes('accelerometer', 'm/s^2', 'm/s^3/sqrt(Hz)'),
     _at_reset('imu.gyroscope_A', 9 * (0.0,), 'Sensitivity of the gyroscope to specific force, row '
@@ -246,6 +266,10 @@ TABLE: tuple[Parameter, ...] = (
           ('random_walk', 'Random walk of the bias of the magnetometer, 0 = none', 'T/s/sqrt(Hz)'),
           ('range', 'Largest reading of the magnetometer, 0 = unlimited', 'T'),
           ('resolution', 'Smallest step of the readings of the magnetometer, 0 = none', 'T'))),
+    *(_at_reset(f'mag.disturbance.{frame}', 5 * (0.0,), f'Events, each of five numbers: begin and '
+                f'end [s], and {text}, x, y, z [T]', '', -LONGEST, LONGEST, is_repeated=True)
+      for frame, text in (('world', 'a field that is added to that of the world'),
+                          ('body', 'the field of a magnet on the body, in its frame'))),
     _at_reset('markers.trace_length', 4.0, 'How far back the trace of the tip goes, 0 = no trace',
               's', 0.0, 3600.0),
     _at_reset('markers.trace_points', 200, 'Points of the trace, evenly spaced in time', '', 1,
@@ -294,9 +318,29 @@ def checked(values: Mapping[str, Value]) -> dict[str, Value]:
         raise ValueError(f'imu.rate = {result["imu.rate"]!r}: must be >= '
                          f'{LOWEST_RATE_OF_INTERVALS:g} with increments.enabled, or with '
                          'imu.sampling = mean')
+    _check_sensor(result)
     top_of(result)
     start_state(result)
     return result
+
+
+def _check_sensor(values: Mapping[str, Value]) -> None:
+    """Raise ValueError for a bandwidth with means, or for profiles and events that make none."""
+    if values['imu.bandwidth'] and values['imu.sampling'] == 'mean':
+        raise ValueError(f'imu.bandwidth = {values["imu.bandwidth"]!r}: must be 0 with '
+                         'imu.sampling = mean, which is a low pass itself')
+    for name in ('imu.vibration.force_psd', 'imu.vibration.rate_psd'):
+        profile, frequencies = values[name], values[name][::2]
+        if any(profile) and (len(profile) < 4 or not all(profile) or not all(
+                one < next_one for one, next_one in pairwise(frequencies))):
+            raise ValueError(f'{name} = {list(profile)!r}: must be two or more ascending '
+                             'frequencies > 0, each with a density > 0')
+    for name in ('mag.disturbance.world', 'mag.disturbance.body'):
+        times = values[name]
+        for begin, end in zip(times[::5], times[1::5], strict=True):
+            if begin > end:
+                raise ValueError(f'{name}: an event from {begin!r} to {end!r} s: must not end '
+                                 'before it begins')
 
 
 def top_of(values: Mapping[str, Value]) -> Top:

@@ -56,11 +56,13 @@ class Segment:
         finally:
             self.reached_ns = self.start_ns + self.solver.reached_ns
 
-    def states(self, times: range) -> States:
+    def states(self, times: range | NDArray[np.int64]) -> States:
         """Return the states at ascending times [ns]."""
         return self.solver.states(self._since_start(times))
 
-    def _since_start(self, times: range) -> range:
+    def _since_start(self, times: range | NDArray[np.int64]) -> range | NDArray[np.int64]:
+        if isinstance(times, np.ndarray):
+            return times - self.start_ns
         return range(times.start - self.start_ns, times.stop - self.start_ns, times.step)
 
     def orientation_error(self, states: States, times: range) -> NDArray[np.float64]:
@@ -115,6 +117,13 @@ class Path:
         return np.concatenate([
             np.stack(segment.exact_axis(times), axis=-1) for segment, times in zip(
                 self._segments, np.split(times_ns, ends), strict=True) if len(times)])
+
+    def pieces(self, begin_ns: int, end_ns: int) -> list[tuple[Segment, int, int]]:
+        """Return the segments between two times [ns], and where each begins and ends there."""
+        ends = [*(later.start_ns for later in self._segments[1:]), end_ns]
+        return [(segment, max(begin_ns, segment.start_ns), until_ns)
+                for segment, until_ns in zip(self._segments, ends, strict=True)
+                if until_ns > begin_ns]
 
     def increments(self, begin_ns: int, end_ns: int, point: Point, count: int = 1,
                    step_ns: int = 1) -> Increments:

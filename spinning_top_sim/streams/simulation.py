@@ -79,8 +79,8 @@ class Simulation:
         self.now_ns = -1
         # The trace of the markers, and intervals of the IMU, reach back across commands.
         trace_ns = round(values['markers.trace_length'] * NANOSECONDS)
-        self.path = Path(segment, keep_ns=max(trace_ns, LONGEST_NS),
-                         keep_steps_ns=self.imu.intervals.keep_ns)
+        self.path = Path(segment, keep_ns=max(trace_ns, LONGEST_NS, self.imu.keep_ns),
+                         keep_steps_ns=self.imu.keep_ns)
         self.version += 1
 
     @property
@@ -156,7 +156,7 @@ class Simulation:
         """Take over new rates of streams after `now_ns`."""
         imu, rate = self.imu, changes.get('imu.rate')
         if rate is not None and imu.set_rate(rate, max(self.now_ns, 0)):
-            self.path.keep_steps_ns = imu.intervals.keep_ns
+            self.path.keep_steps_ns = imu.keep_ns
             self.history.append((max(self.now_ns, 0), rate))
         for stream in self.streams:
             stream.apply(changes)

@@ -36,7 +36,7 @@ def _joints(samples: Samples) -> Sequence[Field]:
 
 
 def _readings(imu: Imu, samples: Samples) -> Sequence[Field]:
-    return (NO_ROTATION, *imu.present_sensor.read(imu.sampled(samples), samples.times))
+    return (NO_ROTATION, *imu.present_sensor.read(samples.once(imu.felt), samples.times))
 
 
 def _estimates(imu: Imu, samples: Samples) -> Sequence[Field]:
@@ -48,12 +48,7 @@ def _estimates(imu: Imu, samples: Samples) -> Sequence[Field]:
 
 def _increment(imu: Imu, place: int, samples: Samples) -> Sequence[Field]:
     """Return the rotation (place 0) or velocity increment over the interval that ends there."""
-    increments = imu.increments(samples)
-    if not imu.present_sensor.is_perfect:
-        increments = imu.present_sensor.disturb(
-            increments, samples.once(imu.means), samples.times,
-            imu.intervals.lengths(samples.times))
-    return (increments[place],)
+    return (samples.once(imu.measured_increments)[place],)
 
 
 def _timing(timing: Timing, imu: Imu, samples: Samples) -> Sequence[Field]:
@@ -126,7 +121,11 @@ class Mag(Stream):
         return self._sensor.true(self._imu.orientation(samples.states))
 
     def _readings(self, samples: Samples) -> Sequence[Field]:
-        return (self._sensor.read(self._exact(samples), samples.times),
+        exact = self._exact(samples)
+        if self._sensor.is_disturbed:
+            exact = self._sensor.disturbed(exact, self._imu.orientation(samples.states),
+                                           self._imu.from_body, samples.t_ns)
+        return (self._sensor.read(exact, samples.times),
                 messages.diagonal(*3 * (self._sensor.variance,)))
 
     def _truth(self, samples: Samples) -> Sequence[Field]:

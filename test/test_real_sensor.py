@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bandwidth, vibration and magnetic disturbances, measured in what a run sends."""
+
+import math
+
+import numpy as np
+import pytest
+from helpers.readings import command, rate, run
+from helpers.simulations import MILLISECOND, SECOND, play, record, simulate
+from scipy import signal
+
+from spinning_top_sim.streams import parameters
+
+# A free top whose attitude turns: its rates and forces are sines of two frequencies at most.
+TURNS = 20.0
+FREE = {'top.com_distance': 0.0, 'top.lambda1': 0.1, 'top.lambda3': 0.2, 'initial.theta': 1.0,
+        'initial.theta_dot': 3.0, 'spin.l3': 0.2 * math.tau * TURNS, 'spin.lz': 0.0,
+        'solver.method': 'exact', 'imu.rate': 1000.0, 'ground_truth_imu.rate': 1000.0}
+STANDING = {'initial.theta': 0.0, 'spin.l3': 0.0, 'spin.lz': 0.0, 'solver.method': 'exact'}
+
+
+@pytest.mark.parametrize('order', [1, 2])
+@pytest.mark.parametrize('corner', [7.0, 20.0, 150.0])
+def test_gain_and_delay_are_those_of_the_analog_filter(order, corner):
+    """In the transverse rate: a sine at |1 - lambda3/lambda1| omega3, the frequency TURNS."""
+    values = {**FREE, 'imu.bandwidth': corner, 'imu.bandwidth_order': order}
+    _, found = run(values, 2 * SECOND, 'imu/data_raw', 'ground_truth/imu')
+    (_, _, _, rates, _, *_), (_, _, _, exact, *_) = found.values()
+    read, true = (np.ravel([1.0, 1j] @ part[1000:2000, :2].T) for part in (rates, exact))
+    turning = true * np.conj(np.roll(true, 1))
+    frequency = np.angle(turning[1:]).mean() * 1000.0
+    b, a = signal.butter(order, math.tau * corner, analog=True)
+    (expected,) = signal.freqs(b, a, [frequency])[1]
+    assert abs(frequency) == pytest.approx(math.tau * TURNS, rel=1e-9)
+    # The integral has its nodes at whole nanoseconds.
+    assert np.abs(read / true - expected).max() < 0.5e-9 * math.tau * TURNS
+    if corner == TURNS:
+        assert np.abs(read / true) == pytest.approx(math.sqrt(0.5), rel=1e-7)
+    assert rates[:, 2] == pytest.approx(exact[:, 2], rel=1e-11)
+
+
+def test_a_command_gives_the_step_response_of_the_filter():
+    """The rate about the axis is a step."""
+    values = {**STANDING, 'spin.l3': 1.0, 'spin.lz': 1.0, 'imu.rate': 1000.0}
+    for order in (1, 2):
+        _, found = run({**values, 'imu.bandwidth': 10.0, 'imu.bandwidth_order': order}, SECOND,
+                       'imu/data_raw', events=[(300 * MILLISECOND + 123, command(2.0, 2.0))])
+        times_ns, _, _, rates, *_ = found['imu/data_raw']
+        late = np.maximum(times_ns * 1e-9 - 0.300000123, 0.0)
+        b, a = signal.butter(order, math.tau * 10.0, analog=True)
+        residues, poles, _ = signal.residue(b, (*a, 0.0))
+        expected = 1.0 + np.real(np.exp(np.outer(late, poles)) @ residues)
+        assert rates[:, 2] * 0.15 == pytest.approx(expected, abs=1e-8)
+
+
+PROFILE = (20.0, 0.1, 80.0, 0.4, 350.0, 0.4, 800.0, 0.07)
+
+
+def test_noise_has_the_power_of_the_profile_and_the_filter_acts_on_it():
+    values = {**STANDING, 'imu.vibration.force_psd': PROFILE, 'imu.rate': 2000.0}
+    frequencies = np.linspace(20.0, 800.0, 200_001)
+    density = np.exp(np.interp(np.log(frequencies), np.log(PROFILE[::2]), np.log(PROFILE[1::2])))
+    for corner in (0.0, 100.0):
+        gain = 1.0 if corner == 0.0 else 1.0 / (1.0 + (frequencies / corner) ** 4)
+        power = np.trapezoid(density * gain, frequencies) if hasattr(np, 'trapezoid') else (
+            np.trapz(density * gain, frequencies))
+        _, found = run({**values, 'imu.bandwidth': corner, 'imu.bandwidth_order': 2},
+                       10 * SECOND, 'imu/data_raw')
+        _, _, _, rates, force, *_ = found['imu/data_raw']
+        assert not rates.any()
+        at, spectra = signal.welch(force, 2000.0, nperseg=1024, axis=0)
+        assert spectra.sum(axis=0) * at[1] == pytest.approx(3 * [power], rel=0.01)
+        assert np.var(force, axis=0) == pytest.approx(3 * [power], rel=0.01)
+        if corner == 0.0:
+            inside = (at > 100.0) & (at < 330.0)
+            assert spectra[inside].mean() == pytest.approx(0.4, rel=0.01)
+            assert spectra[at > 830.0].max() < 1e-4
+            assert np.abs(np.corrcoef(force.T) - np.eye(3)).max() < 0.05
+            assert abs(np.mean((force[:, 0] / force[:, 0].std()) ** 4) - 3.0) < 0.2
+
+
+def test_a_sine_has_its_amplitude_phase_and_gain():
+    values = {**STANDING, 'imu.vibration.frequency': 60.0, 'imu.vibration.force': (1.0, 2.0, 0.0),
+              'imu.vibration.rate': (0.0, 0.0, 0.5), 'increments.enabled': True}
+    gain = 1.0 / (1.0 + 1j)
+    for more, factor in (({}, 1.0), ({'imu.bandwidth': 60.0}, gain),
+                         ({'imu.sampling': 'mean'}, np.sinc(0.3) * np.exp(-0.3j * math.pi))):
+        _, found = run({**values, **more}, SECOND, 'imu/data_raw', 'ground_truth/imu', 'imu/dq')
+        times_ns, _, _, rates, force, *_ = (part[1:] if part is not None else None
+                                            for part in found['imu/data_raw'])
+        sine = np.imag(factor * np.exp(1j * math.tau * 60.0 * times_ns * 1e-9))
+        assert force[:, :2] == pytest.approx(np.outer(sine, (1.0, 2.0)), abs=1e-9)
+        assert force[:, 2] == pytest.approx(9.80665, rel=1e-11)
+        assert rates == pytest.approx(np.outer(sine, (0.0, 0.0, 0.5)), abs=1e-9)
+        assert not found['ground_truth/imu'][3].any()
+        if more.get('imu.sampling') == 'mean':
+            angle = 2.0 * np.arcsin(found['imu/dq'][2][1:, 2])
+            assert angle == pytest.approx(0.005 * rates[:, 2], abs=1e-12)
+
+
+def test_magnetic_events_begin_and_end():
+    turned = {**STANDING, 'initial.psi': 0.5 * math.pi, 'mag.field': (0.0, 2e-5, -4e-5)}
+    values = {**turned, 'mag.disturbance.world': (0.1, 0.2, 3e-6, 0.0, 0.0),
+              'mag.disturbance.body': (0.15, 0.3, 0.0, 0.0, 5e-6, 0.2, 0.25, 1e-6, 0.0, 0.0)}
+    _, found = run(values, SECOND, 'imu/mag', 'ground_truth/mag')
+    (times_ns, _, field, _), (_, _, exact, _) = found.values()
+    k = times_ns // (10 * MILLISECOND)
+    # The body's x axis points north, its y axis west.
+    expected = np.stack((np.where((k >= 20) & (k < 25), 1e-6, 0.0),
+                         np.where((k >= 10) & (k < 20), -3e-6, 0.0),
+                         np.where((k >= 15) & (k < 30), 5e-6, 0.0)), axis=-1)
+    assert field - exact == pytest.approx(expected, abs=1e-19)
+
+
+@pytest.mark.parametrize('method', ['exact', 'rk45'])
+def test_any_division_of_a_run_gives_the_same_bytes(method):
+    """Live and offline, in blocks of any size, across commands and changes of rates."""
+    values = {'solver.method': method, 'imu.bandwidth': 40.0, 'imu.bandwidth_order': 2,
+              'imu.lever_arm': (0.1, -0.2, 0.3), 'imu.rpy': (0.1, 0.2, 0.3), 'imu.rate': 500.0,
+              'imu_data.rate': 77.7, 'imu.vibration.force': (1.0, 2.0, 3.0),
+              'imu.vibration.rate_psd': (10.0, 1e-3, 100.0, 1e-4),
+              'mag.disturbance.world': (0.1, 0.3, 1e-5, 0.0, 0.0)}
+    topics = ('imu/data_raw', 'imu/data', 'imu/mag', 'imu/dq', 'imu/dv')
+    events = ((125 * MILLISECOND, command(1.1, 1.1)), (225_000_001, rate(320.0)),
+              (350_000_003, command(0.9, 0.85)), (350_000_003, command(1.2, 1.2)))
+
+    def go(splits, live):
+        simulation = simulate(values)
+        taken = record(simulation, *topics) if live else []
+        stops = [*events, *((t_ns, lambda _: None) for t_ns in (*splits, 500 * MILLISECOND))]
+        for t_ns, act in sorted(stops, key=lambda stop: stop[0]):
+            if live:
+                simulation.advance(t_ns)
+                simulation.prepare(t_ns + 30 * MILLISECOND, 100_000)
+            else:
+                taken += play(simulation, t_ns, *topics)
+            act(simulation)
+        return sorted(taken)
+
+    whole = go((), False)
+    assert len(whole) > 5 * 40
+    assert go((1, 2_000_000, 77_000_123, 126_000_000, 351_000_000, 352_000_000), False) == whole
+    assert go(range(3_000_000, 500_000_000, 7_000_000), True) == whole
+
+
+@pytest.mark.parametrize(('name', 'value', 'says'), [
+    ('imu.bandwidth', 0.5, 'must be a number 0 or >= 1 and <= 100000'),
+    ('imu.bandwidth_order', 3, '<= 2'),
+    ('imu.vibration.force_psd', (20.0, 0.1), 'two or more ascending'),
+    ('imu.vibration.rate_psd', (20.0, 0.1, 20.0, 0.1), 'two or more ascending'),
+    ('imu.vibration.rate_psd', (20.0, 0.1, 30.0), 'a list of 2 numbers, or a multiple'),
+    ('mag.disturbance.body', (2.0, 1.0, 0.0, 0.0, 0.0), 'must not end before'),
+    ('mag.disturbance.world', (), 'a list of 5 numbers, or a multiple')])
+def test_what_makes_no_sense_is_refused(name, value, says):
+    with pytest.raises(ValueError, match=f'{name}.*{says}'):
+        parameters.checked({name: value})
+
+
+def test_means_have_no_bandwidth():
+    with pytest.raises(ValueError, match=r'imu.bandwidth = 9.0: must be 0 with imu.sampling'):
+        parameters.checked({'imu.bandwidth': 9.0, 'imu.sampling': 'mean'})
