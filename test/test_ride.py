@@ -68,7 +68,8 @@ def test_a_chain_of_exact_motions_is_the_motion_on_a_moving_pivot(name):
 def test_a_thousand_changes_of_acceleration_add_no_error():
     assert len(CASES[LONGEST]['pieces']) == 1000
     worst = errors(CASES[LONGEST])
-    assert max(worst.values()) <= 1e-12, worst
+    # An error grows by some 1e12 on the way: the true motion is chaotic.
+    assert max(worst.values()) <= BOUND, worst
 
 
 def test_changes_that_change_nothing_leave_the_motion_as_it_is():
@@ -85,21 +86,27 @@ def test_changes_that_change_nothing_leave_the_motion_as_it_is():
 
 @pytest.mark.parametrize('acceleration', [
     NOWHERE, (0.0, 0.0, -9.80665), (0.0, 0.0, -30.0), (4.0, -3.0, 2.0), (1e-12, 0.0, -9.80665),
-    (1e-9, 0.0, -30.0), (-1e-9, 1e-9, 0.0), (1e9, 0.0, 0.0)])
+    (1e-9, 0.0, -30.0), (-1e-9, 1e-9, 0.0), (1e4, 0.0, 0.0)])
 @pytest.mark.parametrize('start', [
     GENERAL, State(theta=0.0, theta_dot=0.7, phi=1.0, psi=2.0, l3=0.5, lz=0.5),
     State(theta=math.pi, phi=1.0, psi=2.0, l3=0.5, lz=-0.5),
     State(theta=1e-9, theta_dot=0.2, phi=1.0, psi=2.0, l3=0.5, lz=0.5),
-    State(theta=1.5707963267948966, l3=0.0, lz=0.0)])
-def test_a_posture_survives_the_way_into_a_frame_and_back(start, acceleration):
+    State(theta=1.5707963267948966, l3=0.0, lz=0.0), State(theta=1e-6, l3=0.0, lz=0.0)])
+def test_a_posture_is_handed_over_to_30_digits(start, acceleration):
     exact = tuple(map(Fraction, acceleration))
     posture = posture_of(TOP, start)
     motion = AcceleratedMotion(TOP, posture, exact)
-    back = motion.posture(0)
-    for before, after in zip(posture[:3], back[:3], strict=True):
-        scale = max(1, *map(abs, before))
-        assert max(abs(a - b) for a, b in zip(before, after, strict=True)) < scale * Decimal(
-            '1e-17')
+    whole, half = motion.posture(S), motion.posture(2 * S // 5)
+    back = AcceleratedMotion(TOP, half, exact).posture(3 * S // 5)
+    for one, other in zip(whole[:3], back[:3], strict=True):
+        scale = max(1, *map(abs, one))
+        assert max(abs(a - b) for a, b in zip(one, other, strict=True)) < scale * Decimal('1e-30')
+    for t, ((w, z), (y, minus_x), across, _) in (0, posture), (S, whole):
+        states = motion.states(range(t, t + 1))
+        q = np.ravel(motion.vertical.to_world(states.rows_quaternion))
+        assert abs(q - np.array([-minus_x, y, z, w], float)).max() < 2e-15
+        rates = np.array(across, float)
+        assert abs(states.angular_velocity[0, :2] - rates).max() < 5e-15 * max(1.0, *abs(rates))
     assert back.l3 == start.l3 == motion.start.l3
     assert 0.0 <= motion.start.theta <= math.pi / 2
     # The vertical of the frame is the line of the effective gravity.

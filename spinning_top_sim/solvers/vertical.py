@@ -21,18 +21,17 @@ from spinning_top_sim.physics.pivot import Exact
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.decimal_math import ONE, ZERO, atan2, pi, precision, sin_cos
 from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.solvers.theta_long import set_up_long, short
 from spinning_top_sim.solvers.theta_series import SIN_ODD
-from spinning_top_sim.solvers.theta_setup import DIGITS_TO_TRY, Factor, ThetaMotion, set_up
+from spinning_top_sim.solvers.theta_setup import DIGITS_TO_TRY, Factor, ThetaMotion
 
 DIGITS = DIGITS_TO_TRY[0]
 # An axis nearer to the vertical than this [rad] is vertical.  Lz - L3 keeps as many digits there
 # as this has zeros.
 POLE = Decimal('1e-30')
-# A motion that passes a pole within so much of a right angle, or of its own tilt, passes it exactly.
-# Series of theta functions end at this accuracy, and their set-up squares it in 40 digits.
+# A motion that misses a pole by this share of what it could passes it exactly: the set-up squares
+# the share, and has 40 digits.
 THROUGH = Decimal('1e-19')
-# So long after the axis is exactly at a pole its rates are those at the pole [s].
-MOMENT = Decimal('1e-25')
 Complex = tuple[Decimal, Decimal]
 LongQuaternion = tuple[Decimal, Decimal, Decimal, Decimal]
 
@@ -176,25 +175,30 @@ class AcceleratedMotion(ExactSolution):
             long_top = LongTop(
                 Decimal(top.lambda1), Decimal(top.lambda3), Decimal(top.mass),
                 Decimal(top.com_distance), self.vertical.gravity)
+        self._posture = posture
         self._turns, self._sign, self._half_turn = 0, 1.0, 0.0
         # All that follows turns these into decimals.
         self.top, self.start = cast(Top, long_top), cast(State, long_start)
-        self._motion = set_up(self.top, self.start)
+        self._motion = set_up_long(self.top, self.start)
         self._long = long_top, long_start
         with precision(DIGITS):
-            self._take_constants(self._motion)
+            self._take_constants(short(self._motion))
         self.top = Top(lambda1=top.lambda1, lambda3=top.lambda3, mass=top.mass,
                        com_distance=top.com_distance, gravity=float(long_top.gravity))
         self.start = long_start.rounded()
         self._check_start()
 
     def posture(self, ns: int) -> Posture:
-        """Return the posture in the world at a time [ns] since the start."""
+        """
+        Return the posture in the world at a time [ns] since the start.
+
+        It is right to 38 digits, times what the motion makes of such an error.
+        """
+        if not ns:                  # perhaps at a pole, where the axis does not tell its rates
+            return self._posture
         with precision(DIGITS):
             vertical, (top, start) = self.vertical, self._long
             alpha, beta, u_dot = _cayley_klein(self._motion, Decimal(ns).scaleb(-9))
-            if self._motion.quarter_rate and not (_square(alpha) and _square(beta)):
-                alpha, beta, u_dot = _cayley_klein(self._motion, Decimal(ns).scaleb(-9) + MOMENT)
             across = _across(top, start, alpha, beta, u_dot)
             alpha, beta = _product((vertical.alpha, vertical.beta), (alpha, beta))
             return Posture(alpha, beta, across, float(start.l3))
