@@ -27,11 +27,7 @@ ZERO: Exact = (Fraction(0), Fraction(0), Fraction(0))
 
 
 class Kinematics(NamedTuple):
-    """
-    What a pivot does at n times.
-
-    position, velocity, acceleration : (n, 3), in the world [m], [m/s], [m/s^2]
-    """
+    """What a pivot does at n times: (n, 3) each, in the world [m], [m/s], [m/s^2]."""
 
     position: NDArray[np.float64]
     velocity: NDArray[np.float64]
@@ -55,23 +51,20 @@ class PivotPath:
     """
     The path of a pivot that accelerates piecewise uniformly.
 
-    After the last piece the pivot keeps its velocity, or the pieces are repeated for ever.
+    After the last piece the pivot keeps its velocity, or the first one follows.
 
     Parameters
     ----------
     pieces : sequence of (duration [ns], acceleration (3,) [m/s^2])
         A duration is an integer > 0.
     repeat : bool, default False
-        Whether the pieces are repeated; then they must leave the velocity as it was.
+        Whether they are repeated for ever; then they must leave the velocity as it was.
     position, velocity : (3,) sequence
         At the start, in the world [m], [m/s].
     start_ns : int, default 0
         When the path starts [ns].
 
-    Raises
-    ------
-    ValueError
-        Naming what is wrong, its value, and what is allowed.
+    Raises ValueError naming what is wrong, its value, and what is allowed.
     """
 
     def __init__(self, pieces: Iterable[tuple[int, Given]], *, repeat: bool = False,
@@ -89,8 +82,7 @@ class PivotPath:
             velocities.append(_sum((1, v), (t, acceleration)))
             self._starts.append(self._starts[-1] + duration_ns)
             self._accelerations.append(acceleration)
-        self._cycle_ns = 0
-        self._per_cycle = np.zeros(3)
+        self._cycle_ns, self._per_cycle = 0, np.zeros(3)
         if repeat and any(any(one) for one in self._accelerations):
             if velocities[-1] != velocities[0]:
                 change = [float(x) for x in _sum((1, velocities[-1]), (-1, velocities[0]))]
@@ -183,8 +175,7 @@ class PivotPath:
             raise ValueError(f't = {t_ns} ns: must not be before the start of the path at '
                              f'{self.start_ns} ns')
         offset = self.start_ns + cycle * self._cycle_ns
-        ends = [*self._starts[1:], self._cycle_ns or None]
-        end = ends[k]
+        end = [*self._starts[1:], self._cycle_ns or None][k]
         return Piece(offset + self._starts[k], None if end is None else offset + end,
                      self._accelerations[k])
 
@@ -198,7 +189,7 @@ class PivotPath:
 
     def changes(self, begin_ns: int, end_ns: int) -> list[int]:
         """Return the times in [begin_ns, end_ns) at which the acceleration changes [ns]."""
-        found: list[int] = []
+        found = []
         last = self.piece(begin_ns - 1).acceleration if begin_ns > self.start_ns else ZERO
         for piece in self.pieces(begin_ns, end_ns):
             if piece.acceleration != last:
