@@ -82,7 +82,8 @@ def test_what_is_handed_over_has_all_digits_of_the_references(name):
                            strict=True):
         errors.append(min(abs(value - true), abs(value + true)) / max(1, abs(true)))
     assert l3 == case['start']['l3']
-    assert max(errors) < Decimal('1e-26' if name == LONGEST else '2e-30'), errors
+    # Half of the thirtieth digit, unless the motion is chaotic.
+    assert max(errors) <= Decimal('1e-26' if name == LONGEST else '5e-30'), errors
 
 
 def test_changes_that_change_nothing_leave_the_motion_as_it_is():
@@ -104,13 +105,16 @@ def test_changes_that_change_nothing_leave_the_motion_as_it_is():
     GENERAL, State(theta=0.0, theta_dot=0.7, phi=1.0, psi=2.0, l3=0.5, lz=0.5),
     State(theta=math.pi, phi=1.0, psi=2.0, l3=0.5, lz=-0.5),
     State(theta=1e-9, theta_dot=0.2, phi=1.0, psi=2.0, l3=0.5, lz=0.5),
-    State(theta=1.5707963267948966, l3=0.0, lz=0.0), State(theta=1e-6, l3=0.0, lz=0.0)])
+    State(theta=1.5707963267948966, l3=0.0, lz=0.0), State(theta=1e-6, l3=0.0, lz=0.0),
+    State(theta=0.0018, theta_dot=0.008803139254, l3=0.0, lz=0.0),     # next to the separatrix
+    State(theta=1e-15, theta_dot=1e-15, psi=1.0, l3=0.5, lz=0.5)])
 def test_a_posture_is_handed_over_to_30_digits(start, acceleration):
     exact = tuple(map(Fraction, acceleration))
     posture = posture_of(TOP, start)
     motion = AcceleratedMotion(TOP, posture, exact)
-    whole, half = motion.posture(S), motion.posture(2 * S // 5)
-    back = AcceleratedMotion(TOP, half, exact).posture(3 * S // 5)
+    whole, back = motion.posture(S), posture
+    for length in (1000, S // 3, S - S // 3 - 1000):
+        back = AcceleratedMotion(TOP, back, exact).posture(length)
     for one, other in zip(whole[:3], back[:3], strict=True):
         scale = max(1, *map(abs, one))
         assert max(abs(a - b) for a, b in zip(one, other, strict=True)) < scale * Decimal('1e-30')
