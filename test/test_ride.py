@@ -8,12 +8,14 @@ the frame of the pivot (data/make_ride_references.py): nothing of a closed form 
 
 import json
 import math
+import random
 from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.random_tops import random_case
 from helpers.ride import Ride
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -107,6 +109,7 @@ def test_changes_that_change_nothing_leave_the_motion_as_it_is():
     State(theta=1e-9, theta_dot=0.2, phi=1.0, psi=2.0, l3=0.5, lz=0.5),
     State(theta=1.5707963267948966, l3=0.0, lz=0.0), State(theta=1e-6, l3=0.0, lz=0.0),
     State(theta=0.0018, theta_dot=0.008803139254, l3=0.0, lz=0.0),     # next to the separatrix
+    State(theta=0.0, theta_dot=1e-50, l3=0.5, lz=0.5),
     State(theta=1e-15, theta_dot=1e-15, psi=1.0, l3=0.5, lz=0.5)])
 def test_a_posture_is_handed_over_to_30_digits(start, acceleration):
     exact = tuple(map(Fraction, acceleration))
@@ -132,6 +135,36 @@ def test_a_posture_is_handed_over_to_30_digits(start, acceleration):
         math.copysign(np.linalg.norm(line), motion.top.gravity), rel=1e-15)
     z = np.array(attitude.axis_in_world(motion.vertical.rows)).ravel()
     assert abs(motion.top.gravity * z - line).max() <= 1e-15 * max(1.0, np.linalg.norm(line))
+
+
+def special_acceleration(chance, top, start):
+    """Return nothing, free fall, a reversal, a push, or one along the axis of the start."""
+    g, size = top.gravity, chance.choice((1, -1)) * 10 ** chance.uniform(-12, 2)
+    axis = np.array((math.sin(start.theta) * math.cos(start.phi),
+                     math.sin(start.theta) * math.sin(start.phi), math.cos(start.theta)))
+    return chance.choice((
+        NOWHERE, (0.0, 0.0, -g), (0.0, 0.0, -2 * g), (0.0, 0.0, size), (size, 0.0, 0.0),
+        tuple(chance.uniform(-9, 9) for _ in range(3)), (0.0, size, -g),
+        tuple((size * axis - (0.0, 0.0, g)).tolist())))
+
+
+def test_random_tops_go_on_where_they_were():
+    for seed in range(150):
+        case, chance, worst = random_case(seed), random.Random(seed), 0.0
+        pieces = [(int(10 ** chance.uniform(3, 9.5)),
+                   special_acceleration(chance, case.top, case.start)) for _ in range(6)]
+        ride = Ride(case.top, case.start, PivotPath(pieces), 10 ** 11)
+        for k, piece in enumerate(ride.pieces[:-1]):
+            before, after = ride.motions[k:k + 2]
+            length = piece.end_ns - piece.start_ns
+            one, other = before.states(range(length, length + 1)), after.states(range(1))
+            (w1, w2, _), (u1, u2, _) = one.angular_velocity[0], other.angular_velocity[0]
+            largest = max(1.0, abs(one.angular_velocity).max())
+            worst = max(worst, abs(np.subtract(
+                before.vertical.to_world(one.rows_quaternion),
+                after.vertical.to_world(other.rows_quaternion))).max(),
+                math.hypot(w1 - u1, w2 - u2) / largest)
+        assert worst <= BOUND, case
 
 
 def test_the_specific_force_of_a_moving_frame_is_that_in_the_world():

@@ -269,7 +269,9 @@ def _across(top: LongTop, start: LongState, alpha: Complex, beta: Complex,
     cosine2, sine2 = _square(alpha), _square(beta)
     if not (cosine2 and sine2):
         return ZERO, ZERO           # it rests at a pole
-    momentum = start.lz - start.l3 * (cosine2 - sine2)
+    # Lz - L3 u, without cancellation at either pole
+    momentum = ((start.lz - start.l3) + 2 * start.l3 * sine2 if sine2 < cosine2
+                else (start.lz + start.l3) - 2 * start.l3 * cosine2)
     # 1/(alpha conj(beta)) = conj(alpha) beta/|alpha beta|^2
     inverse = _scaled(-1 / (2 * cosine2 * sine2), _times((alpha[0], -alpha[1]), beta))
     return _times((momentum / top.lambda1, u_dot), inverse)
