@@ -10,12 +10,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from decimal import Decimal
 from itertools import zip_longest
-from types import FunctionType
 
-from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers import theta_setup
-from spinning_top_sim.solvers.cubic import RootsTooCloseError
-from spinning_top_sim.solvers.decimal_math import ONE, ZERO, pi, precision
+from spinning_top_sim.solvers.decimal_math import ONE, ZERO, pi
 from spinning_top_sim.solvers.elliptic import GaussMean
 from spinning_top_sim.solvers.theta_series import (
     COS_EVEN,
@@ -27,7 +23,7 @@ from spinning_top_sim.solvers.theta_series import (
     Series,
     ThetaForm,
 )
-from spinning_top_sim.solvers.theta_setup import DIGITS_TO_TRY, Factor, ThetaMotion
+from spinning_top_sim.solvers.theta_setup import Factor, ThetaMotion
 
 MOST_TERMS = 6
 # A term k is at most the square root of q^(2k^2 - k) beside the first one.
@@ -90,30 +86,6 @@ def _series(prefactor: int, terms: Sequence[Decimal], factors: Sequence[Decimal]
         for power, coefficient in enumerate(SHAPES[prefactor][k]):
             polynomial[power] += (-weight if alternate and k % 2 else weight) * coefficient
     return Series(prefactor, tuple(polynomial))
-
-
-# TO BE REPLACED: `set_up` should take the class of its form as an argument.
-_nutating = FunctionType(theta_setup._nutating.__code__,
-                         {**vars(theta_setup), 'ThetaForm': LongForm},
-                         argdefs=theta_setup._nutating.__defaults__)
-_set_up = FunctionType(theta_setup._set_up.__code__,
-                       {**vars(theta_setup), '_nutating': _nutating})
-
-
-def set_up_long(top: Top, start: State) -> ThetaMotion:
-    """Return `set_up` to 38 digits.  The fields of top and start may be decimals."""
-    for digits in DIGITS_TO_TRY:
-        with precision(digits):
-            try:
-                motion: ThetaMotion = _set_up(top, start)
-                return motion
-            except RootsTooCloseError:
-                continue
-            except (ArithmeticError, OverflowError) as error:
-                raise ValueError(f'{top} from {start}: the constants are too far apart in size '
-                                 f'for the exact solution ({type(error).__name__})') from error
-    raise ValueError(f'{top} from {start}: closer to the separatrix or to steady precession than '
-                     f'{DIGITS_TO_TRY[-1]} digits can tell')
 
 
 def short(motion: ThetaMotion) -> ThetaMotion:

@@ -21,9 +21,9 @@ from spinning_top_sim.physics.pivot import Exact
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.decimal_math import ONE, ZERO, atan2, pi, precision, sin_cos
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.solvers.theta_long import set_up_long, short
+from spinning_top_sim.solvers.theta_long import LongForm, short
 from spinning_top_sim.solvers.theta_series import SIN_ODD
-from spinning_top_sim.solvers.theta_setup import DIGITS_TO_TRY, Factor, ThetaMotion
+from spinning_top_sim.solvers.theta_setup import DIGITS_TO_TRY, Factor, ThetaMotion, set_up
 
 DIGITS = DIGITS_TO_TRY[0]
 # An axis nearer to the vertical than this [rad] is vertical.  Lz - L3 keeps as many digits there
@@ -179,7 +179,7 @@ class AcceleratedMotion(ExactSolution):
         self._turns, self._sign, self._half_turn = 0, 1.0, 0.0
         # All that follows turns these into decimals.
         self.top, self.start = cast(Top, long_top), cast(State, long_start)
-        self._motion = set_up_long(self.top, self.start)
+        self._motion = set_up(self.top, self.start, LongForm)
         self._long = long_top, long_start
         with precision(DIGITS):
             self._take_constants(short(self._motion))
