@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The path of a moving pivot: pieces of constant acceleration, without any rounding that adds up.
+
+Boundaries are integer nanoseconds, and accelerations, velocities and positions at the boundaries
+are fractions.  So a closed path that is repeated returns to its start exactly, however often.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Sequence
+from fractions import Fraction
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.physics.top import shown
+
+NANOSECONDS = 1_000_000_000
+# x, y, z in the world; doubles are fractions, too.
+Exact = tuple[Fraction, Fraction, Fraction]
+Given = Sequence[float | Fraction]
+ZERO: Exact = (Fraction(0), Fraction(0), Fraction(0))
+
+
+class Kinematics(NamedTuple):
+    """What a pivot does at n times: (n, 3) each, in the world [m], [m/s], [m/s^2]."""
+
+    position: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    acceleration: NDArray[np.float64]
+
+
+class Piece(NamedTuple):
+    """
+    A time of constant acceleration.
+
+    start_ns, end_ns : first time, and the first one after it; None if it never ends [ns]
+    acceleration : in the world [m/s^2]
+    """
+
+    start_ns: int
+    end_ns: int | None
+    acceleration: Exact
+
+
+class PivotPath:
+    """
+    The path of a pivot that accelerates piecewise uniformly.
+
+    After the last piece the pivot keeps its velocity, or the first one follows.
+
+    Parameters
+    ----------
+    pieces : sequence of (duration [ns], acceleration (3,) [m/s^2])
+        A duration is an integer > 0.
+    repeat : bool, default False
+        Whether they are repeated for ever; then they must leave the velocity as it was.
+    position, velocity : (3,) sequence
+        At the start, in the world [m], [m/s].
+    start_ns : int, default 0
+        When the path starts [ns].
+
+    Raises ValueError naming what is wrong, its value, and what is allowed.
+    """
+
+    def __init__(self, pieces: Iterable[tuple[int, Given]], *, repeat: bool = False,
+                 position: Given = ZERO, velocity: Given = ZERO, start_ns: int = 0) -> None:
+        self.start_ns = start_ns
+        self._starts, self._accelerations = [0], []
+        places, velocities = [_exact('position', position)], [_exact('velocity', velocity)]
+        for duration_ns, given in pieces:
+            if isinstance(duration_ns, bool) or not (
+                    isinstance(duration_ns, int) and duration_ns > 0):
+                raise ValueError(f'duration = {shown(duration_ns)} ns: must be an integer > 0')
+            acceleration, t = _exact('acceleration', given), Fraction(duration_ns, NANOSECONDS)
+            v = velocities[-1]
+            places.append(_sum((1, places[-1]), (t, v), (t * t / 2, acceleration)))
+            velocities.append(_sum((1, v), (t, acceleration)))
+            self._starts.append(self._starts[-1] + duration_ns)
+            self._accelerations.append(acceleration)
+        self._cycle_ns, self._per_cycle = 0, np.zeros(3)
+        if repeat and any(any(one) for one in self._accelerations):
+            if velocities[-1] != velocities[0]:
+                change = [float(x) for x in _sum((1, velocities[-1]), (-1, velocities[0]))]
+                raise ValueError(f'a repeated path changes the velocity by {change} m/s: it must '
+                                 'end with the velocity that it starts with')
+            self._cycle_ns = self._starts.pop()
+            self._per_cycle = _doubles([_sum((1, places.pop()), (-1, places[0]))])[0]
+            velocities.pop()
+        else:
+            self._accelerations.append(ZERO)
+        self._places, self._velocities = _doubles(places), _doubles(velocities)
+        self._rounded = _doubles(self._accelerations)
+
+    @classmethod
+    def through(cls, waypoints: Sequence[Given], *, speed: float, acceleration: float,
+                repeat: bool = False, start_ns: int = 0) -> PivotPath:
+        """
+        Return the path along straight lines that stops at each waypoint.
+
+        On each line the pivot accelerates, cruises and brakes; speed and acceleration are the
+        greatest, and slightly smaller where a duration is rounded up to nanoseconds.
+
+        Parameters
+        ----------
+        waypoints : sequence of (3,)
+            Two or more [m].  Points that repeat their predecessor are passed over.
+        speed, acceleration : float
+            [m/s], [m/s^2], > 0.
+        repeat : bool, default False
+            Whether the path leads from the last waypoint to the first, and goes on for ever.
+        """
+        points = [_exact('waypoint', point) for point in waypoints]
+        if len(set(points)) < 2:
+            raise ValueError(f'waypoints = {shown(waypoints)}: must be two different points or '
+                             'more')
+        for name, value in (('speed', speed), ('acceleration', acceleration)):
+            _check_positive(name, value)
+        pieces: list[tuple[int, Given]] = []
+        ends = points[1:] + points[:1] if repeat else points[1:]
+        for begin, end in zip(points, ends, strict=False):
+            if begin != end:
+                pieces += _leg(_sum((1, end), (-1, begin)), speed, acceleration)
+        return cls(pieces, repeat=repeat, position=points[0], start_ns=start_ns)
+
+    @classmethod
+    def to_velocity(cls, target: Given, *, most_acceleration: float, position: Given = ZERO,
+                    velocity: Given = ZERO, start_ns: int = 0) -> PivotPath:
+        """
+        Return the path that changes the velocity into `target` uniformly, and keeps that.
+
+        Parameters
+        ----------
+        target : (3,) sequence
+            In the world [m/s]; it is reached exactly.
+        most_acceleration : float
+            > 0 [m/s^2]; the acceleration is slightly smaller: whole nanoseconds.
+        position, velocity : (3,) sequence
+            At the start [m], [m/s].
+        """
+        _check_positive('most_acceleration', most_acceleration)
+        change = _sum((1, _exact('target', target)), (-1, _exact('velocity', velocity)))
+        pieces: list[tuple[int, Given]] = []
+        if any(change):
+            duration_ns = _whole_ns(_length(change) / most_acceleration)
+            pieces.append((duration_ns, _sum((Fraction(NANOSECONDS, duration_ns), change))))
+        return cls(pieces, position=position, velocity=velocity, start_ns=start_ns)
+
+    def at(self, times_ns: NDArray[np.int64] | range) -> Kinematics:
+        """Return position, velocity and acceleration at times (n,) [ns] from the start on."""
+        since = np.asarray(times_ns, np.int64) - self.start_ns
+        if since.size and since.min() < 0:
+            raise ValueError(f't = {int(since.min()) + self.start_ns} ns: must not be before the '
+                             f'start of the path at {self.start_ns} ns')
+        cycles = since // self._cycle_ns if self._cycle_ns else np.zeros_like(since)
+        phase = since - cycles * self._cycle_ns
+        k = np.searchsorted(self._starts, phase, 'right') - 1
+        t = ((phase - np.array(self._starts)[k]) / 1e9)[:, np.newaxis]
+        v, a = self._velocities[k], self._rounded[k]
+        position = self._places[k] + t * (v + 0.5 * t * a)
+        if self._per_cycle.any():
+            position += cycles[:, np.newaxis] * self._per_cycle
+        return Kinematics(position, v + t * a, a)
+
+    def piece(self, t_ns: int) -> Piece:
+        """Return the piece that a time [ns] from the start on belongs to."""
+        cycle, phase = divmod(t_ns - self.start_ns, self._cycle_ns) if self._cycle_ns else (
+            0, t_ns - self.start_ns)
+        k = bisect_right(self._starts, phase) - 1
+        if k < 0:
+            raise ValueError(f't = {t_ns} ns: must not be before the start of the path at '
+                             f'{self.start_ns} ns')
+        offset = self.start_ns + cycle * self._cycle_ns
+        end = [*self._starts[1:], self._cycle_ns or None][k]
+        return Piece(offset + self._starts[k], None if end is None else offset + end,
+                     self._accelerations[k])
+
+    def pieces(self, begin_ns: int, end_ns: int) -> Iterator[Piece]:
+        """Return the pieces in [begin_ns, end_ns), those at the ends as a whole."""
+        at: int | None = begin_ns
+        while at is not None and at < end_ns:
+            piece = self.piece(at)
+            yield piece
+            at = piece.end_ns
+
+    def changes(self, begin_ns: int, end_ns: int) -> list[int]:
+        """Return the times in [begin_ns, end_ns) at which the acceleration changes [ns]."""
+        found = []
+        last = self.piece(begin_ns - 1).acceleration if begin_ns > self.start_ns else ZERO
+        for piece in self.pieces(begin_ns, end_ns):
+            if piece.acceleration != last:
+                found.append(piece.start_ns)
+            last = piece.acceleration
+        return found
+
+
+def _leg(way: Exact, speed: float, acceleration: float) -> list[tuple[int, Given]]:
+    """Return the pieces that lead a pivot at rest to rest again, displaced by `way`."""
+    length = _length(way)
+    ramp = min(speed / acceleration, math.sqrt(length / acceleration))
+    ramp_ns = _whole_ns(ramp)
+    cruise_ns = math.ceil(max(length / speed - ramp, 0.0) * 1e9)
+    # The distance is acceleration * ramp * (ramp + cruise).
+    scale = Fraction(NANOSECONDS ** 2, ramp_ns * (ramp_ns + cruise_ns))
+    pieces: list[tuple[int, Given]] = [(ramp_ns, _sum((scale, way)))]
+    if cruise_ns:
+        pieces.append((cruise_ns, ZERO))
+    return [*pieces, (ramp_ns, _sum((-scale, way)))]
+
+
+def _whole_ns(seconds: float) -> int:
+    """Return a duration in nanoseconds, rounded up to 1 or more; at most the range of int64."""
+    if not seconds < 9e9:
+        raise ValueError(f'the acceleration lasts {seconds!r} s: must be less than 9e9 s')
+    return max(1, math.ceil(seconds * 1e9))
+
+
+def _length(v: Exact) -> float:
+    return math.hypot(*(float(x) for x in v))
+
+
+def _sum(*terms: tuple[int | Fraction, Exact]) -> Exact:
+    """Return the sum of factor * vector."""
+    x, y, z = (sum((factor * v[k] for factor, v in terms), Fraction(0)) for k in range(3))
+    return x, y, z
+
+
+def _exact(name: str, given: Given) -> Exact:
+    try:
+        x, y, z = (Fraction(value) for value in given)
+        _length((x, y, z))
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f'{name} = {shown(given)}: must be three finite numbers') from error
+    return x, y, z
+
+
+def _doubles(vectors: Sequence[Exact]) -> NDArray[np.float64]:
+    return np.array([[float(x) for x in v] for v in vectors]).reshape(-1, 3)
+
+
+def _check_positive(name: str, value: float) -> None:
+    if not 0.0 < value < math.inf:
+        raise ValueError(f'{name} = {shown(value)}: must be a finite number > 0')
