@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.random_tops import random_case
-from helpers.ride import Ride
+from helpers.ride import Ride, changes, kinematics
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.pivot import PivotPath
+from spinning_top_sim.physics.pivot import NEVER_NS, PivotPath
 from spinning_top_sim.solvers.vertical import AcceleratedMotion, posture_of
 
 BOUND = 5e-15
@@ -123,7 +123,7 @@ def test_a_posture_is_handed_over_to_30_digits(start, acceleration):
         assert max(abs(a - b) for a, b in zip(one, other, strict=True)) < scale * Decimal('1e-30')
     for t, ((w, z), (y, minus_x), across, _) in (0, posture), (S, whole):
         states = motion.states(range(t, t + 1))
-        q = np.ravel(motion.vertical.to_world(states.rows_quaternion))
+        q = np.ravel(attitude.product(motion.vertical.rows, states.rows_quaternion))
         assert abs(q - np.array([-minus_x, y, z, w], float)).max() < 2e-15
         rates = np.array(across, float)
         assert abs(states.angular_velocity[0, :2] - rates).max() < 5e-15 * max(1.0, *abs(rates))
@@ -161,8 +161,8 @@ def test_random_tops_go_on_where_they_were():
             (w1, w2, _), (u1, u2, _) = one.angular_velocity[0], other.angular_velocity[0]
             largest = max(1.0, abs(one.angular_velocity).max())
             worst = max(worst, abs(np.subtract(
-                before.vertical.to_world(one.rows_quaternion),
-                after.vertical.to_world(other.rows_quaternion))).max(),
+                attitude.product(before.vertical.rows, one.rows_quaternion),
+                attitude.product(after.vertical.rows, other.rows_quaternion))).max(),
                 math.hypot(w1 - u1, w2 - u2) / largest)
         assert worst <= BOUND, case
 
@@ -200,14 +200,14 @@ TRIANGLE = [(0.1, 0.2, 0.3), (1.7, 0.3, -0.4), (0.6, 2.1, 0.9)]
 def test_pieces_of_constant_acceleration_are_parabolas_that_join():
     pieces = [(S, (1.0, 0.0, 0.5)), (2 * S, (0.0, -3.0, 0.0)), (S // 2, (-2.0, 6.0, 0.25))]
     path = PivotPath(pieces, position=(1.0, 2.0, 3.0), velocity=(0.0, 0.5, 0.0), start_ns=S)
-    found = path.at(np.array([1, 2, 4]) * S)
+    found = kinematics(path, np.array([1, 2, 4]) * S)
     assert found.position.tolist() == [[1.0, 2.0, 3.0], [1.5, 2.5, 3.25], [3.5, -2.5, 4.25]]
     assert found.velocity.tolist() == [[0.0, 0.5, 0.0], [1.0, 0.5, 0.5], [1.0, -5.5, 0.5]]
     # The acceleration at a boundary is that of the piece which begins.
     assert found.acceleration.tolist() == [[1.0, 0.0, 0.5], [0.0, -3.0, 0.0], [-2.0, 6.0, 0.25]]
-    assert path.changes(0 + S, 10 * S) == [S, 2 * S, 4 * S, 4 * S + S // 2]
-    assert path.piece(5 * S) == (4 * S + S // 2, None, REST)
-    coasting = path.at(np.array([5, 105]) * S)
+    assert changes(path, 0 + S, 10 * S) == [S, 2 * S, 4 * S, 4 * S + S // 2]
+    assert path.piece(5 * S)[:3] == (4 * S + S // 2, NEVER_NS, REST)
+    coasting = kinematics(path, np.array([5, 105]) * S)
     assert (np.diff(coasting.position, axis=0) == 100.0 * coasting.velocity[0]).all()
 
 
@@ -217,13 +217,13 @@ def test_a_repeated_path_closes_exactly(waypoints):
     piece, ends = path.piece(0), []
     while len(ends) < len(waypoints):
         piece = path.piece(piece.end_ns)
-        if not path.at(range(piece.start_ns, piece.start_ns + 1)).velocity.any():
+        if not kinematics(path, range(piece.start_ns, piece.start_ns + 1)).velocity.any():
             ends.append(piece.start_ns)
     cycle = ends[-1]
     for times in (0, cycle // 3, ends[0], cycle - 1):
-        once, late = (path.at(np.array([t])) for t in (times, times + 10 ** 15 // cycle * cycle))
+        once, late = (kinematics(path, [t]) for t in (times, times + 10 ** 15 // cycle * cycle))
         assert all(map(np.array_equal, once, late))
-    corners = path.at(np.array([0, *ends]))
+    corners = kinematics(path, np.array([0, *ends]))
     assert abs(corners.position - [*waypoints, waypoints[0]]).max() <= 4e-16
     assert not corners.velocity.any()
 
@@ -231,30 +231,39 @@ def test_a_repeated_path_closes_exactly(waypoints):
 def test_a_path_keeps_to_its_speed_and_acceleration():
     for distance in (0.01, 1.0, 1000.0):
         path = PivotPath.through([NOWHERE, (0.0, distance, 0.0)], speed=2.0, acceleration=3.0)
-        changes = path.changes(0, 10 ** 13)
-        found = path.at(range(0, changes[-1] + 1, max(1, changes[-1] // 1000)))
+        ends = changes(path, 0, 10 ** 13)
+        found = kinematics(path, range(0, ends[-1] + 1, max(1, ends[-1] // 1000)))
         assert abs(found.acceleration).max() <= 3.0 and found.velocity.max() <= 2.0 + 1e-15
         assert found.velocity.max() == pytest.approx(min(2.0, math.sqrt(3.0 * distance)), rel=3e-3)
-        end = path.at(range(changes[-1], changes[-1] + 1))
+        end = kinematics(path, range(ends[-1], ends[-1] + 1))
         assert end.position[0, 1] == pytest.approx(distance, rel=1e-15)
         assert not end.velocity.any()
         ideal = distance / 2.0 + 2.0 / 3.0 if distance >= 4 / 3 else 2 * math.sqrt(distance / 3.0)
-        assert 0 <= changes[-1] - ideal * S <= 4
+        assert 0 <= ends[-1] - ideal * S <= 4
 
 
 def test_a_commanded_velocity_is_reached_by_one_acceleration():
     path = PivotPath.to_velocity((0.3, -0.2, 0.1), most_acceleration=0.7, position=(1.0, 0.0, 0.0),
                                  velocity=(0.1, 0.1, 0.1), start_ns=5 * S)
-    begin, end = path.changes(5 * S, 100 * S)
+    begin, end = changes(path, 5 * S, 100 * S)
     assert begin == 5 * S and end - begin == math.ceil(math.hypot(0.2, 0.3) / 0.7 * S)
-    found = path.at(np.array([begin, end, 90 * S]))
+    found = kinematics(path, np.array([begin, end, 90 * S]))
     assert found.velocity[1:].tolist() == [[0.3, -0.2, 0.1]] * 2
     assert found.position[0].tolist() == [1.0, 0.0, 0.0]
     assert np.linalg.norm(found.acceleration[0]) == pytest.approx(0.7, rel=1e-8)
     assert not found.acceleration[1:].any()
     same = PivotPath.to_velocity((1.0, 0.0, 0.0), most_acceleration=1.0, velocity=(1.0, 0.0, 0.0))
-    assert same.changes(0, S) == [] and same.at(range(S, S + 1)).position.tolist() == [
-        [1.0, 0.0, 0.0]]
+    assert changes(same, 0, S) == [0]
+    assert kinematics(same, [S]).position.tolist() == [[1.0, 0.0, 0.0]]
+
+
+def test_a_commanded_velocity_ends_in_a_stop():
+    for stop_ns, places in ((10 * S, [0, S, 10 * S, 11 * S]), (S // 2, [0, S // 2, S])):
+        path = PivotPath.to_velocity((2.0, 0.0, 0.0), most_acceleration=2.0, stop_ns=stop_ns)
+        assert changes(path, 0, 20 * S) == places
+        assert not kinematics(path, [places[-1]]).velocity.any()
+        area = 2.0 * 10 if stop_ns == 10 * S else 0.5
+        assert kinematics(path, [15 * S]).position[0, 0] == area
 
 
 @settings(max_examples=60, deadline=None)
@@ -273,7 +282,7 @@ def test_position_and_velocity_are_those_of_exact_arithmetic(pieces, there_and_b
         velocity = [v + t * Fraction(x) for v, x in zip(velocity, a, strict=True)]
         now += length
         # One before the boundary, where the parabola ends that leads here.
-        found = path.at(np.array([now - 1, now]))
+        found = kinematics(path, np.array([now - 1, now]))
         # Sums of terms that may cancel: each is within the largest speed times the time.
         scale = max(1.0, 50 * (cycle / S), 50 * (cycle / S) ** 2)
         assert abs(found.position[1] - [float(x) for x in place]).max() <= 1e-15 * scale
@@ -294,7 +303,6 @@ def test_position_and_velocity_are_those_of_exact_arithmetic(pieces, there_and_b
      'speed = 0.0'),
     (lambda: PivotPath.to_velocity((1e300, 0.0, 0.0), most_acceleration=1.0), 'lasts 1e'),
     (lambda: PivotPath.to_velocity(NOWHERE, most_acceleration=-1.0), 'most_acceleration = -1.0'),
-    (lambda: PivotPath([]).at(range(-1, 0)), 't = -1 ns'),
     (lambda: PivotPath([], start_ns=7).piece(6), 't = 6 ns'),
 ])
 def test_a_bad_path_is_refused_in_words(make, words):

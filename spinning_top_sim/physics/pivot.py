@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.top import shown
 
 NANOSECONDS = 1_000_000_000
+NEVER_NS = 2 ** 63 - 1
 # x, y, z in the world; doubles are fractions, too.
 Exact = tuple[Fraction, Fraction, Fraction]
 Given = Sequence[float | Fraction]
@@ -27,7 +28,7 @@ ZERO: Exact = (Fraction(0), Fraction(0), Fraction(0))
 
 
 class Kinematics(NamedTuple):
-    """What a pivot does at n times: (n, 3) each, in the world [m], [m/s], [m/s^2]."""
+    """What a pivot does at n times: (3, n) each, in the world [m], [m/s], [m/s^2]."""
 
     position: NDArray[np.float64]
     velocity: NDArray[np.float64]
@@ -38,13 +39,22 @@ class Piece(NamedTuple):
     """
     A time of constant acceleration.
 
-    start_ns, end_ns : first time, and the first one after it; None if it never ends [ns]
+    start_ns, end_ns : first time, and the first one after it; NEVER_NS if it never ends [ns]
     acceleration : in the world [m/s^2]
+    position, velocity : (3, 1) at the start [m], [m/s]
     """
 
     start_ns: int
-    end_ns: int | None
+    end_ns: int
     acceleration: Exact
+    position: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+
+    def at(self, times_ns: NDArray[np.int64]) -> Kinematics:
+        """Return what the pivot does at times (n,) [ns]."""
+        t, a = (times_ns - self.start_ns) * 1e-9, _doubles([self.acceleration]).T
+        return Kinematics(self.position + t * (self.velocity + 0.5 * t * a),
+                          self.velocity + t * a, np.repeat(a, len(t), axis=1))
 
 
 class PivotPath:
@@ -94,7 +104,6 @@ class PivotPath:
         else:
             self._accelerations.append(ZERO)
         self._places, self._velocities = _doubles(places), _doubles(velocities)
-        self._rounded = _doubles(self._accelerations)
 
     @classmethod
     def through(cls, waypoints: Sequence[Given], *, speed: float, acceleration: float,
@@ -129,73 +138,58 @@ class PivotPath:
 
     @classmethod
     def to_velocity(cls, target: Given, *, most_acceleration: float, position: Given = ZERO,
-                    velocity: Given = ZERO, start_ns: int = 0) -> PivotPath:
+                    velocity: Given = ZERO, start_ns: int = 0,
+                    stop_ns: int = NEVER_NS) -> PivotPath:
         """
-        Return the path that changes the velocity into `target` uniformly, and keeps that.
+        Return the path that changes the velocity into `target` uniformly, keeps it, and stops.
 
         Parameters
         ----------
         target : (3,) sequence
-            In the world [m/s]; it is reached exactly.
+            In the world [m/s].
         most_acceleration : float
             > 0 [m/s^2]; the acceleration is slightly smaller: whole nanoseconds.
         position, velocity : (3,) sequence
             At the start [m], [m/s].
+        stop_ns : int
+            When the pivot begins to brake, even if it has not reached the target [ns].
         """
         _check_positive('most_acceleration', most_acceleration)
-        change = _sum((1, _exact('target', target)), (-1, _exact('velocity', velocity)))
-        pieces: list[tuple[int, Given]] = []
-        if any(change):
-            duration_ns = _whole_ns(_length(change) / most_acceleration)
-            pieces.append((duration_ns, _sum((Fraction(NANOSECONDS, duration_ns), change))))
+        goal, now = _exact('target', target), _exact('velocity', velocity)
+        pieces = list(_ramp(now, goal, most_acceleration))
+        left_ns = stop_ns - start_ns - sum(duration_ns for duration_ns, _ in pieces)
+        if stop_ns < NEVER_NS:
+            if left_ns > 0:
+                pieces.append((left_ns, ZERO))
+            elif left_ns < 0:
+                (duration_ns, acceleration), = pieces
+                pieces = [(duration_ns + left_ns, acceleration)]
+                goal = _sum((1, now), (Fraction(duration_ns + left_ns, NANOSECONDS),
+                                       acceleration))
+            pieces += _ramp(goal, ZERO, most_acceleration)
         return cls(pieces, position=position, velocity=velocity, start_ns=start_ns)
-
-    def at(self, times_ns: NDArray[np.int64] | range) -> Kinematics:
-        """Return position, velocity and acceleration at times (n,) [ns] from the start on."""
-        since = np.asarray(times_ns, np.int64) - self.start_ns
-        if since.size and since.min() < 0:
-            raise ValueError(f't = {int(since.min()) + self.start_ns} ns: must not be before the '
-                             f'start of the path at {self.start_ns} ns')
-        cycles = since // self._cycle_ns if self._cycle_ns else np.zeros_like(since)
-        phase = since - cycles * self._cycle_ns
-        k = np.searchsorted(self._starts, phase, 'right') - 1
-        t = ((phase - np.array(self._starts)[k]) / 1e9)[:, np.newaxis]
-        v, a = self._velocities[k], self._rounded[k]
-        position = self._places[k] + t * (v + 0.5 * t * a)
-        if self._per_cycle.any():
-            position += cycles[:, np.newaxis] * self._per_cycle
-        return Kinematics(position, v + t * a, a)
 
     def piece(self, t_ns: int) -> Piece:
         """Return the piece that a time [ns] from the start on belongs to."""
-        cycle, phase = divmod(t_ns - self.start_ns, self._cycle_ns) if self._cycle_ns else (
-            0, t_ns - self.start_ns)
+        since_ns = t_ns - self.start_ns
+        cycle, phase = divmod(since_ns, self._cycle_ns) if self._cycle_ns else (0, since_ns)
         k = bisect_right(self._starts, phase) - 1
         if k < 0:
             raise ValueError(f't = {t_ns} ns: must not be before the start of the path at '
                              f'{self.start_ns} ns')
         offset = self.start_ns + cycle * self._cycle_ns
-        end = [*self._starts[1:], self._cycle_ns or None][k]
-        return Piece(offset + self._starts[k], None if end is None else offset + end,
-                     self._accelerations[k])
+        end = [*self._starts[1:], self._cycle_ns or NEVER_NS - offset][k]
+        return Piece(offset + self._starts[k], offset + end, self._accelerations[k],
+                     (self._places[k] + cycle * self._per_cycle)[:, np.newaxis],
+                     self._velocities[k][:, np.newaxis])
 
-    def pieces(self, begin_ns: int, end_ns: int) -> Iterator[Piece]:
-        """Return the pieces in [begin_ns, end_ns), those at the ends as a whole."""
-        at: int | None = begin_ns
-        while at is not None and at < end_ns:
-            piece = self.piece(at)
-            yield piece
-            at = piece.end_ns
 
-    def changes(self, begin_ns: int, end_ns: int) -> list[int]:
-        """Return the times in [begin_ns, end_ns) at which the acceleration changes [ns]."""
-        found = []
-        last = self.piece(begin_ns - 1).acceleration if begin_ns > self.start_ns else ZERO
-        for piece in self.pieces(begin_ns, end_ns):
-            if piece.acceleration != last:
-                found.append(piece.start_ns)
-            last = piece.acceleration
-        return found
+def _ramp(begin: Exact, end: Exact, most_acceleration: float) -> Iterator[tuple[int, Exact]]:
+    """Yield the piece that leads from one velocity to another, none if they are equal."""
+    change = _sum((1, end), (-1, begin))
+    if any(change):
+        duration_ns = _whole_ns(_length(change) / most_acceleration)
+        yield duration_ns, _sum((Fraction(NANOSECONDS, duration_ns), change))
 
 
 def _leg(way: Exact, speed: float, acceleration: float) -> list[tuple[int, Given]]:

@@ -11,13 +11,15 @@ rounding, and the phase would drift by that much times the angle that follows.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from decimal import Decimal
 from typing import NamedTuple, cast
 
 import numpy as np
 
-from spinning_top_sim.physics.attitude import Quaternion, product
+from spinning_top_sim.physics.attitude import Quaternion
 from spinning_top_sim.physics.pivot import Exact
+from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.decimal_math import ONE, ZERO, atan2, pi, precision, sin_cos
 from spinning_top_sim.solvers.exact import ExactSolution
@@ -146,9 +148,9 @@ class Vertical:
         return LongState(2 * atan2(sine, cosine), theta_dot / unit, half_sum + half_difference,
                          half_sum - half_difference, +l3, lz)
 
-    def to_world(self, q: Quaternion) -> Quaternion:
-        """Return q(world <- body) from q(frame <- body)."""
-        return product(self.rows, q)
+    def top(self, top: Top) -> Top:
+        """Return the top in the effective gravity."""
+        return replace(top, gravity=float(self.gravity))
 
 
 class AcceleratedMotion(ExactSolution):
@@ -183,8 +185,7 @@ class AcceleratedMotion(ExactSolution):
         self._long = long_top, long_start
         with precision(DIGITS):
             self._take_constants(short(self._motion))
-        self.top = Top(lambda1=top.lambda1, lambda3=top.lambda3, mass=top.mass,
-                       com_distance=top.com_distance, gravity=float(long_top.gravity))
+        self.top = self.vertical.top(top)
         self.start = long_start.rounded()
         self._check_start()
 
@@ -204,6 +205,13 @@ class AcceleratedMotion(ExactSolution):
             return Posture(alpha, beta, across, float(start.l3))
 
 
+def about_vertical(top: Top, posture: Posture, acceleration: Exact) -> tuple[Vertical, State]:
+    """Return the vertical while the pivot accelerates so, and the state there in doubles."""
+    with precision(DIGITS):
+        vertical = Vertical(top.gravity, acceleration, posture)
+        return vertical, vertical.start(top, posture).rounded()
+
+
 def posture_of(top: Top, state: State) -> Posture:
     """Return the posture of a state about the vertical of the world."""
     with precision(DIGITS):
@@ -220,6 +228,13 @@ def posture_of(top: Top, state: State) -> Posture:
         return Posture((cosine * c_sum, cosine * s_sum),
                        (sine * c_difference, sine * s_difference),
                        _times((-swing, Decimal(state.theta_dot)), (c_psi, -s_psi)), state.l3)
+
+
+def posture_at(states: States) -> Posture:
+    """Return the posture of states (n = 1) in the world, as far as doubles know it."""
+    x, y, z, w, o1, o2 = (Decimal(float(part[0])) for part in (
+        *states.rows_quaternion, *states.transverse_velocity))
+    return Posture((w, z), (y, -x), (o1, o2), states.start.l3)
 
 
 def _reduced(angle: Decimal) -> Decimal:

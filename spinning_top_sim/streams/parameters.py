@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+from spinning_top_sim.physics.pivot import PivotPath
 from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.solvers.propagator import EQUATIONS, METHODS
 
@@ -56,6 +57,12 @@ class Parameter:
         """Whether the value is a double; an integer is converted."""
         return self.default is None or isinstance(self.default, float)
 
+    @property
+    def _of_strings(self) -> bool:
+        """Whether it is a list of strings; an empty default is a list of numbers."""
+        return isinstance(self.default, tuple) and bool(self.default) and isinstance(
+            self.default[0], str)
+
     def describe(self, range_too: bool = True) -> str:
         """Return text, unit, range and effect in one line."""
         return '; '.join(filter(None, (
@@ -76,8 +83,8 @@ class Parameter:
         kind = {bool: 'true or false', int: 'an integer', str: 'a string', float: 'a number',
                 type(None): 'a number'}.get(type(self.default))
         if isinstance(self.default, tuple):
-            kind = ('a list of strings' if isinstance(self.default[0], str)
-                    else f'a list of {len(self.default)} numbers')
+            kind = ('a list of strings' if self._of_strings
+                    else f'a list of {len(self.default) or ""} numbers'.replace('  ', ' '))
         return f'must be {kind} {self._bounds()}'.rstrip()
 
     def check(self, value: Value) -> Value:
@@ -87,7 +94,8 @@ class Parameter:
         with contextlib.suppress(TypeError, OverflowError):
             if self._is_allowed(value):
                 if isinstance(self.default, tuple):
-                    return tuple(type(self.default[0])(item) for item in value)
+                    return tuple(str(item) if self._of_strings else float(item)
+                                 for item in value)
                 return float(value) if self.is_double else value
         raise ValueError(f'{self.name} = {shown(value)}: {self.allowed}')
 
@@ -96,9 +104,10 @@ class Parameter:
         if isinstance(default, tuple):
             if isinstance(value, str | bytes | Mapping | Set):       # iterable, but not lists
                 return False
-            if isinstance(default[0], str):
+            if self._of_strings:
                 return all(isinstance(item, str) for item in value)
-            return len(value) == len(default) and all(map(self._is_in_range, value))
+            return len(value) == (len(default) or len(value)) and all(
+                map(self._is_in_range, value))
         if isinstance(default, bool | str):
             return isinstance(value, type(default)) and (not self.choices or value in self.choices)
         return (self.is_double or isinstance(value, int)) and self._is_in_range(value)
@@ -136,6 +145,8 @@ LOWEST_RATE_OF_INTERVALS = 1.0
 LARGEST = 1e30
 # Longest time [s], three years.
 LONGEST = 1e8
+# Speed of the pivot [m/s], and shortest time between two of its accelerations [s].
+FASTEST, SHORTEST_PIECE = 1e4, 1e-3
 
 _at_once = partial(Parameter, effect=Effect.NOW)
 _at_reset = partial(Parameter, effect=Effect.RESET)
@@ -185,6 +196,21 @@ TABLE: tuple[Parameter, ...] = (
     _at_reset('initial.theta_dot', 0.0, 'Nutation rate at the start', 'rad/s', -1e12, 1e12),
     _at_reset('initial.phi', 0.0, 'Precession angle at the start', 'rad', -1e12, 1e12),
     _at_reset('initial.psi', 0.0, 'Spin angle at the start', 'rad', -1e12, 1e12),
+    _at_reset('pivot.path', (), 'Path of the pivot: duration [s] and acceleration x, y, z '
+              '[m/s^2] in the world of each piece, one after the other; empty: none', '', -1e6,
+              1e8),
+    _at_reset('pivot.waypoints', (), 'Path of the pivot: x, y, z in the world of each point at '
+              'which it stops; empty: none', 'm', -1e6, 1e6),
+    _at_reset('pivot.speed', 1.0, 'Highest speed between the waypoints', 'm/s', above=0.0,
+              maximum=FASTEST),
+    _at_reset('pivot.acceleration', 1.0, 'Acceleration between the waypoints', 'm/s^2', above=0.0,
+              maximum=1e6),
+    _at_reset('pivot.repeat', False, 'Repeat the path for ever; the waypoints: back to the first '
+              'one'),
+    _at_reset('pivot.max_acceleration', 2.0, 'Acceleration with which ~/cmd_vel is followed',
+              'm/s^2', 1e-6, 1e6),
+    _at_reset('pivot.cmd_timeout', 0.5, 'The pivot brakes this long after the last ~/cmd_vel, '
+              '0 = never', 's', 0.0, LONGEST, smallest=1e-3),
     # No range: the limit depends on the motion.
     _at_once('spin.l3', 1.6, 'Angular momentum along the axis; a change is a command',
               'kg m^2/s'),
@@ -296,6 +322,7 @@ def checked(values: Mapping[str, Value]) -> dict[str, Value]:
                          'imu.sampling = mean')
     top_of(result)
     start_state(result)
+    pivot_path(result)
     return result
 
 
@@ -303,6 +330,33 @@ def top_of(values: Mapping[str, Value]) -> Top:
     """Return the top that these parameters describe.  Raises ValueError like `Top`."""
     return Top(**{name: values[f'top.{name}']
                   for name in ('lambda1', 'lambda3', 'mass', 'com_distance', 'gravity')})
+
+
+def pivot_path(values: Mapping[str, Value]) -> PivotPath | None:
+    """Return the path of the pivot; None if it rests.  Raises ValueError."""
+    for name, count in (('pivot.path', 4), ('pivot.waypoints', 3)):
+        if len(values[name]) % count:
+            raise ValueError(f'{name} = {list(values[name])!r}: must be a multiple of {count} '
+                             'numbers')
+    path, points = (list(zip(*count * [iter(values[name])], strict=True)) for name, count in (
+        ('pivot.path', 4), ('pivot.waypoints', 3)))
+    if not path and not points:
+        return None
+    if path and points:
+        raise ValueError(f'pivot.waypoints = {points!r}: must be empty with pivot.path')
+    for duration, *_ in path:
+        if not duration >= SHORTEST_PIECE:
+            raise ValueError(f'pivot.path: the duration {duration!r} s: must be >= '
+                             f'{SHORTEST_PIECE:g} s')
+    try:
+        if path:
+            return PivotPath([(round(duration * 1e9), a) for duration, *a in path],
+                             repeat=values['pivot.repeat'])
+        return PivotPath.through(
+            points, speed=values['pivot.speed'], acceleration=values['pivot.acceleration'],
+            repeat=values['pivot.repeat'])
+    except ValueError as error:
+        raise ValueError(f'pivot.{"path" if path else "waypoints"}: {error}') from error
 
 
 def start_state(values: Mapping[str, Value]) -> State:

@@ -32,19 +32,18 @@ FIELDS_OF = {'command': ('l3', 'lz'), 'state': tuple(field.name for field in fie
 # Names in the message definition of the arrays of numbers in a template, in their order, by topic
 # or by type.
 FIELDS = {
-    'geometry_msgs/msg/PoseStamped': ('pose.orientation',),
+    'geometry_msgs/msg/PoseStamped': ('pose.position', 'pose.orientation'),
     'sensor_msgs/msg/JointState': ('position', 'velocity'),
     'sensor_msgs/msg/Imu': ('orientation', 'angular_velocity', 'linear_acceleration'),
     'sensor_msgs/msg/MagneticField': ('magnetic_field', 'magnetic_field_covariance'),
-    'nav_msgs/msg/Odometry': ('pose.pose.orientation', 'twist.twist.angular'),
-    'ground_truth/imu_odom': ('pose.pose.position', 'pose.pose.orientation',
+    'nav_msgs/msg/Odometry': ('pose.pose.position', 'pose.pose.orientation',
                               'twist.twist.linear', 'twist.twist.angular'),
     'geometry_msgs/msg/QuaternionStamped': ('quaternion',),
     'geometry_msgs/msg/Vector3Stamped': ('vector',),
     'std_msgs/msg/Float64MultiArray': ('data',),
     'visualization_msgs/msg/MarkerArray': (
         'markers[0].pose.position', 'markers[0].pose.orientation',
-        'markers[1].pose.orientation', 'markers[2].points'),
+        'markers[1].pose.position', 'markers[1].pose.orientation', 'markers[2].points'),
 }
 
 
