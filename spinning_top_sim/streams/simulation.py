@@ -146,8 +146,12 @@ class Simulation:
         return float(self.segment.orientation_error(self.state(), self._now())[0])
 
     def describe(self) -> Description | None:
-        """Return the present motion in numbers; None where the closed form cannot hold it."""
-        exact = self.segment.exact
+        """
+        Return the present motion in numbers.
+
+        None where the closed form cannot hold it, or the pivot moves.
+        """
+        exact = None if self.segment.ride else self.segment.exact
         return None if exact is None else exact.describe()
 
     def play(self, streams: Sequence[Stream], until_ns: int) -> Iterator[Block]:
@@ -272,13 +276,13 @@ class Simulation:
         return _segment(self.top, last.posture(last.end_ns), last.end_ns, self.values, self.pivot)
 
 
-def checked_velocity(velocity: Sequence[float]) -> tuple[float, ...]:
+def checked_velocity(velocity: Sequence[float]) -> tuple[float, float, float]:
     """Return a velocity of the pivot [m/s].  Raises ValueError."""
-    target = tuple(map(float, velocity))
+    x, y, z = target = tuple(map(float, velocity))
     if not all(abs(part) <= parameters.FASTEST for part in target):
-        raise ValueError(f'velocity = {list(target)!r} m/s: must be three numbers within '
+        raise ValueError(f'linear = {list(target)!r} m/s: each must be finite and within '
                          f'{parameters.FASTEST:g} m/s')
-    return target
+    return x, y, z
 
 
 def _segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[str, Any],

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A pivot that moves: paths as parameters, commanded velocities, and what is sent about it."""
+
+import math
+
+import numpy as np
+import pytest
+from helpers.simulations import play, stream
+
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.live import LiveSimulation
+from spinning_top_sim.streams.simulation import Simulation
+
+S = 10 ** 9
+SHUTTLE = {'pivot.waypoints': (0.0, 0.0, 0.0, 2.0, 1.0, 0.5), 'pivot.speed': 1.5,
+           'pivot.acceleration': 2.0, 'pivot.repeat': True}
+METHODS = ('exact', 'rk45')
+DRIVES = ((S // 2, (1.0, 0.0, 0.0)), (3 * S // 4, (1.0, 0.0, 0.0)), (S, (0.0, -0.5, 0.2)),
+          (4 * S, (0.3, 0.0, 0.0)))
+
+
+def simulation_of(kind=Simulation, **values):
+    return kind(parameters.checked({**values}))
+
+
+def everything(values):
+    return {f'{row[0]}.enabled': True for row in parameters.STREAM_DEFAULTS} | values
+
+
+def sent_offline(values, drives, until_ns):
+    simulation, sent = simulation_of(**values), []
+    for t_ns, velocity in (*drives, (until_ns, None)):
+        for block in simulation.play(simulation.streams, t_ns):
+            sent += [(t, one.topic, row.tobytes()) for one, times, rows in block.parts
+                     for t, row in zip(times.tolist(), rows, strict=True)]
+        if velocity:
+            simulation.drive(velocity)
+    return sorted(sent)
+
+
+@pytest.mark.parametrize('values', [
+    {'solver.method': method, **more} for method in METHODS
+    for more in (SHUTTLE, {'pivot.path': (0.7, 1.0, 0.0, 9.0, 0.7, -1.0, 0.0, -9.0)})])
+def test_live_and_offline_agree_to_the_last_bit(values):
+    values = everything({'imu.lever_arm': (0.1, 0.2, 0.3), 'markers.trace_points': 20, **values})
+    live, sent = simulation_of(LiveSimulation, **values), []
+    for output in live.outputs:
+        output.publish = lambda data, topic=output.stream.topic: sent.append(
+            (live.now_ns, topic, data))
+    drives, now = list(DRIVES), 0
+    while now < 6 * S:
+        now = min(now + 137_000_001, drives[0][0] if drives else 6 * S)
+        live.advance(now)
+        live.prepare(now + S // 4)
+        if drives and drives[0][0] == now:
+            live.drive(drives.pop(0)[1])
+            live.prepare(now + 2 * S)
+    assert sorted(sent) == sent_offline(values, DRIVES, 6 * S)
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_increments_along_a_shuttle_are_those_of_its_path(method):
+    simulation = simulation_of(**{
+        'solver.method': method, 'increments.enabled': True, 'imu.lever_arm': (0.1, -0.2, 0.3),
+        'imu.rate': 200.0, 'ground_truth_imu_odom.rate': 200.0, **SHUTTLE})
+    taken = {'imu/dq': [], 'imu/dv': [], 'ground_truth/imu_odom': []}
+    streams = [one for one in simulation.streams if one.topic in taken]
+    for block in simulation.play(streams, 60 * S):
+        for one, _, rows in block.parts:
+            taken[one.topic].append(np.hstack(one.template.decode(rows.tobytes())))
+    turns, pushes, truth = (np.vstack(taken[topic]) for topic in taken)
+    _, q, v, _ = np.split(truth[0], (3, 7, 10))
+    q = tuple(q[:, np.newaxis])
+    v, dt = np.ravel(attitude.in_world(q, v)), 1 / 200
+    gravity = np.array((0.0, 0.0, -9.80665))
+    for turn, push in zip(turns[1:], pushes[1:], strict=True):
+        v = v + np.ravel(attitude.in_world(q, push)) + gravity * dt
+        q = attitude.product(q, turn)
+    end = truth[-1]
+    assert attitude.angle_between(q, tuple(end[3:7, np.newaxis])).max() < 1e-10
+    true = np.ravel(attitude.in_world(tuple(end[3:7, np.newaxis]), end[7:10]))
+    assert abs(v - true).max() < 1e-9
+
+
+def test_the_specific_force_is_that_of_the_place_in_the_world():
+    values = {'solver.method': 'exact', 'imu.lever_arm': (0.1, -0.2, 0.3),
+              'ground_truth_imu.rate': 1000.0, 'ground_truth_imu_odom.enabled': True,
+              'ground_truth_imu_odom.rate': 1000.0, **SHUTTLE}
+    simulation = simulation_of(**values)
+    force, place = (np.vstack([stream(simulation, topic).template.decode(data)[number]
+                               for _, _, data in taken]) for topic, number, taken in (
+        ('ground_truth/imu', 2, play(simulation_of(**values), S // 2, 'ground_truth/imu')),
+        ('ground_truth/imu_odom', 0,
+         play(simulation_of(**values), S // 2, 'ground_truth/imu_odom'))))
+    q = simulation.segment.states(range(0, S // 2 + 1, 10 ** 6)).rows_quaternion
+    acceleration = (place[2:] - 2 * place[1:-1] + place[:-2]) * 1e6
+    expected = attitude.in_body(tuple(part[1:-1] for part in q),
+                                tuple((acceleration + (0.0, 0.0, 9.80665)).T))
+    assert np.stack(expected, axis=-1) == pytest.approx(force[1:-1], abs=2e-2)
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_a_driven_pivot_goes_to_the_velocity_and_stops(method):
+    simulation = simulation_of(**{'solver.method': method, 'pivot.cmd_timeout': 1.0})
+    list(simulation.play((), S))
+    assert simulation.drive((0.0, 0.0, 0.0)) is None and simulation.segment.ride is None
+    assert simulation.drive((0.0, 0.8, 0.0)) == 2 * S
+    list(simulation.play((), 3 * S // 2))
+    segment = simulation.segment
+    assert simulation.drive((0.0, 0.8, 0.0)) == 5 * S // 2      # to repeat it only lasts longer
+    assert simulation.segment is segment and len(simulation.history) == 1
+    list(simulation.play((), 10 * S))
+    found = simulation.segment.pivot(np.array([simulation.now_ns]))
+    assert not found.velocity.any() and not found.acceleration.any()
+    # Half a ramp of 0.4 s at each end, and 1.1 s of cruise.
+    assert np.ravel(found.position) == pytest.approx((0.0, 0.8 * 1.5, 0.0), abs=1e-12)
+    assert simulation.history == [(S, 0.0, 0.8, 0.0, 5 * S // 2)]
+
+
+@pytest.mark.parametrize('velocity', [(math.nan, 0, 0), (0, math.inf, 0), (0, 0, 1e5)])
+def test_a_bad_velocity_is_refused_with_its_value(velocity):
+    simulation = simulation_of()
+    with pytest.raises(ValueError, match=r'linear = \[.*(nan|inf|100000).*within 10000 m/s'):
+        simulation.drive(velocity)
+    assert not simulation.history
+
+
+@pytest.mark.parametrize(('values', 'words'), [
+    ({'pivot.path': (1.0, 2.0, 3.0)}, 'pivot.path = .*multiple of 4'),
+    ({'pivot.path': (1e-6, 0.0, 0.0, 0.0)}, 'duration 1e-06 s: must be >= 0.001'),
+    ({'pivot.path': (1.0, 1.0, 0.0, 0.0), 'pivot.repeat': True}, 'changes the velocity'),
+    ({'pivot.waypoints': (1.0, 1.0, 0.0)}, 'two different points'),
+    ({'pivot.waypoints': (1.0, 1.0, 0.0, 2.0)}, 'multiple of 3'),
+    ({'pivot.waypoints': (1.0, math.nan, 0.0)}, 'pivot.waypoints = .*nan.*a list of numbers'),
+    ({'pivot.path': (1.0, 0.0, 0.0, 1.0), **SHUTTLE}, 'must be empty with pivot.path')])
+def test_a_bad_path_is_refused_in_words(values, words):
+    with pytest.raises(ValueError, match=words):
+        parameters.checked(values)
+
+
+def test_commands_of_the_spin_count_about_the_vertical_of_the_world():
+    simulation = simulation_of(**{'solver.method': 'exact', **SHUTTLE})
+    list(simulation.play((), S // 2))
+    before = simulation.state()
+    simulation.command(1.2, 0.9)
+    after, top = simulation.state(), simulation.top
+    assert abs(before.quaternion - after.quaternion).max() < 4e-15
+    w1, w2, w3 = after.angular_velocity[0]
+    z1, z2, z3 = (float(part[0]) for part in after.rows_vertical)
+    lz = top.lambda1 * (w1 * z1 + w2 * z2) + top.lambda3 * w3 * z3
+    assert lz == pytest.approx(0.9, rel=1e-14)
+    assert top.lambda3 * w3 == pytest.approx(1.2, rel=1e-15)
+    assert (simulation.l3, simulation.lz) == (1.2, 0.9)
