@@ -37,6 +37,8 @@ AFTER_TOPICS = """| `{throttled}` | nav_msgs/msg/Odometry | at most {rate:g} | y
   sample every 1/`imu.rate`: at other rates a reading has the white noise of the newest sample.
   [sensor.md](sensor.md) has the errors of all sensors.
 - `imu/mag`, `ground_truth/mag`: the magnetic field [T] in `imu.frame_id`.
+- `gnss/fix`, `gnss/velocity`: the pivot as a satellite receiver measures it, and exact in `ground_truth/gnss`.
+  Their stamps are the times of the measurements, `gnss.latency` before they are sent.
 - `ground_truth/imu_bias`: the bias that the readings contain. It depends on time and `seed` alone, and
   changes every millisecond.
 - `ground_truth/imu_timing`: one labelled dimension, {timing}. It has

@@ -62,6 +62,30 @@ def magnetic_field(frame_id: str) -> Template:
 
 
 @lru_cache(64)
+def nav_sat_fix(frame_id: str, covariance: tuple[float, ...] | None) -> Template:
+    """
+    sensor_msgs/NavSatFix of GPS; fields: latitude and longitude [deg], altitude [m].
+
+    covariance : east, north, up [m^2]; None: there is no fix
+    """
+    status, kind = (-1, 0) if covariance is None else (0, 2)    # 2: the diagonal is known
+    writer = CdrWriter().header(frame_id).append('b', status).append('H', 1).field(3)
+    return Template(writer.append('d', *(covariance or 9 * (0.0,))).append('B', kind))
+
+
+@lru_cache(64)
+def twist_with_covariance(frame_id: str, variances: tuple[float, ...]) -> Template:
+    """
+    geometry_msgs/TwistWithCovarianceStamped; fields: linear velocity.
+
+    variances : of the linear velocity; those of the angular one are -1, as ublox_gps has it
+    """
+    covariance = list(diagonal(*variances, *3 * (-1.0,)))
+    writer = CdrWriter().header(frame_id).field(3).append('d', *ORIGIN, *covariance)
+    return Template(writer)
+
+
+@lru_cache(64)
 def odometry(frame_id: str, child_frame_id: str) -> Template:
     """
     nav_msgs/Odometry with exact values.

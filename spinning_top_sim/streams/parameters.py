@@ -12,8 +12,11 @@ import math
 from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from functools import partial
+from importlib.util import find_spec
+from itertools import pairwise
 from typing import Any
 
+from spinning_top_sim.installation import remedy
 from spinning_top_sim.physics.pivot import PivotPath
 from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.solvers.propagator import EQUATIONS, METHODS
@@ -129,6 +132,8 @@ STREAM_DEFAULTS: tuple[tuple[str, float | None, bool, str], ...] = (
     ('ground_truth_imu', 200.0, True, 'ground_truth/imu (sensor_msgs/Imu, noise-free)'),
     ('imu_timing', None, False, 'ground_truth/imu_timing (std_msgs/Float64MultiArray)'),
     ('mag', 100.0, False, 'imu/mag and ground_truth/mag (sensor_msgs/MagneticField)'),
+    ('gnss', 10.0, False, 'gnss/fix (sensor_msgs/NavSatFix), gnss/velocity '
+     '(geometry_msgs/TwistWithCovarianceStamped), and ground_truth/gnss of both'),
     ('increments', None, False, 'imu/dq (geometry_msgs/QuaternionStamped), imu/dv '
      '(geometry_msgs/Vector3Stamped), both at imu.rate, and ground_truth/imu_odom'),
     ('ground_truth_odom', 100.0, True, 'ground_truth/odom (nav_msgs/Odometry)'),
@@ -272,6 +277,16 @@ TABLE: tuple[Parameter, ...] = (
           ('random_walk', 'Random walk of the bias of the magnetometer, 0 = none', 'T/s/sqrt(Hz)'),
           ('range', 'Largest reading of the magnetometer, 0 = unlimited', 'T'),
           ('resolution', 'Smallest step of the readings of the magnetometer, 0 = none', 'T'))),
+    _at_reset('gnss.origin', (48.14, 11.58, 520.0), 'Latitude and longitude [deg] and height above '
+              'the ellipsoid of WGS-84 [m] of the origin of the world', '', -1e6, 1e6),
+    _at_reset('gnss.position_noise', (0.0, 0.0), 'Standard deviation of the white noise of a fix, '
+              'for each horizontal axis and for the vertical one', 'm', 0.0, 1e6, smallest=1e-12),
+    _at_reset('gnss.velocity_noise', (0.0, 0.0), 'The same of gnss/velocity', 'm/s', 0.0, 1e6,
+              smallest=1e-12),
+    _at_reset('gnss.latency', 0.0, 'How long after its stamp a measurement is sent', 's', 0.0,
+              1.0),
+    _at_reset('gnss.outages', (), 'Begin and end of each time without reception, ascending', 's',
+              0.0, LONGEST),
     _at_reset('markers.trace_length', 4.0, 'How far back the trace of the tip goes, 0 = no trace',
               's', 0.0, 3600.0),
     _at_reset('markers.trace_points', 200, 'Points of the trace, evenly spaced in time', '', 1,
@@ -323,6 +338,7 @@ def checked(values: Mapping[str, Value]) -> dict[str, Value]:
     top_of(result)
     start_state(result)
     pivot_path(result)
+    _check_gnss(result)
     return result
 
 
@@ -330,6 +346,20 @@ def top_of(values: Mapping[str, Value]) -> Top:
     """Return the top that these parameters describe.  Raises ValueError like `Top`."""
     return Top(**{name: values[f'top.{name}']
                   for name in ('lambda1', 'lambda3', 'mass', 'com_distance', 'gravity')})
+
+
+def _check_gnss(values: Mapping[str, Value]) -> None:
+    latitude, longitude, _ = values['gnss.origin']
+    if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):
+        raise ValueError(f'gnss.origin = {list(values["gnss.origin"])!r}: must be a latitude from '
+                         '-90 to 90, a longitude from -180 to 180, and a height')
+    edges = values['gnss.outages']
+    if len(edges) % 2 or any(not a < b for a, b in pairwise(edges)):
+        raise ValueError(f'gnss.outages = {list(edges)!r}: must be begin and end of each, '
+                         'ascending')
+    if values['gnss.enabled'] and find_spec('pymap3d') is None:
+        raise ValueError('gnss.enabled = True: needs pymap3d, which is not installed: '
+                         f'{remedy("gnss")}')
 
 
 def pivot_path(values: Mapping[str, Value]) -> PivotPath | None:

@@ -214,6 +214,13 @@ class Path:
             np.stack(segment.exact_point(times, along), axis=-1) for segment, times in zip(
                 self._segments, np.split(times_ns, ends), strict=True) if len(times)])
 
+    def pivot(self, times_ns: NDArray[np.int64]) -> Kinematics:
+        """Return what the pivot does at ascending times (n,) [ns], those before now too."""
+        ends = np.searchsorted(times_ns, [one.start_ns for one in self._segments[1:]], 'right')
+        return Kinematics(*(np.concatenate(parts, axis=1) for parts in zip(*(
+            segment.pivot(times) for segment, times in zip(
+                self._segments, np.split(times_ns, ends), strict=True)), strict=True)))
+
     def increments(self, begin_ns: int, end_ns: int, point: Point, count: int = 1,
                    step_ns: int = 1) -> Increments:
         """

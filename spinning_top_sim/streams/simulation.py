@@ -90,10 +90,11 @@ class Simulation:
         self.values, self.top, self.streams = dict(values), top, streams
         self.history: list[tuple[Any, ...]] = []
         self.now_ns = -1
-        # The trace of the markers, and intervals of the IMU, reach back across commands.
+        # The trace of the markers, intervals of the IMU and late fixes reach back across commands.
         trace_ns = round(values['markers.trace_length'] * NANOSECONDS)
         self.pivot, self._lz = pivot, start.lz
-        self.path = Path(segment, self._follow, keep_ns=max(trace_ns, LONGEST_NS),
+        late_ns = round(values['gnss.latency'] * NANOSECONDS)
+        self.path = Path(segment, self._follow, keep_ns=max(trace_ns, LONGEST_NS + late_ns),
                          keep_steps_ns=self.imu.intervals.keep_ns)
         self.version += 1
 

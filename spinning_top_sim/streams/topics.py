@@ -16,6 +16,7 @@ from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.physics.top import Shape
 from spinning_top_sim.streams import messages, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
+from spinning_top_sim.streams.gnss import Fix, Velocity
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.magnetometer import Magnetometer
 from spinning_top_sim.streams.stream import Samples, Stream
@@ -238,6 +239,10 @@ def all_streams(values: Mapping[str, Any]) -> list[Stream]:
                rate_parameter='imu.rate'),
         Mag(values, imu, 'imu/mag'),
         Mag(values, imu, 'ground_truth/mag', is_exact=True),
+        Fix(values, 'gnss/fix'),
+        Fix(values, 'ground_truth/gnss/fix', is_exact=True),
+        Velocity(values, 'gnss/velocity'),
+        Velocity(values, 'ground_truth/gnss/velocity', is_exact=True),
         increment('imu/dq', 'geometry_msgs/msg/QuaternionStamped', messages.stamped(frame, 4),
                   partial(_increment, imu, 0)),
         increment('imu/dv', 'geometry_msgs/msg/Vector3Stamped', messages.stamped(frame, 3),

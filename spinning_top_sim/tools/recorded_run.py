@@ -37,6 +37,8 @@ FIELDS = {
     'sensor_msgs/msg/JointState': ('position', 'velocity'),
     'sensor_msgs/msg/Imu': ('orientation', 'angular_velocity', 'linear_acceleration'),
     'sensor_msgs/msg/MagneticField': ('magnetic_field', 'magnetic_field_covariance'),
+    'sensor_msgs/msg/NavSatFix': ('position',),
+    'geometry_msgs/msg/TwistWithCovarianceStamped': ('twist.twist.linear',),
     'nav_msgs/msg/Odometry': ('pose.pose.position', 'pose.pose.orientation',
                               'twist.twist.linear', 'twist.twist.angular'),
     'geometry_msgs/msg/QuaternionStamped': ('quaternion',),
