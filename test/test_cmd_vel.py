@@ -96,7 +96,7 @@ def test_the_specific_force_is_that_of_the_place_in_the_world():
     q = simulation.segment.states(range(0, S // 2 + 1, 10 ** 6)).rows_quaternion
     acceleration = (place[2:] - 2 * place[1:-1] + place[:-2]) * 1e6
     expected = attitude.in_body(tuple(part[1:-1] for part in q),
-                                tuple((acceleration + (0.0, 0.0, 9.80665)).T))
+                                tuple((acceleration + np.array((0.0, 0.0, 9.80665))).T))
     assert np.stack(expected, axis=-1) == pytest.approx(force[1:-1], abs=2e-2)
 
 
@@ -152,3 +152,31 @@ def test_commands_of_the_spin_count_about_the_vertical_of_the_world():
     assert lz == pytest.approx(0.9, rel=1e-14)
     assert top.lambda3 * w3 == pytest.approx(1.2, rel=1e-15)
     assert (simulation.l3, simulation.lz) == (1.2, 0.9)
+
+
+@pytest.mark.parametrize('frame', ['world', 'map/θ', ''])
+def test_a_transform_is_the_pose(frame):
+    typesys = pytest.importorskip('rosbags.typesys')
+    store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+    values = {'solver.method': 'exact', 'tf.enabled': True, 'world_frame': frame, **SHUTTLE}
+    sent = {topic: play(simulation_of(**values), S, topic)[-1][2] for topic in ('/tf', 'pose')}
+    (found,) = store.deserialize_cdr(sent['/tf'], 'tf2_msgs/msg/TFMessage').transforms
+    pose = store.deserialize_cdr(sent['pose'], 'geometry_msgs/msg/PoseStamped')
+    assert found.header == pose.header and found.header.frame_id == frame
+    assert found.child_frame_id == 'base_link'
+    for one, other in ((found.transform.translation, pose.pose.position),
+                       (found.transform.rotation, pose.pose.orientation)):
+        assert [getattr(one, axis) for axis in 'xyz'] == [getattr(other, axis) for axis in 'xyz']
+    assert found.transform.translation.x > 0.1
+
+
+def test_odometry_has_the_twist_in_the_frame_of_the_body():
+    values = {'solver.method': 'exact', **SHUTTLE}
+    simulation = simulation_of(**values)
+    (position, q, velocity, rates) = stream(simulation, 'ground_truth/odom').template.decode(
+        play(simulation, S, 'ground_truth/odom')[-1][2])
+    pivot, state = simulation.segment.pivot(np.array([S])), simulation.state()
+    assert (position[0] == pivot.position[:, 0]).all() and (q == state.quaternion).all()
+    assert (rates == state.angular_velocity).all()
+    assert np.ravel(attitude.in_world(tuple(q.T), tuple(velocity.T))) == pytest.approx(
+        pivot.velocity[:, 0], abs=1e-15)
