@@ -12,6 +12,7 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.streams.simulation import Simulation
+from spinning_top_sim.tools import inspect
 
 S = 10 ** 9
 SHUTTLE = {'pivot.waypoints': (0.0, 0.0, 0.0, 2.0, 1.0, 0.5), 'pivot.speed': 1.5,
@@ -60,15 +61,15 @@ def test_live_and_offline_agree_to_the_last_bit(values):
     assert sorted(sent) == sent_offline(values, DRIVES, 6 * S)
 
 
-@pytest.mark.parametrize('arm', [(0.0, 0.0, 0.0), (0.1, -0.2, 0.3)])
-@pytest.mark.parametrize('method', METHODS)
-def test_increments_along_a_shuttle_add_up_to_its_motion(method, arm):
+@pytest.mark.parametrize(('method', 'arm', 'seconds'), [
+    ('exact', (0.0, 0.0, 0.0), 60), ('rk45', (0.1, -0.2, 0.3), 12)])
+def test_increments_along_a_shuttle_add_up_to_its_motion(method, arm, seconds):
     simulation = simulation_of(**{
         **scene_parameters('shuttle'), 'solver.method': method, 'increments.enabled': True,
         'imu.lever_arm': arm, 'imu.rate': 200.0, 'ground_truth_imu_odom.rate': 200.0})
     taken = {'imu/dq': [], 'imu/dv': [], 'ground_truth/imu_odom': []}
     streams = [one for one in simulation.streams if one.topic in taken]
-    for block in simulation.play(streams, 60 * S):
+    for block in simulation.play(streams, seconds * S):
         for one, _, rows in block.parts:
             taken[one.topic].append(np.hstack(one.template.decode(rows.tobytes())))
     turns, pushes, truth = (np.vstack(taken[topic]) for topic in taken)
@@ -203,3 +204,31 @@ def test_a_scene_with_a_moving_pivot_goes_on(scene):
                 'braking': (9.80665, math.hypot(9.80665, 8.0))}[scene]
     sizes = np.linalg.norm(readings, axis=1)
     assert (sizes.min(), sizes.max()) == pytest.approx(expected, rel=1e-15, abs=1e-30)
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_a_driven_node_is_recorded_and_verified(tmp_path, method, capsys):
+    msg = pytest.importorskip('geometry_msgs.msg')
+    own_node = pytest.importorskip('helpers.own_node')
+
+    def twist(linear, angular=0.0):
+        return msg.Twist(linear=msg.Vector3(x=linear), angular=msg.Vector3(z=angular))
+
+    with own_node.OwnNode(tmp_path, solver__method=method, record__enabled=True,
+                          pivot__cmd_timeout=0.2) as top:
+        node, told = top.node, []
+        node.get_logger().warning = told.append
+        for linear in (0.1, 0.7, 0.7, -0.3):
+            for _ in range(50):             # a storm: the last one of a tick counts
+                node._on_velocity(twist(linear))
+            top.wait_until(top.simulation.now_ns + S // 10)
+        assert top.simulation.segment.ride is not None
+        refused = (twist(math.nan), twist(math.inf), twist(1e9), twist(0.0, 2.0))
+        for message in refused:
+            node._on_velocity(message)
+        assert top.loop.rejected_commands == len(refused)
+        top.wait_until(top.simulation.now_ns + S)
+        rests = top.simulation.segment.pivot(np.array([top.simulation.now_ns]))
+        assert not rests.velocity.any() and 4 <= top.loop.commands <= 10
+    assert inspect.main([str(tmp_path / 'run.mcap'), '--verify']) == 0
+    assert 'identical' in capsys.readouterr().out
