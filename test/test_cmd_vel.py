@@ -5,12 +5,14 @@ import math
 
 import numpy as np
 import pytest
+from helpers.reference import RIDES, scene_parameters
 from helpers.simulations import play, stream
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.streams.simulation import Simulation
+from spinning_top_sim.tools import inspect
 
 S = 10 ** 9
 SHUTTLE = {'pivot.waypoints': (0.0, 0.0, 0.0, 2.0, 1.0, 0.5), 'pivot.speed': 1.5,
@@ -59,28 +61,34 @@ def test_live_and_offline_agree_to_the_last_bit(values):
     assert sorted(sent) == sent_offline(values, DRIVES, 6 * S)
 
 
-@pytest.mark.parametrize('method', METHODS)
-def test_increments_along_a_shuttle_are_those_of_its_path(method):
+@pytest.mark.parametrize(('method', 'arm', 'seconds'), [
+    ('exact', (0.0, 0.0, 0.0), 60), ('rk45', (0.1, -0.2, 0.3), 12)])
+def test_increments_along_a_shuttle_add_up_to_its_motion(method, arm, seconds):
     simulation = simulation_of(**{
-        'solver.method': method, 'increments.enabled': True, 'imu.lever_arm': (0.1, -0.2, 0.3),
-        'imu.rate': 200.0, 'ground_truth_imu_odom.rate': 200.0, **SHUTTLE})
+        **scene_parameters('shuttle'), 'solver.method': method, 'increments.enabled': True,
+        'imu.lever_arm': arm, 'imu.rate': 200.0, 'ground_truth_imu_odom.rate': 200.0})
     taken = {'imu/dq': [], 'imu/dv': [], 'ground_truth/imu_odom': []}
     streams = [one for one in simulation.streams if one.topic in taken]
-    for block in simulation.play(streams, 60 * S):
+    for block in simulation.play(streams, seconds * S):
         for one, _, rows in block.parts:
             taken[one.topic].append(np.hstack(one.template.decode(rows.tobytes())))
     turns, pushes, truth = (np.vstack(taken[topic]) for topic in taken)
-    _, q, v, _ = np.split(truth[0], (3, 7, 10))
-    q = tuple(q[:, np.newaxis])
-    v, dt = np.ravel(attitude.in_world(q, v)), 1 / 200
-    gravity = np.array((0.0, 0.0, -9.80665))
+    place, q, v = truth[0, :3], tuple(truth[0, 3:7, np.newaxis]), world(truth[0])
+    dt, gravity = 1 / 200, np.array((0.0, 0.0, -9.80665))
     for turn, push in zip(turns[1:], pushes[1:], strict=True):
-        v = v + np.ravel(attitude.in_world(q, push)) + gravity * dt
-        q = attitude.product(q, turn)
-    end = truth[-1]
-    assert attitude.angle_between(q, tuple(end[3:7, np.newaxis])).max() < 1e-10
-    true = np.ravel(attitude.in_world(tuple(end[3:7, np.newaxis]), end[7:10]))
-    assert abs(v - true).max() < 1e-9
+        change = np.ravel(attitude.in_world(q, push)) + gravity * dt
+        place = place + dt * (v + 0.5 * change)
+        v, q = v + change, attitude.product(q, turn)
+    last = truth[-1]
+    assert attitude.angle_between(q, tuple(last[3:7, np.newaxis])).max() < 1e-12
+    assert abs(v - world(last)).max() < 1e-10
+    if not any(arm):        # else the mean velocity of an interval is not that of its ends
+        assert abs(place - last[:3]).max() < 1e-9
+
+
+def world(row):
+    """Return the velocity in the world of a row of odometry."""
+    return np.ravel(attitude.in_world(tuple(row[3:7, np.newaxis]), row[7:10]))
 
 
 def test_the_specific_force_is_that_of_the_place_in_the_world():
@@ -96,7 +104,7 @@ def test_the_specific_force_is_that_of_the_place_in_the_world():
     q = simulation.segment.states(range(0, S // 2 + 1, 10 ** 6)).rows_quaternion
     acceleration = (place[2:] - 2 * place[1:-1] + place[:-2]) * 1e6
     expected = attitude.in_body(tuple(part[1:-1] for part in q),
-                                tuple((acceleration + (0.0, 0.0, 9.80665)).T))
+                                tuple((acceleration + np.array((0.0, 0.0, 9.80665))).T))
     assert np.stack(expected, axis=-1) == pytest.approx(force[1:-1], abs=2e-2)
 
 
@@ -152,3 +160,75 @@ def test_commands_of_the_spin_count_about_the_vertical_of_the_world():
     assert lz == pytest.approx(0.9, rel=1e-14)
     assert top.lambda3 * w3 == pytest.approx(1.2, rel=1e-15)
     assert (simulation.l3, simulation.lz) == (1.2, 0.9)
+
+
+@pytest.mark.parametrize('frame', ['world', 'map/θ', ''])
+def test_a_transform_is_the_pose(frame):
+    typesys = pytest.importorskip('rosbags.typesys')
+    store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+    values = {'solver.method': 'exact', 'tf.enabled': True, 'world_frame': frame, **SHUTTLE}
+    sent = {topic: play(simulation_of(**values), S, topic)[-1][2] for topic in ('/tf', 'pose')}
+    (found,) = store.deserialize_cdr(sent['/tf'], 'tf2_msgs/msg/TFMessage').transforms
+    pose = store.deserialize_cdr(sent['pose'], 'geometry_msgs/msg/PoseStamped')
+    assert found.header == pose.header and found.header.frame_id == frame
+    assert found.child_frame_id == 'base_link'
+    for one, other in ((found.transform.translation, pose.pose.position),
+                       (found.transform.rotation, pose.pose.orientation)):
+        assert [getattr(one, axis) for axis in 'xyz'] == [getattr(other, axis) for axis in 'xyz']
+    assert found.transform.translation.x > 0.1
+
+
+def test_odometry_has_the_twist_in_the_frame_of_the_body():
+    values = {'solver.method': 'exact', **SHUTTLE}
+    simulation = simulation_of(**values)
+    (position, q, velocity, rates) = stream(simulation, 'ground_truth/odom').template.decode(
+        play(simulation, S, 'ground_truth/odom')[-1][2])
+    pivot, state = simulation.segment.pivot(np.array([S])), simulation.state()
+    assert (position[0] == pivot.position[:, 0]).all() and (q == state.quaternion).all()
+    assert (rates == state.angular_velocity).all()
+    assert np.ravel(attitude.in_world(tuple(q.T), tuple(velocity.T))) == pytest.approx(
+        pivot.velocity[:, 0], abs=1e-15)
+
+
+@pytest.mark.parametrize('scene', RIDES)
+def test_a_scene_with_a_moving_pivot_goes_on(scene):
+    simulation = simulation_of(**scene_parameters(scene))
+    assert len(list(play(simulation, 20 * S, 'ground_truth/odom'))) == 2001
+    assert simulation.top.is_realizable
+    assert len(simulation.path._segments) < 10           # the others are forgotten
+    force = simulation_of(**scene_parameters(scene))
+    readings = np.vstack([stream(force, 'ground_truth/imu').template.decode(data)[2]
+                          for _, _, data in play(force, 9 * S, 'ground_truth/imu')])
+    expected = {'shuttle': (9.80665, math.hypot(9.80665, 2.0)), 'elevator': (7.80665, 11.80665),
+                'free_fall': (0.0, 2 * 9.80665),
+                'braking': (9.80665, math.hypot(9.80665, 8.0))}[scene]
+    sizes = np.linalg.norm(readings, axis=1)
+    assert (sizes.min(), sizes.max()) == pytest.approx(expected, rel=1e-15, abs=1e-30)
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_a_driven_node_is_recorded_and_verified(tmp_path, method, capsys):
+    msg = pytest.importorskip('geometry_msgs.msg')
+    own_node = pytest.importorskip('helpers.own_node')
+
+    def twist(linear, angular=0.0):
+        return msg.Twist(linear=msg.Vector3(x=linear), angular=msg.Vector3(z=angular))
+
+    with own_node.OwnNode(tmp_path, solver__method=method, record__enabled=True,
+                          pivot__cmd_timeout=0.2) as top:
+        node, told = top.node, []
+        node.get_logger().warning = told.append
+        for linear in (0.1, 0.7, 0.7, -0.3):
+            for _ in range(50):             # a storm: the last one of a tick counts
+                node._on_velocity(twist(linear))
+            top.wait_until(top.simulation.now_ns + S // 10)
+        assert top.simulation.segment.ride is not None
+        refused = (twist(math.nan), twist(math.inf), twist(1e9), twist(0.0, 2.0))
+        for message in refused:
+            node._on_velocity(message)
+        assert top.loop.rejected_commands == len(refused)
+        top.wait_until(top.simulation.now_ns + S)
+        rests = top.simulation.segment.pivot(np.array([top.simulation.now_ns]))
+        assert not rests.velocity.any() and 4 <= top.loop.commands <= 10
+    assert inspect.main([str(tmp_path / 'run.mcap'), '--verify']) == 0
+    assert 'identical' in capsys.readouterr().out

@@ -68,6 +68,7 @@ class Simulator(Node):
         self._report = reports.MotionReport(simulation, self.loop, self._session)
         self._status_timer: Timer | None = None
         self._status_period = 0.0
+        self._outputs.check(simulation.outputs, values)
         self._open_outputs(values)
         self._diagnostics = self._outputs.create(DiagnosticArray, '/diagnostics')
         self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
@@ -176,12 +177,12 @@ class Simulator(Node):
         linear, angular = ([part.x, part.y, part.z] for part in (message.linear, message.angular))
         try:
             if any(angular):
-                raise ValueError(f'angular = {angular!r} rad/s: must be 0: the pivot does not turn')
+                raise ValueError(f'angular = {angular!r} rad/s: must be 0')
             with self.lock:
                 self.loop.drive(linear)
         except ValueError as error:
             self.loop.rejected_commands += 1
-            self._log.warning(f'~/cmd_vel: refused: {error}', throttle_duration_sec=1.0)
+            self._log.warning(f'~/cmd_vel: refused: {error}')
 
     def _on_set_parameters(self, given: list[Parameter]) -> SetParametersResult:
         """Apply all changes or none."""
@@ -223,6 +224,7 @@ class Simulator(Node):
         if self._date.follows and journal.is_enabled('clock', values):
             raise ValueError('clock.enabled, publish_clock: must be false while this node follows '
                              'another /clock (use_sim_time)')
+        self._outputs.check(self.simulation.outputs, values)
         lowest = self.simulation.lowest_imu_rate(restarted=restarted)
         if values['imu.rate'] < lowest:
             raise ValueError(f'imu.rate = {values["imu.rate"]!r}: must be >= {lowest:g} while '

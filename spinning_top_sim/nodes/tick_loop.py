@@ -90,7 +90,8 @@ class TickLoop:
         self._clock = SimulatedClock(source, values['time_scale'])
         self._subscribers_due_ns = 0            # on the steady clock
         self._stop_at_ns = 0                    # on the steady clock: when a tick gives way
-        self._velocity: tuple[float, float, float] | None = None     # for the pivot, not yet applied
+        # Asked for the pivot, and not yet applied
+        self._velocity: tuple[float, float, float] | None = None
         self._block_unfinished = False          # `idle` goes on with a block of samples
         self.set_pace(values)
 

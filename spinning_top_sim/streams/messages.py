@@ -99,6 +99,13 @@ def odometry(frame_id: str, child_frame_id: str) -> Template:
 
 
 @lru_cache(64)
+def transform(frame_id: str, child_frame_id: str) -> Template:
+    """tf2_msgs/TFMessage with one transform; fields: translation, rotation x, y, z, w."""
+    return Template(CdrWriter().append('I', 1).header(frame_id).string(child_frame_id)
+                    .field(3).field(4))
+
+
+@lru_cache(64)
 def stamped(frame_id: str, count: int) -> Template:
     """geometry_msgs/Vector3Stamped (count 3) or QuaternionStamped (4); fields: x, y, z(, w)."""
     return Template(CdrWriter().header(frame_id).field(count))

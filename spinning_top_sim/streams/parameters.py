@@ -126,6 +126,7 @@ class Parameter:
 # Name, default rate [Hz], on by default, description.  Streams with None have the rate `imu.rate`.
 STREAM_DEFAULTS: tuple[tuple[str, float | None, bool, str], ...] = (
     ('pose', 100.0, True, 'pose (geometry_msgs/PoseStamped)'),
+    ('tf', 100.0, False, '/tf (tf2_msgs/TFMessage), world_frame -> body_frame'),
     ('joint_states', 100.0, True, 'joint_states (sensor_msgs/JointState)'),
     ('imu', 200.0, True, 'imu/data_raw and ground_truth/imu_bias (sensor_msgs/Imu)'),
     ('imu_data', 200.0, False, 'imu/data (sensor_msgs/Imu with orientation)'),

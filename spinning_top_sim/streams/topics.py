@@ -225,6 +225,7 @@ def all_streams(values: Mapping[str, Any]) -> list[Stream]:
         stream('clock', '/clock', 'rosgraph_msgs/msg/Clock', messages.clock()),
         stream('pose', 'pose', 'geometry_msgs/msg/PoseStamped', messages.pose_stamped(world),
                _pose),
+        stream('tf', '/tf', 'tf2_msgs/msg/TFMessage', messages.transform(world, body), _pose),
         stream('joint_states', 'joint_states', 'sensor_msgs/msg/JointState',
                messages.joint_state(JOINTS), _joints),
         of_imu('imu', 'imu/data_raw', partial(_readings, imu), has_orientation=False,

@@ -34,6 +34,8 @@ FIELDS_OF = {'command': ('l3', 'lz'), 'state': tuple(field.name for field in fie
 # or by type.
 FIELDS = {
     'geometry_msgs/msg/PoseStamped': ('pose.position', 'pose.orientation'),
+    'tf2_msgs/msg/TFMessage': ('transforms[0].transform.translation',
+                               'transforms[0].transform.rotation'),
     'sensor_msgs/msg/JointState': ('position', 'velocity'),
     'sensor_msgs/msg/Imu': ('orientation', 'angular_velocity', 'linear_acceleration'),
     'sensor_msgs/msg/MagneticField': ('magnetic_field', 'magnetic_field_covariance'),

@@ -69,7 +69,7 @@ class Section:
 class MotionReport:
     """A motion of the top, from its cause to the next one."""
 
-    cause: str                            # start, command, state or reset
+    cause: str                            # start, command, state, drive or reset
     origin_ns: int                        # log time of the t = 0 of `segment` [ns]
     segment: Segment                      # its constants and its exact solution
     exact: Description | None             # None if the closed form cannot represent it
@@ -155,7 +155,7 @@ def _follow_run(found: Survey, run: RunDescription) -> None:
                        if stream.topic in run.topics}
             # The velocities of the pivot belong to one motion.
             if event.name != 'parameters' and not (
-                    event.name == 'drive' and motions and motions[-1].event == 'drive'):
+                    event.name == 'drive' and motions and motions[-1].cause == 'drive'):
                 exact = simulation.describe() if len(motions) < MOST_EXACT else None
                 motions.append(MotionReport(
                     event.name, simulation.epoch_ns + simulation.segment.start_ns,
