@@ -66,7 +66,9 @@ def blocks(path: Path, streams: Sequence[Stream], epoch_ns: int, after_ns: int, 
             for stream in streams:
                 times = stream.times(after_ns, block_end_ns)
                 if times:
-                    parts.append((stream, *stream.encode(samples(times))))
+                    times_ns, rows = stream.encode(samples(times))
+                    if len(times_ns):       # a sensor may lose all samples of a block
+                        parts.append((stream, times_ns, rows))
                     yield None
             yield Block(block_end_ns, parts)
             after_ns = block_end_ns

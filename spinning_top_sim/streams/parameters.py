@@ -278,8 +278,8 @@ TABLE: tuple[Parameter, ...] = (
           ('random_walk', 'Random walk of the bias of the magnetometer, 0 = none', 'T/s/sqrt(Hz)'),
           ('range', 'Largest reading of the magnetometer, 0 = unlimited', 'T'),
           ('resolution', 'Smallest step of the readings of the magnetometer, 0 = none', 'T'))),
-    _at_reset('gnss.origin', (48.14, 11.58, 520.0), 'Latitude and longitude [deg] and height above '
-              'the ellipsoid of WGS-84 [m] of the origin of the world', '', -1e6, 1e6),
+    _at_reset('gnss.origin', (48.14, 11.58, 520.0), 'Latitude and longitude [deg] and height '
+              'above the ellipsoid of WGS-84 [m] of the origin of the world', '', -1e6, 1e6),
     _at_reset('gnss.position_noise', (0.0, 0.0), 'Standard deviation of the white noise of a fix, '
               'for each horizontal axis and for the vertical one', 'm', 0.0, 1e6, smallest=1e-12),
     _at_reset('gnss.velocity_noise', (0.0, 0.0), 'The same of gnss/velocity', 'm/s', 0.0, 1e6,
